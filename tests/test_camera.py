@@ -1,0 +1,191 @@
+"""The camera: projection, radial distance, distortion and depth correction agree."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+
+W, H = 176, 144
+K = np.array([[200.0, 0, 88.5], [0, 210.0, 71], [0, 0, 1]])
+DISTORTION = np.array([-0.35, 0.15, 0.002, -0.001, 0.01])
+
+
+def plane_z(camera: Camera, rays: np.ndarray) -> np.ndarray:
+    """Z of the plane 0.2 x + 0.1 y + z = 0.8 along the rays."""
+    return 0.8 / (1 + rays @ (0.2, 0.1))
+
+
+def test_project_undoes_the_rays() -> None:
+    camera = Camera(K, W, H)
+    z = np.random.default_rng(0).uniform(0.3, 2, (H, W, 1))
+    points = np.concatenate([camera.normalised_rays() * z, z], axis=-1)
+    v, u = np.mgrid[:H, :W]
+    np.testing.assert_allclose(camera.project(points), np.stack([u, v], axis=-1), atol=1e-9)
+
+
+def test_pixel_centres_lie_at_integers() -> None:
+    camera = Camera(np.array([[100.0, 0, 2], [0, 100.0, 1], [0, 0, 1]]), 5, 3)
+    np.testing.assert_array_equal(camera.normalised_rays()[1, 2], (0, 0))
+    np.testing.assert_allclose(camera.normalised_rays()[2, 0], (-0.02, 0.01))
+    np.testing.assert_allclose(camera.project(np.array([0.01, 0.02, 0.5])), (4, 5))
+
+
+def test_points_behind_the_camera_have_no_image() -> None:
+    camera = Camera(K, W, H)
+    assert np.isnan(camera.project(np.array([[0.1, 0.1, 0.0], [0.1, 0.1, -1.0]]))).all()
+
+
+def test_distorted_rays_project_back_to_their_pixels() -> None:
+    camera = Camera(K, W, H, DISTORTION)
+    rays = camera.normalised_rays().reshape(-1, 2)
+    points = np.column_stack([rays, np.ones(len(rays))])
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, DISTORTION)
+    v, u = np.mgrid[:H, :W]
+    np.testing.assert_allclose(
+        pixels.reshape(-1, 2), np.column_stack([u.ravel(), v.ravel()]), atol=0.02
+    )
+
+
+def test_no_reading_is_zero() -> None:
+    camera = Camera(np.eye(3), 6, 1)
+    depth = np.array([[0.5, np.nan, np.inf, -np.inf, -1.0, 0.0]], np.float32)
+    for radial in (False, True):
+        z = camera.rectify(depth, radial)
+        assert z.dtype == np.float32
+        assert (z[0, 1:] == 0).all()
+        assert z[0, 0] > 0
+
+
+def test_rectify_leaves_its_input_and_plain_depth_alone() -> None:
+    depth = np.random.default_rng(0).uniform(0, 2, (H, W)).astype(np.float32)
+    before = depth.copy()
+    z = Camera(K, W, H).rectify(depth, radial=False)
+    np.testing.assert_array_equal(z, before)
+    z[:] = 9
+    np.testing.assert_array_equal(depth, before)
+
+
+def test_radial_distance_becomes_depth() -> None:
+    camera = Camera(K, W, H)
+    z = plane_z(camera, camera.normalised_rays())
+    points = np.dstack([camera.normalised_rays() * z[..., None], z])
+    radial = np.linalg.norm(points, axis=-1)
+    np.testing.assert_allclose(camera.radial_to_z(radial), z, rtol=1e-6)
+    np.testing.assert_allclose(camera.rectify(radial.astype(np.float32), True), z, rtol=1e-6)
+
+
+@pytest.mark.parametrize("radial", [False, True])
+def test_undistortion_puts_a_plane_where_a_pinhole_sees_it(radial: bool) -> None:
+    camera, pinhole = Camera(K, W, H, DISTORTION), Camera(K, W, H)
+    rays = camera.normalised_rays()
+    measured = plane_z(camera, rays)
+    if radial:
+        measured = measured * np.sqrt(1 + (rays**2).sum(axis=-1))
+    z = camera.rectify(measured.astype(np.float32), radial)
+    expected = plane_z(pinhole, pinhole.normalised_rays())
+    seen = z > 0
+    assert seen.mean() > 0.9
+    # Nearest neighbour: wrong by the plane's slope over at most half a pixel and a bit.
+    np.testing.assert_allclose(z[seen], expected[seen], atol=0.002)
+
+
+def test_undistortion_never_mixes_two_depths() -> None:
+    camera = Camera(K, W, H, DISTORTION)
+    depth = np.where(np.arange(W) < W // 2, 0.5, 1.5).astype(np.float32) * np.ones((H, 1))
+    assert set(np.unique(camera.rectify(depth.astype(np.float32), False))) <= {
+        np.float32(0),
+        np.float32(0.5),
+        np.float32(1.5),
+    }
+
+
+def test_amplitude_moves_with_the_depth() -> None:
+    image = np.random.default_rng(0).integers(1, 60000, (H, W), dtype=np.uint16)
+    camera = Camera(K, W, H, DISTORTION)
+    moved = camera.undistort_amplitude(image)
+    assert moved.dtype == np.uint16
+    np.testing.assert_array_equal(moved, camera.rectify(image.astype(np.float32), False))
+    assert not np.array_equal(moved, image)
+    np.testing.assert_array_equal(Camera(K, W, H).undistort_amplitude(image), image)
+    assert camera.undistort_amplitude(None) is None
+
+
+@pytest.mark.parametrize("radial", [False, True])
+def test_depth_polynomial_corrects_the_radial_distance(radial: bool) -> None:
+    coefficients = (0.01, -0.02, 0.03)
+    camera = Camera(K, W, H, depth_polynomial=coefficients)
+    measured = np.random.default_rng(0).uniform(0.3, 1.5, (H, W))
+    measured[0, 0] = 0
+    lengths = np.sqrt(1 + (camera.normalised_rays() ** 2).sum(axis=-1))
+    corrected = measured + 0.01 - 0.02 * measured + 0.03 * measured**2
+    image = measured if radial else measured / lengths
+    z = camera.rectify(image.astype(np.float32), radial)
+    assert z[0, 0] == 0, "the correction must not invent a reading"
+    np.testing.assert_allclose(z.ravel()[1:], (corrected / lengths).ravel()[1:], rtol=1e-5)
+
+
+def test_correction_below_zero_is_no_reading() -> None:
+    camera = Camera(K, W, H, depth_polynomial=(-0.5,))
+    assert (camera.rectify(np.full((H, W), 0.4, np.float32), True) == 0).all()
+
+
+def test_image_of_another_size_is_told() -> None:
+    with pytest.raises(ToftrackError, match="144 rows"):
+        Camera(K, W, H).rectify(np.ones((W, H), np.float32), False)
+
+
+def test_save_and_load_are_the_same_camera(tmp_path: Path) -> None:
+    camera = Camera(K, W, H, DISTORTION, (0.01, -0.002))
+    camera.save(tmp_path / "camera.json")
+    loaded = Camera.load(tmp_path / "camera.json")
+    np.testing.assert_array_equal(loaded.K, K)
+    np.testing.assert_array_equal(loaded.distortion, DISTORTION)
+    assert (loaded.width, loaded.height) == (W, H)
+    assert loaded.depth_polynomial == (0.01, -0.002)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": "other"}, "not a camera file"),
+        ({"version": 2}, "version 2"),
+        ({"K": None}, "lacks the key 'K'"),
+        ({"width": None}, "lacks the key 'width'"),
+        ({"width": "wide"}, "whole number"),
+        ({"height": 0}, "not positive"),
+        ({"K": [[1, 0], [0, 1]]}, "3x3"),
+        ({"distortion": [0, 0]}, "5 numbers"),
+        ({"depth_polynomial": ["a"]}, "depth polynomial"),
+    ],
+)
+def test_bad_camera_file_is_told(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    path = tmp_path / "camera.json"
+    Camera(K, W, H).save(path)
+    content = json.loads(path.read_text()) | change
+    path.write_text(json.dumps({k: v for k, v in content.items() if v is not None}))
+    with pytest.raises(ToftrackError, match=words) as caught:
+        Camera.load(path)
+    assert "camera.json" in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe\x00"])
+def test_file_that_is_no_camera_is_told(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "camera.json"
+    path.write_bytes(content)
+    with pytest.raises(ToftrackError, match="not a camera file"):
+        Camera.load(path)
+
+
+def test_missing_and_unwritable_camera_files_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="cannot be read"):
+        Camera.load(tmp_path / "nope.json")
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        Camera(K, W, H).save(tmp_path / "nowhere" / "camera.json")

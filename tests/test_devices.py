@@ -1,0 +1,180 @@
+"""Devices: the frames of a recording, in order, as they were recorded."""
+
+from __future__ import annotations
+
+import json
+import time
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toftrack.camera import Camera
+from toftrack.devices.base import Device
+from toftrack.devices.replay import Replay
+from toftrack.devices.sample import Sample
+from toftrack.errors import ToftrackError
+
+T, H, W = 12, 6, 8
+K = np.array([[20.0, 0, 4], [0, 20.0, 3], [0, 0, 1]])
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "recording.npz"
+    depth = np.arange(1, T + 1, dtype=np.float16)[:, None, None] / 16 * np.ones((1, H, W))
+    np.savez(
+        path,
+        depth_m=depth.astype(np.float16),
+        amplitude=np.arange(T, dtype=np.uint16)[:, None, None] * np.ones((1, H, W), np.uint16),
+        K=K,
+        fps=100.0,
+        joints_m=np.arange(T)[:, None, None] * np.ones((1, 21, 3)),
+        visible=np.arange(T) % 2 == 0,
+        in_space=np.arange(T) % 3 == 0,
+        metadata='{"who": "a test"}',
+    )
+    return path
+
+
+def test_every_frame_once_and_in_order(recording: Path) -> None:
+    with Replay(recording) as device:
+        frames = list(device)
+    assert [frame.index for frame in frames] == list(range(T))
+    assert device.frames == T
+    for i, frame in enumerate(frames):
+        assert frame.depth.dtype == np.float32
+        assert frame.depth.shape == (H, W)
+        assert (frame.depth == (i + 1) / 16).all()
+        assert frame.amplitude.dtype == np.uint16
+        assert (frame.amplitude == i).all()
+        assert frame.timestamp_s == pytest.approx(i / 100)
+        assert not frame.radial
+
+
+def test_iterating_again_starts_again(recording: Path) -> None:
+    device = Replay(recording, stop=3)
+    assert [f.index for f in device] == [f.index for f in device] == [0, 1, 2]
+
+
+def test_a_frame_is_the_callers_own(recording: Path) -> None:
+    device = Replay(recording)
+    next(iter(device)).depth[:] = -1
+    assert (next(iter(device)).depth > 0).all()
+
+
+def test_range_keeps_the_recordings_indices_and_its_truth(recording: Path) -> None:
+    device = Replay(recording, start=4, stop=7)
+    assert [frame.index for frame in device] == [4, 5, 6]
+    assert device.frames == len(device.truth) == 3
+    assert device.truth.joints_m[:, 0, 0].tolist() == [4, 5, 6]
+    assert device.truth.visible.tolist() == [True, False, True]
+    assert device.truth.in_space.tolist() == [False, False, True]
+    assert device.truth.visible_fraction is None
+
+
+@pytest.mark.parametrize(
+    ("start", "stop"),
+    [(T, None), (-1, None), (0, T + 1), (5, 5), (5, 4), (0, 0), ("a", None), (0, 2.5), (True, 3)],
+)
+def test_range_outside_the_recording_is_told(recording: Path, start: Any, stop: Any) -> None:
+    with pytest.raises(ToftrackError, match=f"start|stop.*{T}"):
+        Replay(recording, start=start, stop=stop)
+
+
+def test_no_path_is_told() -> None:
+    with pytest.raises(ToftrackError, match="device.path"):
+        Replay(None)
+
+
+def test_description_is_json_and_says_what_was_replayed(recording: Path) -> None:
+    device = Replay(str(recording), start=2, stop=5)
+    description = json.loads(json.dumps(device.description))
+    assert description["recording"] == str(recording)
+    assert (description["start"], description["stop"]) == (2, 5)
+    assert device.metadata == {"who": "a test"}
+
+
+def test_realtime_waits_for_each_frames_time(recording: Path) -> None:
+    device = Replay(recording, realtime=True)
+    begin = time.monotonic()
+    indices = [frame.index for frame in device]
+    assert time.monotonic() - begin >= (T - 1) / 100
+    assert indices[0] == 0
+    assert indices[-1] == T - 1
+    assert len(indices) + device.dropped == T
+
+
+def test_realtime_drops_what_comes_too_late(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    device = Replay(recording, start=1, realtime=True)
+    indices = []
+    for frame in device:
+        indices.append(frame.index)
+        now[0] += 0.035  # three and a half frames
+    assert indices == [1, 4, 8, 11]
+    assert device.dropped == 7
+    assert [frame.index for frame in device] == list(range(1, T)), "nothing is late this time"
+    assert device.dropped == 0
+
+
+def test_without_realtime_nothing_is_dropped(recording: Path) -> None:
+    device = Replay(recording)
+    count = 0
+    for _ in device:
+        time.sleep(0.012)
+        count += 1
+    assert (count, device.dropped) == (T, 0)
+
+
+def test_camera_file_replaces_the_intrinsics(recording: Path, tmp_path: Path) -> None:
+    other = K.copy()
+    other[0, 0] = 33
+    Camera(other, W, H, depth_polynomial=(0.01,)).save(tmp_path / "camera.json")
+    camera = Replay(recording, camera_file=tmp_path / "camera.json").camera
+    assert camera.K[0, 0] == 33
+    assert camera.depth_polynomial == (0.01,)
+
+
+def test_camera_file_of_another_size_is_told(recording: Path, tmp_path: Path) -> None:
+    Camera(K, W + 1, H).save(tmp_path / "camera.json")
+    with pytest.raises(ToftrackError, match="9x6.*8x6"):
+        Replay(recording, camera_file=tmp_path / "camera.json")
+
+
+def test_sample_is_the_packaged_recording() -> None:
+    device = Sample()
+    assert isinstance(device, Device)
+    assert (device.frames, device.fps) == (100, 25)
+    assert (device.camera.width, device.camera.height) == (176, 144)
+    assert device.truth.joint_visible.shape == (100, 21)
+    assert device.truth.visible_fraction.shape == (100,)
+    assert device.metadata["handedness"] == "right"
+    frame = next(iter(device))
+    assert 0.4 < np.median(frame.depth[frame.depth > 0]) < 2
+    assert frame.amplitude.max() > 1000
+
+
+def test_sample_is_small_and_carries_its_licence() -> None:
+    data = resources.files("toftrack") / "data"
+    assert len((data / "sample.npz").read_bytes()) <= 4_500_000
+    licence = (data / "README.md").read_text(encoding="utf-8")
+    assert "MIT" in licence
+    assert "2019 Amazon" in licence
+
+
+def test_samples_truth_lies_on_the_recorded_hand() -> None:
+    # The joints are inside the hand, so the surface in front of a visible one is a little nearer.
+    device = Sample(stop=20)
+    gaps = []
+    for row, frame in enumerate(device):
+        joints = device.truth.joints_m[row][device.truth.joint_visible[row]]
+        u, v = np.round(device.camera.project(joints)).astype(int).T
+        gaps.extend(joints[:, 2] - frame.depth[v, u])
+    assert 0.003 < np.median(gaps) < 0.025

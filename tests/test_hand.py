@@ -1,0 +1,198 @@
+"""Kinematics, shape and surface of the hand."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from toftrack.errors import ToftrackError
+from toftrack.hand import make_hand_shape
+from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.skeleton import (
+    ANGLE_LIMITS,
+    ANGLE_NAMES,
+    JOINT_NAMES,
+    forward_kinematics,
+)
+from toftrack.hand.surface import hand_surface
+
+
+def random_states(n: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    limits = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
+    unit = torch.rand(n, 21, generator=generator, dtype=torch.float64)
+    angles = limits[:, 0] + unit * (limits[:, 1] - limits[:, 0])
+    pose = torch.randn(n, 6, generator=generator, dtype=torch.float64)
+    return torch.cat((pose, angles), 1).to(dtype)
+
+
+def exponential(axis: int, angle: float) -> torch.Tensor:
+    """4 x 4 matrix exponential of a rotation's twist."""
+    twist = torch.zeros(4, 4, dtype=torch.float64)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    twist[i, j], twist[j, i] = -angle, angle
+    return torch.matrix_exp(twist)
+
+
+def shift(x: float, y: float, z: float) -> torch.Tensor:
+    move = torch.eye(4, dtype=torch.float64)
+    move[:3, 3] = torch.tensor([x, y, z], dtype=torch.float64)
+    return move
+
+
+def joints_by_matrix_exponentials(state: torch.Tensor, shape: HandShape) -> torch.Tensor:
+    """A second implementation: one joint after the other, 4 x 4 products of twists' exponentials."""
+    rx, ry, rz = state[3:6].tolist()
+    twist = torch.tensor(
+        [[0, -rz, ry, 0], [rz, 0, -rx, 0], [-ry, rx, 0, 0], [0, 0, 0, 0]], dtype=torch.float64
+    )
+    world = shift(*state[:3].tolist()) @ torch.matrix_exp(twist)
+    if shape.side == "left":
+        world = world @ torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.float64))
+    angle = dict(zip(ANGLE_NAMES, state[6:].tolist(), strict=True))
+    joints = [world[:3, 3]]
+    for finger, name in enumerate(("thumb", "index", "middle", "ring", "little")):
+        first, second, third = ("cmc", "mcp", "ip") if name == "thumb" else ("mcp", "pip", "dip")
+        base = torch.eye(4, dtype=torch.float64)
+        base[:3, :3] = shape.base_frames[finger]
+        pose = world @ shift(*shape.base_m[finger].tolist()) @ base
+        joints.append(pose[:3, 3])
+        for bone, joint in enumerate((first, second, third)):
+            pose = pose @ exponential(2, angle.get(f"{name}_{joint}_abduction", 0.0))
+            pose = pose @ exponential(0, angle[f"{name}_{joint}_flexion"])
+            pose = pose @ shift(0, -float(shape.bone_lengths_m[finger, bone]), 0)
+            joints.append(pose[:3, 3])
+    return torch.stack(joints)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_kinematics_agree_with_products_of_matrix_exponentials(side: str) -> None:
+    shape = default_hand_shape(side=side).to(torch.float64)
+    states = random_states(20)
+    joints = forward_kinematics(states, shape).joints_m
+    expected = torch.stack([joints_by_matrix_exponentials(state, shape) for state in states])
+    torch.testing.assert_close(joints, expected, atol=1e-9, rtol=0)
+
+
+def test_there_are_21_joints_and_21_angles() -> None:
+    assert len(JOINT_NAMES) == len(ANGLE_NAMES) == len(ANGLE_LIMITS) == 21
+    assert len(set(JOINT_NAMES)) == len(set(ANGLE_NAMES)) == 21
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bone_lengths_do_not_change_with_the_pose(dtype: torch.dtype) -> None:
+    shape = default_hand_shape().to(dtype)
+    joints = forward_kinematics(random_states(200, dtype=dtype), shape).joints_m
+    fingers = joints[:, 1:].unflatten(1, (5, 4))
+    lengths = fingers.diff(dim=2).norm(dim=-1)
+    torch.testing.assert_close(lengths, shape.bone_lengths_m.expand_as(lengths), atol=3e-6, rtol=0)
+    palm = (fingers[:, :, 0] - joints[:, :1]).norm(dim=-1)
+    torch.testing.assert_close(palm, shape.base_m.norm(dim=-1).expand_as(palm), atol=3e-6, rtol=0)
+
+
+def test_a_rigid_motion_moves_all_joints_with_it() -> None:
+    shape = default_hand_shape().to(torch.float64)
+    states = random_states(10)
+    still = states.clone()
+    still[:, :6] = 0
+    local = forward_kinematics(still, shape)
+    moved = forward_kinematics(states, shape)
+    rotation = moved.frames[:, 0]
+    expected = local.joints_m @ rotation.mT + states[:, None, :3]
+    torch.testing.assert_close(moved.joints_m, expected, atol=1e-9, rtol=0)
+
+
+def test_a_left_hand_is_the_mirror_image_of_a_right_one() -> None:
+    states = random_states(10)
+    states[:, :6] = 0
+    right = forward_kinematics(states, default_hand_shape().to(torch.float64)).joints_m
+    left = forward_kinematics(states, default_hand_shape(side="left").to(torch.float64)).joints_m
+    torch.testing.assert_close(left, right * torch.tensor([-1.0, 1, 1], dtype=torch.float64))
+
+
+def test_flexion_curls_towards_the_palm_and_abduction_towards_the_thumb() -> None:
+    state = torch.zeros(1, 27)
+    shape = default_hand_shape()
+    straight = forward_kinematics(state, shape).joints_m[0]
+    for name in ("index_mcp_flexion", "little_pip_flexion", "middle_dip_flexion"):
+        bent = state.clone()
+        bent[0, 6 + ANGLE_NAMES.index(name)] = 0.5
+        tip = JOINT_NAMES.index(name.split("_")[0] + "_tip")
+        assert forward_kinematics(bent, shape).joints_m[0, tip, 2] < straight[tip, 2] - 0.005
+    spread = state.clone()
+    spread[0, 6 + ANGLE_NAMES.index("index_mcp_abduction")] = 0.3
+    tip = JOINT_NAMES.index("index_tip")
+    assert forward_kinematics(spread, shape).joints_m[0, tip, 0] > straight[tip, 0] + 0.01
+
+
+def test_the_last_ellipsoid_of_every_finger_ends_at_its_tip() -> None:
+    shape = default_hand_shape().to(torch.float64)
+    pose = forward_kinematics(random_states(5), shape)
+    surface = hand_surface(shape)
+    ellipsoids = surface.pose(pose)
+    for finger in range(5):
+        index = int((surface.frame_index == 3 + 3 * finger).nonzero()[0])
+        end = ellipsoids.centres_m[:, index] - ellipsoids.axes_m[:, index, :, 1]
+        torch.testing.assert_close(end, pose.joints_m[:, 4 + 4 * finger], atol=1e-9, rtol=0)
+
+
+def test_scaling_the_shape_scales_joints_and_ellipsoids() -> None:
+    shape = default_hand_shape().to(torch.float64)
+    states = random_states(3)
+    states[:, :3] = 0
+    small, large = (
+        hand_surface(s).pose(forward_kinematics(states, s)) for s in (shape, shape.scaled(1.2))
+    )
+    torch.testing.assert_close(large.centres_m, 1.2 * small.centres_m)
+    torch.testing.assert_close(large.axes_m, 1.2 * small.axes_m)
+
+
+def test_thickness_changes_the_fingers_breadth_but_no_joint() -> None:
+    shape = default_hand_shape()
+    thick = dataclasses.replace(shape, thickness=1.2)
+    breadth = [hand_surface(s).axes_m[0, 0, 0] for s in (shape, thick)]
+    torch.testing.assert_close(breadth[1], 1.2 * breadth[0])
+    states = random_states(2, dtype=torch.float32)
+    torch.testing.assert_close(
+        forward_kinematics(states, shape).joints_m, forward_kinematics(states, thick).joints_m
+    )
+
+
+def test_the_default_hand_has_the_length_it_is_asked_for() -> None:
+    assert math.isclose(default_hand_shape(0.17).hand_length_m, 0.17, abs_tol=1e-6)
+
+
+def test_a_shape_file_round_trips(tmp_path) -> None:
+    shape = dataclasses.replace(default_hand_shape(0.18, "left"), thickness=1.1)
+    shape.save(tmp_path / "shape.json")
+    loaded = make_hand_shape(str(tmp_path / "shape.json"), side="left")
+    torch.testing.assert_close(loaded.base_m, shape.base_m)
+    torch.testing.assert_close(loaded.bone_lengths_m, shape.bone_lengths_m)
+    torch.testing.assert_close(loaded.base_frames, shape.base_frames)
+    assert (loaded.side, loaded.thickness) == ("left", 1.1)
+
+
+@pytest.mark.parametrize(
+    ("content", "part"),
+    [
+        (None, "no hand shape file"),
+        ("{", "not a readable"),
+        ("[]", "not a hand shape"),
+        ('{"format": "toftrack-hand-shape", "version": 9}', "version 9"),
+        ('{"format": "toftrack-hand-shape", "version": 1}', "damaged"),
+    ],
+)
+def test_a_bad_shape_file_is_one_clear_error(tmp_path, content, part) -> None:
+    path = tmp_path / "shape.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ToftrackError, match=part):
+        make_hand_shape(str(path))
+
+
+def test_an_unknown_side_or_an_impossible_length_is_refused() -> None:
+    with pytest.raises(ToftrackError, match="hand.side"):
+        default_hand_shape(side="both")
+    with pytest.raises(ToftrackError, match="metres"):
+        default_hand_shape(190.0)

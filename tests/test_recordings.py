@@ -1,0 +1,312 @@
+"""Recordings: what is written is read back, and every broken file is told in one sentence."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toftrack.errors import ToftrackError
+from toftrack.recordings.npz import read_recording, write_recording
+
+T, H, W = 4, 6, 8
+K = np.array([[20.0, 0, 4], [0, 21.0, 3], [0, 0, 1]])
+
+
+def arrays(**changes: Any) -> dict[str, Any]:
+    """A whole recording's arrays; None takes a key away."""
+    rng = np.random.default_rng(0)
+    content = {
+        "depth_m": rng.uniform(0.3, 2.0, (T, H, W)).astype(np.float32),
+        "K": K,
+        "amplitude": rng.integers(0, 4000, (T, H, W), dtype=np.uint16),
+        "timestamp_s": np.arange(T) * 0.1 + 5,
+        "joints_m": rng.normal(size=(T, 21, 3)).astype(np.float32),
+        "visible": np.array([True, True, False, True]),
+        "in_space": np.ones(T, bool),
+        "visible_fraction": np.ones(T, np.float32),
+        "joint_visible": np.ones((T, 21), bool),
+        "distortion": np.array([-0.1, 0.02, 0, 0, 0]),
+        "metadata": '{"hand_length_mm": 190.2}',
+    } | changes
+    return {key: value for key, value in content.items() if value is not None}
+
+
+def save(folder: Path, **changes: Any) -> Path:
+    path = folder / "recording.npz"
+    np.savez(path, **arrays(**changes))
+    return path
+
+
+def complaint(path: Path) -> str:
+    with pytest.raises(ToftrackError) as caught:
+        read_recording(path)
+    text = str(caught.value)
+    assert path.name in text, "the sentence must name the file"
+    assert "\n" not in text
+    return text
+
+
+def test_reads_every_key(tmp_path: Path) -> None:
+    content = arrays()
+    recording = read_recording(save(tmp_path))
+    np.testing.assert_array_equal(recording.depth, content["depth_m"])
+    np.testing.assert_array_equal(recording.amplitude, content["amplitude"])
+    np.testing.assert_array_equal(recording.camera.K, K)
+    np.testing.assert_array_equal(recording.camera.distortion, content["distortion"])
+    np.testing.assert_array_equal(recording.truth.visible, content["visible"])
+    assert (recording.camera.width, recording.camera.height) == (W, H)
+    assert recording.fps == pytest.approx(10.0)
+    assert recording.metadata == {"hand_length_mm": 190.2}
+    assert not recording.radial
+    assert len(recording) == T
+
+
+def test_two_keys_are_enough(tmp_path: Path) -> None:
+    path = tmp_path / "least.npz"
+    np.savez(path, depth_m=np.ones((T, H, W), np.float16), K=K)
+    recording = read_recording(path)
+    assert recording.depth.dtype == np.float16
+    assert recording.amplitude is None
+    assert recording.truth is None
+    assert recording.metadata == {}
+    np.testing.assert_allclose(recording.timestamp_s, np.arange(T) / 25)
+
+
+@pytest.mark.parametrize(
+    ("keys", "fps", "step"),
+    [
+        ({"timestamp_s": None, "fps": 50.0}, 50, 0.02),
+        ({"timestamp_s": np.arange(T) * 0.2, "fps": 50.0}, 5, 0.2),
+        ({"timestamp_s": None}, 25, 0.04),
+    ],
+)
+def test_times_come_from_stamps_then_rate(
+    tmp_path: Path, keys: dict[str, Any], fps: float, step: float
+) -> None:
+    recording = read_recording(save(tmp_path, **keys))
+    assert recording.fps == pytest.approx(fps)
+    np.testing.assert_allclose(np.diff(recording.timestamp_s), step)
+
+
+def test_radial_distance_stands_in_for_depth(tmp_path: Path) -> None:
+    radial = np.full((T, H, W), 0.7, np.float32)
+    recording = read_recording(save(tmp_path, depth_m=None, radial_m=radial))
+    assert recording.radial
+    np.testing.assert_array_equal(recording.depth, radial)
+
+
+def test_truth_without_flags_is_visible_and_in_space(tmp_path: Path) -> None:
+    truth = read_recording(save(tmp_path, visible=None, in_space=None)).truth
+    assert truth.visible.all()
+    assert truth.in_space.all()
+
+
+@pytest.mark.parametrize("radial", [False, True])
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_write_then_read_is_the_same(tmp_path: Path, radial: bool, kind: type) -> None:
+    depth = arrays()["depth_m"].astype(kind)
+    changes = {"depth_m": None, "radial_m": depth} if radial else {"depth_m": depth}
+    first = read_recording(save(tmp_path, **changes))
+    write_recording(tmp_path / "copy.npz", first)
+    second = read_recording(tmp_path / "copy.npz")
+    assert second.depth.dtype == kind
+    assert second.radial == radial
+    for name in ("depth", "amplitude", "timestamp_s"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    for name in ("joints_m", "visible", "in_space", "visible_fraction", "joint_visible"):
+        np.testing.assert_array_equal(getattr(first.truth, name), getattr(second.truth, name))
+    np.testing.assert_array_equal(first.camera.distortion, second.camera.distortion)
+    assert first.metadata == second.metadata
+    assert [p.name for p in tmp_path.glob("*.part")] == []
+
+
+def test_writing_into_no_folder_is_told(tmp_path: Path) -> None:
+    recording = read_recording(save(tmp_path))
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        write_recording(tmp_path / "nowhere" / "copy.npz", recording)
+
+
+def test_no_such_file(tmp_path: Path) -> None:
+    assert "no file" in complaint(tmp_path / "nope.npz")
+
+
+def test_a_directory(tmp_path: Path) -> None:
+    assert "is a directory" in complaint(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"depth", b"\x93NUMPY\x01\x00v\x00{'descr'"])
+def test_not_an_archive(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "text.npz"
+    path.write_bytes(content)
+    assert "not an .npz" in complaint(path)
+
+
+def test_a_single_array_is_not_an_archive(tmp_path: Path) -> None:
+    path = tmp_path / "array.npy"
+    np.save(path, np.ones(3))
+    assert "not an .npz" in complaint(path)
+
+
+def test_cut_off_archive(tmp_path: Path) -> None:
+    path = save(tmp_path)
+    path.write_bytes(path.read_bytes()[:-200])
+    assert "cut off" in complaint(path)
+
+
+def test_flipped_bytes_fail_the_checksum(tmp_path: Path) -> None:
+    path = save(tmp_path)
+    data = bytearray(path.read_bytes())
+    at = data.find(b"depth_m.npy") + 400  # within the first member's numbers
+    data[at : at + 4] = bytes(255 - b for b in data[at : at + 4])
+    path.write_bytes(data)
+    assert "damaged" in complaint(path)
+
+
+def test_damaged_compressed_member(tmp_path: Path) -> None:
+    path = tmp_path / "compressed.npz"
+    np.savez_compressed(path, **arrays())
+    data = bytearray(path.read_bytes())
+    at = data.find(b"depth_m.npy") + 100
+    data[at : at + 60] = bytes(60)
+    path.write_bytes(data)
+    assert "damaged" in complaint(path)
+
+
+def test_member_that_ends_too_early(tmp_path: Path) -> None:
+    path = tmp_path / "short.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, value in arrays().items():
+            stream = io.BytesIO()
+            np.save(stream, value)
+            content = stream.getvalue()
+            archive.writestr(f"{name}.npy", content[:-50] if name == "depth_m" else content)
+    assert "damaged" in complaint(path)
+
+
+def test_member_that_is_no_array(tmp_path: Path) -> None:
+    path = tmp_path / "raw.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("depth_m.npy", b"not an array at all")
+    assert "damaged" in complaint(path)
+
+
+class Canary:
+    """Unpickling one leaves a trace."""
+
+    woken = False
+
+    def __setstate__(self, state: object) -> None:
+        Canary.woken = True
+
+    def __getstate__(self) -> dict[str, int]:
+        return {"egg": 1}
+
+
+@pytest.mark.parametrize("key", ["depth_m", "K", "metadata", "something_else"])
+def test_pickled_objects_are_refused(tmp_path: Path, key: str) -> None:
+    path = save(tmp_path, **{key: np.array([Canary()], dtype=object)})
+    text = complaint(path)
+    assert "pickled" in text
+    assert key in text
+    assert not Canary.woken
+
+
+@pytest.mark.parametrize("key", ["depth_m", "K"])
+def test_required_key_missing(tmp_path: Path, key: str) -> None:
+    text = complaint(save(tmp_path, **{key: None}))
+    assert f"'{key}'" in text
+    assert "missing" in text
+
+
+@pytest.mark.parametrize("shape", [(H, W), (T, H, W, 1), (T,)])
+def test_wrong_number_of_dimensions(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    assert "3 dimensions" in complaint(save(tmp_path, depth_m=np.ones(shape, np.float32)))
+
+
+def test_zero_frames(tmp_path: Path) -> None:
+    text = complaint(save(tmp_path, depth_m=np.ones((0, H, W), np.float32)))
+    assert "zero frames" in text
+
+
+def test_empty_images(tmp_path: Path) -> None:
+    assert "empty" in complaint(save(tmp_path, depth_m=np.ones((T, 0, W), np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (np.eye(4), "3x3"),
+        (np.array([200.0, 200, 88, 72]), "3x3"),
+        (np.full((3, 3), np.nan), "NaN"),
+        (np.array([[np.inf, 0, 4], [0, 20, 3], [0, 0, 1]]), "infinity"),
+        (np.array([[-20.0, 0, 4], [0, 20, 3], [0, 0, 1]]), "positive focal"),
+        (np.zeros((3, 3)), "positive focal"),
+        (np.array([[20.0, 0, 4], [0, 20, 3], [4, 3, 1]]), "0, 0, 1"),
+        (np.array([["a"] * 3] * 3), "numbers"),
+    ],
+)
+def test_bad_camera_matrix(tmp_path: Path, matrix: np.ndarray, words: str) -> None:
+    text = complaint(save(tmp_path, K=matrix))
+    assert "K" in text
+    assert words in text
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.int32, np.int64])
+def test_whole_numbers_look_like_millimetres(tmp_path: Path, kind: type) -> None:
+    text = complaint(save(tmp_path, depth_m=np.full((T, H, W), 500, kind)))
+    assert "millimetres" in text
+    assert "/ 1000" in text
+
+
+@pytest.mark.parametrize("key", ["depth_m", "radial_m"])
+def test_millimetres_are_told_with_the_conversion(tmp_path: Path, key: str) -> None:
+    depth = np.full((T, H, W), 480.0, np.float32)
+    depth[:, : H - 1] = 0  # mostly without a reading, which must not hide it
+    text = complaint(save(tmp_path, **({"depth_m": None} | {key: depth})))
+    assert "millimetres" in text
+    assert f"{key} = depth / 1000" in text
+
+
+def test_a_recording_without_any_reading_is_valid(tmp_path: Path) -> None:
+    depth = np.full((T, H, W), np.nan, np.float32)
+    assert len(read_recording(save(tmp_path, depth_m=depth))) == T
+
+
+@pytest.mark.parametrize("kind", [bool, complex, "U3"])
+def test_depth_of_no_number_type(tmp_path: Path, kind: Any) -> None:
+    assert "float32" in complaint(save(tmp_path, depth_m=np.ones((T, H, W)).astype(kind)))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("joints_m", np.zeros((T - 1, 21, 3))),
+        ("joints_m", np.zeros((T, 20, 3))),
+        ("joints_m", np.full((T, 21, 3), np.nan)),
+        ("visible", np.ones(T + 1, bool)),
+        ("in_space", np.ones((T, 2), bool)),
+        ("visible_fraction", np.ones(T - 1)),
+        ("joint_visible", np.ones((T, 20), bool)),
+        ("amplitude", np.ones((T, H, W - 1), np.uint16)),
+        ("amplitude", np.ones((T, H, W), np.float32)),
+        ("timestamp_s", np.arange(T - 1.0)),
+        ("timestamp_s", np.array([0.0, 0.1, 0.05, 0.2])),
+        ("timestamp_s", np.array([0.0, np.nan, 0.2, 0.3])),
+        ("fps", 0.0),
+        ("fps", np.nan),
+        ("fps", "fast"),
+        ("distortion", np.zeros(3)),
+        ("distortion", np.full(5, np.inf)),
+        ("metadata", "no json"),
+        ("metadata", "[1]"),
+        ("metadata", np.ones(3)),
+    ],
+)
+def test_bad_optional_key_is_named(tmp_path: Path, key: str, value: Any) -> None:
+    text = complaint(save(tmp_path, **{key: value}))
+    assert key in text

@@ -1,0 +1,132 @@
+"""What `python track.py` does: build the parts of a configuration, run the loop, write and report."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+import hydra
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from toftrack.devices.base import Device, Frame
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.evaluation import metrics_table
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.results import ResultWriter
+from toftrack.tracker import Tracker
+from toftrack.views.overlay import View, draw_panel, panel_scale
+
+
+def compute_device(name: str) -> torch.device:
+    """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ToftrackError("compute=cuda, but torch finds no CUDA GPU here; give compute=cpu")
+    if name not in ("cpu", "cuda"):
+        raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
+    return torch.device(name)
+
+
+def build_tracker(config: DictConfig) -> Tracker:
+    """The tracker of a configuration (conf/config.yaml composed)."""
+    make = hydra.utils.instantiate
+    return Tracker(
+        shape=make(config.hand),
+        space=make(config.pose_space),
+        segmentation=make(config.segmentation),
+        likelihood=make(config.likelihood),
+        settings=make(config.filter),
+        start=make(config.start),
+        lost=make(config.lost),
+        renderer=config.renderer,
+        device=compute_device(config.compute),
+        seed=config.seed,
+    )
+
+
+def track(config: DictConfig) -> float:
+    """Run a configuration to its end; returns the mean joint error in mm, else 1 - mean score."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    device: Device = hydra.utils.instantiate(config.device)
+    tracker = build_tracker(config)
+    with device:
+        make_view = hydra.utils.instantiate(config.view, _partial_=True)
+        metadata = _metadata(config, device, tracker)
+        view: View = make_view(folder=folder, fps=device.fps, frames=device.frames)
+        with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
+            try:
+                _loop(device, tracker, results, view)
+            finally:
+                view.close()
+    summary = results.summary or {}
+    if not summary.get("frames"):
+        raise ToftrackError("the device delivered no frame; nothing was tracked")
+    print(metrics_table(summary))
+    print(f"results: {folder}")
+    for name in ("track.npz", "track.jsonl", "summary.json", "overlay.mp4", "overlay.png"):
+        if (folder / name).exists():
+            print(f"  {folder / name}")
+    error = (summary.get("metrics") or {}).get("mean_mm")
+    return float(error) if error is not None else 1.0 - float(summary["mean_score"])
+
+
+def _loop(device: Device, tracker: Tracker, results: ResultWriter, view: View) -> None:
+    progress = partial(tqdm, total=device.frames, unit=" frames", file=sys.stderr, mininterval=0.2)
+    with progress() as bar:
+        for frame in device:
+            depth = device.camera.rectify(frame.depth, frame.radial)
+            estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+            results.append(estimate)
+            if view.active:
+                view.add(_panel(device, tracker, frame, depth, estimate))
+            bar.update()
+            bar.set_postfix_str(f"score {estimate.score:.2f} {estimate.state_name}", refresh=False)
+
+
+def _panel(
+    device: Device, tracker: Tracker, frame: Frame, depth_m: np.ndarray, estimate: Estimate
+) -> np.ndarray:
+    camera = device.camera
+    height, width = depth_m.shape
+    # At most the drawn size is rendered: a big image gains nothing from more.
+    model = tracker.range_image(estimate, camera.K, height, width)
+    amplitude = camera.undistort_amplitude(frame.amplitude)
+    return draw_panel(depth_m, amplitude, camera, estimate, model, panel_scale(width))
+
+
+def _metadata(config: DictConfig, device: Device, tracker: Tracker) -> dict:
+    camera, shape = device.camera, tracker.shape
+    return {
+        "toftrack": version("toftrack"),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "seed": config.seed,
+        "compute": str(tracker.device),
+        "renderer": tracker.scorer.name,
+        "device": device.description,
+        "pose_space": {"kind": tracker.space.kind, "dims": tracker.space.dims},
+        "hand_shape": {
+            "side": shape.side,
+            "thickness": shape.thickness,
+            "hand_length_m": shape.hand_length_m,
+            "bone_lengths_m": shape.bone_lengths_m.tolist(),
+        },
+        "camera": {
+            "K": camera.K.tolist(),
+            "width": camera.width,
+            "height": camera.height,
+            "distortion": camera.distortion.tolist(),
+            "depth_polynomial": list(camera.depth_polynomial),
+        },
+        "config": OmegaConf.to_container(config, resolve=True),
+    }

@@ -1,0 +1,238 @@
+"""The camera: intrinsics, lens distortion and depth correction.
+
+Camera frame: x right, y down, z forward, metres. Pixel centres lie at integer (u, v), so that
+X = (u - cx) Z / fx and Y = (v - cy) Z / fy on the undistorted image.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from toftrack.errors import ToftrackError
+
+_FORMAT = "toftrack-camera"
+_VERSION = 1
+
+
+def _numbers(value: object, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """`value` as a read-only float64 array of exactly `shape`."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ToftrackError(f"{name} must consist of numbers") from None
+    if array.shape != shape:
+        expected = "x".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]} numbers"
+        raise ToftrackError(f"{name} must be {expected}, but has the shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ToftrackError(f"{name} contains NaN or infinity")
+    array.setflags(write=False)
+    return array
+
+
+# Compared by identity: the fields are arrays, and the tables below are cached per object.
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with OpenCV's lens distortion and a correction of the measured depth.
+
+    Raises ToftrackError when K is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with finite numbers and
+    positive focal lengths, or when a size or another coefficient makes no sense.
+    """
+
+    K: np.ndarray
+    """(3, 3) float64, pixels."""
+    width: int
+    height: int
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(5))
+    """(5,) float64, OpenCV's k1 k2 p1 p2 k3."""
+    depth_polynomial: tuple[float, ...] = ()
+    """c_0, c_1, ... of the correction: true = measured + sum_i c_i measured^i, radial metres."""
+
+    def __post_init__(self) -> None:
+        K = _numbers(self.K, (3, 3), "the camera matrix K")
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise ToftrackError(
+                f"the camera matrix K must have positive focal lengths, but they are {K[0, 0]:g} "
+                f"and {K[1, 1]:g} pixels"
+            )
+        if K[0, 1] or K[1, 0] or K[2, 0] or K[2, 1] or K[2, 2] != 1:
+            raise ToftrackError(
+                "the camera matrix K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew"
+            )
+        if int(self.width) < 1 or int(self.height) < 1:
+            raise ToftrackError(f"the image size {self.width}x{self.height} is not positive")
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "width", int(self.width))
+        object.__setattr__(self, "height", int(self.height))
+        distortion = _numbers(self.distortion, (5,), "the lens distortion (k1 k2 p1 p2 k3)")
+        object.__setattr__(self, "distortion", distortion)
+        count = np.size(self.depth_polynomial)
+        polynomial = _numbers(self.depth_polynomial, (count,), "the depth polynomial")
+        object.__setattr__(self, "depth_polynomial", tuple(map(float, polynomial)))
+
+    @cached_property
+    def _distorted(self) -> bool:
+        return bool(self.distortion.any())
+
+    @cached_property
+    def _rays(self) -> np.ndarray:
+        v, u = np.mgrid[: self.height, : self.width].astype(np.float64)
+        focal, centre = self.K[[0, 1], [0, 1]], self.K[:2, 2]
+        if not self._distorted:
+            rays = (np.stack([u, v], axis=-1) - centre) / focal
+        else:
+            pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+            rays = cv2.undistortPoints(pixels, self.K, self.distortion)
+            rays = rays.reshape(self.height, self.width, 2)
+        rays.setflags(write=False)
+        return rays
+
+    @cached_property
+    def _ray_lengths(self) -> np.ndarray:
+        """(H, W) float32: distance along the pixel's ray over the distance along the axis."""
+        return np.sqrt(1.0 + (self._rays**2).sum(axis=-1)).astype(np.float32)
+
+    @cached_property
+    def _undistortion_maps(self) -> tuple[np.ndarray, np.ndarray]:
+        size = (self.width, self.height)
+        return cv2.initUndistortRectifyMap(
+            self.K, self.distortion, None, self.K, size, cv2.CV_32FC1
+        )
+
+    def normalised_rays(self) -> np.ndarray:
+        """(H, W, 2) float64: x and y at Z = 1 of each pixel's ray, after undistortion; cached."""
+        return self._rays
+
+    def radial_to_z(self, radial: np.ndarray) -> np.ndarray:
+        """Distances along the pixels' rays, (..., H, W) metres, to Z along the optical axis."""
+        return radial / self._ray_lengths
+
+    def rectify(self, depth: np.ndarray, radial: bool) -> np.ndarray:
+        """A measured image to Z on the undistorted pinhole grid, with 0 for no reading.
+
+        In this order: NaN, infinities and negative readings become "no reading"; the depth
+        polynomial corrects the radial distance; radial distance becomes Z; the lens distortion is
+        undone by the nearest pixel (interpolation would invent surfaces at the hand's edge).
+
+        Args:
+            depth: (H, W) metres, Z or, if `radial`, the distance along the pixel's ray.
+            radial: which of the two it is.
+
+        Returns:
+            (H, W) float32 metres, a new array.
+
+        Raises:
+            ToftrackError: the image is not of the camera's size.
+        """
+        self._check_size(depth)
+        valid = (depth > 0) & (depth < np.inf)  # also false for NaN
+        z = np.where(valid, depth, 0).astype(np.float32, copy=False)
+        if self.depth_polynomial:
+            measured = z if radial else z * self._ray_lengths
+            z = self._correct(measured, valid) / self._ray_lengths
+        elif radial:
+            z = self.radial_to_z(z)
+        return self._undistort(z) if self._distorted else z
+
+    def undistort_amplitude(self, amplitude: np.ndarray | None) -> np.ndarray | None:
+        """The (H, W) amplitude image on the grid of `rectify`, of the same type; None stays None.
+
+        Raises ToftrackError when the image is not of the camera's size.
+        """
+        if amplitude is None:
+            return None
+        self._check_size(amplitude)
+        return self._undistort(amplitude) if self._distorted else amplitude
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """(..., 3) points in metres, camera frame, to (..., 2) pixels of the undistorted image.
+
+        Points at Z <= 0 have no image and give NaN.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+        return points[..., :2] / z * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
+
+    def save(self, path: str | Path) -> None:
+        """Write the camera as JSON. Raises ToftrackError when the file cannot be written."""
+        content = {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "width": self.width,
+            "height": self.height,
+            "K": self.K.tolist(),
+            "distortion": self.distortion.tolist(),
+            "depth_polynomial": list(self.depth_polynomial),
+        }
+        try:
+            Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise ToftrackError(
+                f"the camera file '{path}' cannot be written ({error.strerror}); choose another "
+                "place"
+            ) from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> Camera:
+        """Read a camera that `save` wrote. Raises ToftrackError for anything else."""
+        try:
+            content = json.loads(Path(path).expanduser().read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ToftrackError(
+                f"the camera file '{path}' cannot be read ({error.strerror}); give the path of a "
+                "camera file (.json)"
+            ) from error
+        except ValueError:  # of the JSON or of the text's encoding
+            raise ToftrackError(
+                f"'{path}' is not a camera file: it is not JSON; give a file that toftrack wrote"
+            ) from None
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise ToftrackError(
+                f"'{path}' is not a camera file: its format is not '{_FORMAT}'; give a file that "
+                "toftrack wrote"
+            )
+        if content.get("version") != _VERSION:
+            raise ToftrackError(
+                f"the camera file '{path}' has version {content.get('version')!r}, but this "
+                f"toftrack reads version {_VERSION}; write it anew"
+            )
+        try:
+            return cls(
+                K=content["K"],
+                width=content["width"],
+                height=content["height"],
+                distortion=content.get("distortion", np.zeros(5)),
+                depth_polynomial=content.get("depth_polynomial", ()),
+            )
+        except KeyError as error:
+            raise ToftrackError(
+                f"the camera file '{path}' lacks the key {error}; add it or write the file anew"
+            ) from None
+        except ToftrackError as error:
+            raise ToftrackError(f"in the camera file '{path}', {error}") from None
+        except (TypeError, ValueError):
+            raise ToftrackError(
+                f"the camera file '{path}' has a width or height that is not a whole number"
+            ) from None
+
+    def _correct(self, measured: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        correction = np.zeros_like(measured)
+        for coefficient in reversed(self.depth_polynomial):
+            correction = correction * measured + np.float32(coefficient)
+        # A correction that pushes a reading behind the camera leaves no reading.
+        return np.where(valid, np.maximum(measured + correction, 0), 0)
+
+    def _undistort(self, image: np.ndarray) -> np.ndarray:
+        return cv2.remap(image, *self._undistortion_maps, cv2.INTER_NEAREST, borderValue=0)
+
+    def _check_size(self, image: np.ndarray) -> None:
+        if image.shape != (self.height, self.width):
+            raise ToftrackError(
+                f"the image has the shape {image.shape}, but the camera has {self.height} rows and "
+                f"{self.width} columns; use the camera file that belongs to the recording"
+            )

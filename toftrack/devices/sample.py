@@ -1,0 +1,25 @@
+"""The recording that comes with the package."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from toftrack.devices.replay import Replay
+
+
+class Sample(Replay):
+    """A right hand for 100 frames, with ground truth; arguments and errors as for `Replay`."""
+
+    def __init__(
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        realtime: bool = False,
+        camera_file: str | Path | None = None,
+    ) -> None:
+        packaged = resources.files("toftrack") / "data" / "sample.npz"
+        with resources.as_file(packaged) as path:
+            super().__init__(path, start, stop, realtime, camera_file)
+        # Where the package happens to be installed says nothing about the result.
+        self.description |= {"device": "sample", "recording": "toftrack/data/sample.npz"}

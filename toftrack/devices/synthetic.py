@@ -1,0 +1,117 @@
+"""Frames of toftrack's own hand model with Time-of-Flight noise.
+
+For demonstrations and unit tests only: a tracker judged on images of its own renderer looks better
+than it is (the inverse crime).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from toftrack.camera import Camera
+from toftrack.devices.base import Frame, Truth
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.surface import Ellipsoids, hand_surface
+from toftrack.pose_space.training_poses import basic_pose
+from toftrack.render.closed_form import render_range_images
+
+_WIDTH, _HEIGHT, _FOCAL_PX = 176, 144, 200.0
+_WALL_M = 1.5
+_AMPLITUDE_AT_1M = 700.0
+
+
+class Synthetic:
+    """A right hand that closes to a fist and opens again while it drifts and turns.
+
+    Args:
+        frames: how many.
+        fps: frames per second.
+        noise_m: standard deviation of the depth at 0.5 m; it grows with the square of the distance,
+            as a Time-of-Flight camera's does while its amplitude falls.
+        seed: of the noise.
+        camera_file: another camera than the SR3000's nominal one (176 x 144, 200 px).
+
+    Raises:
+        ToftrackError: no frames, or negative noise.
+    """
+
+    def __init__(
+        self,
+        frames: int = 60,
+        fps: float = 25.0,
+        noise_m: float = 0.004,
+        seed: int = 0,
+        camera_file: str | None = None,
+    ) -> None:
+        if frames < 1 or fps <= 0 or noise_m < 0:
+            raise ToftrackError(
+                "device=synthetic needs frames of at least 1, fps above 0 and noise_m not below 0"
+            )
+        self.frames, self.fps = frames, fps
+        self.camera = (
+            Camera.load(camera_file)
+            if camera_file
+            else Camera(
+                np.array([[_FOCAL_PX, 0, _WIDTH / 2], [0, _FOCAL_PX, _HEIGHT / 2], [0, 0, 1.0]]),
+                _WIDTH,
+                _HEIGHT,
+            )
+        )
+        self.description: dict[str, Any] = {"device": "synthetic", "noise_m": noise_m, "seed": seed}
+        self.metadata: dict[str, Any] = {}
+        self._noise_m, self._seed = noise_m, seed
+        shape = default_hand_shape()
+        pose = forward_kinematics(self._states(), shape)
+        self._ellipsoids = hand_surface(shape).pose(pose)
+        yes = np.ones(frames, bool)
+        self.truth: Truth | None = Truth(pose.joints_m.numpy(), yes, yes)
+
+    def _states(self) -> torch.Tensor:
+        phase = torch.arange(self.frames) / 50.0 * 2 * math.pi
+        closing = (0.5 - 0.5 * phase.cos())[:, None].double()
+        angles = torch.lerp(basic_pose("palm"), basic_pose("fist"), closing).float()
+        position = torch.stack(
+            (
+                0.05 * phase.sin(),
+                0.085 + 0.02 * (1.3 * phase).sin(),
+                0.5 + 0.04 * (0.7 * phase).sin(),
+            )
+        ).T
+        turn = torch.stack((0.1 * phase.sin(), 0.3 * (0.8 * phase).sin(), 0.2 * phase.sin())).T
+        return torch.cat((position, turn, angles), 1)
+
+    def open(self) -> None:
+        """Nothing to open."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None: ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        generator = np.random.default_rng(self._seed)
+        camera, (centres, axes) = self.camera, self._ellipsoids
+        k = torch.tensor(camera.K, dtype=torch.float32)
+        for index in range(self.frames):
+            hand = Ellipsoids(centres[index : index + 1], axes[index : index + 1])
+            depth = render_range_images(hand, k, camera.height, camera.width)[0].numpy()
+            depth = np.where(depth > 0, depth, _WALL_M)
+            noise = generator.standard_normal(depth.shape) * self._noise_m * (depth / 0.5) ** 2
+            amplitude = np.minimum(_AMPLITUDE_AT_1M / depth**2, 65535).astype(np.uint16)
+            yield Frame(
+                index=index,
+                timestamp_s=index / self.fps,
+                depth=(depth + noise).astype(np.float32),
+                amplitude=amplitude,
+                radial=False,
+            )

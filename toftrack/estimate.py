@@ -1,0 +1,58 @@
+"""What the tracker says about one frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The hand in one frame, on the host. Arrays are NaN where there never was an estimate."""
+
+    index: int
+    """Number of the input frame."""
+    timestamp_s: float
+    state_name: str
+    """'initialising', 'tracking', 'lost' or 'recovering'."""
+    lost: bool
+    """The estimate is not to be trusted."""
+    joints_m: np.ndarray
+    """(21, 3) float32 metres, camera frame, in the order of the recordings."""
+    state: np.ndarray
+    """(27,) float32: translation (3, m), rotation vector (3, rad), joint angles (21, rad)."""
+    latent: np.ndarray
+    """(d,) float32 pose-space coordinates."""
+    score: float
+    """The likelihood head's score, 0..1."""
+    covariance: np.ndarray
+    """(6 + d, 6 + d) float32 over translation, rotation (tangent space) and latent."""
+    effective_sample_size: float
+    """Of the weights, before resampling."""
+    compute_s: float
+    """Wall seconds spent on the frame, capture and drawing excluded."""
+    gesture: str = ""
+    """The nearest known gesture; empty where gesture output is off."""
+    gesture_probability: float = math.nan
+
+
+def no_estimate(
+    index: int, timestamp_s: float, state_name: str, latent_size: int, compute_s: float
+) -> Estimate:
+    """The estimate of a frame before any hand was found: lost, score 0, every array NaN."""
+    size = 6 + latent_size
+    return Estimate(
+        index=index,
+        timestamp_s=timestamp_s,
+        state_name=state_name,
+        lost=True,
+        joints_m=np.full((21, 3), np.nan, np.float32),
+        state=np.full(27, np.nan, np.float32),
+        latent=np.full(latent_size, np.nan, np.float32),
+        score=0.0,
+        covariance=np.full((size, size), np.nan, np.float32),
+        effective_sample_size=0.0,
+        compute_s=compute_s,
+    )

@@ -1,0 +1,184 @@
+"""Sequential importance resampling as pure functions on tensors (paper, section 2.3).
+
+A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector (3,
+rad)
+and d latent coordinates. Weights are kept as logarithms until they are used. Every function that
+draws takes an explicit generator on the particles' device.
+
+Differences between particles are taken in the tangent space of a reference: translation of the
+pivot, rotation vector of R R_ref', latent difference. The pivot is a point in the middle of the
+hand, so that turning the hand does not also carry it away, as turning about the wrist would.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor
+
+from toftrack.errors import ToftrackError
+
+PIVOT_M = (0.0, -0.085, 0.0)
+"""The middle of the hand in the hand frame: near the knuckles of an adult hand."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Standard deviations of a diffusion.
+
+    translation_m, depth_m: across and along the optical axis.  rotation_rad: about every axis.
+    latent: in parts of each coordinate's range between its bounds.
+    """
+
+    translation_m: float
+    depth_m: float
+    rotation_rad: float
+    latent: float
+
+    def sigmas(self, lower: Tensor, upper: Tensor) -> Tensor:
+        """(6 + d,) standard deviations in tangent coordinates."""
+        t, z, r = self.translation_m, self.depth_m, self.rotation_rad
+        pose = torch.tensor([t, t, z, r, r, r], dtype=lower.dtype, device=lower.device)
+        return torch.cat((pose, self.latent * (upper - lower)))
+
+
+def normalise(log_weights: Tensor) -> Tensor:
+    """(N,) log weights to weights that sum to 1, float64.
+
+    NaN counts as impossible. When no particle is possible, all are equally likely: the filter then
+    diffuses on without evidence instead of failing.
+    """
+    w = log_weights.double().nan_to_num(nan=-math.inf, neginf=-math.inf, posinf=1e300)
+    top = w.max()
+    w = torch.where(top.isfinite(), (w - top).exp(), torch.ones_like(w))
+    return w / w.sum()
+
+
+def effective_sample_size(weights: Tensor) -> Tensor:
+    """1 / sum w^2 of normalised weights, between 1 and N; a scalar tensor."""
+    return 1.0 / weights.square().sum()
+
+
+def resample_systematic(weights: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """n indices drawn with one uniform offset and equal steps; index i comes up floor or ceil(n
+    w_i)
+    times (Arulampalam et al. 2002, algorithm 2). Returns (n,) int64, ascending.
+    """
+    offset = torch.rand(1, generator=generator, device=weights.device, dtype=torch.float64)
+    return _pick(weights, torch.arange(n, device=weights.device) + offset, n)
+
+
+def resample_stratified(weights: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """n indices, one uniform draw in each n-th of the unit interval. Returns (n,) int64, ascending."""
+    offset = torch.rand(n, generator=generator, device=weights.device, dtype=torch.float64)
+    return _pick(weights, torch.arange(n, device=weights.device) + offset, n)
+
+
+def _pick(weights: Tensor, positions: Tensor, n: int) -> Tensor:
+    total = weights.double().cumsum(0)
+    # Relative to the sum that was really reached, so that rounding cannot leave a gap at the end.
+    indices = torch.searchsorted(total, positions / n * total[-1], right=True)
+    # The last index that has weight: one past the end is only ever a rounding.
+    last = torch.searchsorted(total, total[-1:])
+    return torch.minimum(indices, last)
+
+
+RESAMPLERS: dict[str, Callable[[Tensor, int, torch.Generator], Tensor]] = {
+    "systematic": resample_systematic,
+    "stratified": resample_stratified,
+}
+
+
+def compose(reference: Tensor, tangent: Tensor) -> Tensor:
+    """Particles at tangent offsets from reference particles; (N, 6 + d) or broadcast, each."""
+    reference, tangent = torch.broadcast_tensors(reference, tangent)
+    pivot = _pivot(reference)
+    rotvec = roma.rotvec_composition((tangent[:, 3:6], reference[:, 3:6]))
+    turned = _rotate_pivot(rotvec)
+    translation = pivot + tangent[:, :3] - turned
+    return torch.cat((translation, rotvec, reference[:, 6:] + tangent[:, 6:]), 1)
+
+
+def difference(particles: Tensor, reference: Tensor) -> Tensor:
+    """Tangent offsets of particles from one reference, (N, 6 + d) and (1, 6 + d) to (N, 6 + d)."""
+    inverse = -reference[:, 3:6].expand(len(particles), 3)
+    turn = roma.rotvec_composition((particles[:, 3:6], inverse))
+    move = _pivot(particles) - _pivot(reference)
+    return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
+
+
+def _rotate_pivot(rotvec: Tensor) -> Tensor:
+    """The pivot's offset from the wrist, by Rodrigues' formula, (N, 3) to (N, 3)."""
+    p = rotvec.new_tensor(PIVOT_M).expand_as(rotvec)
+    square = rotvec.square().sum(1, keepdim=True)
+    angle = square.clamp(min=1e-12).sqrt()
+    cross = torch.linalg.cross(rotvec, p)
+    along = torch.linalg.cross(rotvec, cross)
+    return p + angle.sin() / angle * cross + (1 - angle.cos()) / angle.square() * along
+
+
+def _pivot(particles: Tensor) -> Tensor:
+    return particles[:, :3] + _rotate_pivot(particles[:, 3:6])
+
+
+def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
+    """Keep latent coordinates in their box, (N, d).
+
+    "truncate" moves what is outside onto the bound, as the paper, which draws estimates near a
+    bound away from where they should be and piles particles up on it; "reflect" folds it back.
+    """
+    if mode == "truncate":
+        return torch.minimum(torch.maximum(latent, lower), upper)
+    if mode == "reflect":
+        width = upper - lower
+        folded = torch.remainder(latent - lower, 2 * width)
+        return lower + torch.minimum(folded, 2 * width - folded)
+    raise ToftrackError(f"filter.bounds={mode} is unknown; give truncate or reflect")
+
+
+def diffuse(
+    particles: Tensor,
+    scale: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    mode: str,
+    generator: torch.Generator,
+) -> Tensor:
+    """Move every particle by Gaussian noise inside the bounds of the pose space.
+
+    scale: (6 + d,) standard deviations, or (6 + d, 6 + d) a lower triangular factor of the
+        covariance, in tangent coordinates.
+    """
+    noise = torch.randn(
+        particles.shape, generator=generator, device=particles.device, dtype=particles.dtype
+    )
+    moved = compose(particles, noise * scale if scale.dim() == 1 else noise @ scale.mT)
+    moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
+    return moved
+
+
+def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean on SO(3): the rotation nearest to the mean matrix (chordal L2 mean; Hartley et
+    al., "Rotation averaging", IJCV 2013). (N, 3) and (N,) to (3,).
+    """
+    matrices = roma.rotvec_to_rotmat(rotvec)
+    mean = (weights.to(matrices.dtype)[:, None, None] * matrices).sum(0)
+    return roma.rotmat_to_rotvec(roma.special_procrustes(mean))
+
+
+def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d), the rotation averaged on SO(3)."""
+    mean = (weights.to(particles.dtype) @ particles)[None]
+    mean[0, 3:6] = mean_rotation(particles[:, 3:6], weights)
+    return mean
+
+
+def covariance(tangents: Tensor, weights: Tensor) -> Tensor:
+    """Weighted covariance of tangent offsets about their own mean, (6 + d, 6 + d)."""
+    w = weights.to(tangents.dtype)
+    centred = tangents - w @ tangents
+    return (centred * w[:, None]).mT @ centred

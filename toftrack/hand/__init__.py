@@ -1,0 +1,22 @@
+"""The hand model: skeleton (kinematics), shape (sizes) and surface (ellipsoids)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, SIDES, HandShape, default_hand_shape
+from toftrack.errors import ToftrackError
+
+
+def make_hand_shape(
+    shape: str = "default", side: str = "right", length_m: float = DEFAULT_HAND_LENGTH_M
+) -> HandShape:
+    """The hand of a configuration: the default one scaled to a length, or one read from a file.
+
+    Raises ToftrackError for an unknown side, an impossible length or an unreadable file.
+    """
+    if shape == "default":
+        return default_hand_shape(length_m, side)
+    if side not in SIDES:
+        raise ToftrackError(f"hand.side={side} is unknown; give hand.side=right or hand.side=left")
+    return replace(HandShape.load(shape), side=side)

@@ -1,0 +1,182 @@
+"""Sizes of the hand: bone lengths, where the fingers are rooted, and how thick they are.
+
+The proportions are anthropometric means. Phalanges with the soft tissue of the tips, and
+metacarpals: Buryanov and Kotiuk, "Proportions of hand segments", Int. J. Morphol. 28(3), 2010.
+Finger breadths and hand breadth: Gordon et al., "2012 anthropometric survey of U.S. Army
+personnel" (ANSUR II), mean of both sexes. The wrist's centre of rotation lies in the head of the
+capitate (Youm et al., J. Bone Joint Surg. 60-A, 1978), which puts the middle finger's knuckle at
+0.49 of the hand's length. All are scaled so that wrist to middle fingertip is the hand length.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from toftrack.errors import ToftrackError
+
+SIDES = ("right", "left")
+DEFAULT_HAND_LENGTH_M = 0.190
+"""Wrist to middle fingertip: ANSUR II, between the means of men (193 mm) and women (181 mm)."""
+
+_FORMAT = "toftrack-hand-shape"
+_VERSION = 1
+
+# Everything below is in millimetres for a hand of 190 mm and scaled from there.
+_REFERENCE_LENGTH_MM = 190.0
+# Thumb CMC and the four knuckles in the hand frame. The transverse arch of the palm sets the
+# index and little knuckles towards the palm (-z).
+_BASE_MM = (
+    (27.0, -34.0, -17.0),
+    (24.0, -89.5, -6.5),
+    (1.0, -92.5, -3.0),
+    (-18.0, -86.5, -6.0),
+    (-35.5, -75.0, -12.5),
+)
+# The thumb's first bone is the distal part of its metacarpal: the centre of the saddle joint's
+# motion as seen from outside lies well distal of the joint's surface.
+_BONES_MM = (
+    (34.0, 33.5, 26.5),
+    (43.5, 24.0, 21.7),
+    (46.9, 27.6, 23.0),
+    (43.2, 26.8, 22.8),
+    (34.5, 19.7, 21.0),
+)
+# Rest directions of the fingers: (abduction in the plane of the palm, elevation out of it towards
+# the palm, roll about the bone), degrees. The thumb's nail faces sideways when the palm is open.
+_REST_DEGREES = (
+    (42.0, 14.0, 40.0),
+    (3.0, 0.0, -3.0),
+    (-4.0, 0.0, 0.0),
+    (-12.0, 0.0, 5.0),
+    (-19.0, 0.0, 10.0),
+)
+
+
+@dataclass(frozen=True)
+class HandShape:
+    """Sizes of one hand, metres, in the hand frame of a right hand.
+
+    base_m: (5, 3) thumb CMC and the four knuckles.
+    base_frames: (5, 3, 3) rest orientation of each finger's first bone, distal end along -y.
+    bone_lengths_m: (5, 3) lengths of the three bones of each finger, the last up to the tip of the
+        surface.
+    thickness: scale of all thicknesses relative to the default hand's proportions.
+    side: "right" or "left".
+    """
+
+    base_m: Tensor
+    base_frames: Tensor
+    bone_lengths_m: Tensor
+    thickness: float = 1.0
+    side: str = "right"
+
+    def to(self, *args: object, **kwargs: object) -> HandShape:
+        """The same shape on another device or of another dtype, as `torch.Tensor.to`."""
+        return replace(
+            self,
+            base_m=self.base_m.to(*args, **kwargs),
+            base_frames=self.base_frames.to(*args, **kwargs),
+            bone_lengths_m=self.bone_lengths_m.to(*args, **kwargs),
+        )
+
+    @property
+    def hand_length_m(self) -> float:
+        """Wrist to the middle finger's tip when the finger is straight."""
+        return float(self.base_m[2].norm() + self.bone_lengths_m[2].sum())
+
+    def scaled(self, factor: float) -> HandShape:
+        """The whole hand larger or smaller, thicknesses with it."""
+        return replace(
+            self, base_m=self.base_m * factor, bone_lengths_m=self.bone_lengths_m * factor
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the shape as JSON."""
+        content = {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "side": self.side,
+            "thickness": self.thickness,
+            "base_m": self.base_m.tolist(),
+            "base_frames": self.base_frames.tolist(),
+            "bone_lengths_m": self.bone_lengths_m.tolist(),
+        }
+        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+    @staticmethod
+    def load(path: str | Path) -> HandShape:
+        """Read a shape written by `save`; ToftrackError when it is not one."""
+        try:
+            content = json.loads(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise ToftrackError(
+                f"no hand shape file at {path}; give hand.shape=default or the hand_shape.json of
+                a run"
+            ) from None
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise ToftrackError(f"{path} is not a readable hand shape file: {error}") from None
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
+        if content.get("version") != _VERSION:
+            raise ToftrackError(
+                f"{path} is a hand shape of version {content.get('version')}, and this toftrack reads"
+                f" version {_VERSION}; write it again with this version"
+            )
+        try:
+            shape = HandShape(
+                base_m=torch.tensor(content["base_m"], dtype=torch.float32),
+                base_frames=torch.tensor(content["base_frames"], dtype=torch.float32),
+                bone_lengths_m=torch.tensor(content["bone_lengths_m"], dtype=torch.float32),
+                thickness=float(content["thickness"]),
+                side=str(content["side"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ToftrackError(f"{path} is a damaged hand shape file: {error!r}") from None
+        sizes = (shape.base_m.shape, shape.base_frames.shape, shape.bone_lengths_m.shape)
+        if sizes != ((5, 3), (5, 3, 3), (5, 3)) or shape.side not in SIDES:
+            raise ToftrackError(f"{path} is a damaged hand shape file: sizes {sizes}, {shape.side}")
+        return shape
+
+
+def _rotation(degrees: float, axis: int) -> Tensor:
+    vector = torch.zeros(3, 3, dtype=torch.float64)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    vector[i, j], vector[j, i] = -math.radians(degrees), math.radians(degrees)
+    return torch.matrix_exp(vector)
+
+
+def default_hand_shape(
+    hand_length_m: float = DEFAULT_HAND_LENGTH_M, side: str = "right", thickness: float = 1.0
+) -> HandShape:
+    """The mean adult hand, scaled to a hand length in metres; float32 on the CPU.
+
+    Raises ToftrackError for an unknown side or a length that no hand has.
+    """
+    if side not in SIDES:
+        raise ToftrackError(f"hand.side={side} is unknown; give hand.side=right or hand.side=left")
+    if not 0.08 <= hand_length_m <= 0.30:
+        raise ToftrackError(
+            f"a hand length of {hand_length_m} m is outside 0.08 .. 0.30 m; give metres from the
+            wrist"
+            " to the middle fingertip"
+        )
+    frames = [
+        _rotation(abduction, 2) @ _rotation(elevation, 0) @ _rotation(roll, 1)
+        for abduction, elevation, roll in _REST_DEGREES
+    ]
+    base = torch.tensor(_BASE_MM, dtype=torch.float64)
+    bones = torch.tensor(_BONES_MM, dtype=torch.float64)
+    scale = hand_length_m / float(base[2].norm() + bones[2].sum())
+    return HandShape(
+        base_m=(base * scale).float(),
+        base_frames=torch.stack(frames).float(),
+        bone_lengths_m=(bones * scale).float(),
+        thickness=thickness,
+        side=side,
+    )

@@ -1,0 +1,74 @@
+"""The head that scores hypotheses against an observation (paper, section 2.3, "Observation")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from toftrack.errors import ToftrackError
+from toftrack.render.scoring import Counts, Evidence
+from toftrack.segmentation import Observation
+
+NAMINGS = ("printed", "standard")
+
+
+@dataclass(frozen=True)
+class FMeasure:
+    """The paper's F-measure of correct, false and missed pixels.
+
+    tolerance_m: a model pixel is correct when its depth is within this of the image's (paper:
+    0.02).
+    neighbourhood_m: missed pixels count up to this distance from the silhouette, at the hand's
+        depth ("in proportion to the finger's length": about a third of a finger).
+    beta: weight of the second of the two rates (paper: 1.5).
+    naming: the paper prints precision = c / (c + missed) and recall = c / (c + false), so its
+        beta > 1 punishes *false* pixels more, while its text wants more penalty for missed ones.
+        "printed" is the paper's formula, "standard" the usual names (beta > 1 punishes missed
+        more).
+    residual_weight: how much of a correct pixel is lost at the edge of the depth tolerance,
+        0 (paper, all or nothing) .. 1 (a parabola that falls to 0).
+    """
+
+    tolerance_m: float = 0.02
+    neighbourhood_m: float = 0.025
+    beta: float = 1.5
+    naming: str = "standard"
+    residual_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.naming not in NAMINGS:
+            raise ToftrackError(
+                f"likelihood.naming={self.naming} is unknown; give one of {', '.join(NAMINGS)}"
+            )
+        if not (self.tolerance_m > 0 and self.neighbourhood_m >= 0 and self.beta > 0):
+            raise ToftrackError(
+                "likelihood: tolerance_m and beta must be above 0 and neighbourhood_m not below 0"
+            )
+
+    def evidence(self, observation: Observation) -> Evidence:
+        """The images to compare with, once a frame."""
+        depth, hand = observation.depth_m, observation.hand
+        never = torch.full_like(depth, torch.inf)
+        safe = torch.where(hand, depth, 1.0)
+        low = torch.where(hand, 1.0 / (safe + self.tolerance_m), never)
+        high = torch.where(hand, 1.0 / (safe - self.tolerance_m).clamp(min=1e-3), -never)
+        radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
+        return Evidence(low, high, torch.zeros_like(depth), hand, observation.k, radius)
+
+    def _distance(self, observation: Observation) -> float:
+        return observation.nearest_m if not observation.empty else 1.0
+
+    def score(self, counts: Counts) -> Tensor:
+        """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
+        correct = counts.correct - self.residual_weight * counts.residual
+        # What the residual takes from correct, it does not give to false: F only falls.
+        false = counts.false + (counts.correct - correct)
+        b2 = self.beta**2
+        if self.naming == "printed":
+            rest = b2 * false + counts.missed
+        else:
+            rest = false + b2 * counts.missed
+        weighted = (1 + b2) * correct
+        return weighted / (weighted + rest).clamp(min=1e-9)

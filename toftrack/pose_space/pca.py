@@ -1,0 +1,81 @@
+"""The paper's pose space: principal components of the training poses (section 2.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar
+
+import sklearn.decomposition
+import torch
+from torch import Tensor
+
+from toftrack.errors import ToftrackError
+from toftrack.pose_space.base import clamp_to_joint_limits
+
+
+@dataclass(frozen=True)
+class PCAPoseSpace:
+    """A linear space: angles = mean + latent components.
+
+    mean: (21,) rad.  components: (d, 21) orthonormal rows.
+    explained_variance_ratio: (21,) of all components, the kept ones first.
+    lower, upper: (d,).  training_latents: (M, d).
+    """
+
+    kind: ClassVar[str] = "pca"
+
+    mean: Tensor
+    components: Tensor
+    explained_variance_ratio: Tensor
+    lower: Tensor
+    upper: Tensor
+    training_latents: Tensor
+    training_labels: tuple[str, ...]
+
+    @property
+    def dims(self) -> int:
+        """The number of latent coordinates."""
+        return self.components.shape[0]
+
+    def decode(self, latent: Tensor) -> Tensor:
+        """(N, d) to (N, 21) radians, clamped to the joint limits."""
+        return clamp_to_joint_limits(torch.addmm(self.mean, latent, self.components))
+
+    def encode(self, angles: Tensor) -> Tensor:
+        """(N, 21) radians to (N, d)."""
+        return (angles - self.mean) @ self.components.mT
+
+    def arrays(self) -> dict[str, Tensor]:
+        """The tensors of the model file."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "training_labels"}
+
+    def to(self, device: torch.device | str, dtype: torch.dtype = torch.float32) -> PCAPoseSpace:
+        """The same space on another device or of another dtype."""
+        return replace(
+            self, **{name: value.to(device, dtype) for name, value in self.arrays().items()}
+        )
+
+
+def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSpace:
+    """Principal components of (M, 21) training poses; float32 on the CPU.
+
+    Raises ToftrackError when there are more dimensions than poses or angles.
+    """
+    if not 1 <= dims <= min(angles.shape):
+        raise ToftrackError(
+            f"pose_space.dims={dims} cannot be learned from {angles.shape[0]} poses of"
+            f" {angles.shape[1]} angles; give 1 to {min(angles.shape)}"
+        )
+    x = angles.double().cpu().numpy()
+    model = sklearn.decomposition.PCA(svd_solver="full").fit(x)
+    components = model.components_[:dims]
+    latents = (x - model.mean_) @ components.T
+    return PCAPoseSpace(
+        mean=torch.from_numpy(model.mean_).float(),
+        components=torch.from_numpy(components.copy()).float(),
+        explained_variance_ratio=torch.from_numpy(model.explained_variance_ratio_).float(),
+        lower=torch.from_numpy(latents.min(0)).float(),
+        upper=torch.from_numpy(latents.max(0)).float(),
+        training_latents=torch.from_numpy(latents).float(),
+        training_labels=labels,
+    )

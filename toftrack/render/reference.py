@@ -1,0 +1,124 @@
+"""The reference of every scoring back end: whole range images, counted as the definitions say.
+
+Slow and plain on purpose. `step_range_images` is the paper's own way of finding the surface
+(section 2.2: stepping along the ray to the quadric's zero crossing), kept for tests and benchmarks.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from toftrack.hand.shape import HandShape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
+from toftrack.render.closed_form import pixel_rays, render_range_images
+from toftrack.render.scoring import Counts, Evidence
+
+
+def dilate_disc(mask: Tensor, radius_px: float) -> Tensor:
+    """(N, H, W) bool: pixels within a Euclidean distance of the mask, as the exact distance
+    transform.
+
+    A disc is a horizontal run for each row offset: one running maximum and one shift per row.
+    """
+    image = mask[:, None].float()
+    height = mask.shape[1]
+    out = torch.zeros_like(image)
+    for dy in range(-int(radius_px), int(radius_px) + 1):
+        half = int(math.sqrt(radius_px**2 - dy**2))
+        rows = F.max_pool2d(image, (1, 2 * half + 1), stride=1, padding=(0, half))
+        low, high = max(0, dy), min(height, height + dy)
+        if high > low:
+            target = out[:, :, low - dy : high - dy]
+            torch.maximum(target, rows[:, :, low:high], out=target)
+    return out[:, 0] > 0
+
+
+def step_range_images(
+    ellipsoids: Ellipsoids, k: Tensor, height: int, width: int, step_m: float = 0.005
+) -> Tensor:
+    """Range images by stepping along the rays, as the paper does; (N, H, W) metres, 0 = none.
+
+    Each ray starts in front of the ellipsoid, at its centre's depth less its longest axis, walks
+    in steps of `step_m` in Z to the first point inside and takes the crossing by linear
+    interpolation of the quadric's value between the last two points.
+    """
+    rays = pixel_rays(k, height, width).view(-1, 3)
+    centres, axes = ellipsoids
+    whiten = axes.mT / axes.square().sum(-2)[..., None]
+    reach = axes.square().sum(-2).amax(-1).sqrt()
+    best = centres.new_full((centres.shape[0], rays.shape[0]), math.inf)
+    for e in range(centres.shape[1]):
+        direction = whiten[:, e] @ rays.T  # (N, 3, P)
+        offset = whiten[:, e] @ centres[:, e, :, None]
+        start = (centres[:, e, 2] - reach[:, e])[:, None]
+        steps = int(math.ceil(float(2 * reach[:, e].max()) / step_m)) + 1
+        previous = (direction * start[:, None] - offset).square().sum(1) - 1.0
+        found = torch.zeros_like(previous, dtype=torch.bool)
+        depth = torch.full_like(previous, math.inf)
+        for i in range(1, steps + 1):
+            z = start + i * step_m
+            value = (direction * z[:, None] - offset).square().sum(1) - 1.0
+            crossing = (value <= 0) & ~found
+            part = previous / (previous - value)
+            depth = torch.where(crossing, z - step_m + part * step_m, depth)
+            found |= crossing
+            previous = value
+        best = torch.minimum(best, depth)
+    return torch.where(best.isfinite(), best, 0.0).view(-1, height, width)
+
+
+def count_range_images(depth_m: Tensor, wrist: Tensor, evidence: Evidence) -> Counts:
+    """Counts of given range images.
+
+    depth_m: (N, H, W), 0 = no surface.  wrist: (N, H, W) bool, the wrist ellipsoid's silhouette.
+    """
+    model = depth_m > 0
+    u = torch.where(model, 1.0 / depth_m, 0.0)
+    correct = model & (u >= evidence.low) & (u <= evidence.high)
+    false = model & ~correct & (u >= evidence.occluder)
+    near = dilate_disc(model, evidence.radius_px)
+    missed = evidence.hand & near & ~model & ~wrist
+    middle, half = (evidence.low + evidence.high) / 2, (evidence.high - evidence.low) / 2
+    residual = torch.where(correct, ((u - middle) / half).square(), 0.0)
+    return Counts(
+        *(image.flatten(1).sum(1).float() for image in (correct, false, missed, residual))
+    )
+
+
+class ReferenceScorer:
+    """Full images for every hypothesis, in chunks; what the fast back ends are checked against."""
+
+    name = "reference"
+
+    def __init__(self, shape: HandShape, chunk: int = 8, stepping: bool = False) -> None:
+        """chunk: hypotheses rendered at once.  stepping: find surfaces by stepping, as the paper."""
+        self.shape = shape
+        self.surface: HandSurface = hand_surface(shape)
+        self.chunk = chunk
+        self.stepping = stepping
+
+    def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
+        """See Scorer."""
+        height, width = evidence.hand.shape
+        k = evidence.k.to(states.dtype)
+        parts = []
+        for part in states.split(self.chunk):
+            both = self.surface.pose(forward_kinematics(part, self.shape))
+            hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
+            wrist = Ellipsoids(both.centres_m[:, -1:], both.axes_m[:, -1:])
+            render = step_range_images if self.stepping else render_range_images
+            parts.append(
+                count_range_images(
+                    render(hand, k, height, width),
+                    render_range_images(wrist, k, height, width) > 0,
+                    evidence,
+                )
+            )
+        if not parts:
+            return Counts(*(states.new_zeros(0) for _ in range(4)))
+        return Counts(*(torch.cat(field) for field in zip(*parts, strict=True)))

@@ -1,0 +1,113 @@
+"""Counting correct, false and missed pixels of N hypotheses: the one function every back end
+offers.
+
+A back end is a callable from hand states to Counts. What counts as correct is decided once a frame
+by the likelihood and handed over as Evidence: images of inverse depth to compare with, so that a
+back end knows geometry and pixels but no policy.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import HandShape
+
+log = logging.getLogger(__name__)
+
+BACK_ENDS = ("torch", "numba", "triton")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a frame says of every pixel, in inverse depth u = 1/Z (1/m); all on one device.
+
+    low, high: (H, W) float32: a model surface with low <= u <= high is correct there; low > high
+        where no model surface can be (background).
+    occluder: (H, W) float32: a model surface with u below this is hidden behind something that is
+        not the hand, and counts as nothing; 0 where there is no such thing, inf to ignore a pixel.
+    hand: (H, W) bool: pixels that the model ought to cover, missed when it is only near them.
+    k: (3, 3) float32 intrinsics.
+    radius_px: how far from the silhouette a hand pixel is missed (Euclidean, pixels).
+    """
+
+    low: Tensor
+    high: Tensor
+    occluder: Tensor
+    hand: Tensor
+    k: Tensor
+    radius_px: float
+
+    def cropped(self, left: int, top: int, right: int, bottom: int) -> Evidence:
+        """The part [top, bottom) x [left, right) with intrinsics to match."""
+        k = self.k.clone()
+        k[0, 2] -= left
+        k[1, 2] -= top
+        images = (self.low, self.high, self.occluder, self.hand)
+        parts = (image[top:bottom, left:right].contiguous() for image in images)
+        return Evidence(*parts, k, self.radius_px)
+
+
+class Counts(NamedTuple):
+    """Pixels of N hypotheses, each (N,) float32 (paper, section 2.3, "Observation").
+
+    correct: model pixels whose surface lies within the evidence's band.
+    false: model pixels that do not, unless hidden.
+    missed: hand pixels within `radius_px` of the model's silhouette, outside of it and of the
+        projected wrist ellipsoid.
+    residual: sum over the correct pixels of the squared distance from the band's middle in units of
+        its half-width (0 .. 1 a pixel).
+    """
+
+    correct: Tensor
+    false: Tensor
+    missed: Tensor
+    residual: Tensor
+
+
+class Scorer(Protocol):
+    """A back end made for one hand shape."""
+
+    name: str
+
+    def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
+        """states: (N, 27) on the evidence's device. Pixels outside the image count as nothing."""
+
+
+def make_scorer(name: str, shape: HandShape, device: torch.device) -> Scorer:
+    """The back end of a name in BACK_ENDS, or `auto`: the fastest that works here.
+
+    shape: sizes of the hand that all hypotheses share.
+    Raises ToftrackError for an unknown name or a back end that cannot run here.
+    """
+    from toftrack.render.torch_scorer import TorchScorer
+
+    shape = shape.to(device)
+    if name == "torch":
+        return TorchScorer(shape)
+    if name == "auto":
+        wanted = "triton" if device.type == "cuda" else "numba"
+    elif name in BACK_ENDS:
+        wanted = name
+    else:
+        raise ToftrackError(f"renderer={name} is unknown; give one of auto, {', '.join(BACK_ENDS)}")
+    try:
+        if wanted == "numba":
+            from toftrack.render.numba_scorer import NumbaScorer
+
+            return NumbaScorer(shape)
+        from toftrack.render.triton_scorer import TritonScorer
+
+        return TritonScorer(shape)
+    except ImportError as error:
+        if name != "auto":
+            raise ToftrackError(
+                f"renderer={name} cannot run here ({error}); install it or give renderer=torch"
+            ) from None
+        log.info("renderer: %s is not available (%s), using torch", wanted, error)
+        return TorchScorer(shape)

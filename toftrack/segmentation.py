@@ -1,0 +1,109 @@
+"""From a rectified depth image to an Observation: which pixels are the hand (paper, section 2.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the likelihood sees of one frame.
+
+    depth_m: (H, W) Z in metres, 0 = no reading; the whole scene.
+    hand: (H, W) bool, the pixels taken for the hand (and the arm it hangs on).
+    k: (3, 3) intrinsics of this image, which may be a crop or a reduction of the camera's.
+    nearest_m: depth of the nearest surface, `inf` when nothing is in range.
+    """
+
+    depth_m: Tensor
+    hand: Tensor
+    k: Tensor
+    nearest_m: float
+
+    @property
+    def empty(self) -> bool:
+        """True when nothing in the frame can be a hand."""
+        return not np.isfinite(self.nearest_m)
+
+    def cropped(self, left: int, top: int, right: int, bottom: int) -> Observation:
+        """The part [top, bottom) x [left, right) with intrinsics to match."""
+        k = self.k.clone()
+        k[0, 2] -= left
+        k[1, 2] -= top
+        return replace(
+            self,
+            depth_m=self.depth_m[top:bottom, left:right].contiguous(),
+            hand=self.hand[top:bottom, left:right].contiguous(),
+            k=k,
+        )
+
+
+@dataclass(frozen=True)
+class NearestSurface:
+    """The nearest thing in front of the camera is the hand (paper, section 2.1).
+
+    depth_range_m: everything that is more than this behind the nearest point is dropped (0.20).
+    min_area_m2: the nearest point must belong to a surface of at least this area, so that noisy and
+        flying pixels are no hand. 0 takes the single nearest pixel, as the paper.
+    max_distance_m: nothing beyond this is a hand.
+    max_pixels: images with more pixels are reduced by a whole factor to at most this many.
+    """
+
+    depth_range_m: float = 0.20
+    min_area_m2: float = 0.0008
+    max_distance_m: float = 1.2
+    max_pixels: int = 40_000
+
+    def __call__(self, depth_m: np.ndarray, k: np.ndarray) -> Observation:
+        """depth_m: (H, W) float32 Z, 0 = no reading.  k: (3, 3).  Returns the Observation, on the CPU."""
+        depth_m, k = reduce_image(depth_m, k, self.max_pixels)
+        valid = (depth_m > 0) & (depth_m <= self.max_distance_m)
+        nearest = self._nearest(depth_m, valid, float(k[0, 0] * k[1, 1]))
+        hand = valid & (depth_m >= nearest) & (depth_m <= nearest + self.depth_range_m)
+        return Observation(
+            torch.from_numpy(depth_m),
+            torch.from_numpy(hand),
+            torch.from_numpy(k.astype(np.float32)),
+            nearest,
+        )
+
+    def _nearest(self, depth_m: np.ndarray, valid: np.ndarray, focal_area: float) -> float:
+        candidates = valid.copy()
+        while candidates.any():
+            nearest = float(depth_m[candidates].min())
+            if self.min_area_m2 <= 0:
+                return nearest
+            near = (candidates & (depth_m <= nearest + self.depth_range_m)).astype(np.uint8)
+            _, labels, stats, _ = cv2.connectedComponentsWithStats(near, connectivity=4)
+            label = labels[candidates & (depth_m == nearest)][0]
+            area = stats[label, cv2.CC_STAT_AREA] * nearest**2 / focal_area
+            if area >= self.min_area_m2:
+                return nearest
+            # Too small for a hand: drop the speck and everything as small in front of the rest.
+            candidates &= labels != label
+        return float("inf")
+
+
+def reduce_image(
+    depth_m: np.ndarray, k: np.ndarray, max_pixels: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce an image by a whole factor, keeping real depths: the median-filtered pixel in the
+    middle of each block, so that no new flying pixels arise. Returns the image and its intrinsics.
+    """
+    factor = int(np.ceil(np.sqrt(depth_m.size / max_pixels)))
+    if factor <= 1:
+        return np.ascontiguousarray(depth_m, dtype=np.float32), k
+    filtered = cv2.medianBlur(np.ascontiguousarray(depth_m, dtype=np.float32), 3 + 2 * (factor > 2))
+    offset = (factor - 1) // 2
+    small = filtered[offset::factor, offset::factor]
+    k = k.copy()
+    k[0] /= factor
+    k[1] /= factor
+    k[0, 2] -= offset / factor
+    k[1, 2] -= offset / factor
+    return np.ascontiguousarray(small), k

@@ -1,0 +1,1 @@
+"""Pictures of what the tracker sees and finds. Nothing here decides anything."""

@@ -1,0 +1,19 @@
+"""Follow a hand through the frames of a depth camera or a recording: `python track.py --help`."""
+
+import sys
+
+import hydra
+from omegaconf import DictConfig
+
+from toftrack import app, cli
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+@cli.job
+def main(config: DictConfig) -> float:
+    """Track, write the results, and return what a sweep minimises."""
+    return app.track(config)
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))

@@ -1,0 +1,20 @@
+"""Learn the space of hand poses that the tracker searches: `python train_pose_space.py --help`."""
+
+import sys
+
+import hydra
+from omegaconf import DictConfig
+
+from toftrack import cli
+from toftrack.pose_space.training import train
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="train_pose_space")
+@cli.job
+def main(config: DictConfig) -> float:
+    """Train, write the model and its figures, and return what a sweep minimises."""
+    return train(config)
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))
