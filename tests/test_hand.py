@@ -42,7 +42,7 @@ def shift(x: float, y: float, z: float) -> torch.Tensor:
 
 
 def joints_by_matrix_exponentials(state: torch.Tensor, shape: HandShape) -> torch.Tensor:
-    """A second implementation: one joint after the other, 4 x 4 products of twists' exponentials."""
+    """A second implementation: joint by joint, 4 x 4 products of twists' exponentials."""
     rx, ry, rz = state[3:6].tolist()
     twist = torch.tensor(
         [[0, -rz, ry, 0], [rz, 0, -rx, 0], [-ry, rx, 0, 0], [0, 0, 0, 0]], dtype=torch.float64

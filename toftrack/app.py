@@ -1,4 +1,4 @@
-"""What `python track.py` does: build the parts of a configuration, run the loop, write and report."""
+"""What `python track.py` does: build the parts, run the loop, write and report."""
 
 from __future__ import annotations
 

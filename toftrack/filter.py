@@ -73,7 +73,7 @@ def resample_systematic(weights: Tensor, n: int, generator: torch.Generator) -> 
 
 
 def resample_stratified(weights: Tensor, n: int, generator: torch.Generator) -> Tensor:
-    """n indices, one uniform draw in each n-th of the unit interval. Returns (n,) int64, ascending."""
+    """n indices, one draw in each n-th of the unit interval. Returns (n,) int64, ascending."""
     offset = torch.rand(n, generator=generator, device=weights.device, dtype=torch.float64)
     return _pick(weights, torch.arange(n, device=weights.device) + offset, n)
 

@@ -1,4 +1,4 @@
-"""From a rectified depth image to an Observation: which pixels are the hand (paper, section 2.1)."""
+"""From a depth image to an Observation: which pixels are the hand (paper, section 2.1)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class NearestSurface:
     max_pixels: int = 40_000
 
     def __call__(self, depth_m: np.ndarray, k: np.ndarray) -> Observation:
-        """depth_m: (H, W) float32 Z, 0 = no reading.  k: (3, 3).  Returns the Observation, on the CPU."""
+        """depth_m: (H, W) float32 Z, 0 = no reading.  k: (3, 3).  On the CPU."""
         depth_m, k = reduce_image(depth_m, k, self.max_pixels)
         valid = (depth_m > 0) & (depth_m <= self.max_distance_m)
         nearest = self._nearest(depth_m, valid, float(k[0, 0] * k[1, 1]))

@@ -1,4 +1,4 @@
-"""The tracker: a frame in, an estimate out, particles kept in between (paper, section 2, fig. 1)."""
+"""The tracker: a frame in, an estimate out, particles in between (paper, fig. 1)."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, SIDES, HandShape, default_hand_shape
 from toftrack.errors import ToftrackError
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, SIDES, HandShape, default_hand_shape
 
 
 def make_hand_shape(

@@ -116,8 +116,7 @@ class HandShape:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise ToftrackError(
-                f"no hand shape file at {path}; give hand.shape=default or the hand_shape.json of
-                a run"
+                f"no hand shape file at {path}; give hand.shape=default or the path of one"
             ) from None
         except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise ToftrackError(f"{path} is not a readable hand shape file: {error}") from None
@@ -125,8 +124,8 @@ class HandShape:
             raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
         if content.get("version") != _VERSION:
             raise ToftrackError(
-                f"{path} is a hand shape of version {content.get('version')}, and this toftrack reads"
-                f" version {_VERSION}; write it again with this version"
+                f"{path} is a hand shape of version {content.get('version')}, and this toftrack"
+                f" reads version {_VERSION}; write it again with this version"
             )
         try:
             shape = HandShape(
@@ -162,9 +161,8 @@ def default_hand_shape(
         raise ToftrackError(f"hand.side={side} is unknown; give hand.side=right or hand.side=left")
     if not 0.08 <= hand_length_m <= 0.30:
         raise ToftrackError(
-            f"a hand length of {hand_length_m} m is outside 0.08 .. 0.30 m; give metres from the
-            wrist"
-            " to the middle fingertip"
+            f"a hand length of {hand_length_m} m is outside 0.08 .. 0.30 m; give metres from"
+            " the wrist to the middle fingertip"
         )
     frames = [
         _rotation(abduction, 2) @ _rotation(elevation, 0) @ _rotation(roll, 1)

@@ -34,7 +34,7 @@ class PoseSpace(Protocol):
         """(N, d) latent coordinates to (N, 21) joint angles within the joint limits, radians."""
 
     def encode(self, angles: Tensor) -> Tensor:
-        """(N, 21) joint angles, radians, to (N, d) latent coordinates (not clipped to the bounds)."""
+        """(N, 21) joint angles, radians, to (N, d) coordinates (not clipped to the bounds)."""
 
     def arrays(self) -> dict[str, Tensor]:
         """Everything that a model file must hold to make this space again."""

@@ -60,15 +60,15 @@ def load_pose_space(path: str | Path) -> PoseSpace:
         raise ToftrackError(f"{path} is not a pose-space file; {advice}")
     if header.get("version") != VERSION:
         raise ToftrackError(
-            f"{path} is a pose space of version {header.get('version')} and this toftrack reads version"
-            f" {VERSION}; {advice}"
+            f"{path} is a pose space of version {header.get('version')} and this toftrack reads"
+            f" version {VERSION}; {advice}"
         )
     if header.get("kind") not in _KINDS:
         raise ToftrackError(f"{path} holds a pose space of unknown kind {header.get('kind')!r}")
     if tuple(header.get("angle_names", ())) != ANGLE_NAMES:
         raise ToftrackError(
-            f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this hand;
-            {advice}"
+            f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
+            f" hand; {advice}"
         )
     try:
         tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
@@ -92,8 +92,8 @@ def make_pose_space(kind: str = "pca", dims: int = 4, file: str | None = None) -
     space = load_pose_space(file)
     if space.kind != kind or space.dims != dims:
         raise ToftrackError(
-            f"{file} is a {space.dims}-dimensional {space.kind} space and the configuration asks
-            for a"
-            f" {dims}-dimensional {kind}; give pose_space={space.kind} pose_space.dims={space.dims}"
+            f"{file} is a {space.dims}-dimensional {space.kind} space and the configuration"
+            f" asks for a {dims}-dimensional {kind}; give pose_space={space.kind}"
+            f" pose_space.dims={space.dims}"
         )
     return space

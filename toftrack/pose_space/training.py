@@ -1,4 +1,4 @@
-"""What `python train_pose_space.py` does: fit a space, report it, write the model and two figures."""
+"""What `python train_pose_space.py` does: fit, report, write the model and two figures."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class ReferenceScorer:
     name = "reference"
 
     def __init__(self, shape: HandShape, chunk: int = 8, stepping: bool = False) -> None:
-        """chunk: hypotheses rendered at once.  stepping: find surfaces by stepping, as the paper."""
+        """chunk: hypotheses rendered at once.  stepping: find surfaces as the paper does."""
         self.shape = shape
         self.surface: HandSurface = hand_surface(shape)
         self.chunk = chunk

@@ -1,4 +1,4 @@
-"""Figures of a pose space: its training poses in the plane, and its extreme corners (paper, fig. 4)."""
+"""Figures of a pose space: training poses and extreme corners (paper, fig. 4)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TEXT = (40, 40, 40)
 
 
 def pose_picture(angles: Tensor, size: int = 200, shape: HandShape | None = None) -> np.ndarray:
-    """Range image of an upright hand in a pose, nearer is darker: (21,) rad to (size, size) uint8."""
+    """Range image of an upright hand, nearer is darker: (21,) rad to (size, size) uint8."""
     shape = shape or default_hand_shape()
     state = torch.cat((torch.tensor([0.0, 0.085, 0.5, -0.25, -0.3, 0.0]), angles.float().cpu()))
     both = hand_surface(shape).pose(forward_kinematics(state[None], shape))
