@@ -29,6 +29,8 @@ class FMeasure:
         more).
     residual_weight: how much of a correct pixel is lost at the edge of the depth tolerance,
         0 (paper, all or nothing) .. 1 (a parabola that falls to 0).
+    coverage: how much hypotheses are preferred that explain more of the image. The F-measure is
+        content with a hand of which only a few pixels lie inside the image.
     """
 
     tolerance_m: float = 0.02
@@ -36,6 +38,7 @@ class FMeasure:
     beta: float = 1.5
     naming: str = "standard"
     residual_weight: float = 0.0
+    coverage: float = 0.0
 
     def __post_init__(self) -> None:
         if self.naming not in NAMINGS:
@@ -56,6 +59,10 @@ class FMeasure:
         high = torch.where(hand, 1.0 / (safe - self.tolerance_m).clamp(min=1e-3), -never)
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
         return Evidence(low, high, torch.zeros_like(depth), hand, observation.k, radius)
+
+    def log_score(self, counts: Counts) -> Tensor:
+        """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct)."""
+        return self.score(counts).log() + self.coverage * counts.correct.log()
 
     def _distance(self, observation: Observation) -> float:
         return observation.nearest_m if not observation.empty else 1.0

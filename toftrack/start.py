@@ -1,9 +1,11 @@
-"""Where the first hypotheses come from: the segmented hand, or a pose given by hand."""
+"""Where the first hypotheses come from: a pose given by hand, the nearest blob, or a search."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -11,32 +13,41 @@ import roma
 import torch
 from torch import Tensor
 
+from toftrack import filter as sir
 from toftrack.errors import ToftrackError
-from toftrack.filter import PIVOT_M
 from toftrack.pose_space.base import PoseSpace
 from toftrack.segmentation import Observation
 
+LogScores = Callable[[Tensor], Tensor]
+"""(N, 6 + d) hypotheses to (N,) log scores of the current frame."""
+
+
+class Start(Protocol):
+    """Makes the first particles from a frame that is not empty."""
+
+    def __call__(
+        self,
+        observation: Observation,
+        space: PoseSpace,
+        log_scores: LogScores,
+        n: int,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """(n, 6 + d) particles on the pose space's device."""
+
 
 @dataclass(frozen=True)
-class Start:
-    """First hypotheses around the segmented hand.
+class RoughStart:
+    """The paper's rough manual positioning: an open palm, put by hand or where the nearest blob is.
 
-    pose: wrist translation (3, m) and rotation vector (3, rad), the paper's rough manual
-    positioning
-        of an open palm; None takes the position from the image.
-    search: False: an open palm to the camera with its fingers up (the paper's sequences start so).
-        True: any orientation in the image plane, palm or back, any training pose.
-    hypotheses: how many are scored at once.
-    position_m, tilt_rad, in_plane_rad: standard deviations about the guess; in_plane_rad only where
-        search is off.
+    pose: wrist translation (3, m) and rotation vector (3, rad); None takes the position from the
+        image and points the fingers up with the palm towards the camera.
+    position_m, rotation_rad: standard deviations of the particles about it.
     """
 
     pose: tuple[float, ...] | None = None
-    search: bool = True
-    hypotheses: int = 3000
-    position_m: float = 0.02
-    tilt_rad: float = 0.4
-    in_plane_rad: float = 0.2
+    position_m: float = 0.01
+    rotation_rad: float = 0.1
 
     def __post_init__(self) -> None:
         if self.pose is not None and len(self.pose) != 6:
@@ -45,71 +56,156 @@ class Start:
                 " rotation vector in radians"
             )
 
-    def particles(
-        self, observation: Observation, space: PoseSpace, n: int, generator: torch.Generator
+    def __call__(
+        self,
+        observation: Observation,
+        space: PoseSpace,
+        log_scores: LogScores,
+        n: int,
+        generator: torch.Generator,
     ) -> Tensor:
-        """(M, 6 + d) hypotheses, M = max(n, hypotheses), on the pose space's device.
-
-        observation: not empty unless a pose is given.
-        """
-        m = max(n, self.hypotheses)
+        """See Start; nothing is scored."""
         device = space.lower.device
+        reference = torch.zeros(1, 6 + space.dims, device=device)
+        rows = [label == "palm" for label in space.training_labels]
+        reference[0, 6:] = space.training_latents[rows.index(True) if True in rows else 0]
+        if self.pose is not None:
+            reference[0, :6] = torch.tensor(self.pose, device=device)
+        else:
+            centre = torch.from_numpy(palm_centres(observation, 1, generator)[0]).to(device)
+            reference[0, :3] = centre - reference.new_tensor(sir.PIVOT_M)
+        spread = sir.Spread(self.position_m, self.position_m, self.rotation_rad, 0.0)
+        noise = torch.randn(n, 6 + space.dims, generator=generator, device=device)
+        return sir.compose(reference, noise * spread.sigmas(space.lower, space.upper))
+
+
+@dataclass(frozen=True)
+class SearchStart:
+    """Finds the hand anywhere in the segmented blob: any orientation, palm or back, any training pose.
+
+    Many hypotheses are scored at once; the best distinct ones become islands that are refined by
+    a random local search of shrinking width. In every round as many hypotheses are scored, and half
+    of the islands are given up (successive halving).
+
+    hypotheses: in the first batch.  islands: how many are refined at first; a power of two.
+    samples: hypotheses a round of refinement.
+    position_m: spread about points of the blob.  tilt_rad: spread of the palm's tilt out of the
+        image plane.
+    arm_rad: spread of the forearm's direction about the way to where the blob leaves the image; a
+        fifth of the hypotheses, and all where the blob does not touch the border, point anywhere.
+    """
+
+    hypotheses: int = 3000
+    islands: int = 64
+    samples: int = 1024
+    position_m: float = 0.02
+    tilt_rad: float = 0.5
+    arm_rad: float = 0.5
+
+    def __call__(
+        self,
+        observation: Observation,
+        space: PoseSpace,
+        log_scores: LogScores,
+        n: int,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """See Start."""
+        lower, upper = space.lower, space.upper
+        first = self._draw(observation, space, generator)
+        scores = log_scores(first)
+        best = first[scores.topk(min(self.islands, len(first))).indices]
+        best_scores = scores.topk(len(best)).values
+        sigmas = sir.Spread(self.position_m, 0.015, 0.35, 0.15).sigmas(lower, upper)
+        while True:
+            each = max(1, self.samples // len(best))
+            tried = sir.diffuse(
+                best.repeat_interleave(each, 0), sigmas, lower, upper, "reflect", generator
+            )
+            # Every island keeps what it had if nothing better was found.
+            scores = torch.cat((best_scores[:, None], log_scores(tried).view(-1, each)), 1)
+            top, choice = scores.max(1)
+            candidates = torch.cat((best[:, None], tried.view(len(best), each, -1)), 1)
+            best = candidates[torch.arange(len(best), device=best.device), choice]
+            keep = top.topk(max(1, len(best) // 2)).indices
+            best, best_scores = best[keep], top[keep]
+            if len(keep) == 1:
+                break
+            sigmas = sigmas * 0.75
+        return sir.diffuse(best.expand(n, -1), 0.5 * sigmas, lower, upper, "reflect", generator)
+
+    def _draw(
+        self, observation: Observation, space: PoseSpace, generator: torch.Generator
+    ) -> Tensor:
+        m, device = self.hypotheses, space.lower.device
 
         def normal(*size: int) -> Tensor:
             return torch.randn(*size, generator=generator, device=device)
 
-        tilt = normal(m, 3) * self.tilt_rad
-        tilt[:, 2] = normal(m) * self.in_plane_rad
-        if self.pose is not None:
-            pose = torch.tensor(self.pose, dtype=torch.float32, device=device)
-            rotation = roma.rotvec_composition((tilt, pose[3:].expand(m, 3)))
-            translation = pose[:3] + normal(m, 3) * self.position_m
-            return torch.cat((translation, rotation, self._palm(space, m)), 1)
+        def uniform() -> Tensor:
+            return torch.rand(m, generator=generator, device=device)
 
-        if self.search:
-            tilt[:, 2] = torch.rand(m, generator=generator, device=device) * 2 * math.pi
-            latent, facing = self._any_pose(space, m, generator)
-            rotation = roma.rotvec_composition(
-                (_axis(tilt[:, 2], 2), _axis(tilt[:, 0], 0), _axis(tilt[:, 1] + facing, 1))
-            )
-        else:
-            latent, rotation = self._palm(space, m), tilt
-        centre = torch.from_numpy(palm_centre(observation)).to(device)
-        pivot = roma.rotvec_to_rotmat(rotation) @ rotation.new_tensor(PIVOT_M)
+        centre = torch.from_numpy(palm_centres(observation, m, generator)).to(device)
+        in_plane = uniform() * 2 * math.pi
+        exit_point = arm_exit(observation)
+        if exit_point is not None:
+            way = torch.from_numpy(exit_point).to(device) - centre
+            towards_arm = torch.atan2(-way[:, 0], way[:, 1]) + self.arm_rad * normal(m)
+            in_plane = torch.where(uniform() < 0.8, towards_arm, in_plane)
+        facing = (uniform() < 0.5) * math.pi
+        tilt = normal(m, 2) * self.tilt_rad
+        rotation = roma.rotvec_composition(
+            (_about(in_plane, 2), _about(tilt[:, 0], 0), _about(tilt[:, 1] + facing, 1))
+        )
+        rows = torch.randint(len(space.training_latents), (m,), generator=generator, device=device)
+        pivot = roma.rotvec_to_rotmat(rotation) @ rotation.new_tensor(sir.PIVOT_M)
         translation = centre + normal(m, 3) * self.position_m - pivot
-        return torch.cat((translation, rotation, latent), 1)
-
-    @staticmethod
-    def _palm(space: PoseSpace, m: int) -> Tensor:
-        rows = [label == "palm" for label in space.training_labels]
-        return space.training_latents[rows.index(True) if True in rows else 0].expand(m, -1)
-
-    @staticmethod
-    def _any_pose(space: PoseSpace, m: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        device = space.lower.device
-        count = len(space.training_latents)
-        rows = torch.randint(count, (m,), generator=generator, device=device)
-        back = torch.rand(m, generator=generator, device=device) < 0.5
-        return space.training_latents[rows], back * math.pi
+        return torch.cat((translation, rotation, space.training_latents[rows]), 1)
 
 
-def _axis(angle: Tensor, axis: int) -> Tensor:
+def _about(angle: Tensor, axis: int) -> Tensor:
     vector = torch.zeros(len(angle), 3, device=angle.device)
     vector[:, axis] = angle
     return vector
 
 
-def palm_centre(observation: Observation) -> np.ndarray:
-    """The middle of the palm, (3,) float32 metres: the centre of the widest disc in the hand's
-    silhouette, a palm's half-thickness behind the surface seen there.
+def _points(observation: Observation, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Points of the blob at pixels, a palm's half-thickness behind the surface, (n, 3) metres."""
+    hand, depth = observation.hand.cpu().numpy(), observation.depth_m.cpu().numpy()
+    k = observation.k.cpu().numpy()
+    # Noise and flying pixels: the median of a neighbourhood, wherever it is mostly hand.
+    smooth = cv2.medianBlur(np.where(hand, depth, 0).astype(np.float32), 5)
+    z = np.where(smooth[v, u] > 0, smooth[v, u], depth[v, u]) + 0.012
+    x, y = (u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z
+    return np.stack((x, y, z), 1).astype(np.float32)
+
+
+def palm_centres(observation: Observation, n: int, generator: torch.Generator) -> np.ndarray:
+    """Where the middle of the palm may be, (n, 3) float32 metres.
+
+    The first half is the centre of the widest disc in the hand's silhouette; the others are drawn
+    from all of it, the wider the silhouette there the likelier.
     """
     hand = observation.hand.cpu().numpy().astype(np.uint8)
-    depth = observation.depth_m.cpu().numpy()
-    k = observation.k.cpu().numpy()
-    # The image's border is no silhouette edge for an arm that leaves the picture, so no padding.
-    distance = cv2.distanceTransform(hand, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    v, u = np.unravel_index(int(distance.argmax()), distance.shape)
-    radius = max(1, int(distance[v, u] / 2))
-    patch = (slice(max(0, v - radius), v + radius + 1), slice(max(0, u - radius), u + radius + 1))
-    z = float(np.median(depth[patch][hand[patch] > 0])) + 0.012
-    return np.array([(u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z, z], np.float32)
+    # The border of the image counts as the silhouette's edge, or an arm that leaves the picture
+    # would be widest there.
+    padded = np.pad(hand, 1)
+    distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    wide = torch.from_numpy((distance.ravel() / distance.max()).astype(np.float64) ** 4)
+    spots = torch.multinomial(
+        wide.to(generator.device), n, replacement=True, generator=generator
+    ).cpu()
+    spots[: (n + 1) // 2] = int(distance.argmax())
+    v, u = np.divmod(spots.numpy(), hand.shape[1])
+    return _points(observation, v, u)
+
+
+def arm_exit(observation: Observation) -> np.ndarray | None:
+    """Where the blob leaves the image, (3,) float32 metres; None when it does not touch the border."""
+    hand = observation.hand.cpu().numpy()
+    border = np.zeros_like(hand)
+    border[[0, -1], :] = border[:, [0, -1]] = True
+    v, u = np.nonzero(hand & border)
+    if len(v) < 3:
+        return None
+    return np.median(_points(observation, v, u), axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -142,10 +143,10 @@ class Tracker:
                 particles[chosen], scale, lower, upper, cfg.bounds, self.generator
             )
             exponent = cfg.exponent * cfg.exponent_growth**number
-            weights = sir.normalise(exponent * self._scores(particles, evidence).log())
+            weights = sir.normalise(exponent * self._log_scores(particles, evidence))
 
         mean = sir.mean_particle(particles, weights)
-        score = float(self._scores(mean, evidence))
+        score = float(self.likelihood.score(self.scorer(self.decode(mean), evidence)))
         bad = track.bad + 1 if score < self.lost.score else 0
         velocity = self._velocity(track, mean) if not starting else torch.zeros_like(mean[0])
         self.track = TrackState(particles, weights, mean, velocity, bad)
@@ -155,18 +156,24 @@ class Tracker:
             particles, weights, mean, score, name, bad > 0, index, timestamp_s, began
         )
 
-    def _scores(self, particles: Tensor, evidence: Evidence) -> Tensor:
-        return self.likelihood.score(self.scorer(self.decode(particles), evidence))
+    def _log_scores(self, particles: Tensor, evidence: Evidence) -> Tensor:
+        return self.likelihood.log_score(self.scorer(self.decode(particles), evidence))
 
     def decode(self, particles: Tensor) -> Tensor:
         """(N, 6 + d) particles to (N, 27) hand states."""
         return torch.cat((particles[:, :6], self.space.decode(particles[:, 6:])), 1)
 
     def _initialise(self, observation: Observation, evidence: Evidence) -> TrackState:
-        cfg = self.settings
-        particles = self.start.particles(observation, self.space, cfg.particles, self.generator)
-        weights = sir.normalise(cfg.exponent * self._scores(particles, evidence).log())
-        mean = particles[weights.argmax()][None]
+        n = self.settings.particles
+        particles = self.start(
+            observation,
+            self.space,
+            partial(self._log_scores, evidence=evidence),
+            n,
+            self.generator,
+        )
+        weights = torch.full((n,), 1.0 / n, dtype=torch.float64, device=self.device)
+        mean = particles[:1]
         return TrackState(particles, weights, mean, torch.zeros_like(mean[0]))
 
     def _velocity(self, track: TrackState, mean: Tensor) -> Tensor:

@@ -156,8 +156,8 @@ def hand_surface(shape: HandShape) -> HandSurface:
         0,
         *_between(base[4] + palm(4, -6, -4), base[1] + palm(-4, -4, -6), 15 * mm, 10 * mm, 12 * mm),
     )
-    # The wrist ellipsoid, across the forearm below the hand.
-    attach(0, palm(0, 40, 0), torch.stack([base.new_tensor(v) * mm for v in (48, 40, 40)]))
+    # The wrist ellipsoid, across the forearm below the hand and wide enough for a bent wrist.
+    attach(0, palm(0, 45, 0), torch.stack([base.new_tensor(v) * mm for v in (50, 45, 45)]))
     return HandSurface(
         torch.tensor(frame_index, device=base.device), torch.stack(centres), torch.stack(axes)
     )

@@ -166,7 +166,6 @@ def _read_archive(path: Path, archive: zipfile.ZipFile) -> dict[str, np.ndarray]
         if f"{key}.npy" in members:
             with archive.open(f"{key}.npy") as stream:
                 arrays[key] = np.lib.format.read_array(stream, allow_pickle=False)
-                stream.read()  # to the end, so that the checksum is verified
     return arrays
 
 

@@ -85,10 +85,10 @@ def make_scorer(name: str, shape: HandShape, device: torch.device) -> Scorer:
     shape: sizes of the hand that all hypotheses share.
     Raises ToftrackError for an unknown name or a back end that cannot run here.
     """
-    from toftrack.render.torch_scorer import TorchScorer
-
     shape = shape.to(device)
     if name == "torch":
+        from toftrack.render.torch_scorer import TorchScorer
+
         return TorchScorer(shape)
     if name == "auto":
         wanted = "triton" if device.type == "cuda" else "numba"
@@ -110,4 +110,4 @@ def make_scorer(name: str, shape: HandShape, device: torch.device) -> Scorer:
                 f"renderer={name} cannot run here ({error}); install it or give renderer=torch"
             ) from None
         log.info("renderer: %s is not available (%s), using torch", wanted, error)
-        return TorchScorer(shape)
+        return make_scorer("torch", shape, device)

@@ -1,0 +1,127 @@
+"""The CPU's scoring back end: one fused pass a particle, compiled once by numba and cached."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.hand.shape import HandShape
+from toftrack.hand.skeleton import CHAIN_SLOTS
+from toftrack.hand.surface import hand_surface
+from toftrack.render.numba_hand import LANES
+from toftrack.render.numba_kernel import pack_evidence, score_hands
+from toftrack.render.scoring import Counts, Evidence
+
+log = logging.getLogger(__name__)
+
+_SILENT_S = 0.7
+"""Taking the kernel from numba's cache is faster than this, compiling it is slower."""
+_compiling = threading.Lock()
+
+
+def disc_halves(radius_px: float, height: int, width: int) -> np.ndarray:
+    """Half lengths of a disc's rows at the row offsets 0, 1, .. radius, no longer than the image.
+
+    Returns (reach + 1,) int64, never increasing.
+    """
+    radius = min(max(float(radius_px), 0.0), math.hypot(height, width))
+    offsets = range(min(int(radius), height) + 1)
+    return np.array([min(int(math.sqrt(radius**2 - dy**2)), width) for dy in offsets], np.int64)
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Helper threads of this process; a forked one gets its own."""
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="toftrack-scorer")
+
+
+def _threads() -> int:
+    """As many as torch may use, but no more than there are cores for this process."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, min(torch.get_num_threads(), len(os.sched_getaffinity(0))))
+    return max(1, torch.get_num_threads())
+
+
+class NumbaScorer:
+    """Kinematics, drawing and counting in compiled code, one particle after the other.
+
+    Plain threads share the particles, not numba's own: these are one choice for a whole process
+    and some of them do not allow calls from two threads at once. Safe to call from several
+    threads. States on another device are moved to the CPU and the counts back.
+    """
+
+    name = "numba"
+
+    def __init__(self, shape: HandShape) -> None:
+        """Compiles the kernel if need be, some seconds once on a machine."""
+        shape = shape.to("cpu", torch.float32)
+        surface = hand_surface(shape)
+        slots = np.full(25, -1, np.int64)
+        slots[list(CHAIN_SLOTS)] = np.arange(6, 27)
+        covariances = surface.axes_m @ surface.axes_m.mT
+        rows, columns = torch.triu_indices(3, 3)
+        self._hand = (
+            slots,
+            torch.cat((shape.base_frames, shape.base_m[..., None]), -1).contiguous().numpy(),
+            shape.bone_lengths_m.contiguous().numpy(),
+            np.float32(-1.0 if shape.side == "left" else 1.0),
+            surface.frame_index.contiguous().numpy(),
+            torch.cat((surface.centres_m, covariances[:, rows, columns]), 1).numpy(),
+        )
+        self._compile()
+
+    def _compile(self) -> None:
+        """The first call of a process, with a message if it takes long."""
+        with _compiling:
+            if score_hands.signatures:
+                return
+            message = "renderer: compiling the numba kernel (once, about 6 s)"
+            timer = threading.Timer(_SILENT_S, log.info, (message,))
+            timer.daemon = True
+            timer.start()
+            try:
+                image = torch.zeros(2, 2)
+                self(torch.zeros(1, 27), Evidence(image, image, image, image > 0, torch.eye(3), 0.0))
+            finally:
+                timer.cancel()
+
+    def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
+        """See Scorer; particles whose state is not finite count 0."""
+        tensors = (evidence.low, evidence.high, evidence.occluder)
+        images, hand = pack_evidence(
+            *(_array(tensor, torch.float32) for tensor in tensors), _array(evidence.hand, torch.bool)
+        )
+        height, width = evidence.hand.shape
+        k = _array(evidence.k, torch.float32)
+        x = _array(states, torch.float32)
+        counts = torch.empty(4, len(x))
+        task = functools.partial(
+            score_hands,
+            x,
+            np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+            images,
+            hand,
+            width,
+            disc_halves(evidence.radius_px, height, width),
+            *self._hand,
+            np.zeros(1, np.int64),
+            counts.numpy(),
+        )
+        helpers = min(_threads(), -(-len(x) // LANES)) - 1
+        others = [_pool(os.getpid()).submit(task) for _ in range(helpers)]
+        task()
+        for other in others:
+            other.result()
+        return Counts(*counts.to(states.device))
+
+
+def _array(tensor: Tensor, dtype: torch.dtype) -> np.ndarray:
+    return tensor.detach().to("cpu", dtype).contiguous().numpy()
