@@ -45,6 +45,7 @@ def build_tracker(config: DictConfig) -> Tracker:
         segmentation=make(config.segmentation),
         likelihood=make(config.likelihood),
         settings=make(config.filter),
+        refinement=make(config.refine),
         start=make(config.start),
         lost=make(config.lost),
         renderer=config.renderer,

@@ -60,9 +60,13 @@ class FMeasure:
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
         return Evidence(low, high, torch.zeros_like(depth), hand, observation.k, radius)
 
-    def log_score(self, counts: Counts) -> Tensor:
-        """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct)."""
-        return self.score(counts).log() + self.coverage * counts.correct.log()
+    def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
+        """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct).
+
+        coverage: instead of the likelihood's own, for a search that compares very different poses.
+        """
+        coverage = self.coverage if coverage is None else coverage
+        return self.score(counts).log() + coverage * counts.correct.log()
 
     def _distance(self, observation: Observation) -> float:
         return observation.nearest_m if not observation.empty else 1.0

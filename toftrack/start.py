@@ -18,8 +18,8 @@ from toftrack.errors import ToftrackError
 from toftrack.pose_space.base import PoseSpace
 from toftrack.segmentation import Observation
 
-LogScores = Callable[[Tensor], Tensor]
-"""(N, 6 + d) hypotheses to (N,) log scores of the current frame."""
+LogScores = Callable[[Tensor, float], Tensor]
+"""(N, 6 + d) hypotheses and the weight of coverage to (N,) log scores of the current frame."""
 
 
 class Start(Protocol):
@@ -89,6 +89,8 @@ class SearchStart:
 
     hypotheses: in the first batch.  islands: how many are refined at first; a power of two.
     samples: hypotheses a round of refinement.
+    coverage: as the likelihood's; among all poses it must be felt, or a hand that lies mostly
+        outside of the image wins.
     position_m: spread about points of the blob.  tilt_rad: spread of the palm's tilt out of the
         image plane.
     arm_rad: spread of the forearm's direction about the way to where the blob leaves the image; a
@@ -97,6 +99,7 @@ class SearchStart:
 
     hypotheses: int = 3000
     islands: int = 64
+    coverage: float = 1.0
     samples: int = 1024
     position_m: float = 0.02
     tilt_rad: float = 0.5
@@ -113,7 +116,7 @@ class SearchStart:
         """See Start."""
         lower, upper = space.lower, space.upper
         first = self._draw(observation, space, generator)
-        scores = log_scores(first)
+        scores = log_scores(first, self.coverage)
         best = first[scores.topk(min(self.islands, len(first))).indices]
         best_scores = scores.topk(len(best)).values
         sigmas = sir.Spread(self.position_m, 0.015, 0.35, 0.15).sigmas(lower, upper)
@@ -123,7 +126,8 @@ class SearchStart:
                 best.repeat_interleave(each, 0), sigmas, lower, upper, "reflect", generator
             )
             # Every island keeps what it had if nothing better was found.
-            scores = torch.cat((best_scores[:, None], log_scores(tried).view(-1, each)), 1)
+            new_scores = log_scores(tried, self.coverage).view(-1, each)
+            scores = torch.cat((best_scores[:, None], new_scores), 1)
             top, choice = scores.max(1)
             candidates = torch.cat((best[:, None], tried.view(len(best), each, -1)), 1)
             best = candidates[torch.arange(len(best), device=best.device), choice]

@@ -19,6 +19,7 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace
+from toftrack.refine import Refinement, refine, surroundings
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
 from toftrack.segmentation import NearestSurface, Observation
@@ -92,6 +93,7 @@ class Tracker:
         segmentation: NearestSurface,
         likelihood: FMeasure,
         settings: FilterSettings,
+        refinement: Refinement,
         start: Start,
         lost: LostSettings,
         renderer: str = "auto",
@@ -100,10 +102,12 @@ class Tracker:
     ) -> None:
         self.device = torch.device(device)
         self.shape = shape.to(self.device)
+        self.surface = hand_surface(self.shape)
         self.space = space.to(self.device)
         self.segmentation = segmentation
         self.likelihood = likelihood
         self.settings = settings
+        self.refinement = refinement
         self.start = start
         self.lost = lost
         self.scorer: Scorer = make_scorer(renderer, self.shape, self.device)
@@ -143,9 +147,10 @@ class Tracker:
                 particles[chosen], scale, lower, upper, cfg.bounds, self.generator
             )
             exponent = cfg.exponent * cfg.exponent_growth**number
-            weights = sir.normalise(exponent * self._log_scores(particles, evidence))
+            weights = sir.normalise(exponent * self._log_scores(particles, evidence=evidence))
 
         mean = sir.mean_particle(particles, weights)
+        state = self._refined(mean, observation)
         score = float(self.likelihood.score(self.scorer(self.decode(mean), evidence)))
         bad = track.bad + 1 if score < self.lost.score else 0
         velocity = self._velocity(track, mean) if not starting else torch.zeros_like(mean[0])
@@ -153,11 +158,13 @@ class Tracker:
         lost = self._give_up()
         name = "lost" if lost else "initialising" if starting else "tracking"
         return self._estimate(
-            particles, weights, mean, score, name, bad > 0, index, timestamp_s, began
+            particles, weights, mean, state, score, name, bad > 0, index, timestamp_s, began
         )
 
-    def _log_scores(self, particles: Tensor, evidence: Evidence) -> Tensor:
-        return self.likelihood.log_score(self.scorer(self.decode(particles), evidence))
+    def _log_scores(
+        self, particles: Tensor, coverage: float | None = None, *, evidence: Evidence
+    ) -> Tensor:
+        return self.likelihood.log_score(self.scorer(self.decode(particles), evidence), coverage)
 
     def decode(self, particles: Tensor) -> Tensor:
         """(N, 6 + d) particles to (N, 27) hand states."""
@@ -175,6 +182,17 @@ class Tracker:
         weights = torch.full((n,), 1.0 / n, dtype=torch.float64, device=self.device)
         mean = particles[:1]
         return TrackState(particles, weights, mean, torch.zeros_like(mean[0]))
+
+    def _refined(self, mean: Tensor, observation: Observation) -> Tensor:
+        """The hand state of an estimate, brought onto the seen points; (1, 27)."""
+        state = self.decode(mean)
+        if self.refinement.iterations == 0:
+            return state
+        middle = forward_kinematics(state, self.shape).joints_m[0].mean(0)
+        seen = surroundings(observation, middle, self.refinement.points)
+        if len(seen.points_m) == 0:
+            return state
+        return refine(state, state[:, 6:], seen, self.shape, self.surface, self.refinement)
 
     def _velocity(self, track: TrackState, mean: Tensor) -> Tensor:
         moved = sir.difference(mean, track.mean)[0]
@@ -196,6 +214,7 @@ class Tracker:
         particles: Tensor,
         weights: Tensor,
         mean: Tensor,
+        state: Tensor,
         score: float,
         name: str,
         lost: bool,
@@ -203,7 +222,6 @@ class Tracker:
         timestamp_s: float,
         began: float,
     ) -> Estimate:
-        state = self.decode(mean)
         tangents = sir.difference(particles, mean)
         tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
         joints = forward_kinematics(state, self.shape).joints_m

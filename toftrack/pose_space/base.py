@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from dataclasses import fields, replace
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -14,8 +15,9 @@ from toftrack.hand.skeleton import ANGLE_LIMITS
 class PoseSpace(Protocol):
     """A learned low-dimensional space of hand poses (paper, section 2.3).
 
-    A further space is one module with this interface, a line in pose_space/files.py and one file
-    in conf/pose_space/.
+    A further space is one module in this package, named as its kind, with a class `Space` of this
+    interface and a function `fit(angles, labels, dims, **settings)`, and one file in
+    conf/pose_space/.
 
     kind: the name that stands in model files and configs.
     dims: d, the number of latent coordinates.
@@ -43,7 +45,47 @@ class PoseSpace(Protocol):
         """The same space on another device or of another dtype."""
 
 
+class TensorSpace:
+    """What spaces that are frozen dataclasses of tensors share.
+
+    A subclass has the fields `lower`, `upper`, `training_latents` and `training_labels`, further
+    tensors as it needs them, and the methods `decode_freely` and `encode`.
+    """
+
+    lower: Tensor
+
+    @property
+    def dims(self) -> int:
+        """The number of latent coordinates."""
+        return self.lower.shape[0]
+
+    def decode_freely(self, latent: Tensor) -> Tensor:
+        """(N, d) to (N, 21) radians, without regard to the joint limits."""
+        raise NotImplementedError
+
+    def decode(self, latent: Tensor) -> Tensor:
+        """(N, d) to (N, 21) radians, clamped to the joint limits."""
+        return clamp_to_joint_limits(self.decode_freely(latent))
+
+    def arrays(self) -> dict[str, Tensor]:
+        """The tensors of the model file."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "training_labels"}
+
+    def to(self, device: torch.device | str, dtype: torch.dtype = torch.float32) -> Self:
+        """The same space on another device or of another dtype."""
+        return replace(
+            self, **{name: value.to(device, dtype) for name, value in self.arrays().items()}
+        )
+
+
 def clamp_to_joint_limits(angles: Tensor) -> Tensor:
     """(N, 21) radians, each within hand.skeleton.ANGLE_LIMITS."""
     limits = angles.new_tensor(ANGLE_LIMITS)
     return angles.clamp(limits[:, 0], limits[:, 1])
+
+
+def clamped_share(space: TensorSpace, latent: Tensor, slack_rad: float = 1e-3) -> float:
+    """Part of the decoded angles, 0 .. 1, that the joint limits had to move; latent (N, d)."""
+    free = space.decode_freely(latent)
+    moved = (clamp_to_joint_limits(free) - free).abs() > slack_rad
+    return float(moved.float().mean())

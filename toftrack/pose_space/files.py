@@ -2,43 +2,70 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import pkgutil
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
 
+import toftrack.pose_space
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.pose_space.base import PoseSpace
-from toftrack.pose_space.pca import PCAPoseSpace, fit_pca
-from toftrack.pose_space.training_poses import synthetic_training_poses
+from toftrack.pose_space.pose_data import PoseData, synthetic_data
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
 
-_KINDS: dict[str, type] = {PCAPoseSpace.kind: PCAPoseSpace}
-_FITS: dict[str, Callable[..., PoseSpace]] = {PCAPoseSpace.kind: fit_pca}
+
+def pose_space_kinds() -> tuple[str, ...]:
+    """Every kind of space: the modules of this package that have `Space` and `fit`."""
+    names = sorted(module.name for module in pkgutil.iter_modules(toftrack.pose_space.__path__))
+    return tuple(name for name in names if _module(name) is not None)
 
 
-def fit_pose_space(kind: str = "pca", dims: int = 4) -> PoseSpace:
-    """Learn a pose space of a kind from the synthetic training poses."""
-    if kind not in _FITS:
-        raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {', '.join(_FITS)}")
-    poses = synthetic_training_poses()
-    return _FITS[kind](poses.angles_rad, poses.labels, dims)
+def _module(kind: object) -> ModuleType | None:
+    """The module of a kind of space; None when there is none of that name."""
+    if not isinstance(kind, str) or not kind.isidentifier():
+        return None
+    try:
+        module = importlib.import_module(f"toftrack.pose_space.{kind}")
+    except ModuleNotFoundError:
+        return None
+    return module if hasattr(module, "Space") and hasattr(module, "fit") else None
 
 
-def save_pose_space(space: PoseSpace, path: str | Path) -> None:
-    """Write a model file."""
+def fit_pose_space(
+    kind: str = "pca", dims: int = 4, data: PoseData | None = None, **settings: Any
+) -> PoseSpace:
+    """Learn a pose space of a kind, from the synthetic training poses unless others are given.
+
+    settings: of that kind, as its `fit` takes them.
+    """
+    module = _module(kind)
+    if module is None:
+        known = ", ".join(pose_space_kinds())
+        raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {known}")
+    data = data or synthetic_data()
+    return module.fit(data.angles_rad, data.labels, dims, **settings)
+
+
+def save_pose_space(
+    space: PoseSpace, path: str | Path, sources: tuple[dict[str, Any], ...] = ()
+) -> None:
+    """Write a model file; `sources` says what it was learned from (PoseData.sources)."""
     header = {
         "format": FORMAT,
         "version": VERSION,
         "kind": space.kind,
         "angle_names": ANGLE_NAMES,
         "training_labels": space.training_labels,
+        "sources": sources,
     }
     arrays = {name: tensor.cpu().numpy() for name, tensor in space.arrays().items()}
     with open(path, "wb") as file:
@@ -47,6 +74,41 @@ def save_pose_space(space: PoseSpace, path: str | Path) -> None:
 
 def load_pose_space(path: str | Path) -> PoseSpace:
     """Read a model file; ToftrackError when it is not one of this version and size."""
+    advice = "make one with train_pose_space.py"
+    header, arrays = _read(path)
+    module = _module(header.get("kind"))
+    if module is None:
+        raise ToftrackError(f"{path} holds a pose space of unknown kind {header.get('kind')!r}")
+    if tuple(header.get("angle_names", ())) != ANGLE_NAMES:
+        raise ToftrackError(
+            f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
+            f" hand; {advice}"
+        )
+    try:
+        tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
+        space = module.Space(**tensors, training_labels=tuple(header.get("training_labels", ())))
+        angles = space.decode(space.training_latents)
+        usable = all(bool(tensor.isfinite().all()) for tensor in (*tensors.values(), angles))
+        if angles.shape[-1] == len(ANGLE_NAMES):
+            space.encode(angles[:1])
+    except (TypeError, RuntimeError, IndexError, ValueError) as error:
+        raise ToftrackError(f"{path} is a damaged pose-space file ({error}); {advice}") from None
+    if not usable:
+        raise ToftrackError(f"{path} is a damaged pose-space file (not all finite); {advice}")
+    if angles.shape[-1] != len(ANGLE_NAMES) or space.lower.shape != (space.dims,):
+        raise ToftrackError(
+            f"{path} is a pose space of another size ({angles.shape[-1]} angles); {advice}"
+        )
+    return space
+
+
+def pose_space_sources(path: str | Path) -> list[dict[str, Any]]:
+    """What a model file was learned from, as train_pose_space.py recorded it."""
+    return list(_read(path)[0].get("sources", ()))
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a file of this format and version."""
     advice = "make one with train_pose_space.py"
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -63,32 +125,15 @@ def load_pose_space(path: str | Path) -> PoseSpace:
             f"{path} is a pose space of version {header.get('version')} and this toftrack reads"
             f" version {VERSION}; {advice}"
         )
-    if header.get("kind") not in _KINDS:
-        raise ToftrackError(f"{path} holds a pose space of unknown kind {header.get('kind')!r}")
-    if tuple(header.get("angle_names", ())) != ANGLE_NAMES:
-        raise ToftrackError(
-            f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
-            f" hand; {advice}"
-        )
-    try:
-        tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
-        space = _KINDS[header["kind"]](
-            **tensors, training_labels=tuple(header.get("training_labels", ()))
-        )
-        angles = space.decode(space.training_latents)
-    except (TypeError, RuntimeError, IndexError, ValueError) as error:
-        raise ToftrackError(f"{path} is a damaged pose-space file ({error}); {advice}") from None
-    if angles.shape[-1] != len(ANGLE_NAMES) or space.lower.shape != (space.dims,):
-        raise ToftrackError(
-            f"{path} is a pose space of another size ({angles.shape[-1]} angles); {advice}"
-        )
-    return space
+    return header, arrays
 
 
-def make_pose_space(kind: str = "pca", dims: int = 4, file: str | None = None) -> PoseSpace:
+def make_pose_space(
+    kind: str = "pca", dims: int = 4, file: str | None = None, **settings: Any
+) -> PoseSpace:
     """The pose space of a configuration: read from `file`, or learned on the spot when None."""
     if file is None:
-        return fit_pose_space(kind, dims)
+        return fit_pose_space(kind, dims, **settings)
     space = load_pose_space(file)
     if space.kind != kind or space.dims != dims:
         raise ToftrackError(

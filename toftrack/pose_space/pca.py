@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import sklearn.decomposition
@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.base import clamp_to_joint_limits
+from toftrack.pose_space.base import TensorSpace
 
 
 @dataclass(frozen=True)
-class PCAPoseSpace:
+class PCAPoseSpace(TensorSpace):
     """A linear space: angles = mean + latent components.
 
     mean: (21,) rad.  components: (d, 21) orthonormal rows.
@@ -32,28 +32,13 @@ class PCAPoseSpace:
     training_latents: Tensor
     training_labels: tuple[str, ...]
 
-    @property
-    def dims(self) -> int:
-        """The number of latent coordinates."""
-        return self.components.shape[0]
-
-    def decode(self, latent: Tensor) -> Tensor:
-        """(N, d) to (N, 21) radians, clamped to the joint limits."""
-        return clamp_to_joint_limits(torch.addmm(self.mean, latent, self.components))
+    def decode_freely(self, latent: Tensor) -> Tensor:
+        """(N, d) to (N, 21) radians, without regard to the joint limits."""
+        return torch.addmm(self.mean, latent, self.components)
 
     def encode(self, angles: Tensor) -> Tensor:
         """(N, 21) radians to (N, d)."""
         return (angles - self.mean) @ self.components.mT
-
-    def arrays(self) -> dict[str, Tensor]:
-        """The tensors of the model file."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "training_labels"}
-
-    def to(self, device: torch.device | str, dtype: torch.dtype = torch.float32) -> PCAPoseSpace:
-        """The same space on another device or of another dtype."""
-        return replace(
-            self, **{name: value.to(device, dtype) for name, value in self.arrays().items()}
-        )
 
 
 def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSpace:
@@ -79,3 +64,6 @@ def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSp
         training_latents=torch.from_numpy(latents).float(),
         training_labels=labels,
     )
+
+
+Space, fit = PCAPoseSpace, fit_pca

@@ -1,7 +1,8 @@
 """Kinematics and conics of the CPU kernel: from states of 27 numbers to what a renderer draws.
 
 A projective map takes ellipsoids to ellipsoids, so in (column, row, inverse depth) an ellipsoid
-{c + F u : |u| <= 1} with S = F F' is again one, and w = c_z^2 - S_zz gives its centre and "covariance"
+{c + F u : |u| <= 1} with S = F F' is again one. With w = c_z^2 - S_zz, its centre and "covariance"
+are
 
     x0 = (c_x c_z - S_xz) / w,   u0 = c_z / w,          (y as x)
     K_xx = (S_xx c_z^2 - 2 S_xz c_x c_z + S_zz c_x^2 - S_xx S_zz + S_xz^2) / w^2,
@@ -30,9 +31,10 @@ _NOTHING = np.float32(-1.0)
 # Rows of the table of coefficients of an ellipsoid.
 X, Y, U, HY, IY, XY, HX, DX, UY, UX, DU, TERMS = range(12)
 
+
 @compiled
 def _sin_cos(x):
-    """Branch-free float32 sine and cosine (Cephes' polynomials), so that loops over it vectorise."""
+    """Float32 sine and cosine (Cephes' polynomials) without branches, so that loops vectorise."""
     turns = np.floor(x * np.float32(2 / math.pi) + np.float32(0.5))
     r = x - turns * np.float32(1.5703125)
     r = r - turns * np.float32(4.837512969970703125e-4)
@@ -55,8 +57,8 @@ def _sin_cos(x):
 def pose_hands(states, first, slots, base, lengths, mirror, x, sines, cosines, frames, valid):
     """Frames of LANES hands from states[first:], see skeleton.forward_kinematics.
 
-    frames: (16, 12 * LANES), rotation by rows and origin.  valid: (LANES,), 0 for states that are not
-    finite or past the end, whose frames are those of the zero state.
+    frames: (16, 12 * LANES), rotation by rows and origin.  valid: (LANES,), 0 for states that are
+    not finite or past the end, whose frames are those of the zero state.
     """
     for i in range(LANES):
         row = first + i
@@ -117,7 +119,9 @@ def _root(hand, base, frame):
             for i in range(LANES):
                 value = hand[row * LANES + i] * b0 + hand[(row + 1) * LANES + i] * b1
                 value += hand[(row + 2) * LANES + i] * b2
-                frame[to * LANES + i] = value + (hand[to * LANES + i] if k == 3 else np.float32(0.0))
+                frame[to * LANES + i] = value + (
+                    hand[to * LANES + i] if k == 3 else np.float32(0.0)
+                )
 
 
 @compiled

@@ -30,13 +30,25 @@ from toftrack.render.numba_hand import (
     pose_hands,
     project_hands,
 )
-from toftrack.render.numba_vector import BLOCK, OPTIONS, compiled, count, draw, ones, take
+from toftrack.render.numba_vector import (
+    BLOCK,
+    OPTIONS,
+    WORDS,
+    compiled,
+    count,
+    draw,
+    merge,
+    near,
+    ones,
+    take,
+    widen,
+)
 
 _SOURCES = ("numba_hand.py", "numba_kernel.py", "numba_vector.py")
 
 
 def _cached(function):
-    """Decorator of the kernel's entry points: compiled at the first call, or taken from the cache."""
+    """Decorator of the kernel's entry points: compiled at the first call, or from the cache."""
     # numba's cache notices changes of the function's own file only, but it does go by the name.
     sources = b"".join(Path(__file__).with_name(name).read_bytes() for name in _SOURCES)
     function.__qualname__ += f"_{zlib.crc32(sources):08x}"
@@ -46,6 +58,7 @@ def _cached(function):
         return numba.njit(**OPTIONS)(function)
 
 
+_ROWS = 16
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _FIELD = np.uint64((1 << BLOCK) - 1)
 
@@ -74,7 +87,11 @@ def _box(conics, i, width, height):
     for e in range(conics.shape[0] - 1):
         high = conics[e, HY * LANES + i]
         if high > _ZERO:
-            x, wide, y = conics[e, X * LANES + i], conics[e, HX * LANES + i], conics[e, Y * LANES + i]
+            x, wide, y = (
+                conics[e, X * LANES + i],
+                conics[e, HX * LANES + i],
+                conics[e, Y * LANES + i],
+            )
             left = min(left, _clip(np.ceil(x - wide), width))
             right = max(right, _clip(np.floor(x + wide) + _ONE, width))
             top = min(top, _clip(np.ceil(y - high), height))
@@ -87,52 +104,61 @@ def _render(conics, i, box, origin, stride, tile, spans, lines):
     """The largest inverse depth of each pixel of the box, 0 = none.
 
     tile: flat, rows of `stride` pixels from row `top` and column `origin` of the image.
-    spans: (2 * R,) set to the first and, from R on, the last tile column drawn in each row.
-    lines: (5, R) scratch.
+    spans: (2, rows), set to the first and last tile column drawn in each row.
+    lines: (5 * _ROWS,) scratch.
     """
     left, top, right, bottom = box
     # Whole blocks, and one more that the last drawn block may reach into.
     begin = (left - origin) // BLOCK * BLOCK
     end = ((right - origin) // BLOCK + 2) * BLOCK
-    firsts, lasts = spans
     for row in range(bottom - top):
-        clear(tile, row * stride + begin, end - begin)
-    for row in range(bottom - top + ROWS):
-        firsts[row], lasts[row] = stride, -1
-    low_most, high_most = np.float32(left - origin), np.float32(right - 1 - origin)
+        spans[0, row], spans[1, row] = stride, -1
+        line = tile[row * stride + begin : row * stride + end]
+        for column in range(end - begin):
+            line[column] = _ZERO
+    left_most, right_most = np.float32(left - origin), np.float32(right - 1 - origin)
     for e in range(conics.shape[0] - 1):
         conic = conics[e]
         high = conic[HY * LANES + i]
         if not high > _ZERO:
             continue
         x, y = conic[X * LANES + i] - np.float32(origin), conic[Y * LANES + i]
+        shear, inverse = conic[XY * LANES + i], conic[IY * LANES + i]
+        dx, du = conic[DX * LANES + i], conic[DU * LANES + i]
+        u, slope_y, slope_x = conic[U * LANES + i], conic[UY * LANES + i], conic[UX * LANES + i]
+        curve = du / dx
         first = max(_clip(np.ceil(y - high), bottom), top)
         rows = _clip(y + high + _ONE, bottom) - first
-        lead = np.float32(first) - y
-        du, dx = conic[DU * LANES + i], conic[DX * LANES + i]
-        curve, slope = du / dx, conic[UX * LANES + i]
-        for row in range(0, rows, ROWS):
-            outline(
-                lines,
-                firsts,
-                lasts,
-                first - top + row,
-                rows - row,
-                lead + np.float32(row),
-                x,
-                conic[XY * LANES + i],
-                conic[IY * LANES + i],
-                dx,
-                low_most,
-                high_most,
-                conic[U * LANES + i],
-                conic[UY * LANES + i],
-                du,
-            )
-            at = (first - top + row) * stride
-            for r in range(min(ROWS, rows - row)):
-                draw_line(tile, at, lines, r, slope, curve)
-                at += stride
+        for row in range(0, rows, _ROWS):
+            lead = np.float32(first + row) - y
+            for j in range(_ROWS):  # vectorised: what the rows have of their own
+                dy = lead + np.float32(j)
+                rest = max(_ONE - dy * dy * inverse, _ZERO)
+                middle, half = x + shear * dy, math.sqrt(dx * rest)
+                # Written so that NaN stays inside, too.
+                low = np.ceil(middle - half)
+                low = low if low > left_most else left_most
+                low = low if low < right_most else right_most
+                last = np.floor(middle + half)
+                lines[j] = low
+                lines[_ROWS + j] = last if last < right_most else right_most
+                lines[2 * _ROWS + j] = low - middle
+                lines[3 * _ROWS + j] = u + slope_y * dy
+                lines[4 * _ROWS + j] = du * rest
+            for j in range(min(_ROWS, rows - row)):
+                low, high = int(lines[j]), int(lines[_ROWS + j])
+                if low > high:
+                    continue
+                line = first - top + row + j
+                spans[0, line] = min(spans[0, line], low)
+                spans[1, line] = max(spans[1, line], high)
+                at, t = line * stride + low, lines[2 * _ROWS + j]
+                plane, peak = lines[3 * _ROWS + j], lines[4 * _ROWS + j]
+                draw(tile, at, t, plane, slope_x, peak, curve)
+                for _ in range(low + BLOCK, high + 1, BLOCK):
+                    at += BLOCK
+                    t += np.float32(BLOCK)
+                    draw(tile, at, t, plane, slope_x, peak, curve)
 
 
 @compiled
@@ -167,91 +193,86 @@ def _compare(tile, stride, spans, box, origin, images, model, above, residuals):
 
 
 @compiled
-def _dilate(model, here, there, words, halves, first, rows):
-    """Exact Euclidean disc dilation of bit rows; the result is in the returned one of the buffers.
+def _wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted):
+    """Bits of the hand's pixels outside of the silhouette and of the wrist's ellipsoid.
 
-    A disc is a horizontal run for each row offset dy. Taken from the longest run to the shortest,
-    each step widens all that came before by the difference (Horner's scheme).
-
-    model: (words + 2, R) bit rows by word, with empty words around them; result row r is about
-        model row first + r.  here, there: (words + 2, >= rows) buffers with empty words around.
-    halves: (reach + 1,) half lengths of the runs.
+    hand: (words of a row + 1, H) bits of the evidence.  wanted: (words, rows + WORDS) is set.
     """
-    reach = halves.shape[0] - 1
-    one, last = np.uint64(1), np.uint64(63)
-    for w in range(1, words + 1):
-        source = model[w, first : first + rows]
+    shift = np.uint64(origin & 63)
+    back = np.uint64(63) - shift
+    for w in range(words):
+        here = hand[(origin >> 6) + w, first_row : first_row + rows]
+        after = hand[(origin >> 6) + w + 1, first_row : first_row + rows]
+        covered, line = model[w + 1, reach : reach + rows], wanted[w]
         for r in range(rows):
-            here[w, r] = source[r]
-    for dy in range(1, reach + 2):
-        grow = halves[dy - 1] - (halves[dy] if dy <= reach else 0)
-        for _ in range(grow):
-            for w in range(1, words + 1):
-                for r in range(rows):
-                    x = here[w, r]
-                    carry = (here[w - 1, r] >> last) | (here[w + 1, r] << last)
-                    there[w, r] = x | (x << one) | (x >> one) | carry
-            here, there = there, here
-        if dy <= reach:
-            for w in range(1, words + 1):
-                over = model[w, first - dy : first - dy + rows]
-                under = model[w, first + dy : first + dy + rows]
-                for r in range(rows):
-                    here[w, r] |= over[r] | under[r]
-    return here
+            line[r] = ((here[r] >> shift) | (after[r] << np.uint64(1) << back)) & ~covered[r]
+        for r in range(rows, rows + WORDS):
+            line[r] = np.uint64(0)
+    conic = conics[conics.shape[0] - 1]
+    high, y = conic[HY * LANES + i], conic[Y * LANES + i] - np.float32(first_row)
+    if high > _ZERO:
+        x, shear = conic[X * LANES + i] - np.float32(origin), conic[XY * LANES + i]
+        inverse, dx = conic[IY * LANES + i], conic[DX * LANES + i]
+        for r in range(_clip(np.ceil(y - high), rows), _clip(y + high + _ONE, rows)):
+            dy = np.float32(r) - y
+            middle = x + shear * dy
+            half = math.sqrt(dx * max(_ONE - dy * dy * inverse, _ZERO))
+            first = _clip(np.ceil(middle - half), 64 * words)
+            last = _clip(np.floor(middle + half) + _ONE, 64 * words) - 1
+            for w in range(words):
+                wanted[w, r] &= ~_run(first - 64 * w, last - 64 * w)
 
 
 @compiled
-def _missed(conics, i, model, words, first_row, rows, origin, hand, halves, wanted, here, there):
-    """Hand pixels near the silhouette but outside of it and of the wrist's.
+def _missed(model, words, rows, reach, steps, wanted, buffer):
+    """How many wanted pixels lie within a disc of the silhouette: an exact Euclidean dilation.
 
-    first_row, origin: the image row and column of model's row `reach` and word 1.
-    hand: (H, words of a row + 1) bits of the evidence.
+    A disc is a horizontal run for each row offset. Taken from the longest run to the shortest, each
+    step widens all that came before by the difference of the runs (Horner's scheme). WORDS rows
+    at once, 64 columns to a word.
+
+    model: (words + 2, R) bit rows by word with empty words around, the first at row `reach`.
+    steps: (S, 2) pairs of: widen by a pixel to both sides or not, and the row offset to add or 0.
+    wanted: (words, rows + WORDS).  buffer: (2 * (parts + 2) * WORDS,) scratch.
     """
-    reach = halves.shape[0] - 1
-    e = conics.shape[0] - 1
-    x, y, high, shear = conics[e, X * LANES + i], conics[e, Y * LANES + i], conics[e, HY * LANES + i], conics[e, XY * LANES + i]
-    inverse, dx = conics[e, IY * LANES + i], conics[e, DX * LANES + i]
-    begin, end = rows, 0
-    shift = np.uint64(origin & 63)
-    for r in range(rows):
-        v = first_row + r
-        dy = np.float32(v) - y
-        rest = _ONE - dy * dy * inverse
-        wrist_first, wrist_last = 0, -1
-        if high > _ZERO and rest >= _ZERO:
-            middle, half = x + shear * dy, math.sqrt(dx * rest)
-            wrist_first = _clip(np.ceil(middle - half), 1 << 20) - origin
-            wrist_last = _clip(np.floor(middle + half) + _ONE, 1 << 20) - 1 - origin
-        any_here = np.uint64(0)
-        for w in range(words):
-            at = (origin >> 6) + w
-            bits = hand[v, at] >> shift
-            if shift:
-                bits |= hand[v, at + 1] << (np.uint64(64) - shift)
-            bits &= ~model[w + 1, reach + r]
-            bits &= ~_run(wrist_first - 64 * w, wrist_last - 64 * w)
-            wanted[w, r] = bits
-            any_here |= bits
-        if any_here:
-            begin, end = min(begin, r), r + 1
-    if end <= begin:
-        return 0
-    near = _dilate(model, here, there, words, halves, reach + begin, end - begin)
+    pitch, half = model.shape[1], buffer.shape[0] // 2
     missed = 0
-    for w in range(words):
-        for r in range(begin, end):
-            missed += ones(near[w + 1, r - begin] & wanted[w, r])
+    for first in range(0, rows, WORDS):
+        some = np.uint64(0)
+        for w in range(words):
+            for r in range(first, first + WORDS):
+                some |= wanted[w, r]
+        if not some:
+            continue
+        for r in range(WORDS):
+            for w in range(words + 2):
+                buffer[w * WORDS + r] = model[w, reach + first + r]
+                buffer[half + w * WORDS + r] = np.uint64(0)
+        here, there = 0, half
+        for step in range(steps.shape[0]):
+            dy = steps[step, 1]
+            for w in range(1, words + 1):
+                # The empty word 0 of the model is what a step adds that only widens.
+                middle = w * pitch + reach + first if dy else 0
+                at = here + w * WORDS
+                if steps[step, 0]:
+                    widen(buffer, at, there + w * WORDS, model, middle - dy, middle + dy)
+                else:
+                    merge(buffer, at, model, middle - dy, middle + dy)
+            if steps[step, 0]:
+                here, there = there, here
+        for w in range(words):
+            missed += near(buffer, here + (w + 1) * WORDS, wanted, w * wanted.shape[1] + first)
     return missed
 
 
 @_cached
 def pack_evidence(low, high, occluder, hand):
-    """Evidence as (3, H, W + padding) float32 images and (H, words + 1) bits of the hand."""
+    """Evidence as (3, H, W + padding) float32 images and (words + 1, H) bits of the hand."""
     height, width = hand.shape
     pitch = (width + 2 * BLOCK - 1) // BLOCK * BLOCK
     images = np.empty((3, height, pitch), np.float32)
-    bits = np.zeros((height, (width + 63) // 64 + 1), np.uint64)
+    bits = np.zeros(((width + 63) // 64 + 1, height), np.uint64)
     for v in range(height):
         for u in range(width):
             images[0, v, u] = low[v, u]
@@ -262,21 +283,34 @@ def pack_evidence(low, high, occluder, hand):
             images[1, v, u] = -np.inf
             images[2, v, u] = np.inf
         for u in range(width):
-            bits[v, u >> 6] |= np.uint64(hand[v, u]) << np.uint64(u & 63)
+            bits[u >> 6, v] |= np.uint64(hand[v, u]) << np.uint64(u & 63)
     return images, bits
 
 
 @_cached
 def score_hands(
-    states, k, images, hand, width, halves, slots, base, lengths, mirror, index, surface, counter, out
+    states,
+    k,
+    images,
+    hand,
+    width,
+    steps,
+    slots,
+    base,
+    lengths,
+    mirror,
+    index,
+    surface,
+    counter,
+    out,
 ):
     """Score tasks of LANES particles as long as `counter` has any; called from several threads.
 
     states: (N, 27).  k: fx, fy, cx, cy.  images, hand: of pack_evidence, for `width` columns.
-    halves: half lengths of the rows of the disc.  slots .. surface: see NumbaScorer.
+    steps: of disc_steps.  slots .. surface: see NumbaScorer.
     counter: (1,) int64 tasks taken.  out: (4, N) correct, false, missed, residual.
     """
-    height, reach, parts = images.shape[1], halves.shape[0] - 1, hand.shape[1] - 1
+    height, reach, parts = images.shape[1], steps[:, 1].max(), hand.shape[0] - 1
     x = np.empty(27 * LANES, np.float32)
     sines, cosines = np.empty((2, 25 * LANES), np.float32)
     frames = np.empty((16, 12 * LANES), np.float32)
@@ -284,10 +318,11 @@ def score_hands(
     conics = np.empty((index.shape[0], TERMS * LANES), np.float32)
     tile = np.empty(height * (64 * parts + 2 * BLOCK), np.float32)
     spans = np.empty((2, height), np.int64)
+    lines = np.empty(5 * _ROWS, np.float32)
     residuals = np.empty(BLOCK, np.float32)
-    model = np.empty((parts + 2, height + 2 * reach), np.uint64)
-    here, there = np.zeros((2, parts + 2, height), np.uint64)
-    wanted = np.empty((parts, height), np.uint64)
+    model = np.empty((parts + 2, height + 2 * reach + WORDS), np.uint64)
+    wanted = np.empty((parts, height + WORDS), np.uint64)
+    buffer = np.empty(2 * (parts + 2) * WORDS, np.uint64)
     while True:
         first = take(counter) * LANES
         if first >= states.shape[0]:
@@ -305,16 +340,14 @@ def score_hands(
             rows = min(height, bottom + reach) - first_row
             words = (min(width, right + reach) - origin + 63) >> 6
             stride = 64 * words + 2 * BLOCK
-            _render(conics, i, box, origin, stride, tile, spans)
+            _render(conics, i, box, origin, stride, tile, spans, lines)
             residuals[:] = _ZERO
-            model[: words + 2, : rows + 2 * reach] = np.uint64(0)
-            here[words + 1], there[words + 1] = np.uint64(0), np.uint64(0)
+            model[: words + 2, : rows + 2 * reach + WORDS] = np.uint64(0)
             above = reach + top - first_row
             correct, false = _compare(
                 tile, stride, spans, box, origin, images, model, above, residuals
             )
             out[0, first + i], out[1, first + i] = correct, false
-            out[2, first + i] = _missed(
-                conics, i, model, words, first_row, rows, origin, hand, halves, wanted, here, there
-            )
+            _wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted)
+            out[2, first + i] = _missed(model, words, rows, reach, steps, wanted, buffer)
             out[3, first + i] = residuals.sum()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
-from toftrack.hand.surface import hand_surface
+from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.render.numba_hand import LANES
 from toftrack.render.numba_kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence
@@ -27,14 +27,20 @@ _SILENT_S = 0.7
 _compiling = threading.Lock()
 
 
-def disc_halves(radius_px: float, height: int, width: int) -> np.ndarray:
-    """Half lengths of a disc's rows at the row offsets 0, 1, .. radius, no longer than the image.
+def disc_steps(radius_px: float, height: int, width: int) -> np.ndarray:
+    """How the kernel builds a disc from its longest row to its shortest: see numba_kernel._missed.
 
-    Returns (reach + 1,) int64, never increasing.
+    Returns (S, 2) int64: a pixel wider or not, and the row offset to add or 0.
     """
     radius = min(max(float(radius_px), 0.0), math.hypot(height, width))
     offsets = range(min(int(radius), height) + 1)
-    return np.array([min(int(math.sqrt(radius**2 - dy**2)), width) for dy in offsets], np.int64)
+    halves = [min(int(math.sqrt(radius**2 - dy**2)), width) for dy in offsets] + [0]
+    steps = [(0, 0)]
+    for dy in range(1, len(halves)):
+        grow = halves[dy - 1] - halves[dy]
+        steps += [(1, 0)] * max(grow - 1, 0)
+        steps.append((min(grow, 1), dy if dy < len(halves) - 1 else 0))
+    return np.array(steps, np.int64)
 
 
 @functools.cache
@@ -60,10 +66,13 @@ class NumbaScorer:
 
     name = "numba"
 
-    def __init__(self, shape: HandShape) -> None:
-        """Compiles the kernel if need be, some seconds once on a machine."""
+    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
+        """Compiles the kernel if need be, some seconds once on a machine.
+
+        surface: instead of the shape's own.
+        """
         shape = shape.to("cpu", torch.float32)
-        surface = hand_surface(shape)
+        surface = (surface or hand_surface(shape)).to("cpu", torch.float32)
         slots = np.full(25, -1, np.int64)
         slots[list(CHAIN_SLOTS)] = np.arange(6, 27)
         covariances = surface.axes_m @ surface.axes_m.mT
@@ -89,7 +98,9 @@ class NumbaScorer:
             timer.start()
             try:
                 image = torch.zeros(2, 2)
-                self(torch.zeros(1, 27), Evidence(image, image, image, image > 0, torch.eye(3), 0.0))
+                self(
+                    torch.zeros(1, 27), Evidence(image, image, image, image > 0, torch.eye(3), 0.0)
+                )
             finally:
                 timer.cancel()
 
@@ -97,7 +108,8 @@ class NumbaScorer:
         """See Scorer; particles whose state is not finite count 0."""
         tensors = (evidence.low, evidence.high, evidence.occluder)
         images, hand = pack_evidence(
-            *(_array(tensor, torch.float32) for tensor in tensors), _array(evidence.hand, torch.bool)
+            *(_array(tensor, torch.float32) for tensor in tensors),
+            _array(evidence.hand, torch.bool),
         )
         height, width = evidence.hand.shape
         k = _array(evidence.k, torch.float32)
@@ -110,7 +122,7 @@ class NumbaScorer:
             images,
             hand,
             width,
-            disc_halves(evidence.radius_px, height, width),
+            disc_steps(evidence.radius_px, height, width),
             *self._hand,
             np.zeros(1, np.int64),
             counts.numpy(),

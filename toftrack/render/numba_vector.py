@@ -10,8 +10,11 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-BLOCK = 16
+BLOCK = 8
 """Pixels of a row that are worked on at once; images need this much padding on the right."""
+
+WORDS = 8
+"""Words of 64 pixels, one above the other, that are worked on at once."""
 
 # nnan and ninf stay off: a missed pixel is the NaN of a negative square root.
 OPTIONS = {"fastmath": {"contract", "arcp", "nsz"}, "nogil": True, "error_model": "numpy"}
@@ -19,6 +22,7 @@ compiled = numba.njit(**OPTIONS)
 """Decorator of the kernel's inner functions."""
 
 _VECTOR = ir.VectorType(ir.FloatType(), BLOCK)
+_WORDS = ir.VectorType(ir.IntType(64), WORDS)
 
 
 def _pointer(context, builder, array_type, array, index, lltype=None):
@@ -27,8 +31,9 @@ def _pointer(context, builder, array_type, array, index, lltype=None):
     return at if lltype is None else builder.bitcast(at, lltype.as_pointer())
 
 
-def _load(context, builder, array_type, array, index):
-    return builder.load(_pointer(context, builder, array_type, array, index, _VECTOR), align=4)
+def _load(context, builder, array_type, array, index, lltype=_VECTOR):
+    align = 4 if lltype is _VECTOR else 8
+    return builder.load(_pointer(context, builder, array_type, array, index, lltype), align=align)
 
 
 def _splat(builder, value):
@@ -64,7 +69,7 @@ def draw(typingctx, tile, index, t, u, slope, peak, curve):
 
 @intrinsic
 def count(typingctx, tile, index, images, low, high, occluder, residuals):
-    """Bits of model, correct and false in the three lowest 16 bits; adds to `residuals`."""
+    """Bits of model, correct and false in the lowest 3 * BLOCK bits; adds to `residuals`."""
 
     def codegen(context, builder, signature, args):
         kinds = signature.args
@@ -92,6 +97,72 @@ def count(typingctx, tile, index, images, low, high, occluder, residuals):
 
     indices = (types.intp,) * 3
     return types.uint64(tile, types.intp, images, *indices, residuals), codegen
+
+
+@intrinsic
+def widen(typingctx, buffer, at, to, model, over, under):
+    """Words from `at` widened by a bit to both sides, and two of the model's, are stored at `to`.
+
+    The words to the left and right are WORDS before and after.
+    """
+
+    def codegen(context, builder, signature, args):
+        kinds, (buffer, at, to, model, over, under) = signature.args, args
+        one, top = (ir.Constant(_WORDS, [value] * WORDS) for value in (1, 63))
+        step = ir.IntType(64)(WORDS)
+        left, middle, right = (
+            _load(context, builder, kinds[0], buffer, i, _WORDS)
+            for i in (builder.sub(at, step), at, builder.add(at, step))
+        )
+        parts = (
+            builder.shl(middle, one),
+            builder.lshr(middle, one),
+            builder.lshr(left, top),
+            builder.shl(right, top),
+            _load(context, builder, kinds[3], model, over, _WORDS),
+            _load(context, builder, kinds[3], model, under, _WORDS),
+        )
+        for part in parts:
+            middle = builder.or_(middle, part)
+        builder.store(middle, _pointer(context, builder, kinds[0], buffer, to, _WORDS), align=8)
+        return context.get_dummy_value()
+
+    indices = (types.intp,) * 2
+    return types.void(buffer, *indices, model, *indices), codegen
+
+
+@intrinsic
+def merge(typingctx, buffer, at, model, over, under):
+    """Two times WORDS words of the model are added to those at `at`."""
+
+    def codegen(context, builder, signature, args):
+        kinds, (buffer, at, model, over, under) = signature.args, args
+        words = _load(context, builder, kinds[0], buffer, at, _WORDS)
+        for index in (over, under):
+            words = builder.or_(words, _load(context, builder, kinds[2], model, index, _WORDS))
+        builder.store(words, _pointer(context, builder, kinds[0], buffer, at, _WORDS), align=8)
+        return context.get_dummy_value()
+
+    return types.void(buffer, types.intp, model, types.intp, types.intp), codegen
+
+
+@intrinsic
+def near(typingctx, buffer, at, wanted, index):
+    """How many bits WORDS words of both have in common."""
+
+    def codegen(context, builder, signature, args):
+        words = builder.and_(
+            _load(context, builder, signature.args[0], args[0], args[1], _WORDS),
+            _load(context, builder, signature.args[2], args[2], args[3], _WORDS),
+        )
+        total = ir.IntType(64)(0)
+        for j in range(WORDS):
+            total = builder.add(
+                total, builder.ctpop(builder.extract_element(words, ir.IntType(32)(j)))
+            )
+        return total
+
+    return types.int64(buffer, types.intp, wanted, types.intp), codegen
 
 
 @intrinsic

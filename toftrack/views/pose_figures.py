@@ -1,4 +1,4 @@
-"""Figures of a pose space: training poses and extreme corners (paper, fig. 4)."""
+"""Figures of a pose space: training poses, traversals and extreme corners (paper, fig. 4)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.pose_space.base import PoseSpace
+from toftrack.pose_space.training_poses import GESTURES, basic_pose
 from toftrack.render.closed_form import render_range_images
 from toftrack.views.overlay import range_grey
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 # Okabe and Ito's colours, which colour-blind people can tell apart; BGR.
 _BASIC = {"palm": (178, 114, 0), "fist": (0, 94, 213), "gun": (115, 158, 0)}
+_NEAR_DEGREES = 15.0
+"""A pose is coloured as the gesture that it is within this root mean square distance of."""
 _BETWEEN, _THUMB = (150, 150, 150), (167, 121, 204)
 _TEXT = (40, 40, 40)
 
@@ -81,6 +84,62 @@ def poses_figure(space: PoseSpace, width: int = 1000, height: int = 720) -> np.n
         cv2.circle(picture, (120, y - 5), 6, colour, -1, cv2.LINE_AA)
         cv2.putText(picture, text, (135, y), _FONT, 0.6, _TEXT, 1, cv2.LINE_AA)
     return picture
+
+
+def manifold_figure(space: PoseSpace, size: int = 460) -> np.ndarray:
+    """Training poses in pairs of coordinates (1-2, 1-3, 2-3), coloured by the nearest gesture, grey
+    where none is near; poses of other sources than the synthetic ones, too. BGR.
+    """
+    latents = space.training_latents
+    nearest = _gestures(space.decode(latents))
+    points = latents.cpu().numpy()
+    pairs = [(i, j) for i, j in ((0, 1), (0, 2), (1, 2)) if j < space.dims] or [(0, 0)]
+    panels = []
+    for i, j in pairs:
+        panel = np.full((size, size, 3), 255, np.uint8)
+        cv2.rectangle(panel, (30, 30), (size - 30, size - 30), (210, 210, 210), 1)
+        xy = points[:, (i, j)]
+        span = np.maximum(xy.max(0) - xy.min(0), 1e-9)
+        spots = 30 + (xy - xy.min(0)) / span * (size - 60)
+        for (u, v), gesture in sorted(
+            zip(spots, nearest, strict=True), key=lambda item: item[1] is not None
+        ):
+            colour = _BETWEEN if gesture is None else _BASIC[gesture]
+            cv2.circle(panel, (int(u), int(size - v)), 4, colour, -1, cv2.LINE_AA)
+        name = f"{j + 1} against {i + 1}"
+        cv2.putText(panel, name, (34, size - 10), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
+        panels.append(panel)
+    x = 34
+    for name, colour in (*_BASIC.items(), ("other", _BETWEEN)):
+        cv2.circle(panels[0], (x, 16), 5, colour, -1, cv2.LINE_AA)
+        cv2.putText(panels[0], name, (x + 9, 21), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
+        x += 80
+    return np.hstack(panels)
+
+
+def _gestures(angles: Tensor) -> list[str | None]:
+    """The gesture nearest to each pose, (N, 21) rad; None where all are far."""
+    basic = torch.stack([basic_pose(gesture) for gesture in GESTURES]).to(angles)
+    distance = (angles[:, None] - basic).square().mean(-1).sqrt()
+    least, which = distance.min(1)
+    near = torch.rad2deg(least) < _NEAR_DEGREES
+    return [GESTURES[w] if n else None for w, n in zip(which.tolist(), near.tolist(), strict=True)]
+
+
+def traversals_figure(space: PoseSpace, steps: int = 7, size: int = 150) -> np.ndarray:
+    """A row of range images a coordinate, from its lower to its upper bound through the training
+    pose nearest to the middle of all, the other coordinates as there; BGR.
+    """
+    latents = space.training_latents
+    span = (space.upper - space.lower).clamp(min=1e-9)
+    centre = latents[((latents - latents.mean(0)) / span).square().sum(1).argmin()]
+    rows = []
+    for d in range(space.dims):
+        path = centre.repeat(steps, 1)
+        path[:, d] = torch.linspace(0, 1, steps).to(path) * span[d] + space.lower[d]
+        tiles = [pose_picture(angles, size) for angles in space.decode(path)]
+        rows.append(_captioned(np.hstack(tiles), f"coordinate {d + 1}, lowest to highest"))
+    return cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR)
 
 
 def corners_figure(space: PoseSpace, size: int = 220) -> np.ndarray:
