@@ -10,6 +10,7 @@ import json
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,6 +53,9 @@ class Camera:
     """(5,) float64, OpenCV's k1 k2 p1 p2 k3."""
     depth_polynomial: tuple[float, ...] = ()
     """c_0, c_1, ... of the correction: true = measured + sum_i c_i measured^i, radial metres."""
+    depth_polynomial_range_m: tuple[float, ...] = ()
+    """The nearest and the farthest measured distance that the polynomial was fitted to; beyond them
+    the correction stays what it is there, as a polynomial runs wild outside. () = no limits."""
 
     def __post_init__(self) -> None:
         K = _numbers(self.K, (3, 3), "the camera matrix K")
@@ -74,6 +78,11 @@ class Camera:
         count = np.size(self.depth_polynomial)
         polynomial = _numbers(self.depth_polynomial, (count,), "the depth polynomial")
         object.__setattr__(self, "depth_polynomial", tuple(map(float, polynomial)))
+        if np.size(self.depth_polynomial_range_m):
+            limits = _numbers(self.depth_polynomial_range_m, (2,), "the depth polynomial's range")
+            if not 0 <= limits[0] < limits[1]:
+                raise ToftrackError("the depth polynomial's range must be nearest, then farthest")
+            object.__setattr__(self, "depth_polynomial_range_m", tuple(map(float, limits)))
 
     @cached_property
     def _distorted(self) -> bool:
@@ -160,6 +169,16 @@ class Camera:
 
     def save(self, path: str | Path) -> None:
         """Write the camera as JSON. Raises ToftrackError when the file cannot be written."""
+        try:
+            Path(path).write_text(json.dumps(self.to_dict(), indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise ToftrackError(
+                f"the camera file '{path}' cannot be written ({error.strerror}); choose another "
+                "place"
+            ) from error
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of a camera file, JSON-able."""
         content = {
             "format": _FORMAT,
             "version": _VERSION,
@@ -169,13 +188,9 @@ class Camera:
             "distortion": self.distortion.tolist(),
             "depth_polynomial": list(self.depth_polynomial),
         }
-        try:
-            Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise ToftrackError(
-                f"the camera file '{path}' cannot be written ({error.strerror}); choose another "
-                "place"
-            ) from error
+        if self.depth_polynomial_range_m:
+            content["depth_polynomial_range_m"] = list(self.depth_polynomial_range_m)
+        return content
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
@@ -191,6 +206,11 @@ class Camera:
             raise ToftrackError(
                 f"'{path}' is not a camera file: it is not JSON; give a file that toftrack wrote"
             ) from None
+        return cls.from_dict(content, path)
+
+    @classmethod
+    def from_dict(cls, content: object, path: str | Path) -> Camera:
+        """The camera of `to_dict`; `path` is what errors name. Raises ToftrackError as `load`."""
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ToftrackError(
                 f"'{path}' is not a camera file: its format is not '{_FORMAT}'; give a file that "
@@ -208,6 +228,7 @@ class Camera:
                 height=content["height"],
                 distortion=content.get("distortion", np.zeros(5)),
                 depth_polynomial=content.get("depth_polynomial", ()),
+                depth_polynomial_range_m=content.get("depth_polynomial_range_m", ()),
             )
         except KeyError as error:
             raise ToftrackError(
@@ -222,8 +243,11 @@ class Camera:
 
     def _correct(self, measured: np.ndarray, valid: np.ndarray) -> np.ndarray:
         correction = np.zeros_like(measured)
+        at = measured
+        if self.depth_polynomial_range_m:
+            at = np.clip(measured, *map(np.float32, self.depth_polynomial_range_m))
         for coefficient in reversed(self.depth_polynomial):
-            correction = correction * measured + np.float32(coefficient)
+            correction = correction * at + np.float32(coefficient)
         # A correction that pushes a reading behind the camera leaves no reading.
         return np.where(valid, np.maximum(measured + correction, 0), 0)
 

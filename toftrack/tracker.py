@@ -18,7 +18,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.likelihood import FMeasure
-from toftrack.pose_space.base import PoseSpace
+from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.refine import Refinement, refine, surroundings
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
@@ -77,6 +77,7 @@ class TrackState:
     weights: Tensor
     mean: Tensor
     velocity: Tensor
+    offset: Tensor
     bad: int = 0
 
 
@@ -109,6 +110,8 @@ class Tracker:
         self.settings = settings
         self.refinement = refinement
         self.start = start
+        import os
+        self.feedback = os.environ.get("FB","1")=="1"; self.keep=float(os.environ.get("KEEP","0.9"))
         self.lost = lost
         self.scorer: Scorer = make_scorer(renderer, self.shape, self.device)
         self.generator = torch.Generator(self.device).manual_seed(seed)
@@ -147,14 +150,23 @@ class Tracker:
                 particles[chosen], scale, lower, upper, cfg.bounds, self.generator
             )
             exponent = cfg.exponent * cfg.exponent_growth**number
-            weights = sir.normalise(exponent * self._log_scores(particles, evidence=evidence))
+            weights = sir.normalise(exponent * self._log_scores(particles, evidence=evidence, offset=track.offset))
 
         mean = sir.mean_particle(particles, weights)
-        state = self._refined(mean, observation)
-        score = float(self.likelihood.score(self.scorer(self.decode(mean), evidence)))
+        state = self._refined(mean, track.offset, observation)
+        if self.feedback:
+            latent = sir.bound(self.space.encode(state[:, 6:]), lower, upper, "truncate")
+            refined = torch.cat((state[:, :6], latent), 1)
+            particles = sir.compose(particles, sir.difference(refined, mean))
+            particles[:, 6:] = sir.bound(particles[:, 6:], lower, upper, "truncate")
+            offset = self.keep * (state[0, 6:] - self.space.decode(latent)[0])
+            mean = refined
+        else:
+            offset = track.offset
+        score = float(self.likelihood.score(self.scorer(state, evidence)))
         bad = track.bad + 1 if score < self.lost.score else 0
         velocity = self._velocity(track, mean) if not starting else torch.zeros_like(mean[0])
-        self.track = TrackState(particles, weights, mean, velocity, bad)
+        self.track = TrackState(particles, weights, mean, velocity, offset, bad)
         lost = self._give_up()
         name = "lost" if lost else "initialising" if starting else "tracking"
         return self._estimate(
@@ -162,13 +174,20 @@ class Tracker:
         )
 
     def _log_scores(
-        self, particles: Tensor, coverage: float | None = None, *, evidence: Evidence
+        self,
+        particles: Tensor,
+        coverage: float | None = None,
+        *,
+        evidence: Evidence,
+        offset: Tensor | float = 0.0,
     ) -> Tensor:
-        return self.likelihood.log_score(self.scorer(self.decode(particles), evidence), coverage)
+        counts = self.scorer(self.decode(particles, offset), evidence)
+        return self.likelihood.log_score(counts, coverage)
 
-    def decode(self, particles: Tensor) -> Tensor:
+    def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
         """(N, 6 + d) particles to (N, 27) hand states."""
-        return torch.cat((particles[:, :6], self.space.decode(particles[:, 6:])), 1)
+        angles = clamp_to_joint_limits(self.space.decode(particles[:, 6:]) + offset)
+        return torch.cat((particles[:, :6], angles), 1)
 
     def _initialise(self, observation: Observation, evidence: Evidence) -> TrackState:
         n = self.settings.particles
@@ -181,11 +200,13 @@ class Tracker:
         )
         weights = torch.full((n,), 1.0 / n, dtype=torch.float64, device=self.device)
         mean = particles[:1]
-        return TrackState(particles, weights, mean, torch.zeros_like(mean[0]))
+        return TrackState(
+            particles, weights, mean, torch.zeros_like(mean[0]), torch.zeros(21, device=self.device)
+        )
 
-    def _refined(self, mean: Tensor, observation: Observation) -> Tensor:
+    def _refined(self, mean: Tensor, offset: Tensor, observation: Observation) -> Tensor:
         """The hand state of an estimate, brought onto the seen points; (1, 27)."""
-        state = self.decode(mean)
+        state = self.decode(mean, offset)
         if self.refinement.iterations == 0:
             return state
         middle = forward_kinematics(state, self.shape).joints_m[0].mean(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,10 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.devices.base import Frame
 from toftrack.errors import ToftrackError
-from toftrack.recordings.npz import Recording, read_recording
+from toftrack.recordings.any import FrameStore, open_recording
+from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
+
+_log = logging.getLogger(__name__)
 
 
 class Replay:
@@ -20,14 +24,18 @@ class Replay:
 
     Each frame keeps its index within the recording; `truth` is that of the range.
 
+    A `.npz` is loaded; a `.srs` and a folder of images are read frame by frame, so that long ones
+    need no more memory than short ones.
+
     Args:
-        path: the recording (.npz).
+        path: the recording: `.npz`, `.srs`, or a folder of 16-bit PNG images with a camera file.
         start: first frame.
         stop: the frame after the last; None for all.
         realtime: at the recording's own pace: wait for each frame's time, and drop a frame when the
             next one is already due (the last is always delivered). Otherwise every frame, as fast
             as it is asked for.
         camera_file: a calibrated camera instead of the recording's own.
+        modulation_mhz: of the SR3000, for a `.srs` that does not state its range.
 
     Raises:
         ToftrackError: the recording or the camera cannot be used, or the range lies outside.
@@ -40,10 +48,26 @@ class Replay:
         stop: int | None = None,
         realtime: bool = False,
         camera_file: str | Path | None = None,
+        modulation_mhz: int = DEFAULT_MODULATION_MHZ,
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=FILE.npz")
-        self._recording = read_recording(path)
+        store = open_recording(path, camera_file, modulation_mhz)
+        self._set_up(store, path, start, stop, realtime, camera_file)
+
+    def _set_up(
+        self,
+        store: FrameStore,
+        path: str | Path,
+        start: int,
+        stop: int | None,
+        realtime: bool,
+        camera_file: str | Path | None,
+    ) -> None:
+        self._recording = store
+        damage = getattr(store, "damage", None)
+        if damage:
+            _log.warning("%s: %s; its %d whole frames are used", path, damage, len(store))
         self._range = _checked_range(start, stop, len(self._recording), path)
         self._realtime = bool(realtime)
         self.camera = _camera(self._recording, camera_file, path)
@@ -64,10 +88,11 @@ class Replay:
         """Frames that came too late in the latest iteration; always 0 unless `realtime`."""
 
     def open(self) -> None:
-        """Nothing to open: the file was read and checked by the constructor."""
+        """Nothing to open: the file was checked by the constructor."""
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Close the recording's file, if it is open."""
+        self._recording.close()
 
     def __enter__(self) -> Self:
         self.open()
@@ -79,8 +104,11 @@ class Replay:
     def __iter__(self) -> Iterator[Frame]:
         self.dropped = 0
         indices = self._paced() if self._realtime else iter(self._range)
-        for index in indices:
-            yield self._frame(index)
+        try:
+            for index in indices:
+                yield self._frame(index)
+        finally:
+            self._recording.close()
 
     def _paced(self) -> Iterator[int]:
         due = self._recording.timestamp_s[self._range.start : self._range.stop]
@@ -99,11 +127,12 @@ class Replay:
 
     def _frame(self, index: int) -> Frame:
         recording = self._recording
+        depth, amplitude = recording.image(index)
         return Frame(
             index=index,
             timestamp_s=float(recording.timestamp_s[index]),
-            depth=recording.depth[index].astype(np.float32),
-            amplitude=None if recording.amplitude is None else recording.amplitude[index],
+            depth=depth,
+            amplitude=amplitude,
             radial=recording.radial,
         )
 
@@ -124,7 +153,7 @@ def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -
     return range(start, stop)
 
 
-def _camera(recording: Recording, camera_file: str | Path | None, path: str | Path) -> Camera:
+def _camera(recording: FrameStore, camera_file: str | Path | None, path: str | Path) -> Camera:
     own = recording.camera
     if camera_file is None:
         return own

@@ -31,7 +31,8 @@ class KernelPCAPoseSpace(KernelDecodedSpace):
     """latent = k(x) projection + shift, angles by kernel regression.
 
     poses: (M, 21) rad, the kernel's centres.  gamma: () of exp(-gamma |x - x_m|^2), 1 / rad^2.
-    projection: (M, d) eigenvectors over the roots of their eigenvalues, in radians.  shift: (d,), the centring.
+    projection: (M, d) eigenvectors over the roots of their eigenvalues, in radians.
+    shift: (d,) rad, the centring.
     """
 
     kind: ClassVar[str] = "kernel_pca"

@@ -58,6 +58,14 @@ class Recording:
     def __len__(self) -> int:
         return len(self.depth)
 
+    def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """A frame's depth, (H, W) float32 metres, a new array, and its amplitude, (H, W) uint16."""
+        amplitude = None if self.amplitude is None else self.amplitude[index]
+        return self.depth[index].astype(np.float32), amplitude
+
+    def close(self) -> None:
+        """Nothing to close: the file was read as a whole."""
+
 
 def read_recording(path: str | Path) -> Recording:
     """Read and check a recording.

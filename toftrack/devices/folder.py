@@ -1,0 +1,39 @@
+"""A folder of 16-bit PNG depth images played back as if it were a camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.recordings.png_folder import read_png_folder
+
+
+class Folder(Replay):
+    """The images of a folder, as `Replay`; what the folder does not state can be given.
+
+    Args:
+        path: the folder; see `toftrack.recordings.png_folder` for what lies in it.
+        unit_m: metres of one step of the images; None = as the folder says, else 0.001.
+        fps: frames a second; None = as the folder says, else 25.
+        start, stop, realtime, camera_file: as for `Replay`.
+
+    Raises:
+        ToftrackError: as `Replay`, and when the images are not 16-bit grey PNGs of one size.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        unit_m: float | None = None,
+        fps: float | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        realtime: bool = False,
+        camera_file: str | Path | None = None,
+    ) -> None:
+        if not path:
+            raise ToftrackError("no folder was given; set device.path=FOLDER")
+        store = read_png_folder(path, camera_file, unit_m, fps)
+        self._set_up(store, path, start, stop, realtime, camera_file)
+        self.description |= {"device": "folder", "unit_m": store.unit_m}

@@ -1,0 +1,301 @@
+"""A folder of depth images, 16-bit PNG, with a camera file.
+
+| file | content |
+| --- | --- |
+| `*.png` | one depth image a frame, 16 bits, in the order of their names (numbers by value) |
+| `amplitude*.png` | optional: the amplitude images, 16 bits, as many and in the same order |
+| `camera.json` | the camera as `Camera.save` writes it; optional keys beside: `depth_unit_m` (metres of one step, 0.001), `radial` (false), `fps` (25), `metadata` |
+| `timestamps.txt` | optional: the frames' times, seconds, a line each |
+"""  # noqa: E501
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.recordings.npz import DEFAULT_FPS
+
+_CAMERA, _TIMES = "camera.json", "timestamps.txt"
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_LARGEST_PIXELS = 64_000_000  # a damaged header must not make us allocate gigabytes
+
+
+class PngFolder:
+    """The frames of a folder, read from the disk one at a time."""
+
+    truth = None
+
+    def __init__(
+        self,
+        folder: Path,
+        depth: list[Path],
+        amplitude: list[Path],
+        camera: Camera,
+        facts: _Facts,
+        timestamp_s: np.ndarray | None,
+    ) -> None:
+        self.path = folder
+        self.camera = camera
+        self.radial = facts.radial
+        self.unit_m = facts.unit_m
+        self.fps = facts.fps
+        self.metadata = facts.metadata
+        self.timestamp_s = np.arange(len(depth)) / self.fps if timestamp_s is None else timestamp_s
+        """(T,) float64 seconds, not decreasing."""
+        self._depth, self._amplitude = depth, amplitude
+
+    def __len__(self) -> int:
+        return len(self._depth)
+
+    def words(self, index: int) -> np.ndarray:
+        """A depth image as it lies in the file, (H, W) uint16; ToftrackError when damaged."""
+        return self._read(self._depth[index])
+
+    def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """A frame's depth, (H, W) float32 metres, and amplitude, (H, W) uint16; new arrays."""
+        depth = self.words(index).astype(np.float32) * np.float32(self.unit_m)
+        return depth, self._read(self._amplitude[index]) if self._amplitude else None
+
+    def close(self) -> None:
+        """Nothing to close: every image is opened for itself."""
+
+    def _read(self, path: Path) -> np.ndarray:
+        try:
+            content = np.frombuffer(path.read_bytes(), np.uint8)
+        except OSError as error:
+            raise ToftrackError(
+                f"the image '{path}' cannot be read ({error.strerror}); check its permissions"
+            ) from error
+        try:
+            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+        except cv2.error:
+            image = None
+        if image is None:
+            raise ToftrackError(f"the image '{path}' is damaged; copy or record it again")
+        if image.dtype != np.uint16 or image.shape != (self.camera.height, self.camera.width):
+            raise ToftrackError(f"the image '{path}' changed its kind while the folder was read")
+        return image
+
+
+def read_png_folder(
+    folder: str | Path,
+    camera_file: str | Path | None = None,
+    unit_m: float | None = None,
+    fps: float | None = None,
+) -> PngFolder:
+    """Open a folder of depth images: names, sizes and kinds are checked, pixels stay on the disk.
+
+    Args:
+        folder: its path.
+        camera_file: a camera file instead of the folder's `camera.json`.
+        unit_m: metres of one step of the images; None = as `camera.json` says, else 0.001.
+        fps: frames a second; None = as `camera.json` says, else 25.
+
+    Raises:
+        ToftrackError: there is no folder, image or camera, images differ in size, or one is not a
+            16-bit grey PNG.
+    """
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise ToftrackError(f"there is no folder '{folder}'; give a folder of 16-bit PNG images")
+    try:
+        images = sorted((p for p in folder.iterdir() if p.suffix.lower() == ".png"), key=_order)
+    except OSError as error:
+        raise ToftrackError(f"the folder '{folder}' cannot be read ({error.strerror})") from error
+    amplitude = [path for path in images if path.name.lower().startswith("amplitude")]
+    depth = [path for path in images if path not in set(amplitude)]
+    if not depth:
+        raise ToftrackError(f"the folder '{folder}' has no depth image (*.png); choose another")
+    if amplitude and len(amplitude) != len(depth):
+        raise ToftrackError(
+            f"the folder '{folder}' has {len(depth)} depth and {len(amplitude)} amplitude images; "
+            "there must be as many of both, or no amplitude"
+        )
+    content = _camera_content(folder / _CAMERA)
+    facts = _facts(folder / _CAMERA, content, unit_m, fps)
+    if camera_file is not None:
+        camera = Camera.load(camera_file)
+    elif content is not None:
+        camera = Camera.from_dict(content, folder / _CAMERA)
+    else:
+        raise ToftrackError(
+            f"the folder '{folder}' has no {_CAMERA}; put the camera's file there, or give another "
+            "with camera.file=FILE"
+        )
+    for path in (*depth, *amplitude):
+        size = _png_size(path)
+        if size != (camera.width, camera.height):
+            raise ToftrackError(
+                f"the image '{path}' has {size[0]}x{size[1]} pixels, but the camera has "
+                f"{camera.width}x{camera.height}; all images of a folder must be of one size"
+            )
+    times = _timestamps(folder / _TIMES, len(depth))
+    return PngFolder(folder, depth, amplitude, camera, facts, times)
+
+
+class PngFolderWriter:
+    """Writes a folder that `read_png_folder` reads; use it with `with`.
+
+    Args:
+        folder: made when it does not exist; must not contain PNG images.
+        camera: goes to `camera.json`, with the facts below.
+        unit_m: metres of one step of the depth images.
+        radial: the depth is the distance along the pixel's ray.
+        fps: frames a second.
+        metadata: JSON-able.
+
+    Raises:
+        ToftrackError: the folder cannot be written or is in use.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        camera: Camera,
+        unit_m: float = 0.001,
+        radial: bool = False,
+        fps: float = DEFAULT_FPS,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        self.folder, self.unit_m, self.frames = Path(folder).expanduser(), unit_m, 0
+        facts = {"depth_unit_m": unit_m, "radial": radial, "fps": fps, "metadata": metadata or {}}
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if any(self.folder.glob("*.png")):
+                raise ToftrackError(
+                    f"the folder '{self.folder}' contains PNG images already; choose an empty one"
+                )
+            text = json.dumps(camera.to_dict() | facts, indent=1) + "\n"
+            (self.folder / _CAMERA).write_text(text, encoding="utf-8")
+            self._times = open(self.folder / _TIMES, "w", encoding="utf-8")
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def append(self, depth_m: np.ndarray, amplitude: np.ndarray | None, timestamp_s: float) -> None:
+        """Add a frame: (H, W) metres, rounded to the unit (no reading and too far become 0), and
+        the (H, W) uint16 amplitude. Raises ToftrackError when it cannot be written."""
+        steps = np.where((depth_m > 0) & (depth_m < np.inf), depth_m, 0) / self.unit_m
+        words = np.where(steps <= 0xFFFF, np.rint(steps), 0).astype(np.uint16)
+        try:
+            self._save(f"depth_{self.frames:06d}.png", words)
+            if amplitude is not None:
+                self._save(f"amplitude_{self.frames:06d}.png", amplitude)
+            self._times.write(f"{timestamp_s!r}\n")
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self.frames += 1
+
+    def close(self) -> None:
+        """Finish `timestamps.txt`. Raises ToftrackError when it cannot be written."""
+        try:
+            self._times.close()
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _save(self, name: str, image: np.ndarray) -> None:
+        (self.folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+    def _unwritable(self, error: OSError) -> ToftrackError:
+        return ToftrackError(
+            f"the folder '{self.folder}' cannot be written ({error.strerror}); choose another place"
+        )
+
+
+@dataclass(frozen=True)
+class _Facts:
+    unit_m: float
+    radial: bool
+    fps: float
+    metadata: dict[str, Any]
+
+
+def _camera_content(path: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ToftrackError(
+            f"the camera file '{path}' cannot be read ({error.strerror})"
+        ) from error
+    except (ValueError, RecursionError):
+        raise ToftrackError(f"'{path}' is not a camera file: it is not JSON") from None
+    if not isinstance(content, dict):
+        raise ToftrackError(f"'{path}' is not a camera file")
+    return content
+
+
+def _facts(
+    path: Path, content: dict[str, Any] | None, unit_m: float | None, fps: float | None
+) -> _Facts:
+    stated = content or {}
+
+    def positive(name: str, given: float | None, default: float) -> float:
+        value = given if given is not None else stated.get(name, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e6:
+            raise ToftrackError(f"{name} must be a positive number, but is {value!r} ('{path}')")
+        return float(value)
+
+    radial, metadata = stated.get("radial", False), stated.get("metadata", {})
+    if not isinstance(radial, bool) or not isinstance(metadata, dict):
+        raise ToftrackError(f"in '{path}', radial must be true or false, and metadata an object")
+    unit = positive("depth_unit_m", unit_m, 0.001)
+    return _Facts(unit, radial, positive("fps", fps, DEFAULT_FPS), metadata)
+
+
+def _timestamps(path: Path, count: int) -> np.ndarray | None:
+    if not path.exists():
+        return None
+    try:
+        times = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
+    except OSError as error:
+        raise ToftrackError(f"'{path}' cannot be read ({error.strerror})") from error
+    except ValueError:
+        raise ToftrackError(f"'{path}' must consist of one number a line") from None
+    if len(times) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
+        raise ToftrackError(
+            f"'{path}' must hold {count} finite times, one for each depth image, that do not go "
+            "backwards; repair or remove it"
+        )
+    return times
+
+
+def _png_size(path: Path) -> tuple[int, int]:
+    """Columns and rows of a 16-bit grey PNG, from its header."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(26)
+    except OSError as error:
+        raise ToftrackError(f"the image '{path}' cannot be read ({error.strerror})") from error
+    if len(start) < 26 or start[:8] != _PNG_START:
+        raise ToftrackError(f"the image '{path}' is not a PNG file, or it was cut off")
+    width, height, bits, colour = struct.unpack(">IIBB", start[16:26])
+    if bits != 16 or colour != 0:
+        raise ToftrackError(
+            f"the image '{path}' is not a 16-bit grey PNG; save the depth as such, in steps of a "
+            "millimetre"
+        )
+    if width * height > _LARGEST_PIXELS:
+        raise ToftrackError(f"the image '{path}' claims {width}x{height} pixels; it is damaged")
+    return width, height
+
+
+def _order(path: Path) -> list[tuple[int, int, str]]:
+    """Sorts names with numbers in them by value: 2 before 10."""
+    parts = re.findall(r"\d+|\D+", path.name)
+    return [(0, int(p), p) if p.isdecimal() else (1, 0, p) for p in parts]

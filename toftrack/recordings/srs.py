@@ -1,0 +1,391 @@
+"""The vendor's stream file `.srs`: what the SR3000 delivered, frame by frame.
+
+Little-endian words of 32 bits. Eight bytes of file header (signature, version), then objects, each
+starting with its id and its size including these eight bytes:
+
+| id | object | after the base |
+| --- | --- | --- |
+| 1 | Init, before any frame | product id, interface type, serial number |
+| 2 | Configure, before the first frame, may recur | the 64 registers |
+| 3 | Frame | one raw frame (`toftrack.recordings.sr_frame`) |
+| 4 | CalibData, optional | the vendor's, not interpreted |
+
+Unknown ids are skipped by their size. toftrack uses that for what the format has no place for: an
+object "TOFT" (JSON: camera, range, frames a second, metadata) and before each frame an object
+"TOFS" (one float64, the time stamp in seconds). Source of the format: the vendor's public files.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.recordings.sr_frame import (
+    DEFAULT_MODULATION_MHZ,
+    FRAME_BYTES,
+    HEIGHT,
+    REGISTERS,
+    WIDTH,
+    decode_frame,
+    nominal_camera,
+    unambiguous_range_m,
+)
+
+_SIGNATURE, _VERSION = 0x4F497273, 1
+_INIT, _CONFIGURE, _FRAME = 1, 2, 3
+_FACTS = int.from_bytes(b"TOFT", "little")
+_STAMP = int.from_bytes(b"TOFS", "little")
+_PAIR = struct.Struct("<II")
+_THREE = struct.Struct("<III")
+_SECONDS = struct.Struct("<d")
+_LARGEST_FACTS = 1 << 20  # bytes; a damaged size must not make us read a gigabyte as text
+
+
+@dataclass(frozen=True)
+class SrsInit:
+    """Which camera made the recording."""
+
+    product_id: int = 0x0074
+    interface_type: int = 0
+    serial_number: int = 0
+
+
+@dataclass(frozen=True)
+class SrsFacts:
+    """What toftrack adds to the format."""
+
+    range_m: float | None = None
+    """What the largest distance word stands for; None = not stated."""
+    camera: Camera | None = None
+    """None = not stated."""
+    fps: float = DEFAULT_FPS
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+class SrsWriter:
+    """Appends frames to a new `.srs` file; use it with `with`.
+
+    Each frame reaches the operating system before `append` returns, so that a killed program leaves
+    a file that is readable to its last whole frame.
+
+    Args:
+        path: the new file.
+        init: which camera.
+        registers: the camera's 64 register bytes as far as they are known.
+        facts: what else there is to say.
+        overwrite: replace an existing file.
+
+    Raises:
+        ToftrackError: the file exists already or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        init: SrsInit | None = None,
+        registers: bytes = bytes(REGISTERS),
+        facts: SrsFacts | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        self.path = Path(path).expanduser()
+        self.frames = 0
+        """Whole frames written."""
+        init, facts = init or SrsInit(), facts or SrsFacts()
+        try:
+            self._stream = open(self.path, "wb" if overwrite else "xb", buffering=0)
+        except FileExistsError:
+            raise ToftrackError(
+                f"the file '{self.path}' exists already; choose another name or give --overwrite"
+            ) from None
+        except OSError as error:
+            raise ToftrackError(
+                f"the recording '{self.path}' cannot be written ({error.strerror}); choose another "
+                "place"
+            ) from error
+        self._end = 0
+        try:
+            numbers = (init.product_id, init.interface_type, init.serial_number)
+            self._write(
+                _PAIR.pack(_SIGNATURE, _VERSION)
+                + _object(_INIT, _THREE.pack(*(n & 0xFFFFFFFF for n in numbers)))
+                + _object(_FACTS, _facts_text(facts))
+            )
+            self.configure(registers)
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def configure(self, registers: bytes) -> None:
+        """The 64 registers under which the frames that follow are taken."""
+        if len(registers) != REGISTERS:
+            raise ToftrackError(f"the SR3000 has {REGISTERS} registers, but {len(registers)} came")
+        self._write(_object(_CONFIGURE, registers))
+
+    def append(self, data: bytes, timestamp_s: float) -> None:
+        """Add a raw frame of FRAME_BYTES bytes, received at `timestamp_s`.
+
+        Raises ToftrackError when it cannot be written; the file then ends with the frame before.
+        """
+        if len(data) != FRAME_BYTES:
+            raise ToftrackError(f"a frame has {FRAME_BYTES} bytes, but {len(data)} came")
+        self._write(_object(_STAMP, _SECONDS.pack(timestamp_s)) + _object(_FRAME, data))
+        self.frames += 1
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _write(self, content: bytes) -> None:
+        rest = memoryview(content)
+        try:
+            while rest:
+                written = self._stream.write(rest)
+                rest = rest[written:]
+        except OSError as error:
+            self._cut_off()
+            raise ToftrackError(
+                f"the recording '{self.path}' cannot be written any further ({error.strerror}); "
+                f"free some space; its {self.frames} whole frames are kept"
+            ) from error
+        self._end += len(content)
+
+    def _cut_off(self) -> None:
+        try:
+            self._stream.truncate(self._end)
+        except OSError:  # a device or pipe; the reader copes with a partial object at the end
+            return
+
+
+class SrsRecording:
+    """The frames of a `.srs` file, read from the disk one at a time.
+
+    `image` opens the file when it is first needed and `close` closes it.
+    """
+
+    radial = True
+    truth = None
+
+    def __init__(
+        self, path: Path, offsets: np.ndarray, timestamp_s: np.ndarray, scan: _Scan, range_m: float
+    ) -> None:
+        facts = scan.facts
+        self.path = path
+        self.camera = facts.camera or nominal_camera()
+        self.range_m = range_m
+        self.timestamp_s = timestamp_s
+        """(T,) float64 seconds, not decreasing."""
+        steps = np.diff(timestamp_s)
+        median = float(np.median(steps)) if len(steps) else 0.0
+        self.fps = 1.0 / median if median > 0 else facts.fps
+        self.metadata = facts.metadata
+        self.init = scan.init or SrsInit()
+        self.registers = scan.registers
+        """The first Configure object's 64 bytes."""
+        self.damage = scan.damage
+        """Why the file ends earlier than it should, in words; None when it is whole."""
+        self._offsets = offsets
+        self._stream: BinaryIO | None = None
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def raw(self, index: int) -> bytes:
+        """A frame as the camera sent it, FRAME_BYTES bytes; ToftrackError when it cannot be read."""
+        try:
+            if self._stream is None:
+                self._stream = open(self.path, "rb")
+            self._stream.seek(int(self._offsets[index]))
+            data = self._stream.read(FRAME_BYTES)
+        except OSError as error:
+            raise _unreadable(self.path, error) from error
+        if len(data) != FRAME_BYTES:
+            raise ToftrackError(f"the recording '{self.path}' became shorter while it was read")
+        return data
+
+    def image(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """A frame's radial distance, (144, 176) float32 m, and amplitude, uint16; new arrays."""
+        return decode_frame(self.raw(index), self.range_m)
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+
+def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> SrsRecording:
+    """Open a `.srs` recording: its objects are checked, its frames stay on the disk.
+
+    A file that is cut off or damaged somewhere is usable up to there (`damage` says so).
+
+    Args:
+        path: the file.
+        modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it
+            in registers whose meaning is not public).
+
+    Raises:
+        ToftrackError: the file is missing, not a stream file, of another version, in a wrong order
+            or without any whole frame.
+    """
+    path = Path(path).expanduser()
+    if path.is_dir():
+        raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.srs)")
+    default_range_m = unambiguous_range_m(modulation_mhz)
+    try:
+        with open(path, "rb") as stream:
+            scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
+    except FileNotFoundError:
+        raise ToftrackError(
+            f"there is no file '{path}'; give the path of a recording (.srs)"
+        ) from None
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    if not scan.offsets:
+        reason = f" ({scan.damage})" if scan.damage else ""
+        raise ToftrackError(f"the recording '{path}' has no whole frame{reason}; record it again")
+    stamps = np.array(scan.stamps, np.float64)
+    usable = np.isfinite(stamps).all() and (np.diff(stamps) >= 0).all()
+    timestamp_s = stamps if usable else np.arange(len(stamps)) / scan.facts.fps
+    range_m = scan.facts.range_m or default_range_m
+    return SrsRecording(path, np.array(scan.offsets, np.int64), timestamp_s, scan, range_m)
+
+
+@dataclass
+class _Scan:
+    """What a walk over the objects found."""
+
+    offsets: list[int] = field(default_factory=list)
+    """Where each frame's data begin."""
+    stamps: list[float] = field(default_factory=list)
+    """NaN for a frame without one."""
+    init: SrsInit | None = None
+    registers: bytes | None = None
+    facts: SrsFacts = field(default_factory=SrsFacts)
+    damage: str | None = None
+
+
+def _scan(path: Path, stream: BinaryIO, size: int) -> _Scan:
+    header = stream.read(_PAIR.size)
+    if len(header) < _PAIR.size:
+        raise ToftrackError(
+            f"the file '{path}' is empty or cut off within its first bytes; record it again"
+        )
+    signature, version = _PAIR.unpack(header)
+    if signature != _SIGNATURE:
+        raise ToftrackError(
+            f"'{path}' is not an .srs stream file: it does not begin with 'srIO'; give a recording "
+            "as the vendor's or toftrack's recorder writes it"
+        )
+    if version != _VERSION:
+        raise ToftrackError(
+            f"the stream file '{path}' has version {version}, but this toftrack reads version "
+            f"{_VERSION}; convert it with the vendor's tools"
+        )
+    scan, position, stamp = _Scan(), _PAIR.size, np.nan
+    while position < size and scan.damage is None:
+        base = stream.read(_PAIR.size)
+        if len(base) < _PAIR.size:
+            scan.damage = f"cut off at byte {position}"
+            break
+        kind, length = _PAIR.unpack(base)
+        if length < _PAIR.size:
+            scan.damage = f"an object of {length} bytes at byte {position} makes no sense"
+        elif position + length > size:
+            scan.damage = f"cut off in the object at byte {position}"
+        elif kind == _STAMP and length == _PAIR.size + _SECONDS.size:
+            (stamp,) = _SECONDS.unpack(stream.read(_SECONDS.size))
+        elif kind == _FRAME:
+            _frame(path, scan, position, length, stamp)
+            stamp = np.nan
+        else:
+            _other(path, scan, kind, stream, length - _PAIR.size)
+        position += length
+        stream.seek(position)
+    return scan
+
+
+def _frame(path: Path, scan: _Scan, position: int, length: int, stamp: float) -> None:
+    for name, missing in (("Init", scan.init is None), ("Configure", scan.registers is None)):
+        if missing:
+            raise ToftrackError(
+                f"the recording '{path}' has a frame before its {name} object, which breaks the "
+                "format; record it again"
+            )
+    if length != _PAIR.size + FRAME_BYTES:
+        scan.damage = (
+            f"the frame at byte {position} has {length - _PAIR.size} bytes instead of an SR3000's "
+            f"{FRAME_BYTES}"
+        )
+        return
+    scan.offsets.append(position + _PAIR.size)
+    scan.stamps.append(stamp)
+
+
+def _other(path: Path, scan: _Scan, kind: int, stream: BinaryIO, length: int) -> None:
+    if kind == _INIT and scan.init is None:
+        if length != _THREE.size:
+            raise ToftrackError(f"the Init object of '{path}' is damaged; record it again")
+        scan.init = SrsInit(*_THREE.unpack(stream.read(length)))
+    elif kind == _CONFIGURE and scan.registers is None:
+        if length != REGISTERS:
+            raise ToftrackError(f"the Configure object of '{path}' is damaged; record it again")
+        scan.registers = stream.read(length)
+    elif kind == _FACTS and length <= _LARGEST_FACTS:
+        scan.facts = _parse_facts(path, stream.read(length))
+
+
+def _facts_text(facts: SrsFacts) -> bytes:
+    content = {
+        "range_m": facts.range_m,
+        "fps": facts.fps,
+        "camera": facts.camera and facts.camera.to_dict(),
+        "metadata": facts.metadata,
+    }
+    return json.dumps(content).encode()
+
+
+def _parse_facts(path: Path, text: bytes) -> SrsFacts:
+    """Raises ToftrackError: what the recorder stated must not be replaced by a guess in silence."""
+    damaged = ToftrackError(f"the TOFT object of the recording '{path}' is damaged")
+    try:
+        content = json.loads(text)
+        range_m, fps = content["range_m"], float(content["fps"])
+        range_m = None if range_m is None else float(range_m)
+        camera, metadata = content["camera"], content["metadata"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise damaged from None
+    for number in (fps, 1.0 if range_m is None else range_m):
+        if not (np.isfinite(number) and number > 0):
+            raise damaged
+    if not isinstance(metadata, dict):
+        raise damaged
+    camera = None if camera is None else Camera.from_dict(camera, path)
+    if camera is not None and (camera.width, camera.height) != (WIDTH, HEIGHT):
+        raise damaged
+    return SrsFacts(range_m, camera, fps, metadata)
+
+
+def _object(kind: int, content: bytes) -> bytes:
+    return _PAIR.pack(kind, _PAIR.size + len(content)) + content
+
+
+def _unreadable(path: Path, error: OSError) -> ToftrackError:
+    return ToftrackError(
+        f"the recording '{path}' cannot be read ({error.strerror or error}); check the file and "
+        "its permissions"
+    )
