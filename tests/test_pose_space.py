@@ -106,9 +106,12 @@ def rewrite(path, **changes) -> None:
     [
         ({"header": {"version": 99}}, "version 99"),
         ({"header": {"format": "other"}}, "not a pose-space file"),
-        ({"header": {"kind": "isomap"}}, "unknown kind"),
+        ({"header": {"kind": "hologram"}}, "unknown kind"),
         ({"header": {"angle_names": ["a", "b"]}}, "other joint angles"),
+        ({"header": {"kind": "files"}}, "unknown kind"),
+        ({"header": {"kind": ["pca"]}}, "unknown kind"),
         ({"mean": None}, "damaged"),
+        ({"mean": np.full(21, np.nan, np.float32)}, "damaged"),
         ({"components": np.zeros((4, 20), np.float32)}, "damaged"),
         ({"lower": np.zeros(2, np.float32)}, "another size"),
         ({"mean": np.array([{}], dtype=object)}, "not a pose-space file"),

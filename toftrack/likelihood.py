@@ -57,8 +57,10 @@ class FMeasure:
         safe = torch.where(hand, depth, 1.0)
         low = torch.where(hand, 1.0 / (safe + self.tolerance_m), never)
         high = torch.where(hand, 1.0 / (safe - self.tolerance_m).clamp(min=1e-3), -never)
+        # A model surface at an occluder is hidden, not false.
+        front = torch.where(observation.occluder, torch.inf, 0.0)
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
-        return Evidence(low, high, torch.zeros_like(depth), hand, observation.k, radius)
+        return Evidence(low, high, front, hand, observation.k, radius)
 
     def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
         """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct).

@@ -102,10 +102,11 @@ def surroundings(observation: Observation, around_m: Tensor, count: int) -> Surr
     points = points[((points - around_m.cpu().numpy()) ** 2).sum(1) < 0.16**2]
     points = points[:: max(1, -(-len(points) // count))]
     # Whatever is not behind the hand may hide it or be it.
+    solid = hand | observation.occluder.cpu().numpy()
     _, labels = cv2.distanceTransformWithLabels(
-        (~hand).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        (~solid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    rows, columns = np.nonzero(hand)
+    rows, columns = np.nonzero(solid)
     lookup = np.zeros((labels.max() + 1, 2), np.float32)
     lookup[labels[rows, columns]] = np.stack((columns, rows), 1)
     return Surroundings(

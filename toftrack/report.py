@@ -133,9 +133,12 @@ def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
 
 def _telling(runs: Sequence[Run]) -> list[str]:
     """Overrides, other than seed and recording, in which runs differ."""
-    keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
-    apart = [key for key in keys if len({run.overrides.get(key) for run in runs}) > 1]
+    apart = [key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1]
     return [key for key in apart if key != SEED and key not in RECORDINGS]
+
+
+def _keys(runs: Sequence[Run]) -> list[str]:
+    return list(dict.fromkeys(key for run in runs for key in run.overrides))
 
 
 def recording(run: Run) -> str:
@@ -168,7 +171,7 @@ def _summarise(group: Group, figure: str) -> None:
 
 def write_csv(runs: Sequence[Run], path: Path) -> None:
     """One row a job: its folder, its overrides, its figures, its error."""
-    overrides = list(dict.fromkeys(key for run in runs for key in run.overrides))
+    overrides = _keys(runs)
     figures = list(dict.fromkeys(key for run in runs for key in run.figures))
     with open(path, "w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
@@ -229,8 +232,9 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     failed = [run for run in runs if run.error is not None]
     if failed:
         print(f"\n{len(failed)} of {len(runs)} jobs failed:")
+        told = {key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1}
         for run in failed:
-            changed = " ".join(f"{key}={value}" for key, value in run.overrides.items())
+            changed = " ".join(f"{k}={value}" for k, value in run.overrides.items() if k in told)
             print(f"  {run.name} ({changed}): {run.error}")
     written = [folder / "sweep.csv"]
     points = [

@@ -16,12 +16,14 @@ class Observation:
 
     depth_m: (H, W) Z in metres, 0 = no reading; the whole scene.
     hand: (H, W) bool, the pixels taken for the hand (and the arm it hangs on).
+    occluder: (H, W) bool, surfaces in front of where the hand is expected: they hide it.
     k: (3, 3) intrinsics of this image, which may be a crop or a reduction of the camera's.
     nearest_m: depth of the nearest surface, `inf` when nothing is in range.
     """
 
     depth_m: Tensor
     hand: Tensor
+    occluder: Tensor
     k: Tensor
     nearest_m: float
 
@@ -29,6 +31,16 @@ class Observation:
     def empty(self) -> bool:
         """True when nothing in the frame can be a hand."""
         return not np.isfinite(self.nearest_m)
+
+    def to(self, device: torch.device) -> Observation:
+        """The same observation on another device."""
+        return replace(
+            self,
+            depth_m=self.depth_m.to(device),
+            hand=self.hand.to(device),
+            occluder=self.occluder.to(device),
+            k=self.k.to(device),
+        )
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Observation:
         """The part [top, bottom) x [left, right) with intrinsics to match."""
@@ -39,8 +51,17 @@ class Observation:
             self,
             depth_m=self.depth_m[top:bottom, left:right].contiguous(),
             hand=self.hand[top:bottom, left:right].contiguous(),
+            occluder=self.occluder[top:bottom, left:right].contiguous(),
             k=k,
         )
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Depths between which the surface of the tracked hand is expected, metres."""
+
+    nearest_m: float
+    farthest_m: float
 
 
 @dataclass(frozen=True)
@@ -51,23 +72,43 @@ class NearestSurface:
     min_area_m2: the nearest point must belong to a surface of at least this area, so that noisy and
         flying pixels are no hand. 0 takes the single nearest pixel, as the paper.
     max_distance_m: nothing beyond this is a hand.
+    occluder_margin_m: what is more than this in front of the nearest point of a tracked hand hides
+        it; 0 knows no occluders, as the paper.
     max_pixels: images with more pixels are reduced by a whole factor to at most this many.
     """
 
     depth_range_m: float = 0.20
     min_area_m2: float = 0.0008
     max_distance_m: float = 1.2
+    occluder_margin_m: float = 0.035
     max_pixels: int = 40_000
 
-    def __call__(self, depth_m: np.ndarray, k: np.ndarray) -> Observation:
-        """depth_m: (H, W) float32 Z, 0 = no reading.  k: (3, 3).  On the CPU."""
+    def __call__(
+        self, depth_m: np.ndarray, k: np.ndarray, expected: Expected | None = None
+    ) -> Observation:
+        """Segment one image; the Observation is on the CPU.
+
+        depth_m: (H, W) float32 Z, 0 = no reading.  k: (3, 3).
+        expected: where a tracked hand should be. What is nearer than that, and not the hand itself
+            come nearer, is an occluder and not the nearest surface.
+        """
         depth_m, k = reduce_image(depth_m, k, self.max_pixels)
         valid = (depth_m > 0) & (depth_m <= self.max_distance_m)
+        occluder = np.zeros_like(valid)
+        if expected is not None and self.occluder_margin_m > 0:
+            in_front = valid & (depth_m < expected.nearest_m - self.occluder_margin_m)
+            at_hand = valid & ~in_front & (depth_m < expected.farthest_m + self.occluder_margin_m)
+            seen_m2 = at_hand.sum() * expected.nearest_m**2 / float(k[0, 0] * k[1, 1])
+            if seen_m2 > self.min_area_m2:
+                # Pixels on its edge mix it with what is behind, and are neither.
+                grown = cv2.dilate(in_front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+                occluder, valid = grown, valid & ~grown
         nearest = self._nearest(depth_m, valid, float(k[0, 0] * k[1, 1]))
         hand = valid & (depth_m >= nearest) & (depth_m <= nearest + self.depth_range_m)
         return Observation(
             torch.from_numpy(depth_m),
             torch.from_numpy(hand),
+            torch.from_numpy(occluder),
             torch.from_numpy(k.astype(np.float32)),
             nearest,
         )

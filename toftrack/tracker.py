@@ -22,7 +22,7 @@ from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.refine import Refinement, refine, surroundings
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
-from toftrack.segmentation import NearestSurface, Observation
+from toftrack.segmentation import Expected, NearestSurface, Observation
 from toftrack.start import Start
 
 
@@ -111,7 +111,10 @@ class Tracker:
         self.refinement = refinement
         self.start = start
         import os
-        self.feedback = os.environ.get("FB","1")=="1"; self.keep=float(os.environ.get("KEEP","0.9"))
+        self.swaps=int(os.environ.get("SWAPS","128")); self.margin=float(os.environ.get("MARGIN","0.02"))
+        self._poses = self.space.decode(self.space.training_latents)
+        self._finger_of_angle = torch.tensor([0] * 5 + [1] * 4 + [2] * 4 + [3] * 4 + [4] * 4, device=self.device)
+        self.feedback = os.environ.get("FB","1")=="1"; self.keep=float(os.environ.get("KEEP","0.5"))
         self.lost = lost
         self.scorer: Scorer = make_scorer(renderer, self.shape, self.device)
         self.generator = torch.Generator(self.device).manual_seed(seed)
@@ -124,18 +127,11 @@ class Tracker:
         depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3) intrinsics.
         """
         began = time.perf_counter()
-        observation = self.segmentation(depth_m, k)
-        if observation.empty or not bool(observation.hand.any()):
-            self.track = self.track and replace(self.track, bad=self.track.bad + 1)
-            self._give_up()
+        observation = self.segmentation(depth_m, k, self._expected())
+        if observation.empty:
+            self.track = None
             return self._missing(index, timestamp_s, began)
-
-        observation = replace(
-            observation,
-            depth_m=observation.depth_m.to(self.device),
-            hand=observation.hand.to(self.device),
-            k=observation.k.to(self.device),
-        )
+        observation = observation.to(self.device)
         evidence = self.likelihood.evidence(observation)
         starting = self.track is None
         track = self._initialise(observation, evidence) if self.track is None else self.track
@@ -153,7 +149,8 @@ class Tracker:
             weights = sir.normalise(exponent * self._log_scores(particles, evidence=evidence, offset=track.offset))
 
         mean = sir.mean_particle(particles, weights)
-        state = self._refined(mean, track.offset, observation)
+        state = self._refined(self.decode(mean, track.offset), mean, observation)
+        state = self._swap_fingers(state, mean, evidence, observation)
         if self.feedback:
             latent = sir.bound(self.space.encode(state[:, 6:]), lower, upper, "truncate")
             refined = torch.cat((state[:, :6], latent), 1)
@@ -172,6 +169,14 @@ class Tracker:
         return self._estimate(
             particles, weights, mean, state, score, name, bad > 0, index, timestamp_s, began
         )
+
+    def _expected(self) -> Expected | None:
+        """Depths of the tracked hand, one movement ahead."""
+        if self.track is None:
+            return None
+        state = self.decode(sir.compose(self.track.mean, self.track.velocity[None]))
+        z = forward_kinematics(state, self.shape).joints_m[0, :, 2]
+        return Expected(float(z.min()), float(z.max()))
 
     def _log_scores(
         self,
@@ -204,9 +209,8 @@ class Tracker:
             particles, weights, mean, torch.zeros_like(mean[0]), torch.zeros(21, device=self.device)
         )
 
-    def _refined(self, mean: Tensor, offset: Tensor, observation: Observation) -> Tensor:
-        """The hand state of an estimate, brought onto the seen points; (1, 27)."""
-        state = self.decode(mean, offset)
+    def _refined(self, state: Tensor, mean: Tensor, observation: Observation) -> Tensor:
+        """A hand state brought onto the seen points, with the estimate's pose as prior; (1, 27)."""
         if self.refinement.iterations == 0:
             return state
         middle = forward_kinematics(state, self.shape).joints_m[0].mean(0)
@@ -214,6 +218,32 @@ class Tracker:
         if len(seen.points_m) == 0:
             return state
         return refine(state, state[:, 6:], seen, self.shape, self.surface, self.refinement)
+
+    def _swap_fingers(
+        self, state: Tensor, mean: Tensor, evidence: Evidence, observation: Observation
+    ) -> Tensor:
+        """Try other poses of single fingers and keep the best if it explains the image better.
+
+        Gauss-Newton cannot bring a finger across from where it sees nothing of it. The tried poses
+        are those that the finger has in the training poses.
+        """
+        n = self.swaps
+        if n == 0 or self.refinement.iterations == 0:
+            return state
+        device = self.device
+        rows = torch.randint(len(self._poses), (n,), generator=self.generator, device=device)
+        fingers = torch.randint(5, (n,), generator=self.generator, device=device)
+        tried = state.repeat(n + 1, 1)
+        angles = torch.where(self._finger_of_angle == fingers[:, None], self._poses[rows], tried[1:, 6:])
+        tried[1:, 6:] = angles
+        scores = self.likelihood.log_score(self.scorer(tried, evidence), 0.2)
+        best = scores.argmax()
+        if not bool(scores[best] > scores[0] + self.margin):
+            return state
+        refined = self._refined(tried[best][None], mean, observation)
+        both = torch.cat((tried[best][None], refined))
+        after = self.likelihood.log_score(self.scorer(both, evidence), 0.2)
+        return both[after.argmax()][None]
 
     def _velocity(self, track: TrackState, mean: Tensor) -> Tensor:
         moved = sir.difference(mean, track.mean)[0]

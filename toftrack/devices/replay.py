@@ -13,7 +13,7 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.devices.base import Frame
 from toftrack.errors import ToftrackError
-from toftrack.recordings.any import FrameStore, open_recording
+from toftrack.recordings.store import FrameStore, open_recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 
 _log = logging.getLogger(__name__)

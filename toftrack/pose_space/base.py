@@ -52,12 +52,12 @@ class TensorSpace:
     tensors as it needs them, and the methods `decode_freely` and `encode`.
     """
 
-    lower: Tensor
+    training_latents: Tensor
 
     @property
     def dims(self) -> int:
         """The number of latent coordinates."""
-        return self.lower.shape[0]
+        return self.training_latents.shape[1]
 
     def decode_freely(self, latent: Tensor) -> Tensor:
         """(N, d) to (N, 21) radians, without regard to the joint limits."""

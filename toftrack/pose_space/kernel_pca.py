@@ -86,7 +86,7 @@ def fit(
             best = regression, latents, unit * vectors / np.sqrt(model.eigenvalues_), candidate
     if best is None:
         raise ToftrackError(
-            f"the {len(x)} poses do not span {dims} dimensions; give a smaller pose_space.dims"
+            f"pose_space.dims={dims} is more than the {len(x)} poses span; give a smaller number"
         )
     regression, latents, projection, chosen = best
     kernel = np.exp(-chosen * square)

@@ -13,7 +13,7 @@ import numpy as np
 import sklearn.manifold
 from torch import Tensor
 
-from toftrack.pose_space.neighbours import RIDGE, NeighbourSpace, fit_neighbour_space
+from toftrack.pose_space.neighbours import NeighbourSpace, fit_neighbour_space
 
 _NEIGHBOURS = (6, 8, 12, 16, 24)
 
@@ -38,7 +38,7 @@ def fit(
 
     def embed(x: np.ndarray, number: int) -> np.ndarray:
         latents = sklearn.manifold.LocallyLinearEmbedding(
-            n_neighbors=number, n_components=dims, reg=RIDGE, eigen_solver="dense"
+            n_neighbors=number, n_components=dims, reg=1e-3, eigen_solver="dense"
         ).fit_transform(x)
         # The method gives coordinates of unit length; unit deviation does not depend on M.
         return (latents - latents.mean(0)) / latents.std(0).clip(1e-12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from toftrack.pose_space.kernel_decoder import (
 )
 
 RIDGE = 1e-3
-"""Regularises the weights of neighbours, relative to the trace of their Gram matrix."""
+"""Regularises the weights of neighbours, in parts of their squared distances."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,14 @@ class NeighbourSpace(KernelDecodedSpace):
     poses: Tensor
     neighbours: Tensor
 
+    @cached_property
+    def _count(self) -> int:
+        """Read once, so that encoding does not wait for the device."""
+        return int(self.neighbours)
+
     def encode(self, angles: Tensor) -> Tensor:
         """(N, 21) radians to (N, d), by the weights that make up the pose from its neighbours."""
-        nearest, weights = barycentric_weights(angles, self.poses, int(self.neighbours))
+        nearest, weights = barycentric_weights(angles, self.poses, self._count)
         return torch.einsum("nk,nkd->nd", weights, self.training_latents[nearest])
 
 
@@ -42,7 +48,8 @@ def barycentric_weights(angles: Tensor, poses: Tensor, neighbours: int) -> tuple
     """The nearest poses and the weights, summing to 1, that make up each pose best.
 
     The constrained least squares of locally linear embedding (Saul and Roweis, J. Mach. Learn. Res.
-    4, 2003, section 5), regularised by RIDGE.
+    4, 2003, section 5), regularised by RIDGE times each neighbour's own squared distance, so that
+    nearer ones come first and a training pose is made of itself alone.
 
     angles: (N, 21).  poses: (M, 21).  Returns indices (N, k) and weights (N, k).
     """
@@ -51,8 +58,7 @@ def barycentric_weights(angles: Tensor, poses: Tensor, neighbours: int) -> tuple
     nearest = distance.topk(neighbours, dim=1, largest=False).indices
     offsets = poses[nearest] - angles[:, None]  # (N, k, 21)
     gram = offsets @ offsets.mT
-    trace = gram.diagonal(dim1=1, dim2=2).sum(1)
-    loading = (RIDGE * trace).clamp(min=1e-9)[:, None].expand(-1, neighbours)
+    loading = (RIDGE * gram.diagonal(dim1=1, dim2=2)).clamp(min=1e-9)
     ones = gram.new_ones(len(gram), neighbours, 1)
     weights = torch.linalg.solve(gram + torch.diag_embed(loading), ones)[..., 0]
     return nearest, weights / weights.sum(1, keepdim=True)

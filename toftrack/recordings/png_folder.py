@@ -4,9 +4,12 @@
 | --- | --- |
 | `*.png` | one depth image a frame, 16 bits, in the order of their names (numbers by value) |
 | `amplitude*.png` | optional: the amplitude images, 16 bits, as many and in the same order |
-| `camera.json` | the camera as `Camera.save` writes it; optional keys beside: `depth_unit_m` (metres of one step, 0.001), `radial` (false), `fps` (25), `metadata` |
+| `camera.json` | the camera as `Camera.save` writes it, and more keys, see below |
 | `timestamps.txt` | optional: the frames' times, seconds, a line each |
-"""  # noqa: E501
+
+The optional further keys of `camera.json`: `depth_unit_m` (metres of one step, 0.001), `radial`
+(false), `fps` (25), `metadata` (an object).
+"""
 
 from __future__ import annotations
 

@@ -205,7 +205,7 @@ class SrsRecording:
         return len(self._offsets)
 
     def raw(self, index: int) -> bytes:
-        """A frame as the camera sent it, FRAME_BYTES bytes; ToftrackError when it cannot be read."""
+        """A frame as the camera sent it, FRAME_BYTES bytes. Raises ToftrackError if unreadable."""
         try:
             if self._stream is None:
                 self._stream = open(self.path, "rb")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ from torch import Tensor
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.render.disc import disc_steps
 from toftrack.render.numba_hand import LANES
 from toftrack.render.numba_kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence
@@ -25,22 +25,6 @@ log = logging.getLogger(__name__)
 _SILENT_S = 0.7
 """Taking the kernel from numba's cache is faster than this, compiling it is slower."""
 _compiling = threading.Lock()
-
-
-def disc_steps(radius_px: float, height: int, width: int) -> np.ndarray:
-    """How the kernel builds a disc from its longest row to its shortest: see numba_kernel._missed.
-
-    Returns (S, 2) int64: a pixel wider or not, and the row offset to add or 0.
-    """
-    radius = min(max(float(radius_px), 0.0), math.hypot(height, width))
-    offsets = range(min(int(radius), height) + 1)
-    halves = [min(int(math.sqrt(radius**2 - dy**2)), width) for dy in offsets] + [0]
-    steps = [(0, 0)]
-    for dy in range(1, len(halves)):
-        grow = halves[dy - 1] - halves[dy]
-        steps += [(1, 0)] * max(grow - 1, 0)
-        steps.append((min(grow, 1), dy if dy < len(halves) - 1 else 0))
-    return np.array(steps, np.int64)
 
 
 @functools.cache

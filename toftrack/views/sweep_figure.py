@@ -35,7 +35,7 @@ def sweep_figure(points: Sequence[Point], label: str, width: int = 900) -> np.nd
     picture = np.full((plot + 70 + line * len(points), width, 3), 255, np.uint8)
     left, right, top, bottom = 80, width - 30, 40, plot
     costs = [max(cost, 1e-3) for _, cost, _, _ in points]
-    low, high = min(costs) / 1.25, max(costs) * 1.25
+    low, high = min(costs) / 1.6, max(costs) * 1.6
     tallest = 1.1 * max(error + (spread or 0.0) for _, _, error, spread in points)
     tallest = tallest if tallest > 0 else 1.0
 

@@ -1,0 +1,223 @@
+"""The SwissRanger SR3000, live: over USB, through the vendor's library, or emulated.
+
+Nothing here has met a real camera. What is known of the interface and what is assumed stands in
+`conf/device/sr3000.yaml`, each setting with its source.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+from toftrack.camera import Camera
+from toftrack.devices.base import Frame, Truth
+from toftrack.devices.sample import SAMPLE
+from toftrack.devices.sr3000_emulator import EmulatedBackend, EmulatorSettings
+from toftrack.devices.sr3000_libmesasr import MesaTransport
+from toftrack.devices.sr3000_reader import Capture, Counts, Reader
+from toftrack.devices.sr3000_transport import (
+    Exposure,
+    MesaSettings,
+    Persistence,
+    Transport,
+    UsbSettings,
+)
+from toftrack.devices.sr3000_usb import UsbTransport
+from toftrack.errors import ToftrackError
+from toftrack.recordings.sr_frame import (
+    DEFAULT_MODULATION_MHZ,
+    HEIGHT,
+    WIDTH,
+    decode_frame,
+    nominal_camera,
+)
+from toftrack.recordings.store import FrameStore, open_recording
+
+_log = logging.getLogger(__name__)
+_KEEP = ("newest", "every")
+
+
+class Sr3000:
+    """A live camera: iterate over it for its frames, as radial distances with amplitudes.
+
+    A thread asks for frames from the first iteration on. An unplugged camera is waited for, and
+    the iteration goes on with a gap in the frames' indices when it is back.
+
+    Args:
+        transport: `usb`, `libmesasr` (the vendor's library) or `emulated`.
+        serial: which camera; None = the only one.
+        keep: `newest` delivers the newest frame and drops older ones that nobody has taken;
+            `every` delivers all, and asks the camera for no more while `queue_frames` wait.
+        queue_frames: see `keep`.
+        stop: end before this index; None = go on.
+        fps: the rate that is told to those who must know one in advance (the overlay video); the
+            emulated camera has its own.
+        modulation_mhz, integration_time, amplitude_threshold: see `Exposure`.
+        usb, libmesasr, emulated, persistence: settings of the parts.
+        camera_file: a calibrated camera instead of the vendor's nominal one (emulated: instead of
+            the recording's).
+
+    Raises:
+        ToftrackError: a setting makes no sense, or the emulated camera's recording cannot be used.
+    """
+
+    def __init__(
+        self,
+        transport: str = "usb",
+        serial: str | int | None = None,
+        keep: str = "newest",
+        queue_frames: int = 64,
+        stop: int | None = None,
+        fps: float = 25.0,
+        modulation_mhz: int = DEFAULT_MODULATION_MHZ,
+        integration_time: int | None = None,
+        amplitude_threshold: int = 0,
+        usb: UsbSettings | None = None,
+        libmesasr: MesaSettings | None = None,
+        emulated: EmulatorSettings | None = None,
+        persistence: Persistence | None = None,
+        camera_file: str | Path | None = None,
+    ) -> None:
+        if keep not in _KEEP or queue_frames < 1 or (stop is not None and stop < 1) or fps <= 0:
+            raise ToftrackError(
+                "device=sr3000 needs keep=newest or every, queue_frames and stop of at least 1 and "
+                f"fps above 0, but they are {keep}, {queue_frames}, {stop} and {fps}"
+            )
+        self.exposure = Exposure(modulation_mhz, integration_time, amplitude_threshold)
+        self.camera, self.fps = nominal_camera(), float(fps)
+        self.frames: int | None = stop
+        self.truth: Truth | None = None
+        self.metadata: dict[str, Any] = {}
+        self.emulator: EmulatedBackend | None = None
+        self.counts = Counts()
+        """What became of the frames; those of the latest iteration."""
+        self._waiting = queue_frames if keep == "every" else None
+        self._stop, self._persistence = stop, persistence or Persistence()
+        self._next_index = 0
+        self._reader: Reader | None = None
+        self._opened = False
+        serial = None if serial is None else str(serial)
+        usb, emulated = usb or UsbSettings(), emulated or EmulatorSettings()
+        self._transport: Transport
+        if transport == "usb":
+            self._transport = UsbTransport(usb, self.exposure, serial)
+        elif transport == "libmesasr":
+            self._transport = MesaTransport(libmesasr or MesaSettings(), self.exposure, serial)
+        elif transport == "emulated":
+            backend = self._emulate(emulated, usb)
+            self._transport = UsbTransport(
+                usb, self.exposure, serial, backend, ended=lambda: backend.ended
+            )
+        else:
+            raise ToftrackError(
+                f"device.transport={transport} is unknown; give usb, libmesasr or emulated"
+            )
+        if camera_file is not None:
+            self.camera = _calibrated(camera_file)
+        self.description: dict[str, Any] = {
+            "device": "sr3000",
+            "transport": transport,
+            "keep": keep,
+            "modulation_mhz": modulation_mhz,
+            "integration_time": integration_time,
+            "amplitude_threshold": amplitude_threshold,
+            "camera_file": None if camera_file is None else str(camera_file),
+        }
+        if transport == "emulated":
+            self.description |= {"source": emulated.source, "faults": list(emulated.faults)}
+
+    def open(self) -> None:
+        """Find, claim and configure the camera.
+
+        Raises ToftrackError, with what to try, when that cannot be done.
+        """
+        if self._opened:
+            return
+        self._transport.open()
+        self._opened = True
+        self._next_index = 0
+        self.description |= self._transport.facts()
+
+    def close(self) -> None:
+        """Stop the thread and release the camera; a second call does nothing."""
+        if not self._opened:
+            return
+        self._opened = False
+        reader, self._reader = self._reader, None
+        if reader is not None and not reader.stop():
+            # To close the camera beneath a call that uses it would crash the process.
+            _log.warning("sr3000: the camera hangs in a call and cannot be released")
+            return
+        self._transport.close()
+        if reader is not None:
+            _log.info("sr3000: frames: %s", self.counts)
+
+    def request_stop(self) -> None:
+        """End the iteration, after the frames that were received already. Returns at once."""
+        if self._reader is not None:
+            self._reader.request_stop()
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        for capture in self.captures():
+            depth, amplitude = decode_frame(
+                capture.data, self.exposure.range_m, self.exposure.amplitude_threshold
+            )
+            yield Frame(capture.index, capture.timestamp_s, depth, amplitude, radial=True)
+
+    def captures(self) -> Iterator[Capture]:
+        """The frames as raw bytes, as the iteration; for recording."""
+        self.open()
+        if self._reader is not None:
+            raise ToftrackError("the camera is being read already; iterate over it only once")
+        reader = Reader(self._transport, self._persistence, self._waiting, self._next_index)
+        self._reader, self.counts = reader, reader.counts
+        try:
+            for capture in reader:
+                if self._stop is not None and capture.index >= self._stop:
+                    return
+                yield capture
+        finally:
+            # `close` may have come first, and the next iteration may have begun already.
+            if self._reader is reader and reader.stop():
+                self._next_index, self._reader = reader.next_index, None
+                _log.info("sr3000: frames: %s", reader.counts)
+
+    def _emulate(self, settings: EmulatorSettings, usb: UsbSettings) -> EmulatedBackend:
+        store = _source(settings.source)
+        if (store.camera.width, store.camera.height) != (WIDTH, HEIGHT):
+            raise ToftrackError(
+                f"'{settings.source}' has {store.camera.width}x{store.camera.height} pixels; the "
+                f"emulated SR3000 needs a recording of {WIDTH}x{HEIGHT}"
+            )
+        self.camera = store.camera
+        self.fps = float(settings.fps or store.fps)
+        self.metadata = store.metadata
+        if not settings.loop:
+            count = len(store)
+            self.frames = count if self._stop is None else min(count, self._stop)
+            self.truth = None if store.truth is None else store.truth[: self.frames]
+        self.emulator = EmulatedBackend(store, settings, self.exposure.range_m, usb)
+        return self.emulator
+
+
+def _source(name: str) -> FrameStore:
+    return open_recording(SAMPLE if name == "sample" else name)
+
+
+def _calibrated(path: str | Path) -> Camera:
+    camera = Camera.load(path)
+    if (camera.width, camera.height) != (WIDTH, HEIGHT):
+        raise ToftrackError(
+            f"the camera file '{path}' is for {camera.width}x{camera.height} pixels, but the SR3000 "
+            f"has {WIDTH}x{HEIGHT}; calibrate this camera"
+        )
+    return camera

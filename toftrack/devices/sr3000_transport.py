@@ -1,0 +1,212 @@
+"""What the ways to an SR3000 have in common: their face, their faults and their settings.
+
+Every number below is a setting, because some of them were never tried against a camera: see
+`conf/device/sr3000.yaml` for each one's unit and source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from toftrack.errors import ToftrackError
+from toftrack.recordings.sr_frame import (
+    DEFAULT_MODULATION_MHZ,
+    MODULATION_CODES,
+    REGISTERS,
+    unambiguous_range_m,
+)
+
+KNOWN_IDS = ("0852:0074", "1ad2:0074", "1ad2:0075")
+"""Vendor and product of the early SR3000, the SR3000, and the SR4000."""
+
+
+class CameraFault(Exception):
+    """Something went wrong that may pass; the reader tries again and never shows this to a user."""
+
+
+class NoAnswer(CameraFault):  # noqa: N818 (a state of the camera rather than an error)
+    """The camera did not send the frame that was asked for."""
+
+
+class DamagedFrame(CameraFault):  # noqa: N818
+    """A frame came, but not as many bytes as it has."""
+
+
+class Unplugged(CameraFault):  # noqa: N818
+    """The camera is gone; it has to be opened anew."""
+
+
+class EndOfStream(Exception):  # noqa: N818
+    """There are no more frames (only an emulated camera's recording ends)."""
+
+
+class Transport(Protocol):
+    """A way to the camera. Only one thread uses it at a time."""
+
+    patience_s: float
+    """How long a call of `acquire` may take."""
+
+    def open(self) -> None:
+        """Find, claim and configure the camera. Raises ToftrackError when that cannot be done."""
+        ...
+
+    def acquire(self) -> bytes:
+        """Ask for one frame and wait for its FRAME_BYTES bytes.
+
+        Raises NoAnswer, DamagedFrame or Unplugged for what may pass, EndOfStream at the end.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the camera; never raises, and a second call does nothing."""
+        ...
+
+    def facts(self) -> dict[str, Any]:
+        """What is known of the opened camera, JSON-able."""
+        ...
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How the camera is to take its images."""
+
+    modulation_mhz: int = DEFAULT_MODULATION_MHZ
+    """40, 30, 21, 20 or 19; gives the unambiguous range."""
+    integration_time: int | None = None
+    """0..255, (n + 1) x 0.2 ms; None leaves the camera's own."""
+    amplitude_threshold: int = 0
+    """Pixels of a smaller amplitude have no distance; 0 keeps all."""
+
+    def __post_init__(self) -> None:
+        unambiguous_range_m(self.modulation_mhz)
+        if self.integration_time is not None:
+            _check_whole("integration_time", self.integration_time, 0, 255)
+        _check_whole("amplitude_threshold", self.amplitude_threshold, 0, 0xFFFF)
+
+    @property
+    def range_m(self) -> float:
+        """The unambiguous range, metres."""
+        return unambiguous_range_m(self.modulation_mhz)
+
+    @property
+    def modulation_code(self) -> int:
+        """The vendor's code of the modulation frequency."""
+        return MODULATION_CODES[self.modulation_mhz]
+
+
+@dataclass(frozen=True)
+class UsbSettings:
+    """The USB interface as far as it is known; see conf/device/sr3000.yaml."""
+
+    ids: tuple[str, ...] = KNOWN_IDS
+    interface: int = 0
+    endpoint_in: int = 0x86
+    endpoint_out: int = 0x02
+    request_type: int = 0x40
+    request: int = 0xB0
+    request_value: int = 0
+    request_index: int = 0
+    read_multiple: int = 512
+    timeout_ms: int = 1000
+    drain_ms: int = 20
+    tail_check_ms: int = 2
+    registers: Mapping[int, int] = field(default_factory=dict)
+    """Raw writes when the camera is opened: address to value."""
+    integration_time_register: int | None = None
+    modulation_register: int | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ids", tuple(map(str, self.ids)))
+        for text in self.ids:
+            parse_id(text)
+        if not self.ids:
+            raise ToftrackError("device.usb.ids is empty; give at least one VENDOR:PRODUCT")
+        for name in ("timeout_ms", "drain_ms", "read_multiple"):
+            _check_whole(f"usb.{name}", getattr(self, name), 1, 600_000)
+        _check_whole("usb.tail_check_ms", self.tail_check_ms, 0, 1000)
+        for name in ("interface", "endpoint_in", "endpoint_out", "request_type", "request"):
+            _check_whole(f"usb.{name}", getattr(self, name), 0, 255)
+        for name in ("request_value", "request_index"):
+            _check_whole(f"usb.{name}", getattr(self, name), 0, 0xFFFF)
+        registers = {}
+        for address, value in dict(self.registers).items():
+            address = int(address) if str(address).isdecimal() else address
+            _check_whole("usb.registers: an address", address, 0, REGISTERS - 1)
+            _check_whole(f"usb.registers: the value of {address}", value, 0, 255)
+            registers[address] = value
+        object.__setattr__(self, "registers", registers)
+        for name in ("integration_time_register", "modulation_register"):
+            if getattr(self, name) is not None:
+                _check_whole(f"usb.{name}", getattr(self, name), 0, REGISTERS - 1)
+
+    def register_writes(self, exposure: Exposure) -> list[tuple[int, int]]:
+        """Address and value of what is written when the camera is opened, in this order."""
+        writes = list(self.registers.items())
+        if self.integration_time_register is not None and exposure.integration_time is not None:
+            writes.append((self.integration_time_register, exposure.integration_time))
+        if self.modulation_register is not None:
+            writes.append((self.modulation_register, exposure.modulation_code))
+        return writes
+
+
+@dataclass(frozen=True)
+class MesaSettings:
+    """The vendor's library."""
+
+    library: str = "libmesasr.so"
+    mode: int = 0x05
+    """0x01 fixed-pattern correction + 0x04 median of 3x3, as the vendor proposes."""
+    timeout_ms: int = 1000
+
+    def __post_init__(self) -> None:
+        _check_whole("libmesasr.mode", self.mode, 0, 0x7FFFFFFF)
+        _check_whole("libmesasr.timeout_ms", self.timeout_ms, 1, 600_000)
+
+
+@dataclass(frozen=True)
+class Persistence:
+    """How long to go on trying."""
+
+    first_frame_s: float = 5.0
+    """A camera that was opened but has sent nothing for so long does not answer."""
+    give_up_s: float | None = 30.0
+    """The same later on, and for an unplugged camera to come back; None = for ever."""
+    backoff_s: float = 0.1
+    """Before the first attempt to open an unplugged camera again; doubles from one to the next."""
+    longest_backoff_s: float = 2.0
+    reopen_after: int = 5
+    """So many faults in a row, and the camera is closed and opened again."""
+
+    def __post_init__(self) -> None:
+        for name in ("first_frame_s", "give_up_s", "backoff_s", "longest_backoff_s"):
+            value = getattr(self, name)
+            if value is None and name == "give_up_s":
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+                raise ToftrackError(f"device.persistence.{name} must be above 0 s, not {value!r}")
+        _check_whole("persistence.reopen_after", self.reopen_after, 1, 1_000_000)
+
+
+def parse_id(text: str) -> tuple[int, int]:
+    """Vendor and product of "1ad2:0074". Raises ToftrackError for anything else."""
+    try:
+        vendor, product = (int(part, 16) for part in text.split(":"))
+    except ValueError:
+        raise ToftrackError(
+            f"device.usb.ids: '{text}' is not VENDOR:PRODUCT in hexadecimal, as 1ad2:0074"
+        ) from None
+    return vendor, product
+
+
+def known_ids(ids: Iterable[str]) -> str:
+    """The ids as they stand in messages."""
+    return ", ".join(ids)
+
+
+def _check_whole(name: str, value: object, least: int, most: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ToftrackError(
+            f"device.{name} must be a whole number from {least} to {most}, not {value!r}"
+        )
