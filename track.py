@@ -5,14 +5,18 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from toftrack import app, cli
+from toftrack import cli
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 @cli.job
 def main(config: DictConfig) -> float:
     """Track, write the results, and return what a sweep minimises."""
-    return app.track(config)
+    # The device comes before the seconds that torch takes: a missing camera is told at once.
+    device = hydra.utils.instantiate(config.device)
+    from toftrack import app
+
+    return app.track(config, device)
 
 
 if __name__ == "__main__":

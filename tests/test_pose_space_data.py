@@ -19,11 +19,12 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, forward_kinematics
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, pose_space_sources
-from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space
+from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
 from toftrack.pose_space.inverse_kinematics import fit_angles, joint_jacobian, shape_of_joints
 from toftrack.pose_space.leap import leap_data
 from toftrack.pose_space.pose_data import PoseData, mixed_data, spread_out, synthetic_data
 from toftrack.pose_space.pose_files import file_data
+from toftrack.pose_space.reach import nearest_latents
 from toftrack.views.pose_figures import corners_figure, manifold_figure, traversals_figure
 
 ROOT = Path(__file__).parents[1]
@@ -348,8 +349,28 @@ def test_held_out_clips_are_described_worse_than_training_poses() -> None:
     assert row.training.degrees == pytest.approx(2.78, abs=0.3)
     assert row.held_out is not None and row.held_out.degrees > row.training.degrees
     assert 0 < row.training.mm < row.held_out.mm
+    # The projection of PCA may leave the box, but not by more than a little.
+    assert row.reached is not None and row.reached.degrees > 0.98 * row.held_out.degrees
     text = errors_table([row])
     assert f"{row.held_out.degrees:.2f} deg" in text and f"{row.held_out.mm:.2f} mm" in text
+
+
+def test_the_nearest_point_of_the_box_is_no_worse_than_the_encoded_one_moved_into_it() -> None:
+    poses = synthetic_data()
+    space = fit_pose_space("lle", 3)
+    found = nearest_latents(space, poses.angles_rad[::4])
+    assert (found >= space.lower - 1e-6).all() and (found <= space.upper + 1e-6).all()
+    encoded = space.encode(poses.angles_rad[::4].float()).clamp(space.lower, space.upper)
+    with_search, _ = reconstruction(space, poses.angles_rad[::4], found)
+    without, _ = reconstruction(space, poses.angles_rad[::4], encoded)
+    assert (with_search.sum(1) <= without.sum(1) + 1e-6).all()
+
+
+def test_the_nearest_point_of_a_linear_box_is_the_projection_where_that_lies_inside() -> None:
+    space = fit_pose_space("pca", 2)
+    inside = 0.3 * space.lower + 0.7 * space.upper
+    angles = space.decode_freely(inside[None]) + 0.0
+    torch.testing.assert_close(nearest_latents(space, angles)[0].float(), inside, atol=1e-3, rtol=0)
 
 
 def test_a_single_clip_has_no_held_out_figures() -> None:
@@ -371,14 +392,14 @@ def test_figures_of_any_data_are_drawn(dims: int) -> None:
 def test_the_command_trains_on_a_users_file_and_records_it(tmp_path: Path) -> None:
     mine = write_csv(tmp_path / "mine.csv", random_angles(40).rad2deg().numpy())
     out = tmp_path / "out"
-    command = [sys.executable, "train_pose_space.py", "pose_space=lle", "pose_space.dims=3"]
-    command += ["data=file", f"data.path={mine}", "compare=[2]", f"hydra.run.dir={out}"]
+    command = [sys.executable, "train_pose_space.py", "pose_space=lle", "pose_space.dims=2"]
+    command += ["data=file", f"data.path={mine}", "compare=[1]", f"hydra.run.dir={out}"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "40 training poses" in done.stdout and " deg," in done.stdout
-    assert load_pose_space(out / "pose_space.npz").dims == 3
+    assert load_pose_space(out / "pose_space.npz").dims == 2
     assert pose_space_sources(out / "pose_space.npz")[0]["file"] == "mine.csv"
     for name in ("poses.png", "manifold.png", "traversals.png", "corners.png"):
         assert cv2.imread(str(out / name)).std() > 0
     errors = json.loads((out / "summary.json").read_text())["errors"]
-    assert [row["dims"] for row in errors] == [2, 3]
+    assert [row["dims"] for row in errors] == [1, 2]

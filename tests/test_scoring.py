@@ -222,6 +222,50 @@ def test_the_compiled_kernel_is_cached_and_announced(tmp_path):
     assert seconds[1] < min(1.0, seconds[0] / 4)
 
 
+def test_triton_agrees_as_far_as_its_interpreter_goes():
+    """The CUDA kernels, interpreted on the CPU in a process of its own."""
+    pytest.importorskip("triton", reason="triton is not installed")
+    code = (
+        "import torch, sys; sys.path.insert(0, 'tests')\n"
+        "from test_scoring import *\n"
+        "from toftrack.render.triton_scorer import TritonScorer\n"
+        "shape = default_hand_shape(side='left')\n"
+        "evidence = random_evidence(shape, 48, 64, 6.5, 0.4, 1)\n"
+        "states = random_states(4, (0.3, 0.5), 1)\n"
+        "states[:2, :3] = torch.tensor([0.0, 0.08, 0.4]); states[:2, 3:] *= 0.1\n"
+        "states[3, 7] = math.nan\n"
+        "found = TritonScorer(shape)(states, evidence)\n"
+        "assert all(field[3] == 0 for field in found)\n"
+        "check(Counts(*(f[:3] for f in found)), ReferenceScorer(shape)(states[:3], evidence))\n"
+    )
+    env = {**os.environ, "TRITON_INTERPRET": "1"}
+    run = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("name", ["torch", "triton"])
+@pytest.mark.parametrize("size", SIZES)
+def test_cuda_back_ends_agree_with_reference(name, size):
+    shape, device = default_hand_shape(), torch.device("cuda")
+    evidence = random_evidence(shape, *size, 11.6, 0.5, 1)
+    states = random_states(50, (0.3, 0.8), 1)
+    expected = ReferenceScorer(shape)(states, evidence)
+    images = (evidence.low, evidence.high, evidence.occluder, evidence.hand, evidence.k)
+    there = Evidence(*(image.to(device) for image in images), evidence.radius_px)
+    found = make_scorer(name, shape, device)(states.to(device), there)
+    assert all(field.device.type == "cuda" for field in found)
+    check(Counts(*(field.cpu() for field in found)), expected)
+
+
+def test_triton_is_refused_where_it_cannot_run():
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    with pytest.raises(ToftrackError, match="renderer=triton cannot run here"):
+        make_scorer("triton", default_hand_shape(), CPU)
+
+
 # ---- the reference itself ---------------------------------------------------------
 
 

@@ -54,10 +54,12 @@ def build_tracker(config: DictConfig) -> Tracker:
     )
 
 
-def track(config: DictConfig) -> float:
-    """Run a configuration to its end; returns the mean joint error in mm, else 1 - mean score."""
+def track(config: DictConfig, device: Device) -> float:
+    """Run a configuration to its end; returns the mean joint error in mm, else 1 - mean score.
+
+    `device` is what `config.device` describes; it is opened and closed here.
+    """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    device: Device = hydra.utils.instantiate(config.device)
     tracker = build_tracker(config)
     with device:
         make_view = hydra.utils.instantiate(config.view, _partial_=True)

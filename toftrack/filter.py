@@ -46,6 +46,18 @@ class Spread:
         return torch.cat((pose, self.latent * (upper - lower)))
 
 
+def widened(sigmas: Tensor, velocity: Tensor, rest: float, gain: float) -> Tensor:
+    """Diffusion that follows the speed: narrow for a hand at rest, wide for a fast one.
+
+    sigmas: (6 + d,) for a moderately moving hand.  velocity: (6 + d,) tangent, a frame.
+    rest: part of the sigmas that a hand at rest keeps, 1 = the same at any speed.
+    gain: standard deviation gained per unit of speed; at most the sigmas are doubled.
+    """
+    groups = torch.split(velocity, (3, 3, velocity.shape[0] - 6))
+    speed = torch.cat([group.norm().expand(group.shape) for group in groups])
+    return torch.minimum(rest * sigmas + gain * speed, 2 * sigmas)
+
+
 def normalise(log_weights: Tensor) -> Tensor:
     """(N,) log weights to weights that sum to 1, float64.
 

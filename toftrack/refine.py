@@ -59,6 +59,8 @@ class Refinement:
     point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
         ones count more.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
+    swaps: other poses of single fingers that are tried; one must raise the log score by `swap_gain`.
+    carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
     """
 
     iterations: int = 5
@@ -68,6 +70,9 @@ class Refinement:
     silhouette_px: float = 1.0
     angle_rad: float = 0.25
     damping: float = 1e-3
+    swaps: int = 128
+    swap_gain: float = 0.02
+    carry: float = 0.5
 
 
 @dataclass(frozen=True)

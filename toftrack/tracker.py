@@ -13,12 +13,13 @@ from torch import Tensor
 
 from toftrack import filter as sir
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.estimate import Estimate, no_estimate
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
+from toftrack.proposals import swap_fingers
 from toftrack.refine import Refinement, refine, surroundings
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
@@ -30,16 +31,18 @@ from toftrack.start import Start
 class FilterSettings:
     """How the particles are resampled, moved and weighted; see conf/filter for what each does."""
 
-    particles: int = 300
-    passes: int = 3
-    exponent: float = 20.0
-    exponent_growth: float = 1.5
-    shrink: float = 0.6
-    spread: sir.Spread = sir.Spread(0.012, 0.012, 0.12, 0.08)
-    velocity: float = 0.7
-    velocity_smoothing: float = 0.5
-    resampling: str = "systematic"
-    bounds: str = "reflect"
+    particles: int
+    passes: int
+    exponent: float
+    exponent_growth: float
+    shrink: float
+    spread: sir.Spread
+    rest: float
+    speed_gain: float
+    velocity: float
+    velocity_smoothing: float
+    resampling: str
+    bounds: str
 
     def __post_init__(self) -> None:
         if self.resampling not in sir.RESAMPLERS:
@@ -53,15 +56,14 @@ class FilterSettings:
 
 @dataclass(frozen=True)
 class LostSettings:
-    """When the tracker says that it has lost the hand.
+    """When the tracker says that it has lost the hand; see conf/lost for what each does."""
 
-    score: the estimate's score below which a frame counts as bad.
-    patience: so many bad frames in a row and the hand is lost; the next frame with something near
-        starts anew.  0 never starts anew (the paper).
-    """
-
-    score: float = 0.55
-    patience: int = 3
+    score: float
+    patience: int
+    start_score: float
+    probation: int
+    rival_gain: float
+    outside_rad: float
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,11 @@ class TrackState:
     """What the tracker carries from frame to frame.
 
     particles: (N, 6 + d), after the last observation.  weights: (N,) normalised.
-    mean: (1, 6 + d), the last estimate.  velocity: (6 + d,) its change a frame, tangent.
-    bad: bad frames in a row.
+    mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a frame.
+    offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
+        displaced by it.
+    age: frames since the start.  bad: frames in a row with a low score.
+    outside: frames in a row out of the pose space.
     """
 
     particles: Tensor
@@ -78,7 +83,9 @@ class TrackState:
     mean: Tensor
     velocity: Tensor
     offset: Tensor
+    age: int = 0
     bad: int = 0
+    outside: int = 0
 
 
 class Tracker:
@@ -110,19 +117,15 @@ class Tracker:
         self.settings = settings
         self.refinement = refinement
         self.start = start
-        import os
-        self.swaps=int(os.environ.get("SWAPS","128")); self.margin=float(os.environ.get("MARGIN","0.02"))
-        self._poses = self.space.decode(self.space.training_latents)
-        self._finger_of_angle = torch.tensor([0] * 5 + [1] * 4 + [2] * 4 + [3] * 4 + [4] * 4, device=self.device)
-        self.feedback = os.environ.get("FB","1")=="1"; self.keep=float(os.environ.get("KEEP","0.5"))
         self.lost = lost
         self.scorer: Scorer = make_scorer(renderer, self.shape, self.device)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.track: TrackState | None = None
+        self._poses = self.space.decode(self.space.training_latents)
         self._last: Estimate | None = None
 
     def step(self, depth_m: np.ndarray, k: np.ndarray, index: int, timestamp_s: float) -> Estimate:
-        """One frame: segment, predict, then resample - diffuse - observe in annealed passes.
+        """One frame: segment, predict, then resample - diffuse - observe in annealed passes; refine.
 
         depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3) intrinsics.
         """
@@ -133,50 +136,50 @@ class Tracker:
             return self._missing(index, timestamp_s, began)
         observation = observation.to(self.device)
         evidence = self.likelihood.evidence(observation)
-        starting = self.track is None
-        track = self._initialise(observation, evidence) if self.track is None else self.track
 
+        track = self.track
+        if track is None or track.age < self.lost.probation:
+            track = self._started(track, observation, evidence)
+        particles, weights = self._filter(track, evidence)
+        mean = sir.mean_particle(particles, weights)
+        state = self._refine(self.decode(mean, track.offset), observation, evidence)
+        score = float(self.likelihood.score(self.scorer(state, evidence)))
+
+        estimate = self._estimate(particles, weights, mean, state, score, index, timestamp_s)
+        self.track, name, lost = self._judge(track, particles, weights, mean, state, score)
+        self._last = replace(
+            estimate, state_name=name, lost=lost, compute_s=time.perf_counter() - began
+        )
+        return self._last
+
+    def _filter(self, track: TrackState, evidence: Evidence) -> tuple[Tensor, Tensor]:
+        """Particles and weights after the frame's annealed passes."""
         cfg, lower, upper = self.settings, self.space.lower, self.space.upper
         particles, weights = sir.compose(track.particles, track.velocity[None]), track.weights
-        sigmas = cfg.spread.sigmas(lower, upper)
+        # A hand that was nearly lost is looked for farther away.
+        width = 1.0 + track.bad
+        sigmas = width * sir.widened(
+            cfg.spread.sigmas(lower, upper), track.velocity, cfg.rest, cfg.speed_gain
+        )
         for number in range(cfg.passes):
             chosen = sir.RESAMPLERS[cfg.resampling](weights, cfg.particles, self.generator)
-            scale = sigmas * cfg.shrink**number
             particles = sir.diffuse(
-                particles[chosen], scale, lower, upper, cfg.bounds, self.generator
+                particles[chosen],
+                sigmas * cfg.shrink**number,
+                lower,
+                upper,
+                cfg.bounds,
+                self.generator,
             )
             exponent = cfg.exponent * cfg.exponent_growth**number
-            weights = sir.normalise(exponent * self._log_scores(particles, evidence=evidence, offset=track.offset))
+            scores = self._log_scores(particles, evidence=evidence, offset=track.offset)
+            weights = sir.normalise(exponent * scores)
+        return particles, weights
 
-        mean = sir.mean_particle(particles, weights)
-        state = self._refined(self.decode(mean, track.offset), mean, observation)
-        state = self._swap_fingers(state, mean, evidence, observation)
-        if self.feedback:
-            latent = sir.bound(self.space.encode(state[:, 6:]), lower, upper, "truncate")
-            refined = torch.cat((state[:, :6], latent), 1)
-            particles = sir.compose(particles, sir.difference(refined, mean))
-            particles[:, 6:] = sir.bound(particles[:, 6:], lower, upper, "truncate")
-            offset = self.keep * (state[0, 6:] - self.space.decode(latent)[0])
-            mean = refined
-        else:
-            offset = track.offset
-        score = float(self.likelihood.score(self.scorer(state, evidence)))
-        bad = track.bad + 1 if score < self.lost.score else 0
-        velocity = self._velocity(track, mean) if not starting else torch.zeros_like(mean[0])
-        self.track = TrackState(particles, weights, mean, velocity, offset, bad)
-        lost = self._give_up()
-        name = "lost" if lost else "initialising" if starting else "tracking"
-        return self._estimate(
-            particles, weights, mean, state, score, name, bad > 0, index, timestamp_s, began
-        )
-
-    def _expected(self) -> Expected | None:
-        """Depths of the tracked hand, one movement ahead."""
-        if self.track is None:
-            return None
-        state = self.decode(sir.compose(self.track.mean, self.track.velocity[None]))
-        z = forward_kinematics(state, self.shape).joints_m[0, :, 2]
-        return Expected(float(z.min()), float(z.max()))
+    def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
+        """(N, 6 + d) particles to (N, 27) hand states."""
+        angles = clamp_to_joint_limits(self.space.decode(particles[:, 6:]) + offset)
+        return torch.cat((particles[:, :6], angles), 1)
 
     def _log_scores(
         self,
@@ -189,76 +192,96 @@ class Tracker:
         counts = self.scorer(self.decode(particles, offset), evidence)
         return self.likelihood.log_score(counts, coverage)
 
-    def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
-        """(N, 6 + d) particles to (N, 27) hand states."""
-        angles = clamp_to_joint_limits(self.space.decode(particles[:, 6:]) + offset)
-        return torch.cat((particles[:, :6], angles), 1)
-
-    def _initialise(self, observation: Observation, evidence: Evidence) -> TrackState:
+    def _started(
+        self, track: TrackState | None, observation: Observation, evidence: Evidence
+    ) -> TrackState:
+        """A new track; or the given young one, if the search finds nothing better than it."""
         n = self.settings.particles
-        particles = self.start(
-            observation,
-            self.space,
-            partial(self._log_scores, evidence=evidence),
-            n,
-            self.generator,
-        )
+        log_scores = partial(self._log_scores, evidence=evidence)
+        particles = self.start(observation, self.space, log_scores, n, self.generator)
+        if track is not None:
+            now = sir.compose(track.particles, track.velocity[None])
+            # The search has seen this frame and the track has not, so a little better is no better.
+            gain = log_scores(particles, 1.0).max() - log_scores(now, 1.0).max()
+            if gain < self.lost.rival_gain:
+                return track
         weights = torch.full((n,), 1.0 / n, dtype=torch.float64, device=self.device)
-        mean = particles[:1]
-        return TrackState(
-            particles, weights, mean, torch.zeros_like(mean[0]), torch.zeros(21, device=self.device)
-        )
+        still = torch.zeros(particles.shape[1], device=self.device)
+        offset = torch.zeros(21, device=self.device)
+        return TrackState(particles, weights, particles[:1], still, offset)
 
-    def _refined(self, state: Tensor, mean: Tensor, observation: Observation) -> Tensor:
-        """A hand state brought onto the seen points, with the estimate's pose as prior; (1, 27)."""
-        if self.refinement.iterations == 0:
+    def _expected(self) -> Expected | None:
+        """Depths of the tracked hand, one movement ahead."""
+        if self.track is None:
+            return None
+        state = self.decode(sir.compose(self.track.mean, self.track.velocity[None]))
+        z = forward_kinematics(state, self.shape).joints_m[0, :, 2]
+        return Expected(float(z.min()), float(z.max()))
+
+    def _refine(self, state: Tensor, observation: Observation, evidence: Evidence) -> Tensor:
+        """A hand state brought onto the seen points; (1, 27)."""
+        cfg = self.refinement
+        if cfg.iterations == 0:
             return state
         middle = forward_kinematics(state, self.shape).joints_m[0].mean(0)
-        seen = surroundings(observation, middle, self.refinement.points)
+        seen = surroundings(observation, middle, cfg.points)
         if len(seen.points_m) == 0:
             return state
-        return refine(state, state[:, 6:], seen, self.shape, self.surface, self.refinement)
+        state = refine(state, state[:, 6:], seen, self.shape, self.surface, cfg)
 
-    def _swap_fingers(
-        self, state: Tensor, mean: Tensor, evidence: Evidence, observation: Observation
-    ) -> Tensor:
-        """Try other poses of single fingers and keep the best if it explains the image better.
+        def log_scores(states: Tensor) -> Tensor:
+            return self.likelihood.log_score(self.scorer(states, evidence))
 
-        Gauss-Newton cannot bring a finger across from where it sees nothing of it. The tried poses
-        are those that the finger has in the training poses.
-        """
-        n = self.swaps
-        if n == 0 or self.refinement.iterations == 0:
+        tried = swap_fingers(state, self._poses, cfg.swaps, self.generator)
+        scores = log_scores(tried)
+        best = int(scores.argmax())
+        if scores[best] <= scores[0] + cfg.swap_gain:
             return state
-        device = self.device
-        rows = torch.randint(len(self._poses), (n,), generator=self.generator, device=device)
-        fingers = torch.randint(5, (n,), generator=self.generator, device=device)
-        tried = state.repeat(n + 1, 1)
-        angles = torch.where(self._finger_of_angle == fingers[:, None], self._poses[rows], tried[1:, 6:])
-        tried[1:, 6:] = angles
-        scores = self.likelihood.log_score(self.scorer(tried, evidence), 0.2)
-        best = scores.argmax()
-        if not bool(scores[best] > scores[0] + self.margin):
-            return state
-        refined = self._refined(tried[best][None], mean, observation)
-        both = torch.cat((tried[best][None], refined))
-        after = self.likelihood.log_score(self.scorer(both, evidence), 0.2)
-        return both[after.argmax()][None]
+        swapped = tried[best][None]
+        refined = refine(swapped, swapped[:, 6:], seen, self.shape, self.surface, cfg)
+        both = torch.cat((swapped, refined))
+        return both[log_scores(both).argmax()][None]
 
-    def _velocity(self, track: TrackState, mean: Tensor) -> Tensor:
-        moved = sir.difference(mean, track.mean)[0]
-        cfg = self.settings
-        keep = cfg.velocity_smoothing
-        return keep * track.velocity + (1 - keep) * cfg.velocity * moved
-
-    def _give_up(self) -> bool:
-        """Forget a track that has been bad for too long; True when the hand is lost."""
-        if self.track is None:
-            return True
-        if self.lost.patience and self.track.bad >= self.lost.patience:
-            self.track = None
-            return True
-        return False
+    def _judge(
+        self,
+        track: TrackState,
+        particles: Tensor,
+        weights: Tensor,
+        mean: Tensor,
+        state: Tensor,
+        score: float,
+    ) -> tuple[TrackState | None, str, bool]:
+        """The track to go on with, the state's name, and whether the hand counts as lost."""
+        cfg, lower, upper = self.lost, self.space.lower, self.space.upper
+        bad = track.bad + 1 if score < cfg.score else 0
+        if track.age == 0 and score < cfg.start_score:
+            return None, "initialising", True
+        if cfg.patience and bad >= cfg.patience:
+            return None, "lost", True
+        offset, outside = track.offset, 0
+        if self.refinement.iterations:
+            # The particles follow the refined estimate, and what the space cannot say of its pose
+            # is remembered beside them.
+            latent = sir.bound(self.space.encode(state[:, 6:]), lower, upper, "truncate")
+            refined = torch.cat((state[:, :6], latent), 1)
+            particles = sir.compose(particles, sir.difference(refined, mean))
+            particles[:, 6:] = sir.bound(particles[:, 6:], lower, upper, "truncate")
+            mean = refined
+            offset = state[0, 6:] - self.space.decode(latent)[0]
+            if float(offset.square().mean().sqrt()) > cfg.outside_rad:
+                outside = track.outside + 1
+            offset = self.refinement.carry * offset
+        velocity = torch.zeros_like(track.velocity)
+        if track.age > 0:
+            keep = self.settings.velocity_smoothing
+            moved = sir.difference(mean, track.mean)[0]
+            velocity = keep * track.velocity + (1 - keep) * self.settings.velocity * moved
+        new = TrackState(
+            particles, weights, mean, velocity, offset, track.age + 1, bad, outside
+        )
+        if bad >= 2 or (bad and not cfg.patience):
+            return new, "recovering", True
+        return new, "initialising" if track.age == 0 else "tracking", outside >= 2
 
     def _estimate(
         self,
@@ -267,49 +290,45 @@ class Tracker:
         mean: Tensor,
         state: Tensor,
         score: float,
-        name: str,
-        lost: bool,
         index: int,
         timestamp_s: float,
-        began: float,
     ) -> Estimate:
         tangents = sir.difference(particles, mean)
         tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
         joints = forward_kinematics(state, self.shape).joints_m
+        latent = self.space.encode(state[:, 6:])
 
         def host(tensor: Tensor) -> np.ndarray:
             return tensor.detach().cpu().numpy().astype(np.float32)
 
-        self._last = Estimate(
+        return Estimate(
             index=index,
             timestamp_s=timestamp_s,
-            state_name=name,
-            lost=lost,
+            state_name="",
+            lost=False,
             joints_m=host(joints[0]),
             state=host(state[0]),
-            latent=host(mean[0, 6:]),
+            latent=host(latent[0]),
             score=score,
             covariance=host(sir.covariance(tangents, weights)),
             effective_sample_size=float(sir.effective_sample_size(weights)),
-            compute_s=time.perf_counter() - began,
+            compute_s=math.nan,
         )
-        return self._last
 
     def _missing(self, index: int, timestamp_s: float, began: float) -> Estimate:
         """Nothing in the frame can be a hand: the last estimate stands, and is lost."""
-        facts = {"index": index, "timestamp_s": timestamp_s, "state_name": "lost", "lost": True}
-        d = self.space.dims
-        last = self._last or Estimate(
-            **facts,
-            joints_m=np.full((21, 3), np.nan, np.float32),
-            state=np.full(27, np.nan, np.float32),
-            latent=np.full(d, np.nan, np.float32),
+        seconds = time.perf_counter() - began
+        if self._last is None:
+            return no_estimate(index, timestamp_s, "lost", self.space.dims, seconds)
+        return replace(
+            self._last,
+            index=index,
+            timestamp_s=timestamp_s,
+            state_name="lost",
+            lost=True,
             score=0.0,
-            covariance=np.full((6 + d, 6 + d), np.nan, np.float32),
-            effective_sample_size=math.nan,
-            compute_s=0.0,
+            compute_s=seconds,
         )
-        return replace(last, **facts, score=0.0, compute_s=time.perf_counter() - began)
 
     def range_image(self, estimate: Estimate, k: np.ndarray, height: int, width: int) -> np.ndarray:
         """The estimate's range image, (H, W) float32 metres, 0 = no surface or no estimate."""

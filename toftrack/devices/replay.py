@@ -13,8 +13,8 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.devices.base import Frame
 from toftrack.errors import ToftrackError
-from toftrack.recordings.store import FrameStore, open_recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
+from toftrack.recordings.store import FrameStore, open_recording
 
 _log = logging.getLogger(__name__)
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 from typing import Any, Self
 
 from toftrack.camera import Camera
 from toftrack.devices.base import Frame, Truth
-from toftrack.devices.sample import SAMPLE
 from toftrack.devices.sr3000_emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000_libmesasr import MesaTransport
 from toftrack.devices.sr3000_reader import Capture, Counts, Reader
@@ -60,7 +60,8 @@ class Sr3000:
             the recording's).
 
     Raises:
-        ToftrackError: a setting makes no sense, or the emulated camera's recording cannot be used.
+        ToftrackError: a setting makes no sense, there is no camera (or library), or the emulated
+            camera's recording cannot be used.
     """
 
     def __init__(
@@ -114,6 +115,7 @@ class Sr3000:
             raise ToftrackError(
                 f"device.transport={transport} is unknown; give usb, libmesasr or emulated"
             )
+        self._transport.check()
         if camera_file is not None:
             self.camera = _calibrated(camera_file)
         self.description: dict[str, Any] = {
@@ -210,14 +212,17 @@ class Sr3000:
 
 
 def _source(name: str) -> FrameStore:
-    return open_recording(SAMPLE if name == "sample" else name)
+    if name != "sample":
+        return open_recording(name)
+    with resources.as_file(resources.files("toftrack") / "data" / "sample.npz") as path:
+        return open_recording(path)
 
 
 def _calibrated(path: str | Path) -> Camera:
     camera = Camera.load(path)
     if (camera.width, camera.height) != (WIDTH, HEIGHT):
         raise ToftrackError(
-            f"the camera file '{path}' is for {camera.width}x{camera.height} pixels, but the SR3000 "
-            f"has {WIDTH}x{HEIGHT}; calibrate this camera"
+            f"the camera file '{path}' is for {camera.width}x{camera.height} pixels, but the "
+            f"SR3000 has {WIDTH}x{HEIGHT}; calibrate this camera"
         )
     return camera

@@ -21,13 +21,14 @@ import numpy as np
 import usb.core
 from usb.backend import IBackend
 
+from toftrack.devices import sr3000_descriptors as descriptors
 from toftrack.devices.sr3000_faults import HARMLESS, OPEN_FAULTS, REQUEST_FAULTS, parse_faults
 from toftrack.devices.sr3000_transport import UsbSettings, parse_id
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame, to_radial
 from toftrack.recordings.store import FrameStore
 
-_PACKET = 512
+_PACKET = descriptors.PACKET_BYTES
 _PACKETS = FRAME_BYTES // _PACKET
 _TURN_S = 0.01  # how soon a waiting transfer notices that the camera was unplugged
 _CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
@@ -166,77 +167,23 @@ class EmulatedBackend(IBackend):
             return iter([_Id(number, self._plugging) for number in range(len(serials))])
 
     def get_device_descriptor(self, dev: _Id) -> SimpleNamespace:
-        vendor, product = parse_id(self._usb.ids[min(1, len(self._usb.ids) - 1)])
-        return SimpleNamespace(
-            bLength=18,
-            bDescriptorType=1,
-            bcdUSB=0x0200,
-            bDeviceClass=0xFF,
-            bDeviceSubClass=0,
-            bDeviceProtocol=0,
-            bMaxPacketSize0=64,
-            idVendor=vendor,
-            idProduct=product,
-            bcdDevice=0x0100,
-            iManufacturer=0,
-            iProduct=0,
-            iSerialNumber=3,
-            bNumConfigurations=1,
-            address=4 + dev.camera + 10 * dev.plugging,
-            bus=1,
-            port_number=1 + dev.camera,
-            port_numbers=(1 + dev.camera,),
-            speed=3,
-        )
+        ids = self._usb.ids
+        vendor, product = parse_id(ids[min(1, len(ids) - 1)])  # by default the usual SR3000
+        place = (dev.camera, 4 + dev.camera + 10 * dev.plugging)
+        return descriptors.device(vendor, product, *place)
 
     def get_configuration_descriptor(self, dev: _Id, config: int) -> SimpleNamespace:
-        if config > 0:
-            raise IndexError(config)
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=2,
-            wTotalLength=32,
-            bNumInterfaces=1,
-            bConfigurationValue=1,
-            iConfiguration=0,
-            bmAttributes=0xC0,
-            bMaxPower=0,
-            extra_descriptors=[],
-        )
+        return descriptors.configuration(config)
 
     def get_interface_descriptor(
         self, dev: _Id, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        if intf > 0 or alt > 0 or config > 0:
-            raise IndexError((intf, alt, config))
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=4,
-            bInterfaceNumber=self._usb.interface,
-            bAlternateSetting=0,
-            bNumEndpoints=2,
-            bInterfaceClass=0xFF,
-            bInterfaceSubClass=0,
-            bInterfaceProtocol=0,
-            iInterface=0,
-            extra_descriptors=[],
-        )
+        return descriptors.interface(self._usb.interface, intf, alt, config)
 
     def get_endpoint_descriptor(
         self, dev: _Id, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        addresses = (self._usb.endpoint_in, self._usb.endpoint_out)
-        return SimpleNamespace(
-            bLength=7,
-            bDescriptorType=5,
-            bEndpointAddress=addresses[ep],
-            bmAttributes=2,
-            wMaxPacketSize=_PACKET,
-            bInterval=0,
-            bRefresh=0,
-            bSynchAddress=0,
-            extra_descriptors=[],
-        )
+        return descriptors.endpoint((self._usb.endpoint_in, self._usb.endpoint_out)[ep])
 
     def open_device(self, dev: _Id) -> _Handle:
         with self._lock:
@@ -302,7 +249,9 @@ class EmulatedBackend(IBackend):
         with self._lock:
             self._check(dev_handle, claimed=False)
             if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):
-                return _string(data, wValue & 0xFF, self._settings.serials[dev_handle.camera])
+                return descriptors.string(
+                    data, wValue & 0xFF, self._settings.serials[dev_handle.camera]
+                )
             usb_ = self._usb
             expected = (usb_.request_type, usb_.request, usb_.request_value, usb_.request_index)
             if (bmRequestType, bRequest, wValue, wIndex) != expected:
@@ -457,15 +406,6 @@ class EmulatedBackend(IBackend):
             self._position += 1  # the scene goes on
             return [_Chunk(due, whole), _Chunk(due, error=errno.ENODEV)]
         return [_Chunk(due, whole)]
-
-
-def _string(data: array.array, index: int, serial: str) -> int:
-    """Answer a request for a string descriptor: 0 is the list of languages."""
-    text = (0x0409).to_bytes(2, "little") if index == 0 else serial.encode("utf-16-le")
-    content = bytes((2 + len(text), 3)) + text
-    count = min(len(content), len(data))
-    data[:count] = array.array("B", content[:count])
-    return count
 
 
 def _error(number: int) -> usb.core.USBError:

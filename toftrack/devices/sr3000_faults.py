@@ -55,7 +55,7 @@ class Fault:
 
 
 def parse_faults(texts: Iterable[str]) -> tuple[Fault, ...]:
-    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (three times) or KIND@7+ (from then).
+    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on).
 
     Raises ToftrackError for an unknown kind or another form.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from toftrack.devices.sr3000_transport import Exposure, MesaSettings, NoAnswer, Unplugged
+from toftrack.devices.sr3000_transport import Exposure, MesaSettings, NoAnswerError, UnpluggedError
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import HEIGHT, IMAGE_BYTES, WIDTH
 
@@ -49,10 +49,15 @@ class MesaTransport:
         self._camera: ctypes.c_void_p | None = None
         self.patience_s = settings.timeout_ms / 1000
 
+    def check(self) -> None:
+        """Load the library. Raises ToftrackError when it is not there."""
+        self._library = self._library or _load(self._settings.library)
+
     def open(self) -> None:
         """Load the library and open the camera. Raises ToftrackError when either fails."""
         self.close()
-        library = self._library = self._library or _load(self._settings.library)
+        self.check()
+        library = self._library
         camera = _CAMERA()
         opened = library.SR_OpenUSB(ctypes.byref(camera), self._serial)
         if opened <= 0 or not camera.value:
@@ -73,13 +78,13 @@ class MesaTransport:
         """One frame, FRAME_BYTES bytes; the faults are those of `Transport.acquire`."""
         library, camera = self._library, self._camera
         if library is None or camera is None:
-            raise Unplugged("it is not open")
+            raise UnpluggedError("it is not open")
         result = library.SR_Acquire(camera)
         if result <= 0:
-            raise NoAnswer(f"SR_Acquire gave {result}")
+            raise NoAnswerError(f"SR_Acquire gave {result}")
         images = [library.SR_GetImage(camera, number) for number in (0, 1)]
         if not all(images):
-            raise NoAnswer("SR_GetImage gave no image")
+            raise NoAnswerError("SR_GetImage gave no image")
         return b"".join(ctypes.string_at(image, IMAGE_BYTES) for image in images)
 
     def close(self) -> None:

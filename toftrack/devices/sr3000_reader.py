@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 
 from toftrack.devices.sr3000_transport import (
-    CameraFault,
-    DamagedFrame,
-    EndOfStream,
+    CameraError,
+    DamagedFrameError,
+    EndOfStreamError,
     Persistence,
     Transport,
-    Unplugged,
+    UnpluggedError,
 )
 from toftrack.devices.sr3000_usb import WHEN_IT_DOES_NOT_ANSWER
 from toftrack.errors import ToftrackError
@@ -121,7 +121,7 @@ class Reader:
     def _run(self) -> None:
         try:
             self._read_on()
-        except EndOfStream:
+        except EndOfStreamError:
             pass
         except Exception as error:  # told by the thread that iterates
             self._error = error
@@ -135,10 +135,10 @@ class Reader:
         while not self._stop.is_set():
             try:
                 data = self._transport.acquire()
-            except CameraFault as fault:
+            except CameraError as fault:
                 in_a_row += 1
                 self._count(fault)
-                gone = isinstance(fault, Unplugged)
+                gone = isinstance(fault, UnpluggedError)
                 if gone or in_a_row % settings.reopen_after == 0:
                     self._reopen(since, fault)
                     # A camera that came back gets the time to answer that it got at first.
@@ -148,12 +148,12 @@ class Reader:
                 since, in_a_row = time.monotonic(), 0
                 self._put(data)
 
-    def _count(self, fault: CameraFault) -> None:
-        if isinstance(fault, Unplugged):
+    def _count(self, fault: CameraError) -> None:
+        if isinstance(fault, UnpluggedError):
             self.counts.unplugged += 1
             self.next_index += 1
             _log.warning("sr3000: the camera is gone (%s); waiting for it to come back", fault)
-        elif isinstance(fault, DamagedFrame):
+        elif isinstance(fault, DamagedFrameError):
             self.counts.damaged += 1
             self.next_index += 1
         else:
@@ -178,7 +178,7 @@ class Reader:
             ):
                 self._changed.wait(0.2)
 
-    def _reopen(self, since: float, fault: CameraFault) -> None:
+    def _reopen(self, since: float, fault: CameraError) -> None:
         """Open the camera again, with growing pauses; returns when stopped, too."""
         settings, pause = self._persistence, self._persistence.backoff_s
         self._transport.close()
@@ -191,7 +191,7 @@ class Reader:
             pause = min(2 * pause, settings.longest_backoff_s)
 
     def _give_up_if_late(
-        self, since: float, fault: CameraFault, error: ToftrackError | None = None
+        self, since: float, fault: CameraError, error: ToftrackError | None = None
     ) -> None:
         settings, waited = self._persistence, time.monotonic() - since
         if self._stop.is_set():

@@ -22,23 +22,23 @@ KNOWN_IDS = ("0852:0074", "1ad2:0074", "1ad2:0075")
 """Vendor and product of the early SR3000, the SR3000, and the SR4000."""
 
 
-class CameraFault(Exception):
+class CameraError(Exception):
     """Something went wrong that may pass; the reader tries again and never shows this to a user."""
 
 
-class NoAnswer(CameraFault):  # noqa: N818 (a state of the camera rather than an error)
+class NoAnswerError(CameraError):
     """The camera did not send the frame that was asked for."""
 
 
-class DamagedFrame(CameraFault):  # noqa: N818
+class DamagedFrameError(CameraError):
     """A frame came, but not as many bytes as it has."""
 
 
-class Unplugged(CameraFault):  # noqa: N818
+class UnpluggedError(CameraError):
     """The camera is gone; it has to be opened anew."""
 
 
-class EndOfStream(Exception):  # noqa: N818
+class EndOfStreamError(Exception):
     """There are no more frames (only an emulated camera's recording ends)."""
 
 
@@ -48,6 +48,10 @@ class Transport(Protocol):
     patience_s: float
     """How long a call of `acquire` may take."""
 
+    def check(self) -> None:
+        """Raises ToftrackError when it is plain, without opening it, that there is no camera."""
+        ...
+
     def open(self) -> None:
         """Find, claim and configure the camera. Raises ToftrackError when that cannot be done."""
         ...
@@ -55,7 +59,8 @@ class Transport(Protocol):
     def acquire(self) -> bytes:
         """Ask for one frame and wait for its FRAME_BYTES bytes.
 
-        Raises NoAnswer, DamagedFrame or Unplugged for what may pass, EndOfStream at the end.
+        Raises NoAnswerError, DamagedFrameError or UnpluggedError for what may pass, and
+        EndOfStreamError at the end.
         """
         ...
 

@@ -19,11 +19,11 @@ import usb.util
 from usb.backend import IBackend
 
 from toftrack.devices.sr3000_transport import (
-    DamagedFrame,
-    EndOfStream,
+    DamagedFrameError,
+    EndOfStreamError,
     Exposure,
-    NoAnswer,
-    Unplugged,
+    NoAnswerError,
+    UnpluggedError,
     UsbSettings,
     known_ids,
     parse_id,
@@ -69,6 +69,10 @@ class UsbTransport:
         self._length = -(-FRAME_BYTES // settings.read_multiple) * settings.read_multiple
         self.patience_s = (3 * settings.timeout_ms + settings.drain_ms) / 1000
 
+    def check(self) -> None:
+        """Look whether there is one camera to open. Raises ToftrackError if not."""
+        _let_go([self._find()])
+
     def open(self) -> None:
         """Find, claim and configure the camera.
 
@@ -83,7 +87,7 @@ class UsbTransport:
                 self._write_register(address, value)
             # A program that was killed in mid-frame leaves the rest of the frame behind.
             self._drain()
-        except Unplugged as fault:
+        except UnpluggedError as fault:
             self.close()
             raise ToftrackError(f"the SR3000 went away while it was opened ({fault})") from None
         except BaseException:
@@ -93,9 +97,9 @@ class UsbTransport:
     def acquire(self) -> bytes:
         """One frame, FRAME_BYTES bytes; the faults are those of `Transport.acquire`."""
         if self._ended is not None and self._ended():
-            raise EndOfStream
+            raise EndOfStreamError
         if self._device is None:
-            raise Unplugged("it is not open")
+            raise UnpluggedError("it is not open")
         settings = self._settings
         try:
             self._device.ctrl_transfer(
@@ -111,7 +115,7 @@ class UsbTransport:
             raise self._recovered(error) from error
         if len(data) != FRAME_BYTES:
             self._drain()
-            raise DamagedFrame(f"{len(data)} bytes instead of {FRAME_BYTES}")
+            raise DamagedFrameError(f"{len(data)} bytes instead of {FRAME_BYTES}")
         return data
 
     def close(self) -> None:
@@ -232,7 +236,12 @@ class UsbTransport:
         deadline = time.monotonic() + settings.timeout_ms / 1000
         while count < self._length:
             left_ms = max(1, round((deadline - time.monotonic()) * 1000))
-            part = _read(device, settings.endpoint_in, self._length - count, left_ms)
+            try:
+                part = _read(device, settings.endpoint_in, self._length - count, left_ms)
+            except usb.core.USBTimeoutError:
+                if not count:
+                    raise
+                break
             parts.append(part)
             count += len(part)
             # Less than a whole packet ends a transfer: nothing more belongs to this frame.
@@ -249,7 +258,7 @@ class UsbTransport:
         return data[:FRAME_BYTES] if len(data) == self._length else data
 
     def _drain(self) -> None:
-        """Read and drop what the camera still has to send. Raises Unplugged."""
+        """Read and drop what the camera still has to send. Raises UnpluggedError."""
         settings, drained, empty = self._settings, 0, 0
         try:
             # An empty transfer may stand before the rest; an endless row of them may not hold us.
@@ -263,26 +272,26 @@ class UsbTransport:
             if error.errno == errno.EPIPE:
                 self._clear_stall()
             elif error.errno != errno.EOVERFLOW:
-                raise Unplugged(_reason(error)) from error
+                raise UnpluggedError(_reason(error)) from error
 
     def _clear_stall(self) -> None:
         try:
             self._device.clear_halt(self._settings.endpoint_in)
         except usb.core.USBError as error:
-            raise Unplugged(_reason(error)) from error
+            raise UnpluggedError(_reason(error)) from error
 
     def _recovered(self, error: usb.core.USBError) -> Exception:
         """Bring the endpoint back into order; returns the fault that the error amounts to."""
         if error.errno in (errno.ENODEV, errno.ENOENT, errno.ESHUTDOWN, errno.EACCES):
-            return Unplugged(_reason(error))
+            return UnpluggedError(_reason(error))
         if error.errno == errno.EPIPE:
             self._clear_stall()
         self._drain()
         if error.errno == errno.EOVERFLOW:
-            return DamagedFrame("more data than fit")
+            return DamagedFrameError("more data than fit")
         if isinstance(error, usb.core.USBTimeoutError):
-            return NoAnswer("no answer in time")
-        return NoAnswer(_reason(error))
+            return NoAnswerError("no answer in time")
+        return NoAnswerError(_reason(error))
 
 
 def _read(device: usb.core.Device, endpoint: int, size: int, timeout_ms: int) -> bytes:

@@ -15,6 +15,7 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.pose_space.base import PoseSpace, TensorSpace, clamped_share
 from toftrack.pose_space.files import fit_pose_space
 from toftrack.pose_space.pose_data import PoseData
+from toftrack.pose_space.reach import nearest_latents
 
 DIMENSIONS = (2, 3, 4, 6, 8)
 FOLDS = 4
@@ -32,23 +33,29 @@ class Errors(NamedTuple):
 class Row(NamedTuple):
     """A line of the table; held_out is None where the clips cannot be split.
 
-    variance: part explained, for spaces that have one.  clamped: part of the decoded angles in the
-    whole box that the joint limits had to move.
+    variance: part explained, for spaces that have one.  training, held_out: of decode(encode(x)).
+    reached: of the nearest point in the box to held-out poses, which is the best that a tracker
+    could do.  clamped: part of the decoded angles in the whole box that the joint limits moved.
     """
 
     dims: int
     variance: float | None
     training: Errors
     held_out: Errors | None
+    reached: Errors | None
     clamped: float | None
 
 
-def reconstruction(space: PoseSpace, angles: Tensor) -> tuple[Tensor, Tensor]:
-    """decode(encode(x)) against x, (N, 21) rad: squared angle errors (N, 21) in rad^2 and joint
+def reconstruction(
+    space: PoseSpace, angles: Tensor, latent: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Decoded latents against poses (N, 21) rad: squared angle errors (N, 21) in rad^2 and joint
     distances (N, 20) in metres, on a hand of the default size held still at the wrist.
+
+    latent: (N, d); None encodes the poses.
     """
     angles = angles.to(space.lower)
-    again = space.decode(space.encode(angles))
+    again = space.decode(space.encode(angles) if latent is None else latent.to(space.lower))
     shape = default_hand_shape().to(space.lower)
     still = angles.new_zeros(len(angles), 6)
     joints = [
@@ -90,14 +97,16 @@ def evaluate_space(
     """Errors of one kind of space on its training poses and, fold by fold, on held-out clips."""
     settings = settings or {}
     space = fit_pose_space(kind, dims, data, **settings)
-    results = []
+    results, reached = [], []
     for training, out in clip_folds(data.clips):
         try:
             fold = fit_pose_space(kind, dims, data.rows(training), **settings)
         except ToftrackError:  # too few poses are left for so many dimensions
-            results = []
+            results, reached = [], []
             break
-        results.append(reconstruction(fold, data.angles_rad[out]))
+        poses = data.angles_rad[out]
+        results.append(reconstruction(fold, poses))
+        reached.append(reconstruction(fold, poses, nearest_latents(fold, poses)))
     ratios = getattr(space, "explained_variance_ratio", None)
     clamped = None
     if isinstance(space, TensorSpace):
@@ -108,19 +117,22 @@ def evaluate_space(
         variance=None if ratios is None else float(ratios[:dims].sum()),
         training=summarise([reconstruction(space, data.angles_rad)]),
         held_out=summarise(results) if results else None,
+        reached=summarise(reached) if reached else None,
         clamped=clamped,
     )
 
 
 def errors_table(rows: list[Row]) -> str:
     """The rows as text for the terminal, without final newline."""
-    lines = ["dims   variance   training poses        held-out clips        clamped in the box"]
+    lines = [
+        "dims   variance   training poses        held-out clips        nearest in box       clamped"
+    ]
     for row in rows:
         variance = "-" if row.variance is None else f"{100 * row.variance:.2f} %"
         clamped = "-" if row.clamped is None else f"{100 * row.clamped:.1f} %"
         lines.append(
             f"{row.dims:4d} {variance:>10}   {_figures(row.training)}   {_figures(row.held_out)}"
-            f"   {clamped:>8}"
+            f"   {_figures(row.reached)}   {clamped:>7}"
         )
     return "\n".join(lines)
 

@@ -19,7 +19,7 @@ from toftrack.pose_space.kernel_decoder import (
     tensor32,
 )
 
-RIDGE = 1e-3
+RIDGE = 1e-2
 """Regularises the weights of neighbours, in parts of their squared distances."""
 
 

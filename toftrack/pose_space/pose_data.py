@@ -61,19 +61,17 @@ def mixed_data(parts: dict[str, PoseData], poses: int | None = None) -> PoseData
     """
     if not parts:
         raise ToftrackError("data.parts is empty; give at least one source of poses")
-    chosen, offset = [], 0
+    chosen, clips, offset = [], [], 0
     for part in parts.values():
-        if poses is not None and len(part) > poses:
-            part_ = part.rows(spread_out(part.angles_rad, poses))
-        else:
-            part_ = part
-        chosen.append((part_, part_.clips + offset))
+        rows = spread_out(part.angles_rad, len(part) if poses is None else poses)
+        chosen.append(part.rows(rows))
+        clips.append(chosen[-1].clips + offset)
         offset += int(part.clips.max()) + 1
     return PoseData(
-        torch.cat([part.angles_rad for part, _ in chosen]),
-        tuple(label for part, _ in chosen for label in part.labels),
-        torch.cat([clips for _, clips in chosen]),
-        tuple(source for part in parts.values() for source in part.sources),
+        torch.cat([part.angles_rad for part in chosen]),
+        tuple(label for part in chosen for label in part.labels),
+        torch.cat(clips),
+        tuple(source | {"poses": len(part)} for part in chosen for source in part.sources),
         tuple(note for part in parts.values() for note in part.notes),
     )
 

@@ -46,7 +46,7 @@ def train(config: DictConfig) -> float:
     wanted = [number for number in config.compare if number < min(len(data) - 1, 22)]
     rows = [evaluate_space(kind, number, data, settings) for number in sorted({*wanted, dims})]
     print(errors_table(rows))
-    if rows[0].variance is not None:
+    if rows[0].variance is not None and [s["data"] for s in data.sources] == ["synthetic"]:
         print(_PAPER)
 
     model = folder / "pose_space.npz"
@@ -78,6 +78,7 @@ def _summary(kind: str, dims: int, data: PoseData, rows: list[Row]) -> dict:
         | {
             "training": row.training._asdict(),
             "held_out": row.held_out and row.held_out._asdict(),
+            "reached": row.reached and row.reached._asdict(),
         }
         for row in rows
     ]

@@ -165,7 +165,7 @@ def pack_kernel(hand, out, width, words):
 @triton.jit
 def _whole(value, size):
     """A float as an integer in 0 .. size, 0 for NaN."""
-    return tl.minimum(tl.maximum(value, 0.0), size.to(tl.float32)).to(tl.int32)
+    return tl.minimum(tl.maximum(value, 0.0), size * 1.0).to(tl.int32)
 
 
 @triton.jit
@@ -178,10 +178,10 @@ def count_kernel(
     boxes,
     out,
     n,
-    count,
     height,
     width,
     words,
+    count: tl.constexpr,
     ELLIPSOIDS: tl.constexpr,
     ROWS: tl.constexpr,
 ):
@@ -210,9 +210,11 @@ def count_kernel(
     tl.store(boxes + i * 4 + 3, bottom)
     correct_sum, false_sum, residual_sum = 0.0, 0.0, 0.0
     column, line = tl.arange(0, 64), tl.arange(0, ROWS)
-    for tile_top in range(top, bottom, ROWS):
+    tile_top = top
+    while tile_top < bottom:
         v = tile_top + line
-        for tile_left in range(left, right, 64):
+        tile_left = left
+        while tile_left < right:
             u = tile_left + column
             depth = tl.zeros([ROWS, 64], tl.float32)
             for j in range(count - 1):
@@ -247,6 +249,8 @@ def count_kernel(
             bits = tl.sum(model_here.to(tl.int64) << column.to(tl.int64)[None, :], 1)
             to = model + (i.to(tl.int64) * height + v) * words + tile_left // 64
             tl.store(to, bits, mask=v < height)
+            tile_left += 64
+        tile_top += ROWS
     tl.store(out + i, correct_sum)
     tl.store(out + n + i, false_sum)
     tl.store(out + 3 * n + i, residual_sum)
@@ -307,16 +311,18 @@ def missed_kernel(
     empty = (right <= left) | (bottom <= top)
     begin = tl.maximum(top - reach, 0)
     end = tl.where(empty, begin, tl.minimum(bottom + reach, height))
-    for tile_top in range(begin, end, ROWS):
+    tile_top = begin
+    while tile_top < end:
         v = tile_top + tl.arange(0, ROWS)
         dy = v.to(tl.float32) - y
         rest = 1.0 - dy * dy * iy
         half = tl.sqrt(tl.maximum(dx * rest, 0.0))
         middle = x + shear * dy
-        covered = (tall > 0) & (rest >= 0)
+        covered = tl.where(rest >= 0, tall, -1.0) > 0
         from_column = tl.where(covered, _whole(tl.ceil(middle - half), width), 0)
         to_column = tl.where(covered, _whole(tl.floor(middle + half) + 1.0, width), 0)
-        for word in range(tl.maximum(first - 1, 0), tl.minimum(last + 1, words)):
+        word = tl.maximum(first - 1, 0)
+        while word < tl.minimum(last + 1, words):
             a = _row(mine, v, word - 1, top, bottom, first, last, words)
             b = _row(mine, v, word, top, bottom, first, last, words)
             c = _row(mine, v, word + 1, top, bottom, first, last, words)
@@ -324,7 +330,8 @@ def missed_kernel(
             low = tl.minimum(tl.maximum(from_column - word * 64, 0), 64)
             high = tl.minimum(tl.maximum(to_column - word * 64, 0), 64)
             wanted &= ~(_below(high) & ~_below(low))
-            for s in range(step_count):
+            s = step_count * 0
+            while s < step_count:
                 grow, offset = tl.load(steps + 2 * s), tl.load(steps + 2 * s + 1)
                 if grow > 0:
                     outer_left, outer_right = a, c
@@ -338,9 +345,12 @@ def missed_kernel(
                     b |= _row(mine, v + offset, word, top, bottom, first, last, words)
                     c |= _row(mine, v - offset, word + 1, top, bottom, first, last, words)
                     c |= _row(mine, v + offset, word + 1, top, bottom, first, last, words)
+                s += 1
             b &= wanted
             b = b - ((b >> 1) & 0x5555555555555555)
             b = (b & 0x3333333333333333) + ((b >> 2) & 0x3333333333333333)
             b = (b + (b >> 4)) & 0x0F0F0F0F0F0F0F0F
             total += ((b * 0x0101010101010101) >> 56) & 0xFF
+            word += 1
+        tile_top += ROWS
     tl.store(out + 2 * n + i, tl.sum(total).to(tl.float32))

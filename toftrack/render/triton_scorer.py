@@ -98,7 +98,7 @@ class TritonScorer:
         )
         model = torch.empty(n, height, words, dtype=torch.int64, device=device)
         boxes = torch.empty(n, 4, dtype=torch.int32, device=device)
-        size = (n, count, height, width, words)
+        size = (n, height, width, words)
         count_kernel[(n,)](
             conics,
             *images,
@@ -106,6 +106,7 @@ class TritonScorer:
             boxes,
             counts,
             *size,
+            count=count,
             ELLIPSOIDS=triton.next_power_of_2(count),
             ROWS=_ROWS,
             num_warps=4,
@@ -117,7 +118,11 @@ class TritonScorer:
             hand,
             steps,
             counts,
-            *size,
+            n,
+            count,
+            height,
+            width,
+            words,
             len(steps),
             reach,
             ROWS=32,

@@ -1,0 +1,28 @@
+"""Other poses of single fingers: proposals that a local refinement cannot reach."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from toftrack.hand.skeleton import ANGLE_NAMES, FINGERS
+
+_FINGER_OF_ANGLE = [FINGERS.index(name.split("_")[0]) for name in ANGLE_NAMES]
+
+
+def swap_fingers(state: Tensor, poses: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """The state followed by n copies of it, one finger of each taken from another pose.
+
+    A finger that was lost is bent where it should be straight, or the other way round; between the
+    two the seen points lie too far from the surface for Gauss-Newton to be drawn to them.
+
+    state: (1, 27).  poses: (M, 21) joint angles to take fingers from, such as the training poses.
+    Returns (n + 1, 27).
+    """
+    device = state.device
+    rows = torch.randint(len(poses), (n,), generator=generator, device=device)
+    fingers = torch.randint(len(FINGERS), (n,), generator=generator, device=device)
+    of_angle = torch.tensor(_FINGER_OF_ANGLE, device=device)
+    tried = state.repeat(n + 1, 1)
+    tried[1:, 6:] = torch.where(of_angle == fingers[:, None], poses[rows], tried[1:, 6:])
+    return tried
