@@ -177,6 +177,13 @@ def test_an_unknown_kind_names_the_known_ones() -> None:
         fit_pose_space("hologram")
 
 
+def test_a_setting_of_another_kind_is_one_clear_error() -> None:
+    with pytest.raises(ToftrackError, match="pose_space.neighbours is no setting of pca"):
+        fit_pose_space("pca", 4, neighbours=8)
+    with pytest.raises(ToftrackError, match="pose_space.gamma is no setting of lle, .* neighbours"):
+        fit_pose_space("lle", 4, gamma=1.0)
+
+
 def test_a_wide_kernel_makes_the_coordinates_of_pca() -> None:
     data = synthetic_data()
     wide = kernel_pca.fit(data.angles_rad, data.labels, 4, gamma=1e-4).training_latents

@@ -96,6 +96,15 @@ def test_without_truth_the_score_is_compared(tmp_path: Path, capsys) -> None:
     assert "mean_score" in capsys.readouterr().out
 
 
+def test_sweeps_of_training_compare_held_out_degrees_and_have_no_plot(tmp_path: Path) -> None:
+    for number, kind in enumerate(("pca", "lle")):
+        path = job(tmp_path, number, [f"pose_space={kind}"], None)
+        (path / "summary.json").write_text(json.dumps({"held_out_degrees": 5.0 + number}))
+    _, groups = report(tmp_path)
+    assert [group.error for group in groups] == [5.0, 6.0]
+    assert (tmp_path / "sweep.csv").exists() and not (tmp_path / "sweep.png").exists()
+
+
 def test_another_figure_can_be_asked_for(sweep: Path, capsys) -> None:
     _, groups = report(sweep, "mean_ms")
     assert [group.error for group in groups] == [20.0, 30.0]

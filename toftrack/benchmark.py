@@ -29,7 +29,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
-from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.render.closed_form import project

@@ -22,6 +22,9 @@ from omegaconf import OmegaConf
 
 from toftrack.errors import ToftrackError
 
+FIGURES = ("metrics.mean_mm", "mean_score", "held_out_degrees", "training_degrees")
+"""What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
+
 SEED = "seed"
 RECORDINGS = ("device.path",)
 """Overrides that choose the recording: averaged over, and shown apart where there are several."""
@@ -113,10 +116,10 @@ def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:
 
 
 def error_figure(runs: Sequence[Run]) -> str:
-    """The figure to compare by: the joint error where every good run has one, else the score."""
+    """The first of FIGURES that every good run has, else the first."""
     good = [run for run in runs if run.error is None]
-    has_truth = good and all("metrics.mean_mm" in run.figures for run in good)
-    return "metrics.mean_mm" if has_truth else "mean_score"
+    everywhere = [name for name in FIGURES if all(name in run.figures for run in good)]
+    return everywhere[0] if good and everywhere else FIGURES[0]
 
 
 def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:

@@ -27,6 +27,10 @@ from toftrack.segmentation import Expected, NearestSurface, Observation
 from toftrack.start import Start
 
 
+_APPROACH_M = 0.002
+"""How much nearer than its middle's movement a partly hidden hand may come in a frame."""
+
+
 @dataclass(frozen=True)
 class FilterSettings:
     """How the particles are resampled, moved and weighted; see conf/filter for what each does."""
@@ -76,6 +80,7 @@ class TrackState:
         displaced by it.
     age: frames since the start.  bad: frames in a row with a low score.
     outside: frames in a row out of the pose space.
+    expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
 
     particles: Tensor
@@ -86,6 +91,7 @@ class TrackState:
     age: int = 0
     bad: int = 0
     outside: int = 0
+    expected: Expected | None = None
 
 
 class Tracker:
@@ -130,7 +136,8 @@ class Tracker:
         depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3) intrinsics.
         """
         began = time.perf_counter()
-        observation = self.segmentation(depth_m, k, self._expected())
+        expected = self._expected()
+        observation = self.segmentation(depth_m, k, expected)
         if observation.empty:
             self.track = None
             return self._missing(index, timestamp_s, began)
@@ -147,6 +154,8 @@ class Tracker:
 
         estimate = self._estimate(particles, weights, mean, state, score, index, timestamp_s)
         self.track, name, lost = self._judge(track, particles, weights, mean, state, score)
+        if self.track is not None and bool(observation.occluder.any()):
+            self.track = replace(self.track, expected=expected)
         self._last = replace(
             estimate, state_name=name, lost=lost, compute_s=time.perf_counter() - began
         )
@@ -216,7 +225,13 @@ class Tracker:
             return None
         state = self.decode(sir.compose(self.track.mean, self.track.velocity[None]))
         z = forward_kinematics(state, self.shape).joints_m[0, :, 2]
-        return Expected(float(z.min()), float(z.max()))
+        nearest, farthest = float(z.min()), float(z.max())
+        if self.track.expected is not None:
+            # A hidden finger is free to move in front of what hides it, which would then be taken
+            # for the hand: while something hides the hand, it comes nearer only as its middle does.
+            approach = _APPROACH_M + max(0.0, -float(self.track.velocity[2]))
+            nearest = max(nearest, self.track.expected.nearest_m - approach)
+        return Expected(nearest, farthest)
 
     def _refine(self, state: Tensor, observation: Observation, evidence: Evidence) -> Tensor:
         """A hand state brought onto the seen points; (1, 27)."""

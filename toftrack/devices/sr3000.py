@@ -101,6 +101,7 @@ class Sr3000:
         self._opened = False
         serial = None if serial is None else str(serial)
         usb, emulated = usb or UsbSettings(), emulated or EmulatorSettings()
+        self._usb = usb
         self._transport: Transport
         if transport == "usb":
             self._transport = UsbTransport(usb, self.exposure, serial)
@@ -129,6 +130,10 @@ class Sr3000:
         }
         if transport == "emulated":
             self.description |= {"source": emulated.source, "faults": list(emulated.faults)}
+
+    def register_writes(self) -> list[tuple[int, int]]:
+        """Address and value of the registers that are written when the camera is opened."""
+        return self._usb.register_writes(self.exposure)
 
     def open(self) -> None:
         """Find, claim and configure the camera.

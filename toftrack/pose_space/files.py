@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import pkgutil
 import zipfile
@@ -51,6 +52,13 @@ def fit_pose_space(
     if module is None:
         known = ", ".join(pose_space_kinds())
         raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {known}")
+    takes = tuple(inspect.signature(module.fit).parameters)[3:]
+    unknown = [name for name in settings if name not in takes]
+    if unknown:
+        raise ToftrackError(
+            f"pose_space.{unknown[0]} is no setting of {kind}, which takes"
+            f" {', '.join(takes) or 'none but dims'}"
+        )
     data = data or synthetic_data()
     return module.fit(data.angles_rad, data.labels, dims, **settings)
 

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
-from toftrack.pose_space.held_out import Row, errors_table, evaluate_space
+from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space
 from toftrack.pose_space.pose_data import PoseData
 from toftrack.views.pose_figures import (
     corners_figure,
@@ -82,4 +82,17 @@ def _summary(kind: str, dims: int, data: PoseData, rows: list[Row]) -> dict:
         }
         for row in rows
     ]
-    return {"kind": kind, "dims": dims, "sources": data.sources, "errors": table}
+    asked = next(row for row in rows if row.dims == dims)
+    figures = {"training": asked.training, "held_out": asked.held_out, "reached": asked.reached}
+    return {
+        "kind": kind,
+        "dims": dims,
+        "sources": data.sources,
+        **{
+            f"{name}_{unit}": getattr(errors, unit)
+            for name, errors in figures.items()
+            if errors is not None
+            for unit in Errors._fields
+        },
+        "errors": table,
+    }

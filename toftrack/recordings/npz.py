@@ -19,12 +19,13 @@ Unknown keys are ignored.
 from __future__ import annotations
 
 import json
+import math
 import os
 import zipfile
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -36,6 +37,8 @@ DEFAULT_FPS = 25.0
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
 _LARGEST_MEDIAN_M = 20.0
 _JOINTS = 21
+# Of zip's usual method; nothing shrinks to less than a 1032th.
+_MOST_COMPRESSION = 1032
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +166,7 @@ def _read_members(path: Path) -> dict[str, np.ndarray]:
 def _read_archive(path: Path, archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
     members = [name for name in archive.namelist() if name.endswith(".npy")]
     for name in members:
+        _check_size(archive, name)
         # Also of unknown keys, before anything is used: a file that carries objects is not ours.
         if _holds_objects(archive, name):
             raise ToftrackError(
@@ -179,13 +183,29 @@ def _read_archive(path: Path, archive: zipfile.ZipFile) -> dict[str, np.ndarray]
 
 def _holds_objects(archive: zipfile.ZipFile, name: str) -> bool:
     with archive.open(name) as stream:
-        version = np.lib.format.read_magic(stream)
-        read_header = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        return read_header(stream)[2].hasobject
+        return _header(stream)[1].hasobject
+
+
+def _check_size(archive: zipfile.ZipFile, name: str) -> None:
+    """ValueError where a damaged header claims more than there is: memory must not go after it."""
+    info = archive.getinfo(name)
+    with archive.open(name) as stream:
+        shape, kind = _header(stream)
+    if not kind.hasobject and math.prod(shape) * kind.itemsize > info.file_size:
+        raise ValueError(f"'{name[:-4]}' is smaller than its header says")
+    if info.file_size > _MOST_COMPRESSION * info.compress_size + 1024:
+        raise ValueError(f"'{name[:-4]}' cannot be as large as the archive says")
+
+
+def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    read_header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, _, kind = read_header(stream)
+    return shape, kind
 
 
 def _parse(arrays: dict[str, np.ndarray]) -> Recording:

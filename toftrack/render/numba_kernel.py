@@ -166,7 +166,8 @@ def _compare(tile, stride, spans, box, origin, images, model, above, residuals):
     """Counts of correct and false pixels of a tile, and the silhouette as bits.
 
     images: (3, H, >= W + BLOCK) low, high, occluder, such that nothing beyond W counts.
-    model: (words + 2, ...) zeros; bits go to word 1.. by 64 columns and row `above`...
+    model: (words + 2, R) zeros; the box's bits go to rows from `above` on, words from 1 on.
+    residuals: (BLOCK,) sums to add to.
     """
     left, top, right, bottom = box
     _, height, pitch = images.shape
