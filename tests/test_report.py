@@ -99,7 +99,7 @@ def test_without_truth_the_score_is_compared(tmp_path: Path, capsys) -> None:
 def test_sweeps_of_training_compare_held_out_degrees_and_have_no_plot(tmp_path: Path) -> None:
     for number, kind in enumerate(("pca", "lle")):
         path = job(tmp_path, number, [f"pose_space={kind}"], None)
-        (path / "summary.json").write_text(json.dumps({"held_out_degrees": 5.0 + number}))
+        (path / "summary.json").write_text(json.dumps({"reached_degrees": 5.0 + number}))
     _, groups = report(tmp_path)
     assert [group.error for group in groups] == [5.0, 6.0]
     assert (tmp_path / "sweep.csv").exists() and not (tmp_path / "sweep.png").exists()

@@ -24,7 +24,7 @@ ORDERS = tuple(range(1, 8))
 _SCALES = (3, 6, 2)  # enlargements that are tried in turn: the corner finder wants larger squares
 _FEWEST_VIEWS = 5
 _FOLDS = 5
-_STEP_M = 0.02  # of true distance, within which pixels are averaged
+_STEP_M = 0.1  # of true distance, within which pixels are averaged
 _OUTLIER = 3.0  # times the median reprojection error
 
 

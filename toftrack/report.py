@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 from toftrack.errors import ToftrackError
 
-FIGURES = ("metrics.mean_mm", "mean_score", "held_out_degrees", "training_degrees")
+FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
 """What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
 
 SEED = "seed"

@@ -104,7 +104,11 @@ class NearestSurface:
                 grown = cv2.dilate(in_front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
                 occluder, valid = grown, valid & ~grown
         nearest = self._nearest(depth_m, valid, float(k[0, 0] * k[1, 1]))
-        hand = valid & (depth_m >= nearest) & (depth_m <= nearest + self.depth_range_m)
+        farthest = nearest + self.depth_range_m
+        if expected is not None and self.occluder_margin_m > 0:
+            # What is well behind a tracked hand is the body, not a part of the hand it misses.
+            farthest = min(farthest, expected.farthest_m + 2 * self.occluder_margin_m)
+        hand = valid & (depth_m >= nearest) & (depth_m <= farthest)
         return Observation(
             torch.from_numpy(depth_m),
             torch.from_numpy(hand),

@@ -18,6 +18,13 @@ from toftrack.errors import ToftrackError
 from toftrack.pose_space.base import PoseSpace
 from toftrack.segmentation import Observation
 
+_WIDEST_PALM_M = 0.06
+"""Half the breadth of the broadest hand's palm with the ball of the thumb."""
+_DEPTH_M = 0.12
+"""How far behind the nearest surface a palm typically lies at most."""
+_DEPTH_EDGE_M = 0.04
+"""Between neighbouring pixels of one surface there is less than this."""
+
 LogScores = Callable[[Tensor, float], Tensor]
 """(N, 6 + d) hypotheses and the weight of coverage to (N,) log scores of the current frame."""
 
@@ -187,20 +194,38 @@ def _points(observation: Observation, v: np.ndarray, u: np.ndarray) -> np.ndarra
 def palm_centres(observation: Observation, n: int, generator: torch.Generator) -> np.ndarray:
     """Where the middle of the palm may be, (n, 3) float32 metres.
 
-    The first half is the centre of the widest disc in the hand's silhouette; the others are drawn
-    from all of it, the wider the silhouette there the likelier.
+    They are centres of widest discs: inscribed in the silhouette cut along its depth edges, so that a
+    hand in front of the body stands by itself, and no wider than a palm, so that they do not lie
+    on the body. The wider and the nearer to the camera a disc is, the oftener it is drawn.
     """
-    hand = observation.hand.cpu().numpy().astype(np.uint8)
+    hand = observation.hand.cpu().numpy()
+    depth = observation.depth_m.cpu().numpy()
+    kernel = np.ones((3, 3), np.uint8)
+    far = np.where(hand, depth, depth.max()).astype(np.float32)
+    smooth = hand & (cv2.dilate(far, kernel) - cv2.erode(far, kernel) < _DEPTH_EDGE_M)
+    inside = smooth if smooth.any() else hand
     # The border of the image counts as the silhouette's edge, or an arm that leaves the picture
     # would be widest there.
-    padded = np.pad(hand, 1)
+    padded = np.pad(inside.astype(np.uint8), 1)
     distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    wide = torch.from_numpy((distance.ravel() / distance.max()).astype(np.float64) ** 4)
+    widest = inside & (distance >= cv2.dilate(distance, np.ones((5, 5), np.uint8)) - 0.5)
+    radius_m = distance * depth / float(observation.k[0, 0])
+    weights = np.where(
+        widest & (radius_m < _WIDEST_PALM_M),
+        radius_m**3 * np.exp(-(depth - observation.nearest_m) / _DEPTH_M),
+        0.0,
+    )
+    if not weights.any():
+        weights = inside.astype(np.float64)
     spots = torch.multinomial(
-        wide.to(generator.device), n, replacement=True, generator=generator
-    ).cpu()
-    spots[: (n + 1) // 2] = int(distance.argmax())
-    v, u = np.divmod(spots.numpy(), hand.shape[1])
+        torch.from_numpy(weights.ravel() / weights.max()).double().to(generator.device),
+        n,
+        replacement=True,
+        generator=generator,
+    )
+    if n == 1:
+        spots[0] = int(weights.argmax())
+    v, u = np.divmod(spots.cpu().numpy(), hand.shape[1])
     return _points(observation, v, u)
 
 

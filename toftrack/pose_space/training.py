@@ -26,7 +26,8 @@ _PAPER = "the paper: 97.4 % of the variance in three components, 97.5 % in four"
 
 def train(config: DictConfig) -> float:
     """Learn the configured space; returns what a sweep minimises: the root mean square error in
-    degrees of decode(encode(x)) on held-out clips, or on the training poses of a single clip.
+    degrees of the nearest points in the box to held-out clips, or of decode(encode(x)) on the
+    training poses of a single clip.
     """
     settings = OmegaConf.to_container(config.pose_space, resolve=True)
     if settings.pop("file", None) is not None:
@@ -63,7 +64,7 @@ def train(config: DictConfig) -> float:
                 f"{folder / name} cannot be written; give another hydra.run.dir=DIR"
             )
     asked = next(row for row in rows if row.dims == dims)
-    error = (asked.held_out or asked.training).degrees
+    error = (asked.reached or asked.training).degrees
     (folder / "summary.json").write_text(
         json.dumps(_summary(kind, dims, data, rows), indent=1) + "\n", encoding="utf-8"
     )
