@@ -39,8 +39,9 @@ def compute_device(name: str) -> torch.device:
 def build_tracker(config: DictConfig) -> Tracker:
     """The tracker of a configuration (conf/config.yaml composed)."""
     make = hydra.utils.instantiate
+    hand = make(config.hand)
     return Tracker(
-        shape=make(config.hand),
+        shape=hand.shape,
         space=make(config.pose_space),
         segmentation=make(config.segmentation),
         likelihood=make(config.likelihood),
@@ -48,6 +49,7 @@ def build_tracker(config: DictConfig) -> Tracker:
         refinement=make(config.refine),
         start=make(config.start),
         lost=make(config.lost),
+        fit=hand.fit,
         renderer=config.renderer,
         device=compute_device(config.compute),
         seed=config.seed,

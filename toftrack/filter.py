@@ -110,7 +110,7 @@ def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     reference, tangent = torch.broadcast_tensors(reference, tangent)
     pivot = _pivot(reference)
     rotvec = roma.rotvec_composition((tangent[:, 3:6], reference[:, 3:6]))
-    turned = _rotate_pivot(rotvec)
+    turned = rotated_pivot(rotvec)
     translation = pivot + tangent[:, :3] - turned
     return torch.cat((translation, rotvec, reference[:, 6:] + tangent[:, 6:]), 1)
 
@@ -123,7 +123,7 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
 
 
-def _rotate_pivot(rotvec: Tensor) -> Tensor:
+def rotated_pivot(rotvec: Tensor) -> Tensor:
     """The pivot's offset from the wrist, by Rodrigues' formula, (N, 3) to (N, 3)."""
     p = rotvec.new_tensor(PIVOT_M).expand_as(rotvec)
     square = rotvec.square().sum(1, keepdim=True)
@@ -134,7 +134,7 @@ def _rotate_pivot(rotvec: Tensor) -> Tensor:
 
 
 def _pivot(particles: Tensor) -> Tensor:
-    return particles[:, :3] + _rotate_pivot(particles[:, 3:6])
+    return particles[:, :3] + rotated_pivot(particles[:, 3:6])
 
 
 def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:

@@ -159,9 +159,7 @@ def refine(
     limits = state.new_tensor(ANGLE_LIMITS)
     for _ in range(settings.iterations):
         pose = forward_kinematics(state, shape)
-        rows, residuals = _point_rows(pose, seen.points_m, shape, surface, settings)
-        more, more_residuals = _silhouette_rows(pose, seen, shape, settings)
-        rows, residuals = torch.cat((rows, more)), torch.cat((residuals, more_residuals))
+        rows, residuals, _ = linearised(pose, seen, shape, surface, settings)
         normal = rows.mT @ rows
         gradient = rows.mT @ residuals
         angles = torch.arange(6, 27, device=state.device)
@@ -177,14 +175,33 @@ def refine(
     return state
 
 
+def linearised(
+    pose: HandPose,
+    seen: Surroundings,
+    shape: HandShape,
+    surface: HandSurface,
+    settings: Refinement,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What the seen points and the silhouette say of a pose, in standard deviations.
+
+    Returns the Jacobian (R, 27), the residuals (R,) and the points that they are about (R, 3).
+    """
+    parts = (
+        _point_rows(pose, seen.points_m, shape, surface, settings),
+        _silhouette_rows(pose, seen, shape, settings),
+    )
+    rows, residuals, points = (torch.cat(part) for part in zip(*parts, strict=True))
+    return rows, residuals, points
+
+
 def _point_rows(
     pose: HandPose,
     points: Tensor,
     shape: HandShape,
     surface: HandSurface,
     settings: Refinement,
-) -> tuple[Tensor, Tensor]:
-    """Weighted rows of the seen points: (P, 27) and (P,) in standard deviations."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weighted rows of the seen points: (P, 27), (P,) in standard deviations, (P, 3)."""
     ellipsoids = surface.pose(pose)
     centres, axes = ellipsoids.centres_m[0, :-1], ellipsoids.axes_m[0, :-1]
     whiten = axes.mT / axes.square().sum(-2)[..., None]  # (E, 3, 3)
@@ -201,16 +218,15 @@ def _point_rows(
     use = facing & ~beyond & (distance.abs() < settings.reach_m)
     # Geman and McClure's robust weight, which forgets outliers.
     weight = use / (1 + (distance / (0.4 * settings.reach_m)).square()) / settings.point_m
-    rows = point_jacobian(
-        pose, shape, points - distance[:, None] * normals, normals, surface.frame_index[nearest]
-    )
+    x = points - distance[:, None] * normals
+    rows = point_jacobian(pose, shape, x, normals, surface.frame_index[nearest])
     # The model's surface moves towards the point: the distance falls as n.X grows.
-    return -rows * weight[:, None], distance * weight
+    return -rows * weight[:, None], distance * weight, x
 
 
 def _silhouette_rows(
     pose: HandPose, seen: Surroundings, shape: HandShape, settings: Refinement
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Weighted rows that draw the bones' axes into the silhouette, two for each point."""
     frames, origins = pose.frames[0, 1:], pose.origins_m[0, 1:]
     parts = origins.new_tensor([0.25, 0.6, 0.9])
@@ -231,4 +247,4 @@ def _silhouette_rows(
     rows = point_jacobian(
         pose, shape, x.repeat(2, 1), torch.cat((by_u, by_v)), frame.repeat(2)
     )
-    return rows * weight.repeat(2)[:, None], gap.mT.flatten() * weight.repeat(2)
+    return rows * weight.repeat(2)[:, None], gap.mT.flatten() * weight.repeat(2), x.repeat(2, 1)

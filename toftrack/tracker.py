@@ -15,6 +15,7 @@ from toftrack import filter as sir
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.hand.shape import HandShape
+from toftrack.hand_fit import HandFit, first_belief, update
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.likelihood import FMeasure
@@ -110,13 +111,12 @@ class Tracker:
         refinement: Refinement,
         start: Start,
         lost: LostSettings,
+        fit: HandFit | None = None,
         renderer: str = "auto",
         device: torch.device | str = "cpu",
         seed: int = 0,
     ) -> None:
         self.device = torch.device(device)
-        self.shape = shape.to(self.device)
-        self.surface = hand_surface(self.shape)
         self.space = space.to(self.device)
         self.segmentation = segmentation
         self.likelihood = likelihood
@@ -124,11 +124,20 @@ class Tracker:
         self.refinement = refinement
         self.start = start
         self.lost = lost
-        self.scorer: Scorer = make_scorer(renderer, self.shape, self.device)
+        self.fit = fit
+        self._renderer = renderer
+        self._first_shape = shape.to(self.device)
+        self._size = first_belief(fit) if fit else None
+        self._set_shape(self._first_shape)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.track: TrackState | None = None
         self._poses = self.space.decode(self.space.training_latents)
         self._last: Estimate | None = None
+
+    def _set_shape(self, shape: HandShape) -> None:
+        self.shape = shape
+        self.surface = hand_surface(shape)
+        self.scorer: Scorer = make_scorer(self._renderer, shape, self.device)
 
     def step(self, depth_m: np.ndarray, k: np.ndarray, index: int, timestamp_s: float) -> Estimate:
         """One frame: segment, predict, then resample - diffuse - observe in annealed passes; refine.
@@ -154,6 +163,8 @@ class Tracker:
 
         estimate = self._estimate(particles, weights, mean, state, score, index, timestamp_s)
         self.track, name, lost = self._judge(track, particles, weights, mean, state, score)
+        if not lost:
+            self._fit_size(state, evidence)
         if self.track is not None and bool(observation.occluder.any()):
             self.track = replace(self.track, expected=expected)
         self._last = replace(
@@ -297,6 +308,17 @@ class Tracker:
         if bad >= 2 or (bad and not cfg.patience):
             return new, "recovering", True
         return new, "initialising" if track.age == 0 else "tracking", outside >= 2
+
+    def _fit_size(self, state: Tensor, evidence: Evidence) -> None:
+        """Let a believed estimate say how large the hand is."""
+        if self.fit is None or self._size is None or self._size.frames >= self.fit.frames:
+            return
+        before = self._size.index
+        self._size = update(
+            self._size, self.fit, state, evidence, self.scorer, self.likelihood, self.generator
+        )
+        if self._size.index != before:
+            self._set_shape(self._first_shape.scaled(self._size.ratio(self.fit)))
 
     def _estimate(
         self,

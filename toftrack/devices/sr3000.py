@@ -185,13 +185,12 @@ class Sr3000:
         self.open()
         if self._reader is not None:
             raise ToftrackError("the camera is being read already; iterate over it only once")
-        reader = Reader(self._transport, self._persistence, self._waiting, self._next_index)
+        reader = Reader(
+            self._transport, self._persistence, self._waiting, self._next_index, self._stop
+        )
         self._reader, self.counts = reader, reader.counts
         try:
-            for capture in reader:
-                if self._stop is not None and capture.index >= self._stop:
-                    return
-                yield capture
+            yield from reader
         finally:
             # `close` may have come first, and the next iteration may have begun already.
             if self._reader is reader and reader.stop():

@@ -40,10 +40,10 @@ class Counts:
     """What became of the frames that were asked for."""
 
     received: int = 0
-    """Whole frames; each was delivered, dropped, or is still waiting."""
+    """Whole frames; each is delivered, dropped, or still waiting."""
     delivered: int = 0
     dropped: int = 0
-    """Whole frames that a newer one replaced before anybody had taken them."""
+    """Whole frames that nobody took: a newer one replaced them, or the iteration was left."""
     damaged: int = 0
     """Too short, too long or empty."""
     unanswered: int = 0
@@ -67,6 +67,7 @@ class Reader:
         waiting: None keeps only the newest frame and drops older ones; a number keeps every frame,
             and asks the camera for no more while so many are waiting.
         first_index: of the first frame.
+        end_index: the stream ends before it; None = it goes on.
     """
 
     def __init__(
@@ -75,9 +76,10 @@ class Reader:
         persistence: Persistence,
         waiting: int | None = None,
         first_index: int = 0,
+        end_index: int | None = None,
     ) -> None:
         self.counts = Counts()
-        self.next_index = first_index
+        self.next_index, self._end_index = first_index, end_index
         self._transport, self._persistence, self._waiting = transport, persistence, waiting
         self._buffer: deque[Capture] = deque()
         self._changed = threading.Condition()
@@ -93,11 +95,17 @@ class Reader:
         self._stop.set()
 
     def stop(self) -> bool:
-        """`request_stop`, and wait for the thread; False if it hangs in a call to the camera."""
+        """`request_stop`, drop the frames that still wait, and wait for the thread to end.
+
+        Returns False if it hangs in a call to the camera.
+        """
         self._stop.set()
         with self._changed:
             self._changed.notify_all()
         self._thread.join(self._transport.patience_s + 2.0)
+        with self._changed:
+            self.counts.dropped += len(self._buffer)
+            self._buffer.clear()
         return not self._thread.is_alive()
 
     def __iter__(self) -> Iterator[Capture]:
@@ -132,7 +140,7 @@ class Reader:
 
     def _read_on(self) -> None:
         since, in_a_row, settings = time.monotonic(), 0, self._persistence
-        while not self._stop.is_set():
+        while not self._stop.is_set() and self.next_index != self._end_index:
             try:
                 data = self._transport.acquire()
             except CameraError as fault:

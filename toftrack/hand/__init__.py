@@ -11,11 +11,12 @@ from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, SIDES, HandShape, default
 def make_hand_shape(
     shape: str = "default", side: str = "right", length_m: float = DEFAULT_HAND_LENGTH_M
 ) -> HandShape:
-    """The hand of a configuration: the default one scaled to a length, or one read from a file.
+    """The hand of a configuration: the mean adult's scaled to a length, or one read from a file.
 
+    shape: "default"; "auto", the same as a guess to start from; or the path of a hand-shape file.
     Raises ToftrackError for an unknown side, an impossible length or an unreadable file.
     """
-    if shape == "default":
+    if shape in ("default", "auto"):
         return default_hand_shape(length_m, side)
     if side not in SIDES:
         raise ToftrackError(f"hand.side={side} is unknown; give hand.side=right or hand.side=left")
