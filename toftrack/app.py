@@ -50,6 +50,7 @@ def build_tracker(config: DictConfig) -> Tracker:
         start=make(config.start),
         lost=make(config.lost),
         fit=hand.fit,
+        gestures=make(config.gestures),
         renderer=config.renderer,
         device=compute_device(config.compute),
         seed=config.seed,

@@ -103,7 +103,8 @@ def job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
     """Decorate the function under `@hydra.main` so that a failing job does not stop a sweep.
 
     In a sweep (`-m`) an error is told in one sentence, also as `error` in the summary.json of the
-    job's output folder, and the job returns NaN. Otherwise the error is raised.
+    job's output folder, and the job returns infinity: the worst there is for a sweeper that
+    minimises, where NaN would stop it. Otherwise the error is raised.
     """
 
     @functools.wraps(task)
@@ -119,7 +120,7 @@ def job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
             folder = Path(HydraConfig.get().runtime.output_dir)
             _program.failed_jobs.append(str(folder))
             _note_error(folder, sentence(error))
-            return math.nan
+            return math.inf
 
     return guarded
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,8 +34,13 @@ class Estimate:
     compute_s: float
     """Wall seconds spent on the frame, capture and drawing excluded."""
     gesture: str = ""
-    """The nearest known gesture; empty where gesture output is off."""
+    """The gesture, 'other' where it is none of the known; empty where gesture output is off or the
+    hand is lost."""
     gesture_probability: float = math.nan
+    pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
+    """(3,) float32 metres, camera frame: the index finger's base while it points, else NaN."""
+    pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
+    """(3,) float32 unit vector from there to the finger's tip, else NaN."""
 
 
 def no_estimate(

@@ -68,7 +68,9 @@ class FMeasure:
         coverage: instead of the likelihood's own, for a search that compares very different poses.
         """
         coverage = self.coverage if coverage is None else coverage
-        return self.score(counts).log() + coverage * counts.correct.log()
+        score = self.score(counts).log()
+        # 0 times the logarithm of no correct pixel would be NaN, and the largest of all.
+        return score + coverage * counts.correct.log() if coverage else score
 
     def _distance(self, observation: Observation) -> float:
         return observation.nearest_m if not observation.empty else 1.0

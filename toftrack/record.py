@@ -25,6 +25,10 @@ from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
 
+_ONLY = (
+    "only the SR3000 is recorded, which needs no device=; other recordings are converted with "
+    "python -m toftrack.convert"
+)
 _CONF = Path(__file__).resolve().parents[1] / "conf"
 
 
@@ -38,7 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     parser.add_argument("--conf", default=_CONF, help="folder of the configuration")
     parser.add_argument("overrides", nargs="*", metavar="device.KEY=VALUE", help="settings")
-    options = parser.parse_args(arguments)
+    # Intermixed: options may stand between the settings.
+    options = parser.parse_intermixed_args(arguments)
     if Path(options.out).suffix.lower() != ".srs":
         raise ToftrackError(
             f"a camera is recorded to .srs, not to '{options.out}'; convert that afterwards with "
@@ -48,12 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise ToftrackError(f"--{name} must be above 0, not {value}")
-    device = hydra.utils.instantiate(_compose(options.conf, options.overrides).device)
-    if not isinstance(device, Sr3000):
-        raise ToftrackError(
-            "only device=sr3000 can be recorded; other recordings are converted with "
-            "python -m toftrack.convert"
-        )
+    device: Sr3000 = hydra.utils.instantiate(_compose(options.conf, options.overrides).device)
     with device:
         interrupted = record(
             device, options.out, options.frames, options.seconds, options.overwrite
@@ -144,6 +144,8 @@ def _compose(conf: str | Path, overrides: Sequence[str]) -> DictConfig:
         raise ToftrackError(
             f"there is no configuration in '{folder}'; give toftrack's conf folder with --conf"
         )
+    if any(override.startswith("device=") for override in overrides):
+        raise ToftrackError(_ONLY)
     with hydra.initialize_config_dir(str(folder), version_base="1.3"):
         return hydra.compose("config", ["device=sr3000", "device.keep=every", *overrides])
 

@@ -60,6 +60,7 @@ class Refinement:
         ones count more.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     swaps: other poses of single fingers that are tried; one must raise the log score by `swap_gain`.
+    keep_gain: by how much the log score of another pose must exceed the last frame's.
     carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
     """
 
@@ -72,6 +73,7 @@ class Refinement:
     damping: float = 1e-3
     swaps: int = 128
     swap_gain: float = 0.02
+    keep_gain: float = 0.01
     carry: float = 0.5
 
 

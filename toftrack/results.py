@@ -35,6 +35,8 @@ _ARRAYS: dict[str, type] = {
     "timestamp_s": np.float64,
     "compute_s": np.float32,
 }
+_POINTING = {"pointing_origin_m": np.float32, "pointing_direction": np.float32}
+"""Arrays beside the promised ones: files without them are results as well."""
 
 
 class ResultWriter:
@@ -127,7 +129,7 @@ class ResultWriter:
             return _no_frames(), []
         arrays = {
             name: np.array([getattr(estimate, name) for estimate in done], dtype=kind)
-            for name, kind in _ARRAYS.items()
+            for name, kind in (_ARRAYS | _POINTING).items()
         }
         index = np.array([estimate.index for estimate in done])
         if (np.diff(index) < 1).any():  # the device counts anew; there is nothing to fill in
@@ -176,6 +178,8 @@ def json_line(estimate: Estimate) -> str:
             "effective_sample_size": _strict(estimate.effective_sample_size),
             "gesture": estimate.gesture,
             "gesture_probability": _strict(estimate.gesture_probability),
+            "pointing_origin_m": _strict(estimate.pointing_origin_m),
+            "pointing_direction": _strict(estimate.pointing_direction),
             "compute_s": _strict(estimate.compute_s),
         },
         allow_nan=False,
@@ -191,6 +195,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
     names = (*_ARRAYS, "joint_names", "metadata")
     try:
         with np.load(path, allow_pickle=False) as archive:
+            names += tuple(name for name in _POINTING if name in archive)
             content: dict[str, Any] = {name: archive[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = json.loads(content["metadata"].item())
@@ -212,7 +217,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 def _no_frames() -> dict[str, np.ndarray]:
     shapes = {"joints_m": (0, 21, 3), "state": (0, 27), "latent": (0, 4), "covariance": (0, 10, 10)}
-    return {name: np.zeros(shapes.get(name, 0), kind) for name, kind in _ARRAYS.items()}
+    shapes |= dict.fromkeys(_POINTING, (0, 3))
+    return {name: np.zeros(shapes.get(name, 0), kind) for name, kind in (_ARRAYS | _POINTING).items()}
 
 
 def _strict(value: Any) -> Any:

@@ -14,12 +14,14 @@ from torch import Tensor
 from toftrack import filter as sir
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
+from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
 from toftrack.hand_fit import HandFit, first_belief, update
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
+from toftrack.pose_space.density import latent_density
 from toftrack.proposals import swap_fingers
 from toftrack.refine import Refinement, refine, surroundings
 from toftrack.render.closed_form import render_range_images
@@ -48,6 +50,7 @@ class FilterSettings:
     velocity_smoothing: float
     resampling: str
     bounds: str
+    density: float = 0.0
 
     def __post_init__(self) -> None:
         if self.resampling not in sir.RESAMPLERS:
@@ -57,6 +60,8 @@ class FilterSettings:
             )
         if self.particles < 1 or self.passes < 1:
             raise ToftrackError("filter.particles and filter.passes must be at least 1")
+        if not 0 <= self.density < math.inf:
+            raise ToftrackError("filter.density must be 0 or more")
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,7 @@ class TrackState:
 
     particles: (N, 6 + d), after the last observation.  weights: (N,) normalised.
     mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a frame.
+    state: (1, 27) the last refined hand, None at the start.
     offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
         displaced by it.
     age: frames since the start.  bad: frames in a row with a low score.
@@ -89,6 +95,7 @@ class TrackState:
     mean: Tensor
     velocity: Tensor
     offset: Tensor
+    state: Tensor | None = None
     age: int = 0
     bad: int = 0
     outside: int = 0
@@ -112,6 +119,7 @@ class Tracker:
         start: Start,
         lost: LostSettings,
         fit: HandFit | None = None,
+        gestures: Gestures | None = None,
         renderer: str = "auto",
         device: torch.device | str = "cpu",
         seed: int = 0,
@@ -125,6 +133,9 @@ class Tracker:
         self.start = start
         self.lost = lost
         self.fit = fit
+        self.gestures = gestures
+        self._gesture: GestureState | None = None
+        self._density = latent_density(self.space) if settings.density else None
         self._renderer = renderer
         self._first_shape = shape.to(self.device)
         self._size = first_belief(fit) if fit else None
@@ -158,7 +169,8 @@ class Tracker:
             track = self._started(track, observation, evidence)
         particles, weights = self._filter(track, evidence)
         mean = sir.mean_particle(particles, weights)
-        state = self._refine(self.decode(mean, track.offset), observation, evidence)
+        filtered = self.decode(mean, track.offset)
+        state = self._refine(filtered, track.state, observation, evidence)
         score = float(self.likelihood.score(self.scorer(state, evidence)))
 
         estimate = self._estimate(particles, weights, mean, state, score, index, timestamp_s)
@@ -167,9 +179,9 @@ class Tracker:
             self._fit_size(state, evidence)
         if self.track is not None and bool(observation.occluder.any()):
             self.track = replace(self.track, expected=expected)
-        self._last = replace(
-            estimate, state_name=name, lost=lost, compute_s=time.perf_counter() - began
-        )
+        estimate = replace(estimate, state_name=name, lost=lost)
+        self._gesture, estimate = tell_gesture(self.gestures, self._gesture, estimate, self.space)
+        self._last = replace(estimate, compute_s=time.perf_counter() - began)
         return self._last
 
     def _filter(self, track: TrackState, evidence: Evidence) -> tuple[Tensor, Tensor]:
@@ -193,7 +205,10 @@ class Tracker:
             )
             exponent = cfg.exponent * cfg.exponent_growth**number
             scores = self._log_scores(particles, evidence=evidence, offset=track.offset)
-            weights = sir.normalise(exponent * scores)
+            log_weights = exponent * scores
+            if self._density is not None:
+                log_weights = log_weights + cfg.density * self._density.log_density(particles[:, 6:])
+            weights = sir.normalise(log_weights)
         return particles, weights
 
     def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
@@ -244,8 +259,14 @@ class Tracker:
             nearest = max(nearest, self.track.expected.nearest_m - approach)
         return Expected(nearest, farthest)
 
-    def _refine(self, state: Tensor, observation: Observation, evidence: Evidence) -> Tensor:
-        """A hand state brought onto the seen points; (1, 27)."""
+    def _refine(
+        self,
+        state: Tensor,
+        before: Tensor | None,
+        observation: Observation,
+        evidence: Evidence,
+    ) -> Tensor:
+        """The filter's hand state brought onto the seen points; `before` is the last one; (1, 27)."""
         cfg = self.refinement
         if cfg.iterations == 0:
             return state
@@ -253,19 +274,26 @@ class Tracker:
         seen = surroundings(observation, middle, cfg.points)
         if len(seen.points_m) == 0:
             return state
-        state = refine(state, state[:, 6:], seen, self.shape, self.surface, cfg)
-
         def log_scores(states: Tensor) -> Tensor:
             return self.likelihood.log_score(self.scorer(states, evidence))
 
-        tried = swap_fingers(state, self._poses, cfg.swaps, self.generator)
+        def refined(start: Tensor) -> Tensor:
+            return refine(start, start[:, 6:], seen, self.shape, self.surface, cfg)
+
+        found = refined(state)
+        if before is not None:
+            # The pose of the last frame stands until another one is clearly better: what the image
+            # does not decide, such as a hidden finger, must not flicker.
+            kept = refined(torch.cat((state[:, :6], before[:, 6:]), 1))
+            scores = log_scores(torch.cat((kept, found)))
+            found = kept if scores[0] + cfg.keep_gain >= scores[1] else found
+        tried = swap_fingers(found, self._poses, cfg.swaps, self.generator)
         scores = log_scores(tried)
         best = int(scores.argmax())
         if scores[best] <= scores[0] + cfg.swap_gain:
-            return state
+            return found
         swapped = tried[best][None]
-        refined = refine(swapped, swapped[:, 6:], seen, self.shape, self.surface, cfg)
-        both = torch.cat((swapped, refined))
+        both = torch.cat((swapped, refined(swapped)))
         return both[log_scores(both).argmax()][None]
 
     def _judge(
@@ -303,7 +331,7 @@ class Tracker:
             moved = sir.difference(mean, track.mean)[0]
             velocity = keep * track.velocity + (1 - keep) * self.settings.velocity * moved
         new = TrackState(
-            particles, weights, mean, velocity, offset, track.age + 1, bad, outside
+            particles, weights, mean, velocity, offset, state, track.age + 1, bad, outside
         )
         if bad >= 2 or (bad and not cfg.patience):
             return new, "recovering", True
@@ -357,7 +385,7 @@ class Tracker:
         seconds = time.perf_counter() - began
         if self._last is None:
             return no_estimate(index, timestamp_s, "lost", self.space.dims, seconds)
-        return replace(
+        missing = replace(
             self._last,
             index=index,
             timestamp_s=timestamp_s,
@@ -366,6 +394,8 @@ class Tracker:
             score=0.0,
             compute_s=seconds,
         )
+        self._gesture, missing = tell_gesture(self.gestures, None, missing, self.space)
+        return missing
 
     def range_image(self, estimate: Estimate, k: np.ndarray, height: int, width: int) -> np.ndarray:
         """The estimate's range image, (H, W) float32 metres, 0 = no surface or no estimate."""

@@ -186,7 +186,8 @@ class PngFolderWriter:
     def append(self, depth_m: np.ndarray, amplitude: np.ndarray | None, timestamp_s: float) -> None:
         """Add a frame: (H, W) metres, rounded to the unit (no reading and too far become 0), and
         the (H, W) uint16 amplitude. Raises ToftrackError when it cannot be written."""
-        steps = np.where((depth_m > 0) & (depth_m < np.inf), depth_m, 0) / self.unit_m
+        valid = (depth_m > 0) & (depth_m < np.inf)
+        steps = np.where(valid, depth_m, 0).astype(np.float64) / self.unit_m
         words = np.where(steps <= 0xFFFF, np.rint(steps), 0).astype(np.uint16)
         try:
             self._save(f"depth_{self.frames:06d}.png", words)

@@ -316,6 +316,8 @@ def _scan(path: Path, stream: BinaryIO, size: int) -> _Scan:
             _other(path, scan, kind, stream, length - _PAIR.size)
         position += length
         stream.seek(position)
+    if scan.damage is None and not np.isnan(stamp):
+        scan.damage = "cut off behind a time stamp"
     return scan
 
 

@@ -1,0 +1,179 @@
+"""A user's gestures: named poses of 21 joint angles, in a .json or .csv file.
+
+.json:
+    {"units": "degrees",
+     "poses": [{"name": "vsign", "angles": {"index_mcp_flexion": 0, "index_pip_flexion": 0, ...}},
+               {"name": "fist", "angles": [null, null, null, null, null, 0, 88, 100, 50, ...]}]}
+    `angles` is an object with names of hand.skeleton.ANGLE_NAMES, or a list of all 21 in that order.
+
+.csv: a first line `# units: degrees` or `# units: radians`, a header with `name` and any of the 21
+angle names, one pose a row.
+
+An angle that is left out, null or empty does not matter. Poses of the same name are one gesture.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
+
+_SLACK_DEGREES = 10.0
+_UNITS = ("degrees", "radians")
+
+
+class NamedPose(NamedTuple):
+    """name: of the gesture.  angles_rad: (21,) float64, NaN where the angle does not matter."""
+
+    name: str
+    angles_rad: np.ndarray
+
+
+def read_poses(path: str | Path) -> list[NamedPose]:
+    """The named poses of a file, clamped to the joint limits.
+
+    path: ending in .json or .csv.
+
+    Raises ToftrackError, naming the file and the place in it, when it cannot be read, a pose has no
+    name, an angle is unknown or not a number, the units are missing or do not fit the values, or a
+    joint cannot bend so far.
+    """
+    path = Path(path).expanduser()
+    readers = {".json": _read_json, ".csv": _read_csv}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise ToftrackError(f"{path} is neither .json nor .csv; give gestures.file=FILE of either")
+    try:
+        units, rows = reader(path)
+    except FileNotFoundError:
+        raise ToftrackError(f"no file of gestures at {path}; give gestures.file=FILE") from None
+    except (OSError, ValueError, csv.Error) as error:
+        raise ToftrackError(f"{path} cannot be read as a file of gestures ({error})") from None
+    if not rows:
+        raise ToftrackError(f"{path} names no pose")
+    if units not in _UNITS:
+        what = "does not say its units" if units is None else f"has the unknown units {units!r}"
+        raise ToftrackError(f"{path} {what}; say degrees or radians in it")
+    names = [_name(path, number, row) for number, row in enumerate(rows, 1)]
+    angles = np.array([_angles(path, name, row) for name, row in zip(names, rows, strict=True)])
+    radians = _in_radians(path, angles, units)
+    return [
+        NamedPose(name, _within_limits(path, name, row))
+        for name, row in zip(names, radians, strict=True)
+    ]
+
+
+_Row = Mapping[str, Any]
+
+
+def _name(path: Path, number: int, row: _Row) -> str:
+    name = row.get("name")
+    if not isinstance(name, str) or not name.strip():
+        raise ToftrackError(f"{path}: pose {number} has no name")
+    return name.strip()
+
+
+def _angles(path: Path, name: str, row: _Row) -> list[float]:
+    """The 21 angles of a row as they stand there, NaN where there is none."""
+    unknown = [key for key in row if key != "name" and key not in ANGLE_NAMES]
+    if unknown:
+        raise ToftrackError(
+            f"{path}: pose {name!r} has the unknown angle {unknown[0]!r}; known are"
+            f" {', '.join(ANGLE_NAMES)}"
+        )
+    angles = []
+    for key in ANGLE_NAMES:
+        value = row.get(key)
+        if value is None or value == "":
+            angles.append(math.nan)
+            continue
+        try:
+            # float(True) is 1: not what anybody means by an angle.
+            angle = math.nan if isinstance(value, bool) else float(value)
+        except (TypeError, ValueError):
+            angle = math.nan
+        if not math.isfinite(angle):
+            raise ToftrackError(f"{path}: {key} of pose {name!r} is {value!r}, not a finite number")
+        angles.append(angle)
+    return angles
+
+
+def _in_radians(path: Path, angles: np.ndarray, units: str) -> np.ndarray:
+    largest = float(np.nan_to_num(np.abs(angles)).max())
+    # No joint bends by more than 2.1 rad, and no gestures are all within 3 degrees of a flat hand.
+    if units == "radians" and largest > 4.0:
+        raise ToftrackError(
+            f"{path} has angles up to {largest:.1f} and is said to be in radians, which no joint"
+            " reaches; if they are degrees, say so in it"
+        )
+    if units == "degrees" and 0 < largest < 3.0:
+        raise ToftrackError(
+            f"{path} has no angle above {largest:.2f} and is said to be in degrees, so that all"
+            " gestures would be flat hands; if they are radians, say so in it"
+        )
+    return np.radians(angles) if units == "degrees" else angles
+
+
+def _within_limits(path: Path, name: str, radians: np.ndarray) -> np.ndarray:
+    low, high = np.array(ANGLE_LIMITS).T
+    outside = np.nan_to_num(np.maximum(low - radians, radians - high))
+    worst = int(outside.argmax())
+    if outside[worst] > math.radians(_SLACK_DEGREES):
+        raise ToftrackError(
+            f"{path}: {ANGLE_NAMES[worst]} = {math.degrees(radians[worst]):.0f} degrees in pose"
+            f" {name!r} is beyond a hand's joint limits ({math.degrees(low[worst]):.0f} .."
+            f" {math.degrees(high[worst]):.0f} degrees; flexion is positive)"
+        )
+    return np.clip(radians, low, high)
+
+
+_Content = tuple[str | None, list[_Row]]
+
+
+def _read_json(path: Path) -> _Content:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    poses = content.get("poses") if isinstance(content, dict) else None
+    if not isinstance(poses, list):
+        raise ToftrackError(f"{path} has no list 'poses' of objects with 'name' and 'angles'")
+    rows: list[_Row] = []
+    for number, pose in enumerate(poses, 1):
+        angles = pose.get("angles") if isinstance(pose, dict) else None
+        if isinstance(angles, list) and len(angles) == len(ANGLE_NAMES):
+            angles = dict(zip(ANGLE_NAMES, angles, strict=True))
+        if not isinstance(angles, dict):
+            raise ToftrackError(
+                f"{path}: pose {number} must have 'angles', an object of angle names or a list of"
+                f" {len(ANGLE_NAMES)}"
+            )
+        rows.append(angles | {"name": pose.get("name")})
+    units = content.get("units")
+    return None if units is None else str(units).lower(), rows
+
+
+def _read_csv(path: Path) -> _Content:
+    units, lines = None, []
+    with open(path, encoding="utf-8-sig", newline="") as stream:
+        for line in stream:
+            if line.lstrip().startswith("#"):
+                key, _, value = line.lstrip("# \t").partition(":")
+                units = value.strip().lower() if key.strip().lower() == "units" else units
+            elif line.strip():
+                lines.append(line)
+    table = [[cell.strip() for cell in row] for row in csv.reader(lines, skipinitialspace=True)]
+    header = table[0] if table else []
+    if "name" not in header:
+        raise ToftrackError(f"{path} has no column 'name'; the header must name it and the angles")
+    for number, row in enumerate(table[1:], 1):
+        if len(row) != len(header):
+            raise ToftrackError(
+                f"{path}: pose {number} has {len(row)} values for {len(header)} columns"
+            )
+    return units, [dict(zip(header, row, strict=True)) for row in table[1:]]
