@@ -73,12 +73,20 @@ def track(config: DictConfig, device: Device) -> float:
                 _loop(device, tracker, results, view)
             finally:
                 view.close()
+                tracker.shape.to("cpu").save(folder / "hand_shape.json")
     summary = results.summary or {}
     if not summary.get("frames"):
         raise ToftrackError("the device delivered no frame; nothing was tracked")
     print(metrics_table(summary))
     print(f"results: {folder}")
-    for name in ("track.npz", "track.jsonl", "summary.json", "overlay.mp4", "overlay.png"):
+    for name in (
+        "track.npz",
+        "track.jsonl",
+        "summary.json",
+        "hand_shape.json",
+        "overlay.mp4",
+        "overlay.png",
+    ):
         if (folder / name).exists():
             print(f"  {folder / name}")
     error = (summary.get("metrics") or {}).get("mean_mm")

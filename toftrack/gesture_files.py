@@ -4,7 +4,8 @@
     {"units": "degrees",
      "poses": [{"name": "vsign", "angles": {"index_mcp_flexion": 0, "index_pip_flexion": 0, ...}},
                {"name": "fist", "angles": [null, null, null, null, null, 0, 88, 100, 50, ...]}]}
-    `angles` is an object with names of hand.skeleton.ANGLE_NAMES, or a list of all 21 in that order.
+    `angles` is an object with names of hand.skeleton.ANGLE_NAMES, or a list of all 21 in their
+    order.
 
 .csv: a first line `# units: degrees` or `# units: radians`, a header with `name` and any of the 21
 angle names, one pose a row.

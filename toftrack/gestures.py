@@ -1,15 +1,15 @@
 """Which gesture a hand makes: palm, fist, pointing, other, and classes that a user names.
 
-A gesture is one or more named poses. A pose is looked at through ten sums of its joint angles, which
-a depth image determines better than the angles themselves: of each finger the total flexion, and how
-much more of it the two outer joints have than the knuckle; of the thumb the total flexion and the
-abduction. The fingers' abduction is not looked at.
+A gesture is one or more named poses. A pose is looked at through ten sums of its joint angles,
+which a depth image determines better than the angles themselves: of each finger the total flexion,
+and how much more of it the two outer joints have than the knuckle; of the thumb the total flexion
+and the abduction. The fingers' abduction is not looked at.
 
-A class says that these lie about its pose (normal distribution); or says nothing of some of them, as
-the basic poses say nothing of the thumb. "other" says nothing at all: all sums are equally likely
-within the joint limits. Bayes' rule with equal priors gives the probabilities. The widths come from
-the definition alone: palm and fist differ by 240 degrees in a finger's total flexion, and a finger
-half way lies three standard deviations from both.
+A class says that these lie about its pose (normal distribution); or says nothing of some of them,
+as the basic poses say nothing of the thumb. "other" says nothing at all: all sums are equally
+likely within the joint limits. Bayes' rule with equal priors gives the probabilities. The widths
+come from the definition alone: palm and fist differ by 240 degrees in a finger's total flexion, and
+a finger half way lies three standard deviations from both.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _BASIC = {"palm": "palm", "fist": "fist", POINTING: "gun"}
 _THUMB_ANGLES = 5
 _RAY = JOINT_NAMES.index("index_mcp"), JOINT_NAMES.index("index_tip")
 _OFF_RANGE_RAD = 0.5
-"""How far off the pose space a hand may be at all (rms over the angles); for the uniform density."""
+"""How far off the pose space a hand may be at all, rms over the angles."""
 
 
 def _sums() -> np.ndarray:
@@ -198,8 +198,8 @@ def _gestures(
                 and (apart[known] < 1).all()
             ):
                 raise ToftrackError(
-                    f"{file}: gestures {poses[a].name!r} and {poses[b].name!r} are too much alike to"
-                    " be told apart; give them one name, or leave out the angles that do not matter"
+                    f"{file}: gestures {poses[a].name!r} and {poses[b].name!r} are too much alike"
+                    " to be told apart; give them one name, or angles that differ more"
                 )
     return gestures
 

@@ -111,9 +111,7 @@ def update(
         )
         # The middle of the hand stays where it is: about the wrist, it would grow out of place.
         middle = moved[:, :3] + sir.rotated_pivot(moved[:, 3:6])
-        states = torch.cat(
-            ((middle - ratio * (middle - moved[:, :3])) / ratio, moved[:, 3:]), 1
-        )
+        states = torch.cat(((middle - ratio * (middle - moved[:, :3])) / ratio, moved[:, 3:]), 1)
         best = likelihood.log_score(scorer(states, closer)).max()
         scores.append(fit.exponent * float(best))
     total = belief.log_likelihood.clone()

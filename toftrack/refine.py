@@ -44,7 +44,10 @@ _AXIS_ROW = [
 _ORIGIN_ROW = [1 + 3 * finger + bone for finger, bone, _ in _JOINTS]
 # (16, 21) which angles move a point that is attached to a frame.
 _MOVES = [
-    [frame > 0 and finger == (frame - 1) // 3 and bone <= (frame - 1) % 3 for finger, bone, _ in _JOINTS]
+    [
+        frame > 0 and finger == (frame - 1) // 3 and bone <= (frame - 1) % 3
+        for finger, bone, _ in _JOINTS
+    ]
     for frame in range(16)
 ]
 
@@ -61,6 +64,7 @@ class Refinement:
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     swaps: other poses of single fingers that are tried; one must raise the log score by `swap_gain`.
     keep_gain: by how much the log score of another pose must exceed the last frame's.
+    still: noise of the estimate of a hand at rest, see proposals.steadied.
     carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
     """
 
@@ -74,6 +78,7 @@ class Refinement:
     swaps: int = 128
     swap_gain: float = 0.02
     keep_gain: float = 0.01
+    still: tuple[float, float, float] = (0.003, 0.03, 0.12)
     carry: float = 0.5
 
 
@@ -123,9 +128,7 @@ def surroundings(observation: Observation, around_m: Tensor, count: int) -> Surr
     )
 
 
-def point_jacobian(
-    pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame: Tensor
-) -> Tensor:
+def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame: Tensor) -> Tensor:
     """How n.X changes with the 27 degrees of freedom for points X that move with frames.
 
     pose: of one hand.  x, n: (P, 3) points and directions in the camera frame.
@@ -246,7 +249,5 @@ def _silhouette_rows(
     zero = torch.zeros_like(z)
     by_u = torch.stack((k[0, 0] / z, zero, -k[0, 0] * x[:, 0] / z.square()), 1)
     by_v = torch.stack((zero, k[1, 1] / z, -k[1, 1] * x[:, 1] / z.square()), 1)
-    rows = point_jacobian(
-        pose, shape, x.repeat(2, 1), torch.cat((by_u, by_v)), frame.repeat(2)
-    )
+    rows = point_jacobian(pose, shape, x.repeat(2, 1), torch.cat((by_u, by_v)), frame.repeat(2))
     return rows * weight.repeat(2)[:, None], gap.mT.flatten() * weight.repeat(2), x.repeat(2, 1)

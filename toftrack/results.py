@@ -218,7 +218,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
 def _no_frames() -> dict[str, np.ndarray]:
     shapes = {"joints_m": (0, 21, 3), "state": (0, 27), "latent": (0, 4), "covariance": (0, 10, 10)}
     shapes |= dict.fromkeys(_POINTING, (0, 3))
-    return {name: np.zeros(shapes.get(name, 0), kind) for name, kind in (_ARRAYS | _POINTING).items()}
+    kinds = _ARRAYS | _POINTING
+    return {name: np.zeros(shapes.get(name, 0), kind) for name, kind in kinds.items()}
 
 
 def _strict(value: Any) -> Any:
