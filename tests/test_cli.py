@@ -18,13 +18,22 @@ from toftrack.cli import run, sentence
 from toftrack.errors import ToftrackError
 
 APP = """
-import pathlib, sys, time
+import functools, pathlib, sys, time
 import hydra
 from hydra.utils import instantiate
 from toftrack.cli import job, run
 from toftrack.errors import ToftrackError
 
+def tell(task):
+    @functools.wraps(task)
+    def telling(config):
+        value = task(config)
+        print("value", value)
+        return value
+    return telling
+
 @hydra.main(version_base="1.3", config_path="conf", config_name="app")
+@tell
 @job
 def main(config):
     if config.fail == "clear":
@@ -136,6 +145,8 @@ def test_one_failing_job_does_not_stop_the_others(app: Path) -> None:
     status, out, err = call(app, *arguments)
     assert status == 1, "a sweep with failed jobs is not a success"
     assert "replayed 100" in out, "the last job ran"
+    values = [line for line in out.splitlines() if line.startswith("value ")]
+    assert values == ["value inf"] * 3 + ["value 1.0"], "a sweeper dies of NaN"
     assert "Traceback" not in err
     assert err.splitlines() == [
         "error: the reason, and what to do",

@@ -65,6 +65,8 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "covariance": ((6, 10, 10), "f4"),
         "effective_sample_size": ((6,), "f4"),
         "gesture_probability": ((6,), "f4"),
+        "pointing_origin_m": ((6, 3), "f4"),
+        "pointing_direction": ((6, 3), "f4"),
         "timestamp_s": ((6,), "f8"),
         "compute_s": ((6,), "f4"),
     }

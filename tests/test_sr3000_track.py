@@ -50,7 +50,6 @@ def test_tracks_through_faults_and_an_unplugged_cable(tmp_path: Path) -> None:
         assert len(result["joints_m"]) == 24
         assert result["lost"][12]  # the frame without a reading
         assert not result["lost"][-3:].any()
-    assert "24 frames" not in done.stderr
     assert "22 delivered" in done.stdout + done.stderr
 
 
