@@ -7,7 +7,8 @@ import json
 import pytest
 import torch
 
-from toftrack import benchmark
+from toftrack import benchmark, frame_timing
+from toftrack.errors import ToftrackError
 
 
 @pytest.fixture
@@ -46,8 +47,20 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
     # Speed is not for a test to judge, but this is off by orders of magnitude only if broken.
     assert result["ratios"]["numba, N = 8"]["naive"] > 10
     assert result["largest_difference_px"]["numba"] <= 3
+    frames = {row["configuration"]: row for row in result["frames"]}
+    assert set(frames) == {"default", "default, start", "paper", "paper, start"}
+    assert all(0 < row["min_ms"] <= row["median_ms"] for row in frames.values())
+    assert set(frames["default"]["parts"]) == set(frame_timing.PARTS)
+    assert frames["default"]["parts"]["refinement"] > frames["paper"]["parts"]["refinement"]
+    assert 0 < frames["paper"]["parts"]["filter: scoring"] < frames["paper"]["median_ms"]
     printed = capsys.readouterr().out
     assert "median ms" in printed and "numba" in printed
+
+
+def test_whole_frames_need_the_configuration(tmp_path, monkeypatch):
+    monkeypatch.setattr(frame_timing, "_CONF", tmp_path)
+    with pytest.raises(ToftrackError, match="no configuration files"):
+        frame_timing.frame_times(0.01, torch.device("cpu"))
 
 
 def test_the_device_must_exist(capsys, monkeypatch):

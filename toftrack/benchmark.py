@@ -21,7 +21,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -29,6 +29,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
+from toftrack.frame_timing import FrameRow, frame_times
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
@@ -54,25 +55,6 @@ _SLOW_REPEATS = {"stepping": 3, "naive": 5}
 _CHECKED = 24
 UPSAMPLED = (0.5, 1.0, 2.0, 3.0)
 """Scales of the image's sides for the growth with the number of pixels."""
-
-
-@dataclass(frozen=True)
-class FrameRow:
-    """The time of whole frames of one configuration, milliseconds."""
-
-    configuration: str
-    particles: int
-    min_ms: float
-    median_ms: float
-    repeats: int
-
-
-def frame_times(seconds: float, device: torch.device) -> list[FrameRow]:
-    """Whole frames, from a depth image to a pose, of the configurations worth showing.
-
-    seconds: how long to time each.
-    """
-    return []
 
 
 class Benchmark:
@@ -285,6 +267,12 @@ def run(
     benchmark = Benchmark(device, seconds, baselines)
     rows = benchmark.by_particles(particles)
     memory = peak_memory_gb()
+    whole: list[FrameRow] = []
+    if frames:
+        try:
+            whole = frame_times(seconds, device)
+        except ToftrackError as error:
+            benchmark.notes.append(str(error))
     few = min(_SLOW_PARTICLES, max(particles))
     rows += benchmark.kinematics(few)
     rows += benchmark.by_pixels(few)
@@ -303,7 +291,7 @@ def run(
         "ratios": ratios(rows),
         "largest_difference_px": benchmark.disagreement_px,
         "peak_memory_gb": memory,
-        "frames": [asdict(row) for row in frame_times(seconds, device)] if frames else [],
+        "frames": [asdict(row) for row in whole],
         "notes": benchmark.notes,
     }
 
@@ -326,9 +314,10 @@ def show(result: dict) -> str:
         )
     for row in result["frames"]:
         lines.append(
-            f"{'whole frame':<22}{row['configuration']:<13}{row['particles']:>7}{'':>18}"
+            f"{'whole frame':<16}{row['configuration']:<19}{row['particles']:>7}{'':>18}"
             f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}"
         )
+        lines += [f"    {part:<56}{row['parts'][part]:>15.3f}" for part in row["parts"]]
     for name, against in result["ratios"].items():
         parts = ", ".join(f"{ratio:.0f} x {baseline}" for baseline, ratio in against.items())
         lines.append(f"{name}: {parts} (ratio of medians)")

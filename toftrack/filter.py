@@ -12,10 +12,13 @@ hand, so that turning the hand does not also carry it away, as turning about the
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 
+import numpy as np
 import roma
 import torch
 from torch import Tensor
@@ -24,6 +27,7 @@ from toftrack.errors import ToftrackError
 
 PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
+_PIVOT = np.array(PIVOT_M)
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,36 @@ class Spread:
         t, z, r = self.translation_m, self.depth_m, self.rotation_rad
         pose = torch.tensor([t, t, z, r, r, r], dtype=lower.dtype, device=lower.device)
         return torch.cat((pose, self.latent * (upper - lower)))
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """How the particles are resampled, moved and weighted; see conf/filter for what each does."""
+
+    particles: int
+    passes: int
+    exponent: float
+    exponent_growth: float
+    shrink: float
+    spread: Spread
+    rest: float
+    speed_gain: float
+    velocity: float
+    velocity_smoothing: float
+    resampling: str
+    bounds: str
+    density: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.resampling not in RESAMPLERS:
+            raise ToftrackError(
+                f"filter.resampling={self.resampling} is unknown; give one of"
+                f" {', '.join(RESAMPLERS)}"
+            )
+        if self.particles < 1 or self.passes < 1:
+            raise ToftrackError("filter.particles and filter.passes must be at least 1")
+        if not 0 <= self.density < math.inf:
+            raise ToftrackError("filter.density must be 0 or more")
 
 
 def widened(sigmas: Tensor, velocity: Tensor, rest: float, gain: float) -> Tensor:
@@ -108,6 +142,8 @@ RESAMPLERS: dict[str, Callable[[Tensor, int, torch.Generator], Tensor]] = {
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """Particles at tangent offsets from reference particles; (N, 6 + d) or broadcast, each."""
     reference, tangent = torch.broadcast_tensors(reference, tangent)
+    if (kernels := _compiled(reference)) is not None:
+        return _called(kernels.compose, reference, tangent)
     pivot = _pivot(reference)
     rotvec = roma.rotvec_composition((tangent[:, 3:6], reference[:, 3:6]))
     turned = rotated_pivot(rotvec)
@@ -117,10 +153,36 @@ def compose(reference: Tensor, tangent: Tensor) -> Tensor:
 
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
     """Tangent offsets of particles from one reference, (N, 6 + d) and (1, 6 + d) to (N, 6 + d)."""
+    if (kernels := _compiled(particles)) is not None:
+        return _called(kernels.difference, particles, reference)
     inverse = -reference[:, 3:6].expand(len(particles), 3)
     turn = roma.rotvec_composition((particles[:, 3:6], inverse))
     move = _pivot(particles) - _pivot(reference)
     return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
+
+
+def _compiled(particles: Tensor) -> ModuleType | None:
+    """The compiled versions of compose and difference, for what they can do."""
+    if particles.device.type != "cpu" or particles.dtype != torch.float32:
+        return None
+    return _kernels()
+
+
+@functools.cache
+def _kernels() -> ModuleType | None:
+    try:
+        from toftrack import rigid_numba
+    except ImportError:
+        return None
+    rigid_numba.load()
+    return rigid_numba
+
+
+def _called(kernel: Callable[..., None], left: Tensor, right: Tensor) -> Tensor:
+    out = torch.empty(left.shape)
+    left, right = left.detach().contiguous(), right.detach().contiguous()
+    kernel(left.numpy(), right.numpy(), _PIVOT, out.numpy())
+    return out
 
 
 def rotated_pivot(rotvec: Tensor) -> Tensor:
@@ -177,9 +239,14 @@ def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean on SO(3): the rotation nearest to the mean matrix (chordal L2 mean; Hartley et
     al., "Rotation averaging", IJCV 2013). (N, 3) and (N,) to (3,).
     """
-    matrices = roma.rotvec_to_rotmat(rotvec)
-    mean = (weights.to(matrices.dtype)[:, None, None] * matrices).sum(0)
-    return roma.rotmat_to_rotvec(roma.special_procrustes(mean))
+    half = 0.5 * rotvec.double()
+    angle = half.norm(dim=1, keepdim=True)
+    q = torch.cat((half * (angle / torch.pi).sinc(), angle.cos()), 1)
+    # The nearest rotation's quaternion is the main axis of all quaternions (Markley et al., JGCD
+    # 2007), whatever their signs.
+    scatter = (q * weights[:, None]).mT @ q
+    main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
+    return roma.unitquat_to_rotvec(main).to(rotvec.dtype)
 
 
 def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:

@@ -53,12 +53,13 @@ class FMeasure:
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
         depth, hand = observation.depth_m, observation.hand
-        never = torch.full_like(depth, torch.inf)
-        safe = torch.where(hand, depth, 1.0)
-        low = torch.where(hand, 1.0 / (safe + self.tolerance_m), never)
-        high = torch.where(hand, 1.0 / (safe - self.tolerance_m).clamp(min=1e-3), -never)
+        background = ~hand
+        # Written in place: a frame's images are few, but so are the milliseconds.
+        low = (depth + self.tolerance_m).reciprocal_().masked_fill_(background, torch.inf)
+        high = (depth - self.tolerance_m).clamp_(min=1e-3).reciprocal_()
+        high.masked_fill_(background, -torch.inf)
         # A model surface at an occluder is hidden, not false.
-        front = torch.where(observation.occluder, torch.inf, 0.0)
+        front = torch.zeros_like(depth).masked_fill_(observation.occluder, torch.inf)
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
         return Evidence(low, high, front, hand, observation.k, radius)
 

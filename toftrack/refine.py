@@ -6,8 +6,8 @@ hand tracking", SGP 2015) with toftrack's ellipsoids:
 
   * seen points are drawn to the nearest ellipsoid (point to plane along its normal);
   * the bones' axes are drawn into the silhouette where they stick out over the background;
-  * the joint angles are drawn to the filter's estimate, the pose space acting as a prior, and are kept
-    within the joint limits.
+  * the joint angles are drawn to the filter's estimate, the pose space acting as a prior, and are
+    kept within the joint limits.
 
 Derivatives are analytic: a joint angle moves a point X by a x (X - o), a the joint's axis and o its
 origin, both columns of the kinematic chain's frames.
@@ -16,6 +16,7 @@ origin, both columns of the kinematic chain's frames.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -51,6 +52,12 @@ _MOVES = [
     for frame in range(16)
 ]
 
+_REACH_M = 0.16
+"""Points farther than this from the middle of the hand are none of it."""
+_MARGIN_PX = 24
+"""Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
+_SQUARE = np.ones((3, 3), np.uint8)
+
 
 @dataclass(frozen=True)
 class Refinement:
@@ -62,7 +69,8 @@ class Refinement:
     point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
         ones count more.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
-    swaps: other poses of single fingers that are tried; one must raise the log score by `swap_gain`.
+    swaps: other poses of single fingers that are tried; one must raise the log score by
+        `swap_gain`.
     keep_gain: by how much the log score of another pose must exceed the last frame's.
     still: noise of the estimate of a hand at rest, see proposals.steadied.
     carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
@@ -87,13 +95,18 @@ class Surroundings:
     """What the refinement sees of a frame, once a frame.
 
     points_m: (P, 3) seen points of the hand and the arm.
-    nearest_px: (H, W, 2) for each pixel the nearest pixel (u, v) that is not background.
-    k: (3, 3).
+    nearest_px: (h, w, 2) for each pixel of a crop the nearest pixel (u, v) of the image that is
+        not background. The crop holds all of these and a margin.
+    k: (3, 3) of the image.
+    size: (H, W) of the image.
+    corner: row and column of the crop's first pixel.
     """
 
     points_m: Tensor
     nearest_px: Tensor
     k: Tensor
+    size: tuple[int, int]
+    corner: tuple[int, int] = (0, 0)
 
 
 def surroundings(observation: Observation, around_m: Tensor, count: int) -> Surroundings:
@@ -101,31 +114,83 @@ def surroundings(observation: Observation, around_m: Tensor, count: int) -> Surr
 
     Pixels on depth edges are left out: they mix foreground and background.
     """
-    depth = observation.depth_m.cpu().numpy()
-    hand = observation.hand.cpu().numpy()
-    k = observation.k.cpu().numpy()
-    device = observation.depth_m.device
-    kernel = np.ones((3, 3), np.uint8)
-    far = np.where(depth > 0, depth, 10.0).astype(np.float32)
-    smooth = (cv2.dilate(far, kernel) - cv2.erode(far, kernel)) < 0.03
-    v, u = np.nonzero(hand & smooth)
-    z = depth[v, u]
-    points = np.stack(((u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z, z), 1)
-    points = points[((points - around_m.cpu().numpy()) ** 2).sum(1) < 0.16**2]
-    points = points[:: max(1, -(-len(points) // count))]
     # Whatever is not behind the hand may hide it or be it.
+    hand = observation.hand.cpu().numpy()
     solid = hand | observation.occluder.cpu().numpy()
-    _, labels = cv2.distanceTransformWithLabels(
-        (~solid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    left, top, wide, high = cv2.boundingRect(solid.view(np.uint8))
+    left, right = max(0, left - _MARGIN_PX), min(solid.shape[1], left + wide + _MARGIN_PX)
+    top, bottom = max(0, top - _MARGIN_PX), min(solid.shape[0], top + high + _MARGIN_PX)
+    part = slice(top, bottom), slice(left, right)
+    solid, depth = solid[part], observation.depth_m.cpu().numpy()[part]
+    far = np.where(depth > 0, depth, np.float32(10.0))
+    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < 0.03
+    u, v = _pixels(hand[part] & smooth)
+    z = depth[v, u]
+    k = observation.k.cpu().numpy()
+    points = np.stack(
+        ((u + left - k[0, 2]) / k[0, 0] * z, (v + top - k[1, 2]) / k[1, 1] * z, z), 1
     )
-    rows, columns = np.nonzero(solid)
-    lookup = np.zeros((labels.max() + 1, 2), np.float32)
-    lookup[labels[rows, columns]] = np.stack((columns, rows), 1)
+    points = points[np.square(points - around_m.cpu().numpy()).sum(1) < _REACH_M**2]
+    points = points[:: max(1, -(-len(points) // count))]
+    _, labels = cv2.distanceTransformWithLabels(
+        (~solid).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    u, v = _pixels(solid)
+    lookup = np.zeros((len(u) + 1, 2), np.float32)
+    lookup[labels[v, u]] = np.stack((u + left, v + top), 1)
+    device = observation.depth_m.device
     return Surroundings(
         torch.from_numpy(points.astype(np.float32)).to(device),
-        torch.from_numpy(lookup[labels]).to(device),
+        torch.from_numpy(lookup.take(labels, 0)).to(device),
         observation.k,
+        tuple(observation.hand.shape),
+        (top, left),
     )
+
+
+def _pixels(mask: np.ndarray) -> np.ndarray:
+    """Columns and rows of the pixels of a mask, (2, n) int32, row by row."""
+    found = cv2.findNonZero(mask.view(np.uint8))
+    return np.zeros((2, 0), np.int32) if found is None else found.reshape(-1, 2).T
+
+
+class Refiner(Protocol):
+    """Brings hands of one shape onto the seen points."""
+
+    def __call__(
+        self, state: Tensor, prior_angles: Tensor, seen: Surroundings, settings: Refinement
+    ) -> Tensor:
+        """See refine."""
+
+    def joints(self, state: Tensor) -> Tensor:
+        """(1, 27) to the joints (21, 3), camera frame, metres."""
+
+
+@dataclass(frozen=True)
+class TorchRefiner:
+    """The reference, which runs everywhere."""
+
+    shape: HandShape
+    surface: HandSurface
+
+    def __call__(
+        self, state: Tensor, prior_angles: Tensor, seen: Surroundings, settings: Refinement
+    ) -> Tensor:
+        """See refine."""
+        return refine(state, prior_angles, seen, self.shape, self.surface, settings)
+
+    def joints(self, state: Tensor) -> Tensor:
+        """See Refiner."""
+        return forward_kinematics(state, self.shape).joints_m[0]
+
+
+def make_refiner(shape: HandShape, surface: HandSurface, scorer: str) -> Refiner:
+    """The refiner that goes with a scoring back end: compiled where that is "numba"."""
+    if scorer == "numba" and shape.base_m.device.type == "cpu":
+        from toftrack.refine_numba import CompiledRefiner
+
+        return CompiledRefiner(shape, surface)
+    return TorchRefiner(shape, surface)
 
 
 def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame: Tensor) -> Tensor:
@@ -238,11 +303,13 @@ def _silhouette_rows(
     along = -frames[:, :, 1] * shape.bone_lengths_m.flatten()[:, None]
     x = (origins[:, None] + parts[:, None] * along[:, None]).flatten(0, 1)
     frame = torch.arange(1, 16, device=x.device).repeat_interleave(len(parts))
-    height, width = seen.nearest_px.shape[:2]
+    height, width = seen.size
     k, z = seen.k, x[:, 2].clamp(min=0.05)
     u, v = k[0, 0] * x[:, 0] / z + k[0, 2], k[1, 1] * x[:, 1] / z + k[1, 2]
     inside = (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
-    column, row = u.round().long().clamp(0, width - 1), v.round().long().clamp(0, height - 1)
+    (top, left), (high, wide) = seen.corner, seen.nearest_px.shape[:2]
+    column = (u.round().long() - left).clamp(0, wide - 1)
+    row = (v.round().long() - top).clamp(0, high - 1)
     gap = torch.stack((u, v), 1) - seen.nearest_px[row, column]
     outside = gap.norm(dim=1)
     weight = (inside & (outside > 1.0)) / (1 + (outside / 8.0).square()) / settings.silhouette_px

@@ -98,7 +98,7 @@ class NearestSurface:
         if expected is not None and self.occluder_margin_m > 0:
             in_front = valid & (depth_m < expected.nearest_m - self.occluder_margin_m)
             at_hand = valid & ~in_front & (depth_m < expected.farthest_m + self.occluder_margin_m)
-            seen_m2 = at_hand.sum() * expected.nearest_m**2 / float(k[0, 0] * k[1, 1])
+            seen_m2 = np.count_nonzero(at_hand) * expected.nearest_m**2 / float(k[0, 0] * k[1, 1])
             if seen_m2 > self.min_area_m2:
                 # Pixels on its edge mix it with what is behind, and are neither.
                 grown = cv2.dilate(in_front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -120,13 +120,14 @@ class NearestSurface:
     def _nearest(self, depth_m: np.ndarray, valid: np.ndarray, focal_area: float) -> float:
         candidates = valid.copy()
         while candidates.any():
-            nearest = float(depth_m[candidates].min())
+            lowest = cv2.minMaxLoc(depth_m, candidates.view(np.uint8))
+            nearest, (column, row) = lowest[0], lowest[2]
             if self.min_area_m2 <= 0:
                 return nearest
-            near = (candidates & (depth_m <= nearest + self.depth_range_m)).astype(np.uint8)
-            _, labels, stats, _ = cv2.connectedComponentsWithStats(near, connectivity=4)
-            label = labels[candidates & (depth_m == nearest)][0]
-            area = stats[label, cv2.CC_STAT_AREA] * nearest**2 / focal_area
+            near = (candidates & (depth_m <= nearest + self.depth_range_m)).view(np.uint8)
+            _, labels = cv2.connectedComponents(near, connectivity=4)
+            label = labels[row, column]
+            area = np.count_nonzero(labels == label) * nearest**2 / focal_area
             if area >= self.min_area_m2:
                 return nearest
             # Too small for a hand: drop the speck and everything as small in front of the rest.

@@ -12,23 +12,23 @@ import torch
 from torch import Tensor
 
 from toftrack import filter as sir
-from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
+from toftrack.filter import FilterSettings
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
-from toftrack.hand_fit import HandFit, first_belief, update
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
+from toftrack.hand_fit import HandFit, first_belief, update
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import latent_density
 from toftrack.proposals import steadied, swap_fingers
-from toftrack.refine import Refinement, refine, surroundings
+from toftrack.refine import Refinement, make_refiner, surroundings
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
 from toftrack.segmentation import Expected, NearestSurface, Observation
 from toftrack.start import Start
-
+from toftrack.threads import small_operations
 
 _APPROACH_M = 0.002
 """How much nearer than its middle's movement a partly hidden hand may come in a frame."""
@@ -37,36 +37,6 @@ _APPROACH_M = 0.002
 _MODEL_ERROR = sir.Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes the
 90 % region of a joint hold the truth in about 92 % of the frames of mesh-rendered recordings."""
-
-
-@dataclass(frozen=True)
-class FilterSettings:
-    """How the particles are resampled, moved and weighted; see conf/filter for what each does."""
-
-    particles: int
-    passes: int
-    exponent: float
-    exponent_growth: float
-    shrink: float
-    spread: sir.Spread
-    rest: float
-    speed_gain: float
-    velocity: float
-    velocity_smoothing: float
-    resampling: str
-    bounds: str
-    density: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.resampling not in sir.RESAMPLERS:
-            raise ToftrackError(
-                f"filter.resampling={self.resampling} is unknown; give one of"
-                f" {', '.join(sir.RESAMPLERS)}"
-            )
-        if self.particles < 1 or self.passes < 1:
-            raise ToftrackError("filter.particles and filter.passes must be at least 1")
-        if not 0 <= self.density < math.inf:
-            raise ToftrackError("filter.density must be 0 or more")
 
 
 @dataclass(frozen=True)
@@ -155,7 +125,9 @@ class Tracker:
         self.shape = shape
         self.surface = hand_surface(shape)
         self.scorer: Scorer = make_scorer(self._renderer, shape, self.device)
+        self._refiner = make_refiner(shape, self.surface, self.scorer.name)
 
+    @small_operations()
     def step(self, depth_m: np.ndarray, k: np.ndarray, index: int, timestamp_s: float) -> Estimate:
         """One frame: segment, predict, then resample - diffuse - observe in annealed passes; refine.
 
@@ -259,8 +231,8 @@ class Tracker:
         if self.track is None:
             return None
         state = self.decode(sir.compose(self.track.mean, self.track.velocity[None]))
-        z = forward_kinematics(state, self.shape).joints_m[0, :, 2]
-        nearest, farthest = float(z.min()), float(z.max())
+        nearest, farthest = self._refiner.joints(state)[:, 2].aminmax()
+        nearest, farthest = float(nearest), float(farthest)
         if self.track.expected is not None:
             # A hidden finger is free to move in front of what hides it, which would then be taken
             # for the hand: while something hides the hand, it comes nearer only as its middle does.
@@ -279,7 +251,7 @@ class Tracker:
         cfg = self.refinement
         if cfg.iterations == 0:
             return state
-        middle = forward_kinematics(state, self.shape).joints_m[0].mean(0)
+        middle = self._refiner.joints(state).mean(0)
         seen = surroundings(observation, middle, cfg.points)
         if len(seen.points_m) == 0:
             return state
@@ -288,7 +260,7 @@ class Tracker:
             return self.likelihood.log_score(self.scorer(states, evidence))
 
         def refined(start: Tensor) -> Tensor:
-            return refine(start, start[:, 6:], seen, self.shape, self.surface, cfg)
+            return self._refiner(start, start[:, 6:], seen, cfg)
 
         found = refined(state)
         if before is not None:
@@ -370,7 +342,6 @@ class Tracker:
     ) -> Estimate:
         tangents = sir.difference(particles, mean)
         tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
-        joints = forward_kinematics(state, self.shape).joints_m
         latent = self.space.encode(state[:, 6:])
 
         def host(tensor: Tensor) -> np.ndarray:
@@ -381,7 +352,7 @@ class Tracker:
             timestamp_s=timestamp_s,
             state_name="",
             lost=False,
-            joints_m=host(joints[0]),
+            joints_m=host(self._refiner.joints(state)),
             state=host(state[0]),
             latent=host(latent[0]),
             score=score,

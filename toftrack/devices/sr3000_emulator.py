@@ -22,14 +22,19 @@ import usb.core
 from usb.backend import IBackend
 
 from toftrack.devices import sr3000_descriptors as descriptors
-from toftrack.devices.sr3000_faults import HARMLESS, OPEN_FAULTS, REQUEST_FAULTS, parse_faults
+from toftrack.devices.sr3000_faults import (
+    HARMLESS,
+    OPEN_FAULTS,
+    REQUEST_FAULTS,
+    Chunk,
+    parse_faults,
+    transfer,
+)
 from toftrack.devices.sr3000_transport import UsbSettings, parse_id
 from toftrack.errors import ToftrackError
-from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame, to_radial
+from toftrack.recordings.sr_frame import REGISTERS, encode_frame, to_radial
 from toftrack.recordings.store import FrameStore
 
-_PACKET = descriptors.PACKET_BYTES
-_PACKETS = FRAME_BYTES // _PACKET
 _TURN_S = 0.01  # how soon a waiting transfer notices that the camera was unplugged
 _CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
 
@@ -64,18 +69,6 @@ class EmulatorSettings:
                 "device.emulated needs fps above 0 and fault_every of 0 or more, but they are "
                 f"{self.fps} and {self.fault_every}"
             )
-
-
-@dataclass(eq=False)
-class _Chunk:
-    """A piece of what waits at the bulk IN endpoint."""
-
-    ready_s: float
-    data: memoryview = memoryview(b"")
-    ends: bool = False
-    """The transfer ends behind it."""
-    error: int | None = None
-    """Instead of data: the errno of a failed transfer."""
 
 
 @dataclass(eq=False)
@@ -122,7 +115,7 @@ class EmulatedBackend(IBackend):
         self._faults = parse_faults(settings.faults)
         self._period_s = 1.0 / (settings.fps or source.fps)
         self._lock = threading.RLock()
-        self._queue: deque[_Chunk] = deque()
+        self._queue: deque[Chunk] = deque()
         self._stalled = False
         self._opens = self._position = self._splits = self._cycled = 0
         self._last_due_s = -np.inf
@@ -352,10 +345,10 @@ class EmulatedBackend(IBackend):
             self.unplug(self._settings.replug_s)
             raise _error(errno.ENODEV)
         if fault == "stall":
-            self._queue.append(_Chunk(0.0, error=errno.EPIPE))
+            self._queue.append(Chunk(0.0, error=errno.EPIPE))
             return
         if fault == "io_error":
-            self._queue.append(_Chunk(0.0, error=errno.EIO))
+            self._queue.append(Chunk(0.0, error=errno.EIO))
             return
         data = self._next_frame()
         if data is None:
@@ -366,7 +359,10 @@ class EmulatedBackend(IBackend):
             due += self._settings.late_s
         if fault is None or fault in HARMLESS:
             self.served += 1
-        self._queue.extend(self._chunks(fault, data, due))
+        if fault == "unplug_after":
+            self._position += 1  # the scene goes on
+        self._queue.extend(transfer(fault, data, due, self._splits, self._random))
+        self._splits += fault == "split"
 
     def _next_frame(self) -> bytes | None:
         source = self._source
@@ -379,33 +375,6 @@ class EmulatedBackend(IBackend):
         return encode_frame(
             to_radial(depth, source.radial, source.camera), amplitude, self._range_m
         )
-
-    def _chunks(self, fault: str | None, data: bytes, due: float) -> list[_Chunk]:
-        whole = memoryview(data)
-        if fault == "overflow":
-            return [_Chunk(due, error=errno.EOVERFLOW)]
-        if fault == "short":
-            return [_Chunk(due, whole[:50_001], ends=True)]
-        if fault == "cut":
-            return [_Chunk(due, whole[: 99 * _PACKET])]
-        if fault == "empty":
-            return [_Chunk(due, ends=True)]
-        if fault == "long":
-            return [_Chunk(due, memoryview(data + b"\xa5" * 700), ends=True)]
-        if fault == "split":
-            at = (1 + self._splits % (_PACKETS - 1)) * _PACKET
-            self._splits += 1
-            return [_Chunk(due, whole[:at], ends=True), _Chunk(due, whole[at:])]
-        if fault == "garbage":
-            return [_Chunk(due, memoryview(self._random.bytes(FRAME_BYTES)))]
-        if fault in ("zeros", "ones"):
-            return [_Chunk(due, memoryview((b"\0" if fault == "zeros" else b"\xff") * FRAME_BYTES))]
-        if fault == "unplug_during":
-            return [_Chunk(due, whole[: 50 * _PACKET]), _Chunk(due, error=errno.ENODEV)]
-        if fault == "unplug_after":
-            self._position += 1  # the scene goes on
-            return [_Chunk(due, whole), _Chunk(due, error=errno.ENODEV)]
-        return [_Chunk(due, whole)]
 
 
 def _error(number: int) -> usb.core.USBError:

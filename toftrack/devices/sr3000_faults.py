@@ -1,12 +1,19 @@
-"""What an emulated SR3000 can be told to do wrong, and when."""
+"""What an emulated SR3000 can be told to do wrong, when, and what comes over the wire then."""
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
+from toftrack.devices.sr3000_descriptors import PACKET_BYTES
 from toftrack.errors import ToftrackError
+from toftrack.recordings.sr_frame import FRAME_BYTES
+
+_PACKETS = FRAME_BYTES // PACKET_BYTES
 
 OPEN_FAULTS = {
     "missing": "no camera is plugged in",
@@ -52,6 +59,57 @@ class Fault:
     def hits(self, number: int) -> bool:
         """Whether this attempt or request goes wrong."""
         return self.first <= number and (self.count is None or number < self.first + self.count)
+
+
+@dataclass(eq=False)
+class Chunk:
+    """A piece of what waits at the bulk IN endpoint."""
+
+    ready_s: float
+    """On the monotonic clock."""
+    data: memoryview = memoryview(b"")
+    ends: bool = False
+    """The transfer ends behind it."""
+    error: int | None = None
+    """Instead of data: the errno of a failed transfer."""
+
+
+def transfer(
+    fault: str | None, data: bytes, ready_s: float, split: int, random: np.random.Generator
+) -> list[Chunk]:
+    """What comes over the wire for a frame.
+
+    Args:
+        fault: one of REQUEST_FAULTS under which something comes, or None.
+        data: the frame.
+        ready_s: when.
+        split: how many frames came in two transfers so far.
+        random: of the garbage.
+    """
+    whole = memoryview(data)
+    if fault == "overflow":
+        return [Chunk(ready_s, error=errno.EOVERFLOW)]
+    if fault == "short":
+        return [Chunk(ready_s, whole[:50_001], ends=True)]
+    if fault == "cut":
+        return [Chunk(ready_s, whole[: 99 * PACKET_BYTES])]
+    if fault == "empty":
+        return [Chunk(ready_s, ends=True)]
+    if fault == "long":
+        return [Chunk(ready_s, memoryview(data + b"\xa5" * 700), ends=True)]
+    if fault == "split":
+        at = (1 + split % (_PACKETS - 1)) * PACKET_BYTES
+        return [Chunk(ready_s, whole[:at], ends=True), Chunk(ready_s, whole[at:])]
+    if fault == "unplug_during":
+        half = Chunk(ready_s, whole[: 50 * PACKET_BYTES])
+        return [half, Chunk(ready_s, error=errno.ENODEV)]
+    if fault == "unplug_after":
+        return [Chunk(ready_s, whole), Chunk(ready_s, error=errno.ENODEV)]
+    if fault == "garbage":
+        whole = memoryview(random.bytes(FRAME_BYTES))
+    elif fault in ("zeros", "ones"):
+        whole = memoryview((b"\0" if fault == "zeros" else b"\xff") * FRAME_BYTES)
+    return [Chunk(ready_s, whole)]
 
 
 def parse_faults(texts: Iterable[str]) -> tuple[Fault, ...]:

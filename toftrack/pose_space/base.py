@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import fields, replace
 from typing import Protocol, Self, runtime_checkable
 
@@ -80,8 +81,13 @@ class TensorSpace:
 
 def clamp_to_joint_limits(angles: Tensor) -> Tensor:
     """(N, 21) radians, each within hand.skeleton.ANGLE_LIMITS."""
-    limits = angles.new_tensor(ANGLE_LIMITS)
-    return angles.clamp(limits[:, 0], limits[:, 1])
+    return angles.clamp(*_limits(angles.device, angles.dtype))
+
+
+@functools.cache
+def _limits(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, ...]:
+    """The lower and the upper joint limits, each (21,)."""
+    return torch.tensor(ANGLE_LIMITS, device=device, dtype=dtype).T.contiguous().unbind(0)
 
 
 def clamped_share(space: TensorSpace, latent: Tensor, slack_rad: float = 1e-3) -> float:

@@ -21,8 +21,8 @@ import math
 
 import numpy as np
 
+from toftrack.compiling import compiled
 from toftrack.render.closed_form import _NEAREST_M
-from toftrack.render.numba_vector import compiled
 
 LANES = 16
 """Particles whose kinematics are computed side by side, one to a SIMD lane; a task of a thread."""

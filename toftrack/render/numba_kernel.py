@@ -7,12 +7,11 @@ each row; then the tile is compared with the evidence, which leaves the silhouet
 from __future__ import annotations
 
 import math
-import zlib
 from pathlib import Path
 
-import numba
 import numpy as np
 
+from toftrack.compiling import compiled, entry_point
 from toftrack.render.numba_hand import (
     DU,
     DX,
@@ -32,9 +31,7 @@ from toftrack.render.numba_hand import (
 )
 from toftrack.render.numba_vector import (
     BLOCK,
-    OPTIONS,
     WORDS,
-    compiled,
     count,
     draw,
     merge,
@@ -44,19 +41,9 @@ from toftrack.render.numba_vector import (
     widen,
 )
 
-_SOURCES = ("numba_hand.py", "numba_kernel.py", "numba_vector.py")
-
-
-def _cached(function):
-    """Decorator of the kernel's entry points: compiled at the first call, or from the cache."""
-    # numba's cache notices changes of the function's own file only, but it does go by the name.
-    sources = b"".join(Path(__file__).with_name(name).read_bytes() for name in _SOURCES)
-    function.__qualname__ += f"_{zlib.crc32(sources):08x}"
-    try:
-        return numba.njit(cache=True, **OPTIONS)(function)
-    except RuntimeError:  # there is no place to write to
-        return numba.njit(**OPTIONS)(function)
-
+_cached = entry_point(
+    *(Path(__file__).with_name(f"numba_{part}.py") for part in ("hand", "kernel", "vector"))
+)
 
 _ROWS = 16
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)

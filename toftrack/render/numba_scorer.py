@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import functools
-import logging
 import os
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compiling import announced
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
@@ -19,25 +18,13 @@ from toftrack.render.disc import disc_steps
 from toftrack.render.numba_hand import LANES
 from toftrack.render.numba_kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence
-
-log = logging.getLogger(__name__)
-
-_SILENT_S = 0.7
-"""Taking the kernel from numba's cache is faster than this, compiling it is slower."""
-_compiling = threading.Lock()
+from toftrack.threads import threads
 
 
 @functools.cache
 def _pool(process: int) -> ThreadPoolExecutor:
     """Helper threads of this process; a forked one gets its own."""
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="toftrack-scorer")
-
-
-def _threads() -> int:
-    """As many as torch may use, but no more than there are cores for this process."""
-    if hasattr(os, "sched_getaffinity"):
-        return max(1, min(torch.get_num_threads(), len(os.sched_getaffinity(0))))
-    return max(1, torch.get_num_threads())
 
 
 class NumbaScorer:
@@ -69,32 +56,20 @@ class NumbaScorer:
             surface.frame_index.contiguous().numpy(),
             torch.cat((surface.centres_m, covariances[:, rows, columns]), 1).numpy(),
         )
+        self._frame: tuple = (None, None)
         self._compile()
 
     def _compile(self) -> None:
         """The first call of a process, with a message if it takes long."""
-        with _compiling:
-            if score_hands.signatures:
-                return
-            message = "renderer: compiling the numba kernel (once, about 6 s)"
-            timer = threading.Timer(_SILENT_S, log.info, (message,))
-            timer.daemon = True
-            timer.start()
-            try:
-                image = torch.zeros(2, 2)
-                self(
-                    torch.zeros(1, 27), Evidence(image, image, image, image > 0, torch.eye(3), 0.0)
-                )
-            finally:
-                timer.cancel()
+        if score_hands.signatures:
+            return
+        with announced("renderer: compiling the numba kernel (once, about 6 s)"):
+            image = torch.zeros(2, 2)
+            self(torch.zeros(1, 27), Evidence(image, image, image, image > 0, torch.eye(3), 0.0))
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""
-        tensors = (evidence.low, evidence.high, evidence.occluder)
-        images, hand = pack_evidence(
-            *(_array(tensor, torch.float32) for tensor in tensors),
-            _array(evidence.hand, torch.bool),
-        )
+        images, hand = self._packed(evidence)
         height, width = evidence.hand.shape
         k = _array(evidence.k, torch.float32)
         x = _array(states, torch.float32)
@@ -111,12 +86,26 @@ class NumbaScorer:
             np.zeros(1, np.int64),
             counts.numpy(),
         )
-        helpers = min(_threads(), -(-len(x) // LANES)) - 1
+        helpers = min(threads(), -(-len(x) // LANES)) - 1
         others = [_pool(os.getpid()).submit(task) for _ in range(helpers)]
         task()
         for other in others:
-            other.result()
+            # A helper that has not begun has nothing left to do.
+            if not other.cancel():
+                other.result()
         return Counts(*counts.to(states.device))
+
+    def _packed(self, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+        """The evidence as the kernel wants it, once for all calls of a frame."""
+        before, packed = self._frame
+        if before is not evidence:
+            tensors = (evidence.low, evidence.high, evidence.occluder)
+            packed = pack_evidence(
+                *(_array(tensor, torch.float32) for tensor in tensors),
+                _array(evidence.hand, torch.bool),
+            )
+            self._frame = evidence, packed
+        return packed
 
 
 def _array(tensor: Tensor, dtype: torch.dtype) -> np.ndarray:

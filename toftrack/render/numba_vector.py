@@ -5,7 +5,6 @@ Written as LLVM vectors, which every processor has or gets split into what it ha
 
 from __future__ import annotations
 
-import numba
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
@@ -15,11 +14,6 @@ BLOCK = 8
 
 WORDS = 8
 """Words of 64 pixels, one above the other, that are worked on at once."""
-
-# nnan and ninf stay off: a missed pixel is the NaN of a negative square root.
-OPTIONS = {"fastmath": {"contract", "arcp", "nsz"}, "nogil": True, "error_model": "numpy"}
-compiled = numba.njit(**OPTIONS)
-"""Decorator of the kernel's inner functions."""
 
 _VECTOR = ir.VectorType(ir.FloatType(), BLOCK)
 _WORDS = ir.VectorType(ir.IntType(64), WORDS)

@@ -1,0 +1,127 @@
+"""Every file of the configuration composes, and what it describes can be made."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import hydra
+import numpy as np
+import pytest
+import torch
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from tracking import CONF, ROOT, configuration
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
+from toftrack.pose_space.pose_data import synthetic_data
+
+OPTIONS = sorted(
+    (path.parent.name, path.stem) for path in CONF.glob("*/*.yaml") if path.parent != CONF
+)
+OF_TRAINING = ("data",)
+"""Groups of train_pose_space.py; the others are track.py's."""
+
+# Without it the kernels' widths are cross-validated, which takes seconds.
+FASTER = {
+    "isomap": ["pose_space.neighbours=8"],
+    "kernel_pca": ["pose_space.gamma=0.1"],
+    "lle": ["pose_space.neighbours=8"],
+}
+
+
+def given_for(folder: Path) -> dict[tuple[str, str], list[str]]:
+    """What is given to the options that cannot do without: files, written into a folder."""
+    angles = synthetic_data().angles_rad[::8]
+    with open(folder / "poses.csv", "w", newline="") as file:
+        file.write("# units: radians\n")
+        csv.writer(file).writerows([ANGLE_NAMES, *angles.tolist()])
+    state = torch.cat((torch.zeros(len(angles), 6), angles.float()), 1)
+    joints = forward_kinematics(state, default_hand_shape()).joints_m[:, 1:].unflatten(1, (5, 4))
+    clip = {"seq_name": ["one"], "seq_len": [len(joints)], "is_left": np.zeros(len(joints), bool)}
+    np.savez(folder / "leap.npz", joints_mm=1e3 * joints.numpy(), **clip)
+    images = folder / "images"
+    images.mkdir()
+    cv2.imwrite(str(images / "0.png"), np.full((30, 40), 600, np.uint16))
+    camera = {"format": "toftrack-camera", "version": 1, "width": 40, "height": 30}
+    k = [[50, 0, 20], [0, 50, 15], [0, 0, 1]]
+    (images / "camera.json").write_text(json.dumps(camera | {"K": k}))
+    sample = ROOT / "toftrack" / "data" / "sample.npz"
+    return {
+        ("device", "replay"): [f"device.path={sample}"],
+        ("device", "folder"): [f"device.path={images}"],
+        ("device", "sr3000"): ["device.transport=emulated"],  # there is no camera here
+        ("data", "file"): [f"data.path={folder / 'poses.csv'}"],
+        ("data", "leap"): [f"data.path={folder / 'leap.npz'}"],
+        ("data", "mixture"): [f"data.parts.leap.path={folder / 'leap.npz'}"],
+    }
+
+
+def composed(group: str, option: str, *overrides: str) -> DictConfig:
+    name = "train_pose_space" if group in OF_TRAINING else "config"
+    return configuration(f"{group}={option}", *overrides, name=name)
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_composes_and_can_be_made(group: str, option: str, tmp_path: Path) -> None:
+    given = given_for(tmp_path).get((group, option), []) + FASTER.get(option, [])
+    config = composed(group, option, *given)
+    part = config if group == "experiment" else config[group]
+    missing = OmegaConf.missing_keys(part)
+    assert not missing, f"{group}={option} asks for {missing}: give this test values for them"
+    OmegaConf.to_container(part, resolve=True)
+    if "_target_" in part:
+        # What it is called with further on, a view's folder for one, is not there yet.
+        made = hydra.utils.instantiate(part, _partial_=True)
+        assert callable(made.func)
+        if group != "view":
+            hydra.utils.instantiate(part)
+
+
+@pytest.mark.parametrize(
+    ("group", "option", "key"),
+    [
+        ("device", "replay", "device.path"),
+        ("device", "folder", "device.path"),
+        ("data", "leap", "data.path"),
+        ("data", "file", "data.path"),
+        ("data", "mixture", "data.parts.leap.path"),
+    ],
+)
+def test_what_must_be_given_is_named(group: str, option: str, key: str) -> None:
+    config = composed(group, option)
+    assert key in OmegaConf.missing_keys(config)
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_opens_with_a_line_about_what_it_is(group: str, option: str) -> None:
+    text = (CONF / group / f"{option}.yaml").read_text()
+    opening = [line for line in text.splitlines() if not line.startswith("# @package")]
+    assert opening[0].startswith("# ") and len(opening[0]) > 10
+
+
+def test_the_defaults_are_options_that_there_are() -> None:
+    for name in ("config", "train_pose_space"):
+        content = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+        chosen = [entry for entry in content["defaults"] if isinstance(entry, dict)]
+        options = {pair for entry in chosen for pair in entry.items() if pair[1] is not None}
+        assert options <= set(OPTIONS)
+
+
+def test_a_calibrated_camera_reaches_every_device_that_replays(tmp_path: Path) -> None:
+    gone = tmp_path / "gone.json"
+    for overrides in (["device=sample"], ["device=replay", "device.path=sample.npz"]):
+        config = configuration(*overrides, f"camera.file={gone}")
+        assert config.device.camera_file == str(gone)
+    with pytest.raises(hydra.errors.InstantiationException) as caught:
+        hydra.utils.instantiate(configuration(f"camera.file={gone}").device)
+    assert isinstance(caught.value.__cause__, ToftrackError)
+
+
+def test_the_same_seed_reaches_the_tracker_and_the_synthetic_device() -> None:
+    config = configuration("device=synthetic", "seed=7")
+    assert (config.seed, config.device.seed) == (7, 7)

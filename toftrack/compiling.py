@@ -1,0 +1,57 @@
+"""How numba's kernels are compiled: once on a machine, announced if it takes long, then cached."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numba
+
+log = logging.getLogger(__name__)
+
+OPTIONS = {"fastmath": {"contract", "arcp", "nsz"}, "nogil": True, "error_model": "numpy"}
+"""nnan and ninf stay off: NaN is how a kernel learns that a square root missed."""
+compiled = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Decorator of the functions that entry points call."""
+
+_SILENT_S = 1.0
+"""Taking a kernel from numba's cache is faster than this, compiling it is slower."""
+_compiling = threading.Lock()
+
+
+def entry_point(*sources: str | Path) -> Callable:
+    """Decorator of a kernel's entry points: compiled at the first call, or from the cache.
+
+    sources: the files that the kernel is made of; a change in any of them compiles it anew.
+    """
+    # numba's cache notices changes of the function's own file only, but it does go by the name.
+    checksum = zlib.crc32(b"".join(Path(file).read_bytes() for file in (__file__, *sources)))
+
+    def decorator(function: Callable) -> Callable:
+        function.__qualname__ += f"_{checksum:08x}"
+        try:
+            return numba.njit(cache=True, **OPTIONS)(function)
+        except RuntimeError:  # there is no place to write to
+            return numba.njit(**OPTIONS)(function)
+
+    return decorator
+
+
+@contextmanager
+def announced(message: str) -> Iterator[None]:
+    """Around the first call of an entry point: logs the message if compiling it takes long.
+
+    Only one thread compiles at a time, so that the others do not compile the same once more.
+    """
+    with _compiling:
+        timer = threading.Timer(_SILENT_S, log.info, (message,))
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()

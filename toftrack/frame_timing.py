@@ -1,0 +1,168 @@
+"""How long whole frames take, from a depth image to an estimate, and on what: see benchmark.py."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from itertools import cycle
+from pathlib import Path
+from unittest.mock import patch
+
+import hydra
+import torch
+from omegaconf import DictConfig
+
+from toftrack.app import build_tracker
+from toftrack.errors import ToftrackError
+from toftrack.likelihood import FMeasure
+from toftrack.segmentation import NearestSurface
+from toftrack.tracker import Tracker
+
+CONFIGURATIONS: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "paper": ("experiment=paper",),
+}
+PARTS = ("segmentation and evidence", "filter: scoring", "filter: rest", "refinement", "rest")
+_CONF = Path(__file__).resolve().parents[1] / "conf"
+_FEWEST = 12
+_STARTS = 6
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """The time of whole frames of one configuration, milliseconds.
+
+    configuration: its name; "start" in it says that the hand was looked for anew in every frame.
+    parts: what a frame in the middle spends on each of PARTS; empty for starts.
+    """
+
+    configuration: str
+    particles: int
+    min_ms: float
+    median_ms: float
+    repeats: int
+    parts: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class _Stopwatch:
+    """Attributes time to the innermost part that is running; `spent` is in seconds."""
+
+    spent: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    running: list[str] = field(default_factory=lambda: ["rest"])
+    since: float = 0.0
+
+    def switch(self) -> None:
+        """Book the time until now on what is running."""
+        now = time.perf_counter()
+        self.spent[self.running[-1]] += now - self.since
+        self.since = now
+
+    def around(self, part: str, within: str, function: Callable) -> Callable:
+        """A function whose time counts as `part`, unless it runs outside of `within`."""
+
+        def timed(*args: object, **kwargs: object) -> object:
+            if within and self.running[-1] != within:
+                return function(*args, **kwargs)
+            self.switch()
+            self.running.append(part)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.switch()
+                self.running.pop()
+
+        return timed
+
+    @contextmanager
+    def watching(self, tracker: Tracker) -> Iterator[None]:
+        """The parts of a frame are timed within."""
+        observation, scoring, rest, refinement, _ = PARTS
+        places = (
+            (NearestSurface, "__call__", observation, ""),
+            (FMeasure, "evidence", observation, ""),
+            (Tracker, "_filter", rest, ""),
+            (type(tracker.scorer), "__call__", scoring, rest),
+            (Tracker, "_refine", refinement, ""),
+        )
+        with ExitStack() as stack:
+            for owner, name, part, within in places:
+                timed = self.around(part, within, getattr(owner, name))
+                stack.enter_context(patch.object(owner, name, timed))
+            yield
+
+
+def frame_times(
+    seconds: float, device: torch.device, configurations: dict[str, tuple[str, ...]] | None = None
+) -> list[FrameRow]:
+    """Whole frames of the packaged recording, capture and drawing excluded.
+
+    seconds: how long to time each configuration.
+    configurations: overrides by name; None = CONFIGURATIONS.
+    Raises ToftrackError where the configuration files are not beside the package.
+    """
+    rows = []
+    for name, overrides in (configurations or CONFIGURATIONS).items():
+        config = _config([*overrides, f"compute={device.type}"])
+        rows += _times(name, config, seconds)
+    return rows
+
+
+def _config(overrides: list[str]) -> DictConfig:
+    if not (_CONF / "config.yaml").is_file():
+        raise ToftrackError(
+            f"whole frames cannot be timed: there are no configuration files in {_CONF}; run the"
+            " benchmark from a checkout of toftrack"
+        )
+    with hydra.initialize_config_dir(str(_CONF), version_base="1.3"):
+        return hydra.compose("config", overrides=["device=sample", *overrides])
+
+
+def _times(name: str, config: DictConfig, seconds: float) -> list[FrameRow]:
+    tracker = build_tracker(config)
+    with hydra.utils.instantiate(config.device) as device:
+        frames = [
+            (device.camera.rectify(frame.depth, frame.radial), device.camera.K) for frame in device
+        ]
+
+    def step(index: int) -> float:
+        depth, k = frames[index % len(frames)]
+        began = time.perf_counter()
+        tracker.step(depth, k, index, 0.04 * index)
+        return time.perf_counter() - began
+
+    starts = []
+    for index in range(_STARTS):
+        tracker.track = None
+        starts.append(step(index))
+    # Young tracks are still compared with a new start in every frame.
+    young = range(_STARTS, _STARTS + tracker.lost.probation + 1)
+    for index in young:
+        step(index)
+    whole: list[float] = []
+    parts: dict[str, list[float]] = {part: [] for part in PARTS}
+    began = time.perf_counter()
+    for index in cycle(range(young.stop, len(frames))):
+        whole.append(step(index))
+        watch = _Stopwatch(since=time.perf_counter())
+        # Every other frame is taken apart, so that the stopwatch does not slow down the figures.
+        with watch.watching(tracker):
+            step(index)
+            watch.switch()
+        for part, found in parts.items():
+            found.append(watch.spent[part])
+        if len(whole) >= _FEWEST and time.perf_counter() - began > seconds:
+            break
+    shares = {part: 1e3 * statistics.median(found) for part, found in parts.items()}
+    n = tracker.settings.particles
+    # The first start of a process still waits for what is only done once.
+    return [_row(name, n, whole, shares), _row(f"{name}, start", n, starts[1:], {})]
+
+
+def _row(name: str, particles: int, found: list[float], parts: dict[str, float]) -> FrameRow:
+    median = 1e3 * statistics.median(found)
+    return FrameRow(name, particles, 1e3 * min(found), median, len(found), parts)
