@@ -32,8 +32,8 @@ def swap_fingers(state: Tensor, poses: Tensor, n: int, generator: torch.Generato
 def steadied(state: Tensor, before: Tensor, still: tuple[float, float, float]) -> Tensor:
     """Take less of a change the more it looks like noise, so that a still hand does not jitter.
 
-    Of a change of size c in translation, rotation or a finger's angles, c^2 / (c^2 + s^2) is taken, s
-    being the noise of that group: nearly all of a movement, little of a tremble.
+    Of a change of size c in translation, rotation or a finger's angles, c^2 / (c^2 + s^2) is taken,
+    s being the noise of that group: nearly all of a movement, little of a tremble.
 
     state, before: (1, 27).  still: s of translation (m), rotation (rad) and a finger (rad).
     """

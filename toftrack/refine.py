@@ -127,9 +127,7 @@ def surroundings(observation: Observation, around_m: Tensor, count: int) -> Surr
     u, v = _pixels(hand[part] & smooth)
     z = depth[v, u]
     k = observation.k.cpu().numpy()
-    points = np.stack(
-        ((u + left - k[0, 2]) / k[0, 0] * z, (v + top - k[1, 2]) / k[1, 1] * z, z), 1
-    )
+    points = np.stack(((u + left - k[0, 2]) / k[0, 0] * z, (v + top - k[1, 2]) / k[1, 1] * z, z), 1)
     points = points[np.square(points - around_m.cpu().numpy()).sum(1) < _REACH_M**2]
     points = points[:: max(1, -(-len(points) // count))]
     _, labels = cv2.distanceTransformWithLabels(

@@ -88,7 +88,7 @@ class RoughStart:
 
 @dataclass(frozen=True)
 class SearchStart:
-    """Finds the hand anywhere in the segmented blob: any orientation, palm or back, any training pose.
+    """Finds the hand anywhere in the blob: any orientation, palm or back, any training pose.
 
     Many hypotheses are scored at once; the best distinct ones become islands that are refined by
     a random local search of shrinking width. In every round as many hypotheses are scored, and half
@@ -194,8 +194,8 @@ def _points(observation: Observation, v: np.ndarray, u: np.ndarray) -> np.ndarra
 def palm_centres(observation: Observation, n: int, generator: torch.Generator) -> np.ndarray:
     """Where the middle of the palm may be, (n, 3) float32 metres.
 
-    They are centres of widest discs: inscribed in the silhouette cut along its depth edges, so that a
-    hand in front of the body stands by itself, and no wider than a palm, so that they do not lie
+    They are centres of widest discs: inscribed in the silhouette cut along its depth edges, so that
+    a hand in front of the body stands by itself, and no wider than a palm, so that they do not lie
     on the body. The wider and the nearer to the camera a disc is, the oftener it is drawn.
     """
     hand = observation.hand.cpu().numpy()
@@ -230,7 +230,7 @@ def palm_centres(observation: Observation, n: int, generator: torch.Generator) -
 
 
 def arm_exit(observation: Observation) -> np.ndarray | None:
-    """Where the blob leaves the image, (3,) float32 metres; None when it does not touch the border."""
+    """Where the blob leaves the image, (3,) float32 metres; None where it does not."""
     hand = observation.hand.cpu().numpy()
     border = np.zeros_like(hand)
     border[[0, -1], :] = border[:, [0, -1]] = True

@@ -35,8 +35,8 @@ _APPROACH_M = 0.002
 
 
 _MODEL_ERROR = sir.Spread(0.002, 0.002, 0.015, 0.015)
-"""What the particles do not know: the hand model's own error. Added to their covariance, it makes the
-90 % region of a joint hold the truth in about 92 % of the frames of mesh-rendered recordings."""
+"""What the particles do not know: the hand model's own error. Added to their covariance, it makes
+the 90 % region of a joint hold the truth in about 92 % of the frames of mesh-rendered recordings."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class Tracker:
 
     @small_operations()
     def step(self, depth_m: np.ndarray, k: np.ndarray, index: int, timestamp_s: float) -> Estimate:
-        """One frame: segment, predict, then resample - diffuse - observe in annealed passes; refine.
+        """One frame: segment, predict, resample - diffuse - observe in annealed passes, refine.
 
         depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3) intrinsics.
         """
@@ -247,7 +247,7 @@ class Tracker:
         observation: Observation,
         evidence: Evidence,
     ) -> Tensor:
-        """The filter's hand state brought onto the seen points; `before` is the last one; (1, 27)."""
+        """The filter's hand brought onto the seen points; `before` is the last one; (1, 27)."""
         cfg = self.refinement
         if cfg.iterations == 0:
             return state

@@ -67,9 +67,7 @@ def write_npz_streamed(
         partial.unlink(missing_ok=True)
 
 
-def _member(
-    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kind: str
-) -> IO[bytes]:
+def _member(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kind: str) -> IO[bytes]:
     stream = archive.open(f"{name}.npy", "w", force_zip64=True)
     header = {"descr": kind, "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(stream, header)
