@@ -369,12 +369,13 @@ def test_the_configurations_make_the_defaults() -> None:
 
 def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
     scene = sample()
-    told = follow_scene(scene.cut(*range(5)))
-    assert [one.gesture for one in told] == ["palm"] * 5
-    assert min(one.gesture_probability for one in told) > 0.9
-    rows = range(93, 98)
-    last = follow_scene(scene.cut(*rows))[-1]
-    assert last.gesture == "pointing"
+    rows = range(55, 98)  # from the palm on; "" until the hand is found
+    told = follow_scene(scene.cut(*rows))
+    labels = [one.gesture for one in told]
+    assert "palm" in labels[:9] and set(labels[:9]) <= {"palm", ""}
+    assert labels[-10:] == ["pointing"] * 10
+    assert min(one.gesture_probability for one in told[-10:]) > 0.9
+    last = told[-1]
     reach = scene.joints_m[rows[-1], 8] - scene.joints_m[rows[-1], 5]
     cosine = last.pointing_direction @ reach / np.linalg.norm(reach)
     assert cosine > math.cos(math.radians(15))

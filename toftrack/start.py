@@ -28,6 +28,9 @@ _DEPTH_EDGE_M = 0.04
 LogScores = Callable[[Tensor, float], Tensor]
 """(N, 6 + d) hypotheses and the weight of coverage to (N,) log scores of the current frame."""
 
+Improve = Callable[[Tensor], Tensor]
+"""(N, 6 + d) hypotheses to (N, 6 + d) brought onto the seen points, as far as the space allows."""
+
 
 class Start(Protocol):
     """Makes the first particles from a frame that is not empty."""
@@ -37,6 +40,7 @@ class Start(Protocol):
         observation: Observation,
         space: PoseSpace,
         log_scores: LogScores,
+        improve: Improve,
         n: int,
         generator: torch.Generator,
     ) -> Tensor:
@@ -68,6 +72,7 @@ class RoughStart:
         observation: Observation,
         space: PoseSpace,
         log_scores: LogScores,
+        improve: Improve,
         n: int,
         generator: torch.Generator,
     ) -> Tensor:
@@ -96,6 +101,7 @@ class SearchStart:
 
     hypotheses: in the first batch.  islands: how many are refined at first; a power of two.
     samples: hypotheses a round of refinement.
+    improved: when so few islands are left, Gauss-Newton helps them on.
     coverage: as the likelihood's; among all poses it must be felt, or a hand that lies mostly
         outside of the image wins.
     position_m: spread about points of the blob.  tilt_rad: spread of the palm's tilt out of the
@@ -108,6 +114,7 @@ class SearchStart:
     islands: int = 64
     coverage: float = 1.0
     samples: int = 1024
+    improved: int = 32
     position_m: float = 0.02
     tilt_rad: float = 0.5
     arm_rad: float = 0.5
@@ -117,6 +124,7 @@ class SearchStart:
         observation: Observation,
         space: PoseSpace,
         log_scores: LogScores,
+        improve: Improve,
         n: int,
         generator: torch.Generator,
     ) -> Tensor:
@@ -140,7 +148,13 @@ class SearchStart:
             best = candidates[torch.arange(len(best), device=best.device), choice]
             keep = top.topk(max(1, len(best) // 2)).indices
             best, best_scores = best[keep], top[keep]
-            if len(keep) == 1:
+            if len(best) <= self.improved:
+                better = improve(best)
+                new_scores = log_scores(better, self.coverage)
+                wins = new_scores > best_scores
+                best = torch.where(wins[:, None], better, best)
+                best_scores = torch.maximum(best_scores, new_scores)
+            if len(best) == 1:
                 break
             sigmas = sigmas * 0.75
         return sir.diffuse(best.expand(n, -1), 0.5 * sigmas, lower, upper, "reflect", generator)

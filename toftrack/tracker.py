@@ -214,7 +214,8 @@ class Tracker:
         """A new track; or the given young one, if the search finds nothing better than it."""
         n = self.settings.particles
         log_scores = partial(self._log_scores, evidence=evidence)
-        particles = self.start(observation, self.space, log_scores, n, self.generator)
+        improve = partial(self._improved, observation=observation)
+        particles = self.start(observation, self.space, log_scores, improve, n, self.generator)
         if track is not None:
             now = sir.compose(track.particles, track.velocity[None])
             # The search has seen this frame and the track has not, so a little better is no better.
@@ -239,6 +240,21 @@ class Tracker:
             approach = _APPROACH_M + max(0.0, -float(self.track.velocity[2]))
             nearest = max(nearest, self.track.expected.nearest_m - approach)
         return Expected(nearest, farthest)
+
+    def _improved(self, particles: Tensor, *, observation: Observation) -> Tensor:
+        """Hypotheses brought onto the seen points, each by itself, and back into the pose space."""
+        cfg = self.refinement
+        if cfg.iterations == 0:
+            return particles
+        states = self.decode(particles)
+        for row in range(len(states)):
+            state = states[row : row + 1]
+            seen = surroundings(observation, self._refiner.joints(state).mean(0), cfg.points)
+            if len(seen.points_m):
+                states[row] = self._refiner(state, state[:, 6:], seen, cfg)[0]
+        latent = self.space.encode(states[:, 6:])
+        latent = sir.bound(latent, self.space.lower, self.space.upper, "truncate")
+        return torch.cat((states[:, :6], latent), 1)
 
     def _refine(
         self,
