@@ -61,12 +61,17 @@ def unscored(x: torch.Tensor, coverage: float) -> torch.Tensor:
     raise AssertionError("nothing is to be scored")
 
 
+def unimproved(x: torch.Tensor) -> torch.Tensor:
+    """The search alone, without Gauss-Newton's help."""
+    return x
+
+
 def first_error_mm(start: Start, scene: Scene, seed: int, side: str = "right") -> float:
     """Mean joint error of the particles' mean on the first frame."""
     shape = default_hand_shape(side=side)
     seen = observed(scene)
     scores = log_scores_of(seen, shape)
-    particles = start(seen, pose_space(), scores, 50, generator(seed))
+    particles = start(seen, pose_space(), scores, unimproved, 50, generator(seed))
     mean = sir.mean_particle(particles, torch.full((50,), 0.02))
     joints = forward_kinematics(states_of(mean), shape).joints_m[0].numpy()
     return 1e3 * float(np.linalg.norm(joints - scene.joints_m[0], axis=-1).mean())
@@ -96,7 +101,7 @@ def test_the_search_beats_the_best_of_as_many_unrefined_hypotheses() -> None:
     seen = observed(sample().cut(0))
     scores = log_scores_of(seen, default_hand_shape())
     search = SearchStart(hypotheses=1000, samples=256)
-    found = search(seen, pose_space(), scores, 50, generator())
+    found = search(seen, pose_space(), scores, unimproved, 50, generator())
     drawn = search._draw(seen, pose_space(), generator())
     assert scores(found, 1.0).max() > scores(drawn, 1.0).max() + 0.1
 
@@ -106,7 +111,7 @@ def test_as_many_particles_as_asked_for_inside_the_pose_space(start: Start) -> N
     seen = observed(sample().cut(0))
     space = pose_space()
     scores = log_scores_of(seen, default_hand_shape())
-    one, two = (start(seen, space, scores, 37, generator(5)) for _ in range(2))
+    one, two = (start(seen, space, scores, unimproved, 37, generator(5)) for _ in range(2))
     assert one.shape == (37, 6 + space.dims)
     assert one.isfinite().all()
     assert (one[:, 6:] >= space.lower - 1e-5).all() and (one[:, 6:] <= space.upper + 1e-5).all()
@@ -117,7 +122,7 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
     pose = (0.05, -0.02, 0.6, 0.3, -0.4, 1.2)
     start = RoughStart(pose=pose, position_m=0.01, rotation_rad=0.1)
     n = 4000
-    x = start(observed(sample().cut(0)), pose_space(), unscored, n, generator())
+    x = start(observed(sample().cut(0)), pose_space(), unscored, unimproved, n, generator())
     reference = torch.cat((torch.tensor(pose), x[0, 6:]))[None]
     off = sir.difference(x, reference)[:, :6]
     sigma = torch.tensor([0.01] * 3 + [0.1] * 3)
@@ -132,7 +137,7 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
 def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     scene = sample().cut(0)
     seen = observed(scene)
-    x = RoughStart()(seen, pose_space(), unscored, 300, generator())
+    x = RoughStart()(seen, pose_space(), unscored, unimproved, 300, generator())
     middle = (x[:, :3] + sir.rotated_pivot(x[:, 3:6])).mean(0).numpy()
     true_palm = scene.joints_m[0, PALM].mean(0)
     assert np.linalg.norm(middle - true_palm) < 0.06
@@ -154,7 +159,7 @@ def test_a_pose_can_be_given_on_the_command_line() -> None:
 
     config = configuration("start=rough", "start.pose=[0,0.1,0.5,0,0,0]")
     start = hydra.utils.instantiate(config.start)
-    x = start(observed(sample().cut(0)), pose_space(), unscored, 100, generator())
+    x = start(observed(sample().cut(0)), pose_space(), unscored, unimproved, 100, generator())
     assert float((x[:, :3].mean(0) - torch.tensor([0, 0.1, 0.5])).norm()) < 0.02
 
 
