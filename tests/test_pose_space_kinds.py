@@ -239,5 +239,6 @@ def test_a_density_out_of_range_is_refused(bandwidth: float, floor: float) -> No
 def test_decoding_is_timed_for_every_space() -> None:
     spaces = {kind: fitted(kind) for kind in KINDS}
     times = decode_times(spaces=spaces, repeats=2)
-    assert set(times) == set(KINDS) == set(LIMITS_MS)
+    assert set(times) == set(KINDS)
+    assert set(LIMITS_MS) <= set(KINDS)
     assert all(0 < milliseconds < 60_000 for milliseconds in times.values())
