@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 
 from toftrack.camera import Camera
+from toftrack.devices.base import Frame
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.views.overlay import NoView, VideoView, draw_panel, panel_scale
+from toftrack.hand.shape import default_hand_shape
+from toftrack.views.base import Moment, NoView
+from toftrack.views.overlay import VideoView, draw_panel, panel_scale
 
 W, H = 176, 144
 CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), W, H)
@@ -38,6 +41,11 @@ def hand(lost: bool = False) -> Estimate:
 
 def lost_hand() -> Estimate:
     return no_estimate(7, 0.28, "lost", 4, 0.01)
+
+
+def moment() -> Moment:
+    frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
+    return Moment(frame, DEPTH, CAMERA, hand(), default_hand_shape(), None)
 
 
 def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -235,7 +243,15 @@ def test_a_video_that_cannot_be_written_is_told(tmp_path: Path) -> None:
 
 def test_no_view_takes_the_same_calls_and_writes_nothing(tmp_path: Path) -> None:
     with NoView(folder=tmp_path, fps=25, frames=3) as view:
-        view.add(panel_of(1))
-    assert not NoView.active
-    assert VideoView.active
+        view.show(moment())
+        assert not view.commands()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tracked_frame_is_appended_as_its_panel(tmp_path: Path) -> None:
+    with VideoView(tmp_path, 25, 2) as view:
+        view.show(moment())
+        assert not view.commands()
+    assert (tmp_path / "overlay.mp4").stat().st_size > 0
+    strip = cv2.imread(str(tmp_path / "overlay.png"))
+    assert strip is not None and colour_share(strip, THUMB) > 0

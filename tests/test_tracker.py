@@ -14,6 +14,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.tracker import Tracker
+from toftrack.views.model_image import model_range_image
 
 FRAMES = 40
 QUICK = ("start.hypotheses=1000", "start.samples=256")
@@ -91,11 +92,29 @@ def test_the_covariance_is_symmetric_and_positive_semi_definite(default: Run) ->
 
 def test_the_range_image_shows_the_hand_where_it_was_seen(default: Run) -> None:
     scene, estimate = first(FRAMES), default.estimates[-1]
-    model = default.tracker.range_image(estimate, scene.k, 144, 176)
+    model = model_range_image(estimate.state, default.tracker.shape, scene.k, 144, 176)
     seen = scene.depth_m[FRAMES - 1]
     assert model.shape == (144, 176) and (model > 0).sum() > 1000
     close = np.abs(model - seen)[model > 0] < 0.02
     assert close.mean() > 0.75
+
+
+def test_a_restart_forgets_the_hand_and_may_change_its_side() -> None:
+    scene = first(8)
+    tracker = make_tracker(*QUICK)
+    before = tracker.shape
+    tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
+    tracker.restart()
+    assert tracker.track is None and tracker.shape is before
+    right = tracker.step(scene.depth_m[1], scene.k, 1, 0.04)
+    assert errors_mm([right], scene.cut(1))[0] < 25
+    tracker.restart("left")
+    assert tracker.shape.side == "left"
+    left = scene.mirrored()
+    found = [tracker.step(left.depth_m[i], left.k, i, i / 25) for i in range(2, 8)]
+    assert errors_mm(found[-1:], left.cut(7))[0] < 20
+    with pytest.raises(ToftrackError, match="hand.side=middle"):
+        tracker.restart("middle")
 
 
 def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
@@ -152,7 +171,7 @@ def test_a_recording_that_begins_without_a_hand_has_no_estimate_until_there_is_o
         assert none.lost and none.score == 0 and none.effective_sample_size == 0
         assert np.isnan(none.joints_m).all() and np.isnan(none.state).all()
         assert none.latent.shape == (4,) and none.covariance.shape == (10, 10)
-        assert not tracker.range_image(none, scene.k, 144, 176).any()
+        assert not model_range_image(none.state, tracker.shape, scene.k, 144, 176).any()
     found = tracker.step(scene.depth_m[0], scene.k, 2, 0.1)
     assert not found.lost
     assert errors_mm([found], scene)[0] < 25

@@ -15,14 +15,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from toftrack.devices.base import Device, Frame
+from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
 from toftrack.evaluation import metrics_table
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.results import ResultWriter
+from toftrack.stream import Stream
 from toftrack.tracker import Tracker
-from toftrack.views.overlay import View, draw_panel, panel_scale
+from toftrack.views.base import Moment, View
 
 
 def compute_device(name: str) -> torch.device:
@@ -63,15 +63,18 @@ def track(config: DictConfig, device: Device) -> float:
     `device` is what `config.device` describes; it is opened and closed here.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
+    make = hydra.utils.instantiate
     tracker = build_tracker(config)
     with device:
-        make_view = hydra.utils.instantiate(config.view, _partial_=True)
+        make_view = make(config.view, _partial_=True)
         metadata = _metadata(config, device, tracker)
         view: View = make_view(folder=folder, fps=device.fps, frames=device.frames)
+        stream: Stream = make(config.stream)
         with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
             try:
-                _loop(device, tracker, results, view)
+                _loop(device, tracker, results, view, stream)
             finally:
+                stream.close()
                 view.close()
                 tracker.shape.to("cpu").save(folder / "hand_shape.json")
     summary = results.summary or {}
@@ -79,42 +82,29 @@ def track(config: DictConfig, device: Device) -> float:
         raise ToftrackError("the device delivered no frame; nothing was tracked")
     print(metrics_table(summary))
     print(f"results: {folder}")
-    for name in (
-        "track.npz",
-        "track.jsonl",
-        "summary.json",
-        "hand_shape.json",
-        "overlay.mp4",
-        "overlay.png",
-    ):
-        if (folder / name).exists():
-            print(f"  {folder / name}")
+    for path in sorted(folder.iterdir()):
+        if path.is_file() and path.suffix != ".log":
+            print(f"  {path}")
     error = (summary.get("metrics") or {}).get("mean_mm")
     return float(error) if error is not None else 1.0 - float(summary["mean_score"])
 
 
-def _loop(device: Device, tracker: Tracker, results: ResultWriter, view: View) -> None:
+def _loop(
+    device: Device, tracker: Tracker, results: ResultWriter, view: View, stream: Stream
+) -> None:
     progress = partial(tqdm, total=device.frames, unit=" frames", file=sys.stderr, mininterval=0.2)
     with progress() as bar:
         for frame in device:
+            for command in view.commands():
+                tracker.restart(None if command == "restart" else command)
             depth = device.camera.rectify(frame.depth, frame.radial)
+            shape = tracker.shape
             estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
             results.append(estimate)
-            if view.active:
-                view.add(_panel(device, tracker, frame, depth, estimate))
+            stream.send(estimate)
+            view.show(Moment(frame, depth, device.camera, estimate, shape, tracker.insight))
             bar.update()
             bar.set_postfix_str(f"score {estimate.score:.2f} {estimate.state_name}", refresh=False)
-
-
-def _panel(
-    device: Device, tracker: Tracker, frame: Frame, depth_m: np.ndarray, estimate: Estimate
-) -> np.ndarray:
-    camera = device.camera
-    height, width = depth_m.shape
-    # At most the drawn size is rendered: a big image gains nothing from more.
-    model = tracker.range_image(estimate, camera.K, height, width)
-    amplitude = camera.undistort_amplitude(frame.amplitude)
-    return draw_panel(depth_m, amplitude, camera, estimate, model, panel_scale(width))
 
 
 def _metadata(config: DictConfig, device: Device, tracker: Tracker) -> dict:

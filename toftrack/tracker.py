@@ -16,15 +16,13 @@ from toftrack.estimate import Estimate, no_estimate
 from toftrack.filter import FilterSettings
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
-from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
+from toftrack.hand.surface import hand_surface
 from toftrack.hand_fit import HandFit, first_belief, update
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import latent_density
 from toftrack.proposals import steadied, swap_fingers
 from toftrack.refine import Refinement, make_refiner, surroundings
-from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
 from toftrack.segmentation import Expected, NearestSurface, Observation
 from toftrack.start import Start
@@ -77,6 +75,18 @@ class TrackState:
     expected: Expected | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Insight:
+    """What the tracker saw and believed in a frame, on its own device; for those who watch it.
+
+    particles: (N, 6 + d) before the estimate was refined.  weights: (N,) normalised.
+    """
+
+    observation: Observation
+    particles: Tensor
+    weights: Tensor
+
+
 class Tracker:
     """Follows one hand through rectified depth images.
 
@@ -117,6 +127,7 @@ class Tracker:
         self._set_shape(self._first_shape)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.track: TrackState | None = None
+        self.insight: Insight | None = None
         self._model_variance = _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
         self._poses = self.space.decode(self.space.training_latents)
         self._last: Estimate | None = None
@@ -126,6 +137,17 @@ class Tracker:
         self.surface = hand_surface(shape)
         self.scorer: Scorer = make_scorer(self._renderer, shape, self.device)
         self._refiner = make_refiner(shape, self.surface, self.scorer.name)
+
+    def restart(self, side: str | None = None) -> None:
+        """Forget the hand, also its size, and look for one anew; of another side if one is given.
+
+        Raises ToftrackError for an unknown side.
+        """
+        if side is not None:
+            self._first_shape = self._first_shape.of_side(side)
+        self.track = None
+        self._size = first_belief(self.fit) if self.fit else None
+        self._set_shape(self._first_shape)
 
     @small_operations()
     def step(self, depth_m: np.ndarray, k: np.ndarray, index: int, timestamp_s: float) -> Estimate:
@@ -137,7 +159,7 @@ class Tracker:
         expected = self._expected()
         observation = self.segmentation(depth_m, k, expected)
         if observation.empty:
-            self.track = None
+            self.track = self.insight = None
             return self._missing(index, timestamp_s, began)
         observation = observation.to(self.device)
         evidence = self.likelihood.evidence(observation)
@@ -146,6 +168,7 @@ class Tracker:
         if track is None or track.age < self.lost.probation:
             track = self._started(track, observation, evidence)
         particles, weights = self._filter(track, evidence)
+        self.insight = Insight(observation, particles, weights)
         mean = sir.mean_particle(particles, weights)
         filtered = self.decode(mean, track.offset)
         state = self._refine(filtered, track.state, observation, evidence)
@@ -393,14 +416,3 @@ class Tracker:
         )
         self._gesture, missing = tell_gesture(self.gestures, None, missing, self.space)
         return missing
-
-    def range_image(self, estimate: Estimate, k: np.ndarray, height: int, width: int) -> np.ndarray:
-        """The estimate's range image, (H, W) float32 metres, 0 = no surface or no estimate."""
-        if not np.isfinite(estimate.state).all():
-            return np.zeros((height, width), np.float32)
-        state = torch.from_numpy(estimate.state)[None]
-        shape = self.shape.to("cpu")
-        both = hand_surface(shape).pose(forward_kinematics(state, shape))
-        hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
-        k_t = torch.from_numpy(np.asarray(k, np.float32))
-        return render_range_images(hand, k_t, height, width)[0].numpy()

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from toftrack.errors import ToftrackError
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, SIDES, HandShape, default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 
 
 def make_hand_shape(
@@ -18,6 +15,4 @@ def make_hand_shape(
     """
     if shape in ("default", "auto"):
         return default_hand_shape(length_m, side)
-    if side not in SIDES:
-        raise ToftrackError(f"hand.side={side} is unknown; give hand.side=right or hand.side=left")
-    return replace(HandShape.load(shape), side=side)
+    return HandShape.load(shape).of_side(side)

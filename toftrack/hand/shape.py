@@ -96,6 +96,14 @@ class HandShape:
             self, base_m=self.base_m * factor, bone_lengths_m=self.bone_lengths_m * factor
         )
 
+    def of_side(self, side: str) -> HandShape:
+        """The mirror image, or the same; ToftrackError for an unknown side."""
+        if side not in SIDES:
+            raise ToftrackError(
+                f"hand.side={side} is unknown; give hand.side=right or hand.side=left"
+            )
+        return replace(self, side=side)
+
     def save(self, path: str | Path) -> None:
         """Write the shape as JSON."""
         content = {

@@ -6,8 +6,9 @@ All images are on the undistorted pixel grid of the camera. Pictures are (h, w, 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Self
 
 import cv2
 import numpy as np
@@ -15,6 +16,8 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
+from toftrack.views.base import Moment
+from toftrack.views.model_image import model_range_image
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
 _FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
@@ -81,34 +84,13 @@ def draw_panel(
     return np.vstack([_caption(estimate, size[0]), np.hstack([left, right])])
 
 
-class View(Protocol):
-    """Where panels go."""
-
-    active: bool
-    """False: nobody looks, so that panels need not be drawn."""
-
-    def add(self, panel: np.ndarray) -> None: ...
-
-    def close(self) -> None: ...
-
-
-class NoView:
-    """Shows and keeps nothing."""
-
-    active = False
-
-    def __init__(self, *_: Any, **__: Any) -> None: ...
-
-    def add(self, panel: np.ndarray) -> None:
-        """Do nothing with a (h, w, 3) panel."""
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None: ...
+def draw_moment(moment: Moment) -> np.ndarray:
+    """The panel of a tracked frame, (h, w, 3); see draw_panel."""
+    camera = moment.camera
+    height, width = moment.depth_m.shape
+    model = model_range_image(moment.estimate.state, moment.shape, camera.K, height, width)
+    amplitude = camera.undistort_amplitude(moment.frame.amplitude)
+    return draw_panel(moment.depth_m, amplitude, camera, moment.estimate, model, panel_scale(width))
 
 
 class VideoView:
@@ -123,8 +105,6 @@ class VideoView:
         ToftrackError: by `add` and `close`, when a file cannot be written.
     """
 
-    active = True
-
     def __init__(self, folder: str | Path, fps: float, frames: int | None = None) -> None:
         self.video_path = Path(folder) / "overlay.mp4"
         self.strip_path = Path(folder) / "overlay.png"
@@ -135,6 +115,14 @@ class VideoView:
         self._count = 0
         self._tiles: list[np.ndarray] = []
         self._stride = 1 if frames is None else max(1, math.ceil(frames / _STRIP_KEPT))
+
+    def show(self, moment: Moment) -> None:
+        """Append the frame's panel."""
+        self.add(draw_moment(moment))
+
+    def commands(self) -> Sequence[str]:
+        """A file asks for nothing."""
+        return ()
 
     def add(self, panel: np.ndarray) -> None:
         """Append a (h, w, 3) uint8 BGR panel; the first one decides on the size of the video."""

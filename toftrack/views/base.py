@@ -1,0 +1,68 @@
+"""What a view gets to show, and what it may ask of the tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.devices.base import Frame
+from toftrack.estimate import Estimate
+from toftrack.hand.shape import HandShape
+from toftrack.tracker import Insight
+
+COMMANDS = ("restart", "right", "left")
+"""What a view may ask: a new start, or another hand (which starts anew)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One tracked frame. Nothing in it changes later, so a view may keep it for its own thread."""
+
+    frame: Frame
+    """As the device delivered it."""
+    depth_m: np.ndarray
+    """(H, W) float32 metres, rectified Z on the camera's undistorted grid, 0 = no reading."""
+    camera: Camera
+    estimate: Estimate
+    shape: HandShape
+    """The hand of the estimate."""
+    insight: Insight | None
+    """What the tracker saw and believed; None where there was nothing to track."""
+
+
+class View(Protocol):
+    """Where tracked frames are shown or kept; made with folder, fps and frames (None: unknown)."""
+
+    def show(self, moment: Moment) -> None:
+        """Take one frame; raises ToftrackError when it cannot be kept."""
+
+    def commands(self) -> Sequence[str]:
+        """What was asked since the last call, of COMMANDS, in order."""
+
+    def close(self) -> None:
+        """Finish what is kept; raises ToftrackError when it cannot be."""
+
+
+class NoView:
+    """Shows and keeps nothing."""
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...
+
+    def show(self, moment: Moment) -> None:
+        """Do nothing."""
+
+    def commands(self) -> Sequence[str]:
+        """Nobody asks for anything."""
+        return ()
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None: ...
