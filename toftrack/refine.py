@@ -28,6 +28,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface
 from toftrack.segmentation import Observation
+from toftrack.steadying import Steadying
 
 # The joints of the 21 angles: (finger, bone that moves first, is it an abduction).
 _JOINTS = [
@@ -72,7 +73,7 @@ class Refinement:
     swaps: other poses of single fingers that are tried; one must raise the log score by
         `swap_gain`.
     keep_gain: by how much the log score of another pose must exceed the last frame's.
-    still: noise of the estimate of a hand at rest, see proposals.steadied.
+    steadying: how much of a change from frame to frame is believed.
     carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
     """
 
@@ -86,7 +87,7 @@ class Refinement:
     swaps: int = 128
     swap_gain: float = 0.02
     keep_gain: float = 0.01
-    still: tuple[float, float, float] = (0.003, 0.03, 0.12)
+    steadying: Steadying = Steadying()
     carry: float = 0.5
 
 

@@ -21,11 +21,12 @@ from toftrack.hand_fit import HandFit, first_belief, update
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import latent_density
-from toftrack.proposals import steadied, swap_fingers
+from toftrack.proposals import swap_fingers
 from toftrack.refine import Refinement, make_refiner, surroundings
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
 from toftrack.segmentation import Expected, NearestSurface, Observation
 from toftrack.start import Start
+from toftrack.steadying import steadied
 from toftrack.threads import small_operations
 
 _APPROACH_M = 0.002
@@ -56,6 +57,7 @@ class TrackState:
     particles: (N, 6 + d), after the last observation.  weights: (N,) normalised.
     mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a frame.
     state: (1, 27) the last refined hand, None at the start.
+    trend: (27,) its mean change a frame, see steadying.
     offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
         displaced by it.
     age: frames since the start.  bad: frames in a row with a low score.
@@ -69,6 +71,7 @@ class TrackState:
     velocity: Tensor
     offset: Tensor
     state: Tensor | None = None
+    trend: Tensor | None = None
     age: int = 0
     bad: int = 0
     outside: int = 0
@@ -172,11 +175,13 @@ class Tracker:
         mean = sir.mean_particle(particles, weights)
         filtered = self.decode(mean, track.offset)
         state = self._refine(filtered, track.state, observation, evidence)
+        trend = track.trend
         if track.state is not None:
-            state = steadied(state, track.state, self.refinement.still)
+            state, trend = steadied(state, track.state, trend, self.refinement.steadying)
         score = float(self.likelihood.score(self.scorer(state, evidence)))
 
         estimate = self._estimate(particles, weights, mean, state, score, index, timestamp_s)
+        track = replace(track, trend=trend)
         self.track, name, lost = self._judge(track, particles, weights, mean, state, score)
         if not lost:
             self._fit_size(state, evidence)
@@ -352,7 +357,16 @@ class Tracker:
             moved = sir.difference(mean, track.mean)[0]
             velocity = keep * track.velocity + (1 - keep) * self.settings.velocity * moved
         new = TrackState(
-            particles, weights, mean, velocity, offset, state, track.age + 1, bad, outside
+            particles,
+            weights,
+            mean,
+            velocity,
+            offset,
+            state,
+            track.trend,
+            track.age + 1,
+            bad,
+            outside,
         )
         if bad >= 2 or (bad and not cfg.patience):
             return new, "recovering", True
