@@ -43,8 +43,12 @@ class Start(Protocol):
         improve: Improve,
         n: int,
         generator: torch.Generator,
+        before: Tensor | None = None,
     ) -> Tensor:
-        """(n, 6 + d) particles on the pose space's device."""
+        """(n, 6 + d) particles on the pose space's device.
+
+        before: (1, 6 + d) the hand as it was lately, if it was; it may be anywhere by now.
+        """
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,7 @@ class RoughStart:
         improve: Improve,
         n: int,
         generator: torch.Generator,
+        before: Tensor | None = None,
     ) -> Tensor:
         """See Start; nothing is scored."""
         device = space.lower.device
@@ -127,10 +132,11 @@ class SearchStart:
         improve: Improve,
         n: int,
         generator: torch.Generator,
+        before: Tensor | None = None,
     ) -> Tensor:
         """See Start."""
         lower, upper = space.lower, space.upper
-        first = self._draw(observation, space, generator)
+        first = self._draw(observation, space, generator, before)
         scores = log_scores(first, self.coverage)
         best = first[scores.topk(min(self.islands, len(first))).indices]
         best_scores = scores.topk(len(best)).values
@@ -160,7 +166,11 @@ class SearchStart:
         return sir.diffuse(best.expand(n, -1), 0.5 * sigmas, lower, upper, "reflect", generator)
 
     def _draw(
-        self, observation: Observation, space: PoseSpace, generator: torch.Generator
+        self,
+        observation: Observation,
+        space: PoseSpace,
+        generator: torch.Generator,
+        before: Tensor | None,
     ) -> Tensor:
         m, device = self.hypotheses, space.lower.device
 
@@ -172,9 +182,9 @@ class SearchStart:
 
         centre = torch.from_numpy(palm_centres(observation, m, generator)).to(device)
         in_plane = uniform() * 2 * math.pi
-        exit_point = arm_exit(observation)
-        if exit_point is not None:
-            way = torch.from_numpy(exit_point).to(device) - centre
+        exits = arm_exits(observation, m, generator)
+        if exits is not None:
+            way = torch.from_numpy(exits).to(device) - centre
             towards_arm = torch.atan2(-way[:, 0], way[:, 1]) + self.arm_rad * normal(m)
             in_plane = torch.where(uniform() < 0.8, towards_arm, in_plane)
         facing = (uniform() < 0.5) * math.pi
@@ -183,9 +193,16 @@ class SearchStart:
             (_about(in_plane, 2), _about(tilt[:, 0], 0), _about(tilt[:, 1] + facing, 1))
         )
         rows = torch.randint(len(space.training_latents), (m,), generator=generator, device=device)
+        latent = space.training_latents[rows]
+        if before is not None:
+            again = slice(0, m // 4)
+            turn = 0.3 * normal(m // 4, 3)
+            rotation[again] = roma.rotvec_composition((turn, before[:, 3:6].expand(m // 4, -1)))
+            latent = latent.clone()
+            latent[again] = before[:, 6:]
         pivot = roma.rotvec_to_rotmat(rotation) @ rotation.new_tensor(sir.PIVOT_M)
         translation = centre + normal(m, 3) * self.position_m - pivot
-        return torch.cat((translation, rotation, space.training_latents[rows]), 1)
+        return torch.cat((translation, rotation, latent), 1)
 
 
 def _about(angle: Tensor, axis: int) -> Tensor:
@@ -195,12 +212,16 @@ def _about(angle: Tensor, axis: int) -> Tensor:
 
 
 def _points(observation: Observation, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Points of the blob at pixels, a palm's half-thickness behind the surface, (n, 3) metres."""
+    """Points of the blob at pixels, a palm's half-thickness behind the surface, (n, 3) metres.
+
+    Outside of the image the surface is as deep as at the nearest pixel inside.
+    """
     hand, depth = observation.hand.cpu().numpy(), observation.depth_m.cpu().numpy()
     k = observation.k.cpu().numpy()
     # Noise and flying pixels: the median of a neighbourhood, wherever it is mostly hand.
     smooth = cv2.medianBlur(np.where(hand, depth, 0).astype(np.float32), 5)
-    z = np.where(smooth[v, u] > 0, smooth[v, u], depth[v, u]) + 0.012
+    row, column = v.clip(0, hand.shape[0] - 1), u.clip(0, hand.shape[1] - 1)
+    z = np.where(smooth[row, column] > 0, smooth[row, column], depth[row, column]) + 0.012
     x, y = (u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z
     return np.stack((x, y, z), 1).astype(np.float32)
 
@@ -211,6 +232,9 @@ def palm_centres(observation: Observation, n: int, generator: torch.Generator) -
     They are centres of widest discs: inscribed in the silhouette cut along its depth edges, so that
     a hand in front of the body stands by itself, and no wider than a palm, so that they do not lie
     on the body. The wider and the nearer to the camera a disc is, the oftener it is drawn.
+
+    Up to a third lie where they would if the silhouette went on beyond the image: a hand that
+    enters sideways shows fingers and forearm before its palm.
     """
     hand = observation.hand.cpu().numpy()
     depth = observation.depth_m.cpu().numpy()
@@ -218,19 +242,28 @@ def palm_centres(observation: Observation, n: int, generator: torch.Generator) -
     far = np.where(hand, depth, depth.max()).astype(np.float32)
     smooth = hand & (cv2.dilate(far, kernel) - cv2.erode(far, kernel) < _DEPTH_EDGE_M)
     inside = smooth if smooth.any() else hand
+    focal = float(observation.k[0, 0])
+    # A palm's radius in pixels, and one for the border of zeros that ends the silhouette.
+    margin = 1 + math.ceil(_WIDEST_PALM_M * focal / max(observation.nearest_m, 0.1))
+    depths = np.pad(depth, margin, mode="edge")
+    nearness = np.exp(-(depths - observation.nearest_m) / _DEPTH_M)
+
+    def disc_weights(silhouette: np.ndarray) -> np.ndarray:
+        distance = cv2.distanceTransform(silhouette, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        peaks = distance >= cv2.dilate(distance, np.ones((5, 5), np.uint8)) - 0.5
+        radius_m = distance * depths / focal
+        usable = (silhouette > 0) & peaks & (radius_m < _WIDEST_PALM_M)
+        return np.where(usable, radius_m**3 * nearness, 0.0)
+
     # The border of the image counts as the silhouette's edge, or an arm that leaves the picture
     # would be widest there.
-    padded = np.pad(inside.astype(np.uint8), 1)
-    distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    widest = inside & (distance >= cv2.dilate(distance, np.ones((5, 5), np.uint8)) - 0.5)
-    radius_m = distance * depth / float(observation.k[0, 0])
-    weights = np.where(
-        widest & (radius_m < _WIDEST_PALM_M),
-        radius_m**3 * np.exp(-(depth - observation.nearest_m) / _DEPTH_M),
-        0.0,
-    )
+    weights = disc_weights(np.pad(inside.astype(np.uint8), margin))
     if not weights.any():
-        weights = inside.astype(np.float64)
+        weights = np.pad(inside.astype(np.float64), margin)
+    if n > 1:
+        beyond = disc_weights(_ended(np.pad(inside.astype(np.uint8), margin, mode="edge")))
+        beyond = np.where(weights > 0, 0.0, beyond)
+        weights = weights + beyond * min(1.0, 0.5 * weights.sum() / max(beyond.sum(), 1e-12))
     spots = torch.multinomial(
         torch.from_numpy(weights.ravel() / weights.max()).double().to(generator.device),
         n,
@@ -239,16 +272,23 @@ def palm_centres(observation: Observation, n: int, generator: torch.Generator) -
     )
     if n == 1:
         spots[0] = int(weights.argmax())
-    v, u = np.divmod(spots.cpu().numpy(), hand.shape[1])
-    return _points(observation, v, u)
+    v, u = np.divmod(spots.cpu().numpy(), weights.shape[1])
+    return _points(observation, v - margin, u - margin)
 
 
-def arm_exit(observation: Observation) -> np.ndarray | None:
-    """Where the blob leaves the image, (3,) float32 metres; None where it does not."""
+def _ended(silhouette: np.ndarray) -> np.ndarray:
+    """The same with an outermost row and column of zeros, in place."""
+    silhouette[[0, -1], :] = silhouette[:, [0, -1]] = 0
+    return silhouette
+
+
+def arm_exits(observation: Observation, n: int, generator: torch.Generator) -> np.ndarray | None:
+    """Points where the blob leaves the image, (n, 3) float32 metres; None where it does not."""
     hand = observation.hand.cpu().numpy()
     border = np.zeros_like(hand)
     border[[0, -1], :] = border[:, [0, -1]] = True
     v, u = np.nonzero(hand & border)
     if len(v) < 3:
         return None
-    return np.median(_points(observation, v, u), axis=0)
+    rows = torch.randint(len(v), (n,), generator=generator, device=generator.device).cpu().numpy()
+    return _points(observation, v[rows], u[rows])

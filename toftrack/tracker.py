@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import roma
 import torch
 from torch import Tensor
 
 from toftrack import filter as sir
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.filter import FilterSettings
+from toftrack.forearm import arm_sight, seen_through
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
@@ -48,6 +50,7 @@ class LostSettings:
     probation: int
     rival_gain: float
     outside_rad: float
+    memory: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,7 @@ class Tracker:
         self._set_shape(self._first_shape)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.track: TrackState | None = None
+        self._seen = None
         self.insight: Insight | None = None
         self._model_variance = _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
         self._poses = self.space.decode(self.space.training_latents)
@@ -169,7 +173,7 @@ class Tracker:
 
         track = self.track
         if track is None or track.age < self.lost.probation:
-            track = self._started(track, observation, evidence)
+            track = self._started(track, observation, evidence, timestamp_s)
         particles, weights = self._filter(track, evidence)
         self.insight = Insight(observation, particles, weights)
         mean = sir.mean_particle(particles, weights)
@@ -184,7 +188,9 @@ class Tracker:
         track = replace(track, trend=trend)
         self.track, name, lost = self._judge(track, particles, weights, mean, state, score)
         if not lost:
-            self._fit_size(state, evidence)
+            if self.track.age > self.lost.probation:
+                self._seen = self.track.mean, timestamp_s
+            self._fit_size(state, observation, evidence)
         if self.track is not None and bool(observation.occluder.any()):
             self.track = replace(self.track, expected=expected)
         estimate = replace(estimate, state_name=name, lost=lost)
@@ -237,13 +243,34 @@ class Tracker:
         return self.likelihood.log_score(counts, coverage)
 
     def _started(
-        self, track: TrackState | None, observation: Observation, evidence: Evidence
+        self,
+        track: TrackState | None,
+        observation: Observation,
+        evidence: Evidence,
+        timestamp_s: float,
     ) -> TrackState:
         """A new track; or the given young one, if the search finds nothing better than it."""
         n = self.settings.particles
-        log_scores = partial(self._log_scores, evidence=evidence)
+        sight = arm_sight(observation)
+        before, fresh = None, 0.0
+        if self._seen is not None:
+            before, when = self._seen
+            fresh = math.exp(-(timestamp_s - when) / 2.0)
+            if fresh < 0.1: before = None
+
+        def log_scores(particles: Tensor, coverage: float) -> Tensor:
+            armless = seen_through(particles, sight)
+            scores = self._log_scores(particles, coverage, evidence=evidence)
+            scores = scores - self.likelihood.forearm * armless
+            if before is not None:
+                turned = roma.rotvec_geodesic_distance(particles[:, 3:6], before[:, 3:6].expand(len(particles), -1))
+                scores = scores + self.lost.memory * fresh * torch.exp(-0.5 * (turned / 0.7).square())
+            return scores
+
         improve = partial(self._improved, observation=observation)
-        particles = self.start(observation, self.space, log_scores, improve, n, self.generator)
+        particles = self.start(
+            observation, self.space, log_scores, improve, n, self.generator, before
+        )
         if track is not None:
             now = sir.compose(track.particles, track.velocity[None])
             # The search has seen this frame and the track has not, so a little better is no better.
@@ -372,14 +399,28 @@ class Tracker:
             return new, "recovering", True
         return new, "initialising" if track.age == 0 else "tracking", outside >= 2
 
-    def _fit_size(self, state: Tensor, evidence: Evidence) -> None:
+    def _fit_size(self, state: Tensor, observation: Observation, evidence: Evidence) -> None:
         """Let a believed estimate say how large the hand is."""
         if self.fit is None or self._size is None or self._size.frames >= self.fit.frames:
             return
         before = self._size.index
-        self._size = update(
-            self._size, self.fit, state, evidence, self.scorer, self.likelihood, self.generator
+        middle = self._refiner.joints(state).mean(0)
+        seen = surroundings(observation, middle, self.refinement.points)
+
+        def improve(moved, ratio):
+            if len(seen.points_m) == 0:
+                return moved
+            return self._refiner(moved, moved[:, 6:], replace(seen, points_m=seen.points_m / ratio), self.refinement)
+
+        self._size, found, gain = update(
+            self._size, self.fit, state, evidence, self.scorer, self.likelihood, self._poses, improve, self.generator
         )
+        if self._size.index != before and self._size.frames <= self.fit.early and self.track is not None:
+            latent = sir.bound(self.space.encode(found[:, 6:]), self.space.lower, self.space.upper, "truncate")
+            mean = torch.cat((found[:, :6], latent), 1)
+            particles = sir.compose(self.track.particles, sir.difference(mean, self.track.mean))
+            particles[:, 6:] = sir.bound(particles[:, 6:], self.space.lower, self.space.upper, "truncate")
+            self.track = replace(self.track, mean=mean, state=found, particles=particles)
         if self._size.index != before:
             self._set_shape(self._first_shape.scaled(self._size.ratio(self.fit)))
 
