@@ -11,7 +11,6 @@ built: the evidence is taken closer instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,7 +22,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer
 
-_REACH = 4  # sizes tried on either side of the present one
+_REACH = 3  # sizes tried on either side of the present one
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,6 @@ class HandFit:
     largest: float = 1.4
     samples: int = 64
     exponent: float = 20.0
-    early: int = 8
-    keep: float = 0.9
 
 
 @dataclass(frozen=True)
@@ -91,29 +88,19 @@ def update(
     evidence: Evidence,
     scorer: Scorer,
     likelihood: FMeasure,
-    poses: Tensor,
-    improve: Callable[[Tensor, float], Tensor],
     generator: torch.Generator,
-):
+) -> SizeBelief:
     """What is believed after one more estimate.
 
     state: (1, 27) refined with a hand of the present size, for which `scorer` was made.
     """
     sizes = len(belief.log_likelihood)
     around = range(max(0, belief.index - _REACH), min(sizes, belief.index + _REACH + 1))
-    early = belief.frames < fit.early
-    n = fit.samples * (4 if early else 1)
-    noise = torch.randn(n, 27, generator=generator, device=state.device)
-    width = torch.ones(n, 1)
-    if early: width[n//2:] = 2.0
-    noise = width * noise * noise.new_tensor([0.004] * 3 + [0.03] * 3 + [0.06] * 21)
+    noise = torch.randn(fit.samples, 27, generator=generator, device=state.device)
+    noise = noise * noise.new_tensor([0.004] * 3 + [0.03] * 3 + [0.06] * 21)
     noise[0] = 0.0
     moved = sir.compose(state, noise)  # every angle is a coordinate here
-    if early:
-        rows = torch.randint(len(poses), (n // 2,), generator=generator)
-        part = 0.6 * torch.rand(n // 2, 1, generator=generator)
-        moved[n // 2 :, 6:] = torch.lerp(moved[n // 2 :, 6:], poses[rows], part)
-    scores, found = [], []
+    scores = []
     for index in around:
         ratio = (1 + fit.step) ** (index - belief.index)
         closer = replace(
@@ -125,22 +112,11 @@ def update(
         # The middle of the hand stays where it is: about the wrist, it would grow out of place.
         middle = moved[:, :3] + sir.rotated_pivot(moved[:, 3:6])
         states = torch.cat(((middle - ratio * (middle - moved[:, :3])) / ratio, moved[:, 3:]), 1)
-        logs = likelihood.log_score(scorer(states, closer))
-        if early:
-            top = states[logs.topk(2).indices]
-            better = torch.cat([improve(t[None], ratio) for t in top])
-            states = torch.cat((states, better))
-            logs = torch.cat((logs, likelihood.log_score(scorer(better, closer))))
-        best = int(logs.argmax())
-        st = states[best : best + 1].clone(); st[:, :3] *= ratio
-        found.append(st)
-        scores.append(fit.exponent * float(logs[best]))
-    prior = first_belief(fit).log_likelihood
-    total = prior + (fit.keep if early else 1.0) * (belief.log_likelihood - prior)
+        best = likelihood.log_score(scorer(states, closer)).max()
+        scores.append(fit.exponent * float(best))
+    total = belief.log_likelihood.clone()
     # Sizes that were not tried are as unlikely as the nearest one that was.
     total[: around[0]] += scores[0]
     total[around[-1] + 1 :] += scores[-1]
     total[around[0] : around[-1] + 1] += torch.tensor(scores)
-    new = int(total.argmax())
-    k = max(0, min(len(found) - 1, new - around[0]))
-    return SizeBelief(total, new, belief.frames + 1), found[k], (scores[k]-scores[belief.index-around[0]])/fit.exponent
+    return SizeBelief(total, int(total.argmax()), belief.frames + 1)

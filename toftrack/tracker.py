@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from dataclasses import dataclass, replace
 from functools import partial
@@ -137,6 +138,11 @@ class Tracker:
         self.insight: Insight | None = None
         self._model_variance = _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
         self._poses = self.space.decode(self.space.training_latents)
+        from toftrack.pose_space.training_poses import basic_pose, GESTURES
+        nb = int(os.environ.get("NB", "0"))
+        if nb:
+            basic = torch.stack([basic_pose(g) for g in GESTURES]).float()
+            self._poses = torch.cat((self._poses, basic.repeat(nb, 1)))
         self._last: Estimate | None = None
 
     def _set_shape(self, shape: HandShape) -> None:
@@ -413,7 +419,7 @@ class Tracker:
             return self._refiner(moved, moved[:, 6:], replace(seen, points_m=seen.points_m / ratio), self.refinement)
 
         self._size, found, gain = update(
-            self._size, self.fit, state, evidence, self.scorer, self.likelihood, self._poses, improve, self.generator
+            self._size, self.fit, state, evidence, self.scorer, replace(self.likelihood, beta=float(os.environ.get("BETA","1.5")), residual_weight=float(os.environ.get("RW","1"))), self._poses, improve, self.generator
         )
         if self._size.index != before and self._size.frames <= self.fit.early and self.track is not None:
             latent = sir.bound(self.space.encode(found[:, 6:]), self.space.lower, self.space.upper, "truncate")
