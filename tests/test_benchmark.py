@@ -37,6 +37,7 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
         "largest_difference_px",
         "peak_memory_gb",
         "frames",
+        "decoding",
         "notes",
     }
     tables = {row["table"] for row in result["rows"]}
@@ -53,8 +54,13 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
     assert set(frames["default"]["parts"]) == set(frame_timing.PARTS)
     assert frames["default"]["parts"]["refinement"] > frames["paper"]["parts"]["refinement"]
     assert 0 < frames["paper"]["parts"]["filter: scoring"] < frames["paper"]["median_ms"]
+    spaces = {row["space"]: row for row in result["decoding"]}
+    assert set(spaces) == {"pca", "kernel_pca", "lle", "isomap"}
+    assert all(row["latents"] == 10_000 for row in spaces.values())
+    assert all(0 < row["min_ms"] <= row["median_ms"] for row in spaces.values())
     printed = capsys.readouterr().out
     assert "median ms" in printed and "numba" in printed
+    assert printed.count("decoding latents") == 4 and "kernel_pca" in printed
 
 
 def test_whole_frames_need_the_configuration(tmp_path, monkeypatch):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import cv2
+import fake_realsense
 import hydra
 import numpy as np
 import pytest
@@ -67,7 +69,12 @@ def composed(group: str, option: str, *overrides: str) -> DictConfig:
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_composes_and_can_be_made(group: str, option: str, tmp_path: Path) -> None:
+def test_every_option_composes_and_can_be_made(
+    group: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A camera like none, so that realsense.yaml needs neither its SDK nor a camera here.
+    camera = fake_realsense.Camera("1", [fake_realsense.Profile("depth", "z16", (640, 480))], [])
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake_realsense.Sdk(camera))
     given = given_for(tmp_path).get((group, option), []) + FASTER.get(option, [])
     config = composed(group, option, *given)
     part = config if group == "experiment" else config[group]

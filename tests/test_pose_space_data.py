@@ -108,6 +108,14 @@ def broken(kind: str, path: Path) -> str:
         path.write_text(path.read_text() + ",".join(["1"] * 20 + ["much"]) + "\n")
     if kind == "short row":
         path.write_text(path.read_text() + "1,2,3\n")
+    if kind == "semicolons":
+        path.write_text(path.read_text().replace(",", ";"))
+    if kind == "column twice":
+        path.write_text(path.read_text().replace("index_mcp_abduction", "thumb_ip_flexion"))
+    if kind == "infinite":
+        path.write_text(path.read_text() + ",".join(["1"] * 20 + ["inf"]) + "\n")
+    if kind == "no value":
+        path.write_text(path.read_text() + "1," * 20 + "\n")
     if kind == "empty":
         path.write_text("")
     if kind == "binary":
@@ -128,8 +136,12 @@ def broken(kind: str, path: Path) -> str:
         ("other signs", "beyond a hand's joint limits"),
         ("short row", "pose 6 has 3 values for 21 columns"),
         ("one pose", "holds 1 poses"),
-        ("empty", "no column"),
-        ("binary", "cannot be read"),
+        ("infinite", "little_dip_flexion of pose 6 is not a finite number"),
+        ("no value", "little_dip_flexion of pose 6 is '', not a number"),
+        ("semicolons", "no header of comma-separated names"),
+        ("column twice", "2 columns 'thumb_ip_flexion'"),
+        ("empty", "is empty"),
+        ("binary", "comma-separated text in UTF-8"),
     ],
 )
 def test_a_bad_csv_is_one_clear_sentence(tmp_path: Path, kind: str, part: str) -> None:
@@ -145,7 +157,7 @@ def test_a_bad_csv_is_one_clear_sentence(tmp_path: Path, kind: str, part: str) -
         ({"poses": np.zeros((3, 21))}, "no array 'angles'"),
         ({"angles": np.zeros((3, 20))}, "of the shape"),
         ({"angles": np.array([["a"] * 21])}, "must be numbers"),
-        ({"angles": np.array([{}] * 21, dtype=object)}, "not an .npz of joint angles"),
+        ({"angles": np.array([{}] * 21, dtype=object)}, "'angles' holds pickled objects"),
         ({"angles": np.ones((3, 21)), "labels": np.array(["a"])}, "1 'labels' for 3 poses"),
         ({"angles": np.ones((3, 21)), "angle_names": np.array(["a"] * 21)}, "does not name"),
     ],
@@ -201,8 +213,8 @@ def test_folds_hold_out_whole_clips_and_every_pose_once() -> None:
 
 def test_held_out_clips_are_described_worse_than_training_poses() -> None:
     row = evaluate_space("pca", 4, synthetic_data())
-    assert row.variance == pytest.approx(0.9887, abs=0.01)
-    assert row.training.degrees == pytest.approx(2.78, abs=0.3)
+    assert row.variance == pytest.approx(0.9788, abs=0.001)
+    assert row.training.degrees == pytest.approx(2.96, abs=0.03)
     assert row.held_out is not None and row.held_out.degrees > row.training.degrees
     assert 0 < row.training.mm < row.held_out.mm
     # The projection of PCA may leave the box, but not by more than a little.

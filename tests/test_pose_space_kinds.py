@@ -25,7 +25,7 @@ from toftrack.pose_space.files import (
 )
 from toftrack.pose_space.neighbours import barycentric_weights
 from toftrack.pose_space.pose_data import synthetic_data
-from toftrack.pose_space.timing import LIMITS_MS, decode_times
+from toftrack.pose_space.timing import AIMS_MS, decode_times
 
 CONF = str(Path(__file__).parents[1] / "conf")
 KINDS = ("pca", "kernel_pca", "lle", "isomap")
@@ -238,7 +238,9 @@ def test_a_density_out_of_range_is_refused(bandwidth: float, floor: float) -> No
 
 def test_decoding_is_timed_for_every_space() -> None:
     spaces = {kind: fitted(kind) for kind in KINDS}
-    times = decode_times(spaces=spaces, repeats=2)
-    assert set(times) == set(KINDS)
-    assert set(LIMITS_MS) <= set(KINDS)
-    assert all(0 < milliseconds < 60_000 for milliseconds in times.values())
+    rows = decode_times(spaces=spaces, count=100, repeats=3)
+    assert [row.space for row in rows] == list(KINDS)
+    assert all(0 < row.min_ms <= row.median_ms for row in rows)
+    assert all((row.latents, row.dims, row.repeats) == (100, 4, 3) for row in rows)
+    # The aims are of 10 000 latents, and of fewer they say nothing.
+    assert set(AIMS_MS) <= set(KINDS) and {row.aim_ms for row in rows} == {None}

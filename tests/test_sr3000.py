@@ -15,7 +15,7 @@ import pytest
 import usb.core
 
 from toftrack.camera import Camera
-from toftrack.devices import sr3000, sr3000_usb
+from toftrack.devices import sr3000_usb
 from toftrack.devices.base import Device
 from toftrack.devices.sample import Sample
 from toftrack.devices.sr3000 import Sr3000
@@ -25,6 +25,7 @@ from toftrack.devices.sr3000_transport import Exposure, Persistence, UsbSettings
 from toftrack.devices.sr3000_usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES, unambiguous_range_m
+from toftrack.recordings.store import open_source
 
 FAST = {"fps": 1000.0, "replug_s": 0.02, "late_s": 0.06}
 STEP_M = unambiguous_range_m(20) / 0xFFFF
@@ -376,7 +377,7 @@ def test_amplitude_threshold_takes_the_distance_of_dim_pixels() -> None:
 
 
 def test_a_camera_with_other_endpoints_is_told() -> None:
-    source, settings = sr3000._source("sample"), EmulatorSettings()
+    source, settings = open_source("sample"), EmulatorSettings()
     backend = EmulatedBackend(source, settings, 7.5, UsbSettings(endpoint_in=0x81))
     transport = UsbTransport(UsbSettings(), Exposure(), None, backend)
     with pytest.raises(ToftrackError, match="no endpoint 0x86 .it has 0x02, 0x81"):
@@ -385,7 +386,7 @@ def test_a_camera_with_other_endpoints_is_told() -> None:
 
 
 def test_a_register_that_the_camera_refuses_is_told() -> None:
-    source, settings = sr3000._source("sample"), EmulatorSettings()
+    source, settings = open_source("sample"), EmulatorSettings()
     backend = EmulatedBackend(source, settings, 7.5, UsbSettings(endpoint_out=0x02))
     backend.bulk_write = lambda *_: (_ for _ in ()).throw(usb.core.USBError("Pipe error", -9, 32))
     transport = UsbTransport(UsbSettings(registers={1: 2}), Exposure(), None, backend)

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from toftrack.app import build_tracker
+from toftrack.app import build_tracker, track
+from toftrack.devices.base import Device
 from toftrack.devices.sample import Sample
 from toftrack.estimate import Estimate
 from toftrack.tracker import Tracker
@@ -79,6 +81,18 @@ def configuration(*overrides: str, name: str = "config") -> DictConfig:
     """The configuration of `python track.py` with overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose(name, overrides=list(overrides))
+
+
+def run(folder: Path, device: Device, *overrides: str) -> None:
+    """What `python track.py` does with overrides and an opened device, in this process."""
+    hydra = (f"hydra.runtime.output_dir={folder}", "hydra.job.num=0", "hydra.job.id=0")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=[*overrides, *hydra], return_hydra_config=True)
+    HydraConfig.instance().set_config(config)
+    try:
+        track(config, device)
+    finally:
+        HydraConfig.instance().cfg = None
 
 
 def make_tracker(*overrides: str) -> Tracker:

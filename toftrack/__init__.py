@@ -1,0 +1,76 @@
+"""toftrack: a tracker of a human hand in depth images.
+
+For a program of one's own:
+
+    import toftrack
+
+    tracker = toftrack.make_tracker("hand.side=left")
+    estimate = tracker.step(depth_m, K)
+    estimate.joints_m
+
+The names in `__all__` are stable. Everything else is private and may change with any version.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from toftrack.camera import Camera
+    from toftrack.devices.base import BaseDevice, Frame
+    from toftrack.errors import ToftrackError
+    from toftrack.estimate import Estimate
+    from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
+    from toftrack.interface import make_device, make_tracker
+    from toftrack.results import read_results
+    from toftrack.tracker import Tracker
+
+    __version__: str
+
+# Imported when they are first asked for: torch takes seconds, and not every program needs it.
+_PLACES = {
+    "ANGLE_NAMES": "toftrack.hand.skeleton",
+    "BaseDevice": "toftrack.devices.base",
+    "Camera": "toftrack.camera",
+    "Estimate": "toftrack.estimate",
+    "Frame": "toftrack.devices.base",
+    "JOINT_NAMES": "toftrack.hand.skeleton",
+    "ToftrackError": "toftrack.errors",
+    "Tracker": "toftrack.tracker",
+    "make_device": "toftrack.interface",
+    "make_tracker": "toftrack.interface",
+    "read_results": "toftrack.results",
+}
+
+__all__ = [
+    "ANGLE_NAMES",
+    "BaseDevice",
+    "Camera",
+    "Estimate",
+    "Frame",
+    "JOINT_NAMES",
+    "ToftrackError",
+    "Tracker",
+    "__version__",
+    "make_device",
+    "make_tracker",
+    "read_results",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: Any = version("toftrack")
+    elif name in _PLACES:
+        value = getattr(import_module(_PLACES[name]), name)
+    else:
+        raise AttributeError(f"module 'toftrack' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

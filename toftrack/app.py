@@ -20,7 +20,8 @@ from toftrack.errors import ToftrackError
 from toftrack.evaluation import metrics_table
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.results import ResultWriter
-from toftrack.stream import Stream
+from toftrack.smoothing import OneEuro, smooth
+from toftrack.stream import ReaderGoneError, Stream
 from toftrack.tracker import Tracker
 from toftrack.views.base import Moment, View
 
@@ -62,21 +63,27 @@ def track(config: DictConfig, device: Device) -> float:
 
     `device` is what `config.device` describes; it is opened and closed here.
     """
+    with hydra.utils.instantiate(config.stream) as stream:
+        return _track(config, device, stream)
+
+
+def _track(config: DictConfig, device: Device, stream: Stream) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     make = hydra.utils.instantiate
     tracker = build_tracker(config)
+    smoothing: OneEuro | None = make(config.smooth)
     with device:
         make_view = make(config.view, _partial_=True)
         metadata = _metadata(config, device, tracker)
-        view: View = make_view(folder=folder, fps=device.fps, frames=device.frames)
-        stream: Stream = make(config.stream)
-        with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
-            try:
-                _loop(device, tracker, results, view, stream)
-            finally:
-                stream.close()
-                view.close()
-                tracker.shape.to("cpu").save(folder / "hand_shape.json")
+        view: View
+        with make_view(folder=folder, fps=device.fps, frames=device.frames) as view:
+            with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
+                try:
+                    _loop(device, tracker, results, view, stream, smoothing)
+                except ReaderGoneError as gone:
+                    print(f"{gone}: tracking ends here", file=sys.stderr)
+                finally:
+                    tracker.shape.to("cpu").save(folder / "hand_shape.json")
     summary = results.summary or {}
     if not summary.get("frames"):
         raise ToftrackError("the device delivered no frame; nothing was tracked")
@@ -90,8 +97,14 @@ def track(config: DictConfig, device: Device) -> float:
 
 
 def _loop(
-    device: Device, tracker: Tracker, results: ResultWriter, view: View, stream: Stream
+    device: Device,
+    tracker: Tracker,
+    results: ResultWriter,
+    view: View,
+    stream: Stream,
+    smoothing: OneEuro | None,
 ) -> None:
+    smoothed = None
     progress = partial(tqdm, total=device.frames, unit=" frames", file=sys.stderr, mininterval=0.2)
     with progress() as bar:
         for frame in device:
@@ -100,8 +113,11 @@ def _loop(
             depth = device.camera.rectify(frame.depth, frame.radial)
             shape = tracker.shape
             estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+            smoothed, calm = smooth(smoothing, smoothed, estimate, shape)
+            if smoothing is not None and smoothing.results:
+                estimate = calm
             results.append(estimate)
-            stream.send(estimate)
+            stream.send(calm)
             view.show(Moment(frame, depth, device.camera, estimate, shape, tracker.insight))
             bar.update()
             bar.set_postfix_str(f"score {estimate.score:.2f} {estimate.state_name}", refresh=False)

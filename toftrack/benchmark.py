@@ -9,6 +9,8 @@ the true wrist as a filter's are. The baselines:
   chunks of hypotheses that suit the cache;
 * naive: the closed form over whole images of all ellipsoids (ReferenceScorer), in chunks of the
   size that turns out fastest here.
+
+Besides, what decoding 10 000 latents of each pose space takes.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from toftrack.frame_timing import FrameRow, frame_times
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.pose_space.timing import decode_times
 from toftrack.render.closed_form import project
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import BACK_ENDS, Evidence, Scorer, make_scorer
@@ -292,6 +295,7 @@ def run(
         "largest_difference_px": benchmark.disagreement_px,
         "peak_memory_gb": memory,
         "frames": [asdict(row) for row in whole],
+        "decoding": [asdict(row) for row in decode_times(device=device)],
         "notes": benchmark.notes,
     }
 
@@ -318,6 +322,12 @@ def show(result: dict) -> str:
             f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}"
         )
         lines += [f"    {part:<56}{row['parts'][part]:>15.3f}" for part in row["parts"]]
+    for row in result["decoding"]:
+        aim = "" if row["aim_ms"] is None else f"   (aim: at most {row['aim_ms']:g})"
+        lines.append(
+            f"{'decoding latents':<22}{row['space']:<13}{row['latents']:>7}{'':>18}"
+            f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}{aim}"
+        )
     for name, against in result["ratios"].items():
         parts = ", ".join(f"{ratio:.0f} x {baseline}" for baseline, ratio in against.items())
         lines.append(f"{name}: {parts} (ratio of medians)")

@@ -209,6 +209,20 @@ class Camera:
         return cls.from_dict(content, path)
 
     @classmethod
+    def load_for(cls, path: str | Path, width: int, height: int, images: str) -> Camera:
+        """`load` a camera file for images of that size; `images` is what errors call them.
+
+        Raises ToftrackError as `load`, and when the camera is of another size.
+        """
+        camera = cls.load(path)
+        if (camera.width, camera.height) != (width, height):
+            raise ToftrackError(
+                f"the camera file '{path}' is for {camera.width}x{camera.height} pixels, but "
+                f"{images} has {width}x{height}; use the camera that made the images"
+            )
+        return camera
+
+    @classmethod
     def from_dict(cls, content: object, path: str | Path) -> Camera:
         """The camera of `to_dict`; `path` is what errors name. Raises ToftrackError as `load`."""
         if not isinstance(content, dict) or content.get("format") != _FORMAT:

@@ -19,6 +19,7 @@ import functools
 import json
 import math
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -137,6 +138,11 @@ def sentence(error: BaseException) -> str:
         # Some of Hydra's errors are OSErrors too, without being of the system.
         if isinstance(cause, OSError) and not isinstance(cause, HydraException):
             return _of_system(cause)
+    if target := re.match(r"Error locating target '([^']+)'", str(error)):
+        return (
+            f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "
+            "name, and that its module lies beside the program or on PYTHONPATH"
+        )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _of_config(error)
     text = _one_line(str(error))

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import cycle
-from pathlib import Path
 from unittest.mock import patch
 
 import hydra
@@ -18,6 +17,7 @@ from omegaconf import DictConfig
 
 from toftrack.app import build_tracker
 from toftrack.errors import ToftrackError
+from toftrack.interface import configuration_folder
 from toftrack.likelihood import FMeasure
 from toftrack.segmentation import NearestSurface
 from toftrack.tracker import Tracker
@@ -27,7 +27,7 @@ CONFIGURATIONS: dict[str, tuple[str, ...]] = {
     "paper": ("experiment=paper",),
 }
 PARTS = ("segmentation and evidence", "filter: scoring", "filter: rest", "refinement", "rest")
-_CONF = Path(__file__).resolve().parents[1] / "conf"
+_CONF = configuration_folder()
 _FEWEST = 12
 _STARTS = 6
 

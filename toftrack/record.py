@@ -22,6 +22,7 @@ from tqdm import tqdm
 from toftrack import cli
 from toftrack.devices.sr3000 import Sr3000
 from toftrack.errors import ToftrackError
+from toftrack.interface import configuration_folder
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
 
@@ -29,7 +30,6 @@ _ONLY = (
     "only the SR3000 is recorded, which needs no device=; other recordings are converted with "
     "python -m toftrack.convert"
 )
-_CONF = Path(__file__).resolve().parents[1] / "conf"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -40,7 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, help="stop after so many (default: at Ctrl-C)")
     parser.add_argument("--seconds", type=float, help="stop after so long")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    parser.add_argument("--conf", default=_CONF, help="folder of the configuration")
+    parser.add_argument(
+        "--conf", default=configuration_folder(), help="folder of the configuration"
+    )
     parser.add_argument("overrides", nargs="*", metavar="device.KEY=VALUE", help="settings")
     # Intermixed: options may stand between the settings.
     options = parser.parse_intermixed_args(arguments)

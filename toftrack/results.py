@@ -37,6 +37,24 @@ _ARRAYS: dict[str, type] = {
 }
 _POINTING = {"pointing_origin_m": np.float32, "pointing_direction": np.float32}
 """Arrays beside the promised ones: files without them are results as well."""
+LINE_FIELDS = (
+    "index",
+    "timestamp_s",
+    "state_name",
+    "lost",
+    "score",
+    "joints_m",
+    "state",
+    "latent",
+    "covariance",
+    "effective_sample_size",
+    "gesture",
+    "gesture_probability",
+    "pointing_origin_m",
+    "pointing_direction",
+    "compute_s",
+)
+"""What a line of track.jsonl says, fields of Estimate, in their order."""
 
 
 class ResultWriter:
@@ -162,28 +180,13 @@ class ResultWriter:
         return summary
 
 
-def json_line(estimate: Estimate) -> str:
-    """An estimate as one line of strict JSON, without newline; NaN becomes null."""
-    return json.dumps(
-        {
-            "index": estimate.index,
-            "timestamp_s": estimate.timestamp_s,
-            "state_name": estimate.state_name,
-            "lost": bool(estimate.lost),
-            "score": _strict(estimate.score),
-            "joints_m": _strict(estimate.joints_m),
-            "state": _strict(estimate.state),
-            "latent": _strict(estimate.latent),
-            "covariance": _strict(estimate.covariance),
-            "effective_sample_size": _strict(estimate.effective_sample_size),
-            "gesture": estimate.gesture,
-            "gesture_probability": _strict(estimate.gesture_probability),
-            "pointing_origin_m": _strict(estimate.pointing_origin_m),
-            "pointing_direction": _strict(estimate.pointing_direction),
-            "compute_s": _strict(estimate.compute_s),
-        },
-        allow_nan=False,
-    )
+def json_line(estimate: Estimate, fields: Sequence[str] = LINE_FIELDS) -> str:
+    """An estimate as one line of strict JSON, without newline; NaN becomes null.
+
+    fields: which of LINE_FIELDS, in this order.
+    """
+    content = {name: _strict(getattr(estimate, name)) for name in fields}
+    return json.dumps(content, allow_nan=False, separators=(",", ":"))
 
 
 def read_results(path: str | Path) -> dict[str, Any]:

@@ -6,10 +6,24 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
+from threading import Lock
 
 import torch
 
 _given: ContextVar[int | None] = ContextVar("toftrack_threads", default=None)
+
+
+@dataclass
+class _Inside:
+    """How many threads are within `small_operations`, and how many torch had outside."""
+
+    count: int = 0
+    outside: int = 1
+
+
+_inside = _Inside()
+_lock = Lock()
 
 
 def threads() -> int:
@@ -27,11 +41,22 @@ def small_operations() -> Iterator[None]:
     Operations on a few hundred particles gain nothing from a second thread, and wait for
     milliseconds at its barrier when another process, or the scorer, has the other core.
     """
-    before = torch.get_num_threads()
+    if _given.get() is not None:
+        yield
+        return
+    with _lock:
+        # A thread that is new to torch begins with the number that was set last, in any thread:
+        # asked while another one is in here, it would say 1, and would say so ever after.
+        if _inside.count == 0:
+            _inside.outside = torch.get_num_threads()
+        _inside.count += 1
+        before = _inside.outside
     token = _given.set(before)
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
         _given.reset(token)
+        with _lock:
+            torch.set_num_threads(before)
+            _inside.count -= 1

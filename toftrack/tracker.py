@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from toftrack import filter as sir
+from toftrack.depth_image import checked_image
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.filter import FilterSettings
 from toftrack.forearm import arm_sight, seen_through
@@ -144,6 +145,7 @@ class Tracker:
             basic = torch.stack([basic_pose(g) for g in GESTURES]).float()
             self._poses = torch.cat((self._poses, basic.repeat(nb, 1)))
         self._last: Estimate | None = None
+        self._next_index = 0
 
     def _set_shape(self, shape: HandShape) -> None:
         self.shape = shape
@@ -163,12 +165,27 @@ class Tracker:
         self._set_shape(self._first_shape)
 
     @small_operations()
-    def step(self, depth_m: np.ndarray, k: np.ndarray, index: int, timestamp_s: float) -> Estimate:
+    def step(
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        index: int | None = None,
+        timestamp_s: float | None = None,
+    ) -> Estimate:
         """One frame: segment, predict, resample - diffuse - observe in annealed passes, refine.
 
-        depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3) intrinsics.
+        depth_m: (H, W) rectified Z in metres, 0 = no reading; H and W may change.
+        k: (3, 3) intrinsics in pixels.
+        index: number of the frame; None counts on from the last.
+        timestamp_s: None is now, seconds on a clock that never goes back.
+
+        Raises ToftrackError when the image or k has the wrong shape, type or unit.
         """
         began = time.perf_counter()
+        depth_m, k = checked_image(depth_m, k)
+        index = self._next_index if index is None else index
+        timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
+        self._next_index = index + 1
         expected = self._expected()
         observation = self.segmentation(depth_m, k, expected)
         if observation.empty:

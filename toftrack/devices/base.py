@@ -9,6 +9,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +87,42 @@ class Device(Protocol):
     def __exit__(self, *exception: object) -> None: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
+
+
+class BaseDevice:
+    """A `Device` but for its frames: derive from it, write `__iter__`, and `open` where needed.
+
+    Args:
+        camera: of the images.
+        fps: frames a second; what the overlay video plays at.
+        frames: how many an iteration yields at most; None = nobody knows.
+        truth: one row for each of `frames`.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        fps: float = 30.0,
+        frames: int | None = None,
+        truth: Truth | None = None,
+    ) -> None:
+        self.camera, self.fps, self.frames, self.truth = camera, float(fps), frames, truth
+        self.description: dict[str, Any] = {"device": type(self).__name__}
+        self.metadata: dict[str, Any] = {}
+
+    def open(self) -> None:
+        """Nothing to open."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The frames, in order; raises ToftrackError when the device cannot deliver."""
+        raise ToftrackError(f"{type(self).__name__} has no frames; write its method __iter__")

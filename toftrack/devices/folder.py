@@ -16,7 +16,7 @@ class Folder(Replay):
         path: the folder; see `toftrack.recordings.png_folder` for what lies in it.
         unit_m: metres of one step of the images; None = as the folder says, else 0.001.
         fps: frames a second; None = as the folder says, else 25.
-        start, stop, realtime, camera_file: as for `Replay`.
+        start, stop, realtime, repeat, camera_file: as for `Replay`.
 
     Raises:
         ToftrackError: as `Replay`, and when the images are not 16-bit grey PNGs of one size.
@@ -30,10 +30,11 @@ class Folder(Replay):
         start: int = 0,
         stop: int | None = None,
         realtime: bool = False,
+        repeat: bool = False,
         camera_file: str | Path | None = None,
     ) -> None:
         if not path:
             raise ToftrackError("no folder was given; set device.path=FOLDER")
         store = read_png_folder(path, camera_file, unit_m, fps)
-        self._set_up(store, path, start, stop, realtime, camera_file)
+        self._set_up(store, path, start, stop, realtime, repeat, camera_file)
         self.description |= {"device": "folder", "unit_m": store.unit_m}

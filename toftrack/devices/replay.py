@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Frame
+from toftrack.devices.base import BaseDevice, Frame
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording
@@ -19,10 +21,12 @@ from toftrack.recordings.store import FrameStore, open_recording
 _log = logging.getLogger(__name__)
 
 
-class Replay:
+class Replay(BaseDevice):
     """The frames of a recording, from `start` up to but not including `stop`.
 
-    Each frame keeps its index within the recording; `truth` is that of the range.
+    Each frame keeps its index within the recording; `truth` is that of the range. With `repeat`
+    indices and timestamps go on counting from one round to the next, as a camera's would; there is
+    no last frame then, so `frames` is None, and so is `truth`, which has a row for each of them.
 
     A `.npz` is loaded; a `.srs` and a folder of images are read frame by frame, so that long ones
     need no more memory than short ones.
@@ -34,6 +38,7 @@ class Replay:
         realtime: at the recording's own pace: wait for each frame's time, and drop a frame when the
             next one is already due (the last is always delivered). Otherwise every frame, as fast
             as it is asked for.
+        repeat: begin again after the last frame, until nobody asks for more.
         camera_file: a calibrated camera instead of the recording's own.
         modulation_mhz: of the SR3000, for a `.srs` that does not state its range.
 
@@ -47,13 +52,14 @@ class Replay:
         start: int = 0,
         stop: int | None = None,
         realtime: bool = False,
+        repeat: bool = False,
         camera_file: str | Path | None = None,
         modulation_mhz: int = DEFAULT_MODULATION_MHZ,
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=FILE.npz")
         store = open_recording(path, camera_file, modulation_mhz)
-        self._set_up(store, path, start, stop, realtime, camera_file)
+        self._set_up(store, path, start, stop, realtime, repeat, camera_file)
 
     def _set_up(
         self,
@@ -62,6 +68,7 @@ class Replay:
         start: int,
         stop: int | None,
         realtime: bool,
+        repeat: bool,
         camera_file: str | Path | None,
     ) -> None:
         self._recording = store
@@ -69,68 +76,85 @@ class Replay:
         if damage:
             _log.warning("%s: %s; its %d whole frames are used", path, damage, len(store))
         self._range = _checked_range(start, stop, len(self._recording), path)
-        self._realtime = bool(realtime)
-        self.camera = _camera(self._recording, camera_file, path)
-        self.fps = self._recording.fps
-        self.frames: int | None = len(self._range)
-        truth = self._recording.truth
-        self.truth = None if truth is None else truth[self._range.start : self._range.stop]
-        self.metadata: dict[str, Any] = self._recording.metadata
+        self._realtime, self._repeat = bool(realtime), bool(repeat)
+        camera = store.camera
+        if camera_file is not None:
+            camera = Camera.load_for(camera_file, camera.width, camera.height, f"'{path}'")
+        truth = None if self._repeat else store.truth
+        super().__init__(
+            camera,
+            store.fps,
+            frames=None if self._repeat else len(self._range),
+            truth=None if truth is None else truth[self._range.start : self._range.stop],
+        )
+        self.metadata = store.metadata
         self.description: dict[str, Any] = {
             "device": "replay",
             "recording": str(path),
             "start": self._range.start,
             "stop": self._range.stop,
             "realtime": self._realtime,
+            "repeat": self._repeat,
             "camera_file": None if camera_file is None else str(camera_file),
         }
         self.dropped = 0
         """Frames that came too late in the latest iteration; always 0 unless `realtime`."""
 
-    def open(self) -> None:
-        """Nothing to open: the file was checked by the constructor."""
-
     def close(self) -> None:
         """Close the recording's file, if it is open."""
         self._recording.close()
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
     def __iter__(self) -> Iterator[Frame]:
         self.dropped = 0
-        indices = self._paced() if self._realtime else iter(self._range)
+        counts = self._paced() if self._realtime else self._all()
         try:
-            for index in indices:
-                yield self._frame(index)
+            for count in counts:
+                yield self._frame(count)
         finally:
             self._recording.close()
 
-    def _paced(self) -> Iterator[int]:
-        due = self._recording.timestamp_s[self._range.start : self._range.stop]
-        begin = time.monotonic()
-        row, last = 0, len(due) - 1
-        while row <= last:
-            now = time.monotonic() - begin + due[0]
-            newest = min(int(np.searchsorted(due, now, side="right")) - 1, last)
-            if newest > row:
-                self.dropped += newest - row
-                row = newest
-            elif due[row] > now:
-                time.sleep(due[row] - now)
-            yield self._range[row]
-            row += 1
+    def _all(self) -> Iterator[int]:
+        return itertools.count() if self._repeat else iter(range(len(self._range)))
 
-    def _frame(self, index: int) -> Frame:
+    def _paced(self) -> Iterator[int]:
+        begin = time.monotonic()
+        count, last = 0, math.inf if self._repeat else len(self._range) - 1
+        while count <= last:
+            now = time.monotonic() - begin
+            newest = int(min(self._due(now), last))
+            if newest > count:
+                self.dropped += newest - count
+                count = newest
+            elif (early_s := self._time_s(count) - self._time_s(0) - now) > 0:
+                time.sleep(early_s)
+            yield count
+            count += 1
+
+    def _due(self, elapsed_s: float) -> int:
+        """The count of the newest frame that is due so long after the first one."""
+        times_s = self._times_s()
+        rounds, within_s = divmod(elapsed_s, self._round_s()) if self._repeat else (0, elapsed_s)
+        row = int(np.searchsorted(times_s, times_s[0] + within_s, side="right")) - 1
+        return int(rounds) * len(times_s) + row
+
+    def _time_s(self, count: int) -> float:
+        rounds, row = divmod(count, len(self._range))
+        return float(self._times_s()[row]) + (rounds * self._round_s() if rounds else 0.0)
+
+    def _round_s(self) -> float:
+        """From a frame to the same one in the next round; the last one lasts one frame's time."""
+        times_s = self._times_s()
+        return float(times_s[-1] - times_s[0]) + 1 / self.fps
+
+    def _times_s(self) -> np.ndarray:
+        return self._recording.timestamp_s[self._range.start : self._range.stop]
+
+    def _frame(self, count: int) -> Frame:
         recording = self._recording
-        depth, amplitude = recording.image(index)
+        depth, amplitude = recording.image(self._range[count % len(self._range)])
         return Frame(
-            index=index,
-            timestamp_s=float(recording.timestamp_s[index]),
+            index=self._range.start + count,
+            timestamp_s=self._time_s(count),
             depth=depth,
             amplitude=amplitude,
             radial=recording.radial,
@@ -151,16 +175,3 @@ def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -
             f"{count} frames; choose 0 <= start < stop <= {count}"
         )
     return range(start, stop)
-
-
-def _camera(recording: FrameStore, camera_file: str | Path | None, path: str | Path) -> Camera:
-    own = recording.camera
-    if camera_file is None:
-        return own
-    camera = Camera.load(camera_file)
-    if (camera.width, camera.height) != (own.width, own.height):
-        raise ToftrackError(
-            f"the camera file '{camera_file}' is for {camera.width}x{camera.height} pixels, but "
-            f"'{path}' has {own.width}x{own.height}; use the camera that made the recording"
-        )
-    return camera

@@ -16,10 +16,11 @@ class Sample(Replay):
         start: int = 0,
         stop: int | None = None,
         realtime: bool = False,
+        repeat: bool = False,
         camera_file: str | Path | None = None,
     ) -> None:
         packaged = resources.files("toftrack") / "data" / "sample.npz"
         with resources.as_file(packaged) as path:
-            super().__init__(path, start, stop, realtime, camera_file)
+            super().__init__(path, start, stop, realtime, repeat, camera_file)
         # Where the package happens to be installed says nothing about the result.
         self.description |= {"device": "sample", "recording": "toftrack/data/sample.npz"}

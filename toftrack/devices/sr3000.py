@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Frame, Truth
+from toftrack.devices.base import BaseDevice, Frame
 from toftrack.devices.sr3000_emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000_libmesasr import MesaTransport
 from toftrack.devices.sr3000_reader import Capture, Counts, Reader
@@ -33,13 +32,13 @@ from toftrack.recordings.sr_frame import (
     decode_frame,
     nominal_camera,
 )
-from toftrack.recordings.store import FrameStore, open_recording
+from toftrack.recordings.store import open_source
 
 _log = logging.getLogger(__name__)
 _KEEP = ("newest", "every")
 
 
-class Sr3000:
+class Sr3000(BaseDevice):
     """A live camera: iterate over it for its frames, as radial distances with amplitudes.
 
     A thread asks for frames from the first iteration on. An unplugged camera is waited for, and
@@ -87,10 +86,7 @@ class Sr3000:
                 f"fps above 0, but they are {keep}, {queue_frames}, {stop} and {fps}"
             )
         self.exposure = Exposure(modulation_mhz, integration_time, amplitude_threshold)
-        self.camera, self.fps = nominal_camera(), float(fps)
-        self.frames: int | None = stop
-        self.truth: Truth | None = None
-        self.metadata: dict[str, Any] = {}
+        super().__init__(nominal_camera(), fps, frames=stop)
         self.emulator: EmulatedBackend | None = None
         self.counts = Counts()
         """What became of the frames; those of the latest iteration."""
@@ -118,7 +114,7 @@ class Sr3000:
             )
         self._transport.check()
         if camera_file is not None:
-            self.camera = _calibrated(camera_file)
+            self.camera = Camera.load_for(camera_file, WIDTH, HEIGHT, "the SR3000")
         self.description: dict[str, Any] = {
             "device": "sr3000",
             "transport": transport,
@@ -166,13 +162,6 @@ class Sr3000:
         if self._reader is not None:
             self._reader.request_stop()
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
     def __iter__(self) -> Iterator[Frame]:
         for capture in self.captures():
             depth, amplitude = decode_frame(
@@ -198,7 +187,7 @@ class Sr3000:
                 _log.info("sr3000: frames: %s", reader.counts)
 
     def _emulate(self, settings: EmulatorSettings, usb: UsbSettings) -> EmulatedBackend:
-        store = _source(settings.source)
+        store = open_source(settings.source)
         if (store.camera.width, store.camera.height) != (WIDTH, HEIGHT):
             raise ToftrackError(
                 f"'{settings.source}' has {store.camera.width}x{store.camera.height} pixels; the "
@@ -213,20 +202,3 @@ class Sr3000:
             self.truth = None if store.truth is None else store.truth[: self.frames]
         self.emulator = EmulatedBackend(store, settings, self.exposure.range_m, usb)
         return self.emulator
-
-
-def _source(name: str) -> FrameStore:
-    if name != "sample":
-        return open_recording(name)
-    with resources.as_file(resources.files("toftrack") / "data" / "sample.npz") as path:
-        return open_recording(path)
-
-
-def _calibrated(path: str | Path) -> Camera:
-    camera = Camera.load(path)
-    if (camera.width, camera.height) != (WIDTH, HEIGHT):
-        raise ToftrackError(
-            f"the camera file '{path}' is for {camera.width}x{camera.height} pixels, but the "
-            f"SR3000 has {WIDTH}x{HEIGHT}; calibrate this camera"
-        )
-    return camera

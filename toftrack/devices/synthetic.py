@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, Self
 
 import numpy as np
 import torch
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Frame, Truth
+from toftrack.devices.base import BaseDevice, Frame, Truth
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -27,7 +26,7 @@ _WALL_M = 1.5
 _AMPLITUDE_AT_1M = 700.0
 
 
-class Synthetic:
+class Synthetic(BaseDevice):
     """A right hand that closes to a fist and opens again while it drifts and turns.
 
     Args:
@@ -54,8 +53,7 @@ class Synthetic:
             raise ToftrackError(
                 "device=synthetic needs frames of at least 1, fps above 0 and noise_m not below 0"
             )
-        self.frames, self.fps = frames, fps
-        self.camera = (
+        camera = (
             Camera.load(camera_file)
             if camera_file
             else Camera(
@@ -64,14 +62,14 @@ class Synthetic:
                 _HEIGHT,
             )
         )
-        self.description: dict[str, Any] = {"device": "synthetic", "noise_m": noise_m, "seed": seed}
-        self.metadata: dict[str, Any] = {}
+        super().__init__(camera, fps, frames)
+        self.description = {"device": "synthetic", "noise_m": noise_m, "seed": seed}
         self._noise_m, self._seed = noise_m, seed
         shape = default_hand_shape()
         pose = forward_kinematics(self._states(), shape)
         self._ellipsoids = hand_surface(shape).pose(pose)
         yes = np.ones(frames, bool)
-        self.truth: Truth | None = Truth(pose.joints_m.numpy(), yes, yes)
+        self.truth = Truth(pose.joints_m.numpy(), yes, yes)
 
     def _states(self) -> torch.Tensor:
         phase = torch.arange(self.frames) / 50.0 * 2 * math.pi
@@ -86,17 +84,6 @@ class Synthetic:
         ).T
         turn = torch.stack((0.1 * phase.sin(), 0.3 * (0.8 * phase).sin(), 0.2 * phase.sin())).T
         return torch.cat((position, turn, angles), 1)
-
-    def open(self) -> None:
-        """Nothing to open."""
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None: ...
 
     def __iter__(self) -> Iterator[Frame]:
         generator = np.random.default_rng(self._seed)

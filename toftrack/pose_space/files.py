@@ -6,7 +6,7 @@ import importlib
 import inspect
 import json
 import pkgutil
-import zipfile
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,11 +17,15 @@ import torch
 import toftrack.pose_space
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_NAMES
+from toftrack.pose_space.archives import read_archive
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.pose_data import PoseData, synthetic_data
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
+_ADVICE = "make one with train_pose_space.py"
+_SAME_RAD = 1e-6
+"""Poses that differ by less than this in every angle are the same."""
 
 
 def pose_space_kinds() -> tuple[str, ...]:
@@ -60,6 +64,10 @@ def fit_pose_space(
             f" {', '.join(takes) or 'none but dims'}"
         )
     data = data or synthetic_data()
+    if float((data.angles_rad - data.angles_rad[:1]).abs().max()) < _SAME_RAD:
+        raise ToftrackError(
+            f"the {len(data)} training poses are all the same; a pose space needs poses that differ"
+        )
     return module.fit(data.angles_rad, data.labels, dims, **settings)
 
 
@@ -82,30 +90,42 @@ def save_pose_space(
 
 def load_pose_space(path: str | Path) -> PoseSpace:
     """Read a model file; ToftrackError when it is not one of this version and size."""
-    advice = "make one with train_pose_space.py"
     header, arrays = _read(path)
     module = _module(header.get("kind"))
     if module is None:
-        raise ToftrackError(f"{path} holds a pose space of unknown kind {header.get('kind')!r}")
+        raise ToftrackError(
+            f"{path} holds a pose space of the unknown kind {header.get('kind')!r}; known:"
+            f" {', '.join(pose_space_kinds())}"
+        )
     if tuple(header.get("angle_names", ())) != ANGLE_NAMES:
         raise ToftrackError(
             f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
-            f" hand; {advice}"
+            f" hand; {_ADVICE}"
         )
+    needed = {field.name for field in fields(module.Space)} - {"training_labels"}
+    if set(arrays) != needed:
+        name = min(set(arrays) ^ needed)
+        what = f"no array {name!r}" if name in needed else f"an array {name!r} too many"
+        raise ToftrackError(f"{path} is a damaged pose-space file: it has {what}; {_ADVICE}")
+    labels = tuple(header.get("training_labels", ()))
     try:
         tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
-        space = module.Space(**tensors, training_labels=tuple(header.get("training_labels", ())))
+        space = module.Space(**tensors, training_labels=labels)
         angles = space.decode(space.training_latents)
         usable = all(bool(tensor.isfinite().all()) for tensor in (*tensors.values(), angles))
         if angles.shape[-1] == len(ANGLE_NAMES):
             space.encode(angles[:1])
     except (TypeError, RuntimeError, IndexError, ValueError) as error:
-        raise ToftrackError(f"{path} is a damaged pose-space file ({error}); {advice}") from None
+        raise ToftrackError(f"{path} is a damaged pose-space file ({error}); {_ADVICE}") from None
     if not usable:
-        raise ToftrackError(f"{path} is a damaged pose-space file (not all finite); {advice}")
+        raise ToftrackError(f"{path} is a damaged pose-space file (not all finite); {_ADVICE}")
     if angles.shape[-1] != len(ANGLE_NAMES) or space.lower.shape != (space.dims,):
         raise ToftrackError(
-            f"{path} is a pose space of another size ({angles.shape[-1]} angles); {advice}"
+            f"{path} is a pose space of another size ({angles.shape[-1]} angles); {_ADVICE}"
+        )
+    if bool((space.lower > space.upper).any()) or len(labels) != len(space.training_latents):
+        raise ToftrackError(
+            f"{path} is a damaged pose-space file (bounds or labels do not fit); {_ADVICE}"
         )
     return space
 
@@ -117,23 +137,23 @@ def pose_space_sources(path: str | Path) -> list[dict[str, Any]]:
 
 def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of this format and version."""
-    advice = "make one with train_pose_space.py"
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            arrays = {name: archive[name] for name in archive.files if name != "header"}
+        content = read_archive(path)
+        header = json.loads(str(content.pop("header")))
     except FileNotFoundError:
-        raise ToftrackError(f"no pose-space file at {path}; {advice}") from None
-    except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise ToftrackError(f"{path} is not a pose-space file ({error}); {advice}") from None
+        raise ToftrackError(f"no pose-space file at {path}; {_ADVICE}") from None
+    except KeyError:
+        raise ToftrackError(f"{path} is not a pose-space file (no header); {_ADVICE}") from None
+    except (OSError, ValueError) as error:
+        raise ToftrackError(f"{path} is not a pose-space file ({error}); {_ADVICE}") from None
     if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ToftrackError(f"{path} is not a pose-space file; {advice}")
+        raise ToftrackError(f"{path} is not a pose-space file; {_ADVICE}")
     if header.get("version") != VERSION:
         raise ToftrackError(
             f"{path} is a pose space of version {header.get('version')} and this toftrack reads"
-            f" version {VERSION}; {advice}"
+            f" version {VERSION}; {_ADVICE}"
         )
-    return header, arrays
+    return header, content
 
 
 def make_pose_space(

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from toftrack.pose_space.neighbours import NeighbourSpace, fit_neighbour_space
 
-_NEIGHBOURS = (5, 8, 12, 16, 24)
+_NEIGHBOURS = (5, 8, 12, 16, 24, 32, 48)
 
 
 @dataclass(frozen=True)

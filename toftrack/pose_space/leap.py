@@ -8,7 +8,6 @@ after another.
 from __future__ import annotations
 
 import math
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
+from toftrack.pose_space.archives import read_archive
 from toftrack.pose_space.inverse_kinematics import (
     fit_angles,
     shape_of_joints,
@@ -115,19 +115,19 @@ def _longest(family: list[int], lengths: list[int], number: int) -> int:
 
 def _read(path: str) -> tuple[np.ndarray, np.ndarray, list[str], list[int]]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            joints = np.asarray(archive["joints_mm"], np.float32)
-            left = np.asarray(archive["is_left"], bool)
-            names = [str(name) for name in archive["seq_name"]]
-            lengths = [int(length) for length in archive["seq_len"]]
+        content = read_archive(path)
+        joints = np.asarray(content["joints_mm"], np.float32)
+        left = np.asarray(content["is_left"], bool)
+        names = [str(name) for name in content["seq_name"]]
+        lengths = [int(length) for length in content["seq_len"]]
     except FileNotFoundError:
         raise ToftrackError(f"no file of recorded joints at {path}; give data.path=FILE") from None
     except KeyError as error:
         raise ToftrackError(
-            f"{path} is not a file of recorded joints: {error.args[0]}; data=file reads joint"
-            " angles"
+            f"{path} is not a file of recorded joints, it has no array {error}; data=file reads"
+            " joint angles"
         ) from None
-    except (OSError, ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise ToftrackError(f"{path} is not a readable .npz of recorded joints ({error})") from None
     shapes = joints.ndim == 4 and joints.shape[1:] == (5, 4, 3) and left.shape == joints.shape[:1]
     if not shapes or len(names) != len(lengths) or sum(lengths) != len(joints) or not len(joints):

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import csv
 import math
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ import torch
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
+from toftrack.pose_space.archives import read_archive
 from toftrack.pose_space.pose_data import PoseData
 
 UNITS = ("degrees", "radians")
@@ -44,8 +44,14 @@ def file_data(path: str, units: str | None = None) -> PoseData:
         angles, labels, clips, said = reader(path)
     except FileNotFoundError:
         raise ToftrackError(f"no file of joint angles at {path}; give data.path=FILE") from None
-    except (OSError, UnicodeDecodeError, csv.Error, EOFError, zipfile.BadZipFile) as error:
-        raise ToftrackError(f"{path} cannot be read as a file of joint angles ({error})") from None
+    except OSError as error:
+        why = error.strerror or error
+        raise ToftrackError(f"{path} cannot be read ({why}); give data.path=FILE") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ToftrackError(
+            f"{path} cannot be read as a table of joint angles ({error}); save it as"
+            " comma-separated text in UTF-8"
+        ) from None
     if len(angles) < 2:
         raise ToftrackError(f"{path} holds {len(angles)} poses; a pose space needs many more")
     bad = np.argwhere(~np.isfinite(angles))
@@ -120,7 +126,20 @@ def _read_csv(path: str) -> _Content:
                 lines.append(line)
     rows = list(csv.reader(lines, skipinitialspace=True))
     header = [name.strip() for name in rows[0]] if rows else []
+    if not header:
+        raise ToftrackError(
+            f"{path} is empty; it must have a header of the {len(ANGLE_NAMES)} joint angles' names"
+            " and a pose a row"
+        )
+    twice = [name for name in (*ANGLE_NAMES, "label", "clip") if header.count(name) > 1]
+    if twice:
+        raise ToftrackError(f"{path} has {header.count(twice[0])} columns {twice[0]!r}; keep one")
     missing = [name for name in ANGLE_NAMES if name not in header]
+    if len(missing) == len(ANGLE_NAMES):
+        raise ToftrackError(
+            f"{path} has no header of comma-separated names of joint angles, as"
+            f" {missing[0]},{missing[1]},...; its first line is {lines[0].strip()[:40]!r}"
+        )
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ToftrackError(
@@ -154,9 +173,8 @@ def _read_csv(path: str) -> _Content:
 
 def _read_npz(path: str) -> _Content:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            content = {name: archive[name] for name in archive.files}
-    except (ValueError, AttributeError) as error:
+        content = read_archive(path)
+    except ValueError as error:
         raise ToftrackError(f"{path} is not an .npz of joint angles ({error})") from None
     if "angles" not in content:
         raise ToftrackError(f"{path} has no array 'angles' of (poses, {len(ANGLE_NAMES)})")

@@ -35,7 +35,7 @@ from toftrack.errors import ToftrackError
 
 DEFAULT_FPS = 25.0
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
-_LARGEST_MEDIAN_M = 20.0
+LARGEST_MEDIAN_M = 20.0
 _JOINTS = 21
 # Of zip's usual method; nothing shrinks to less than a 1032th.
 _MOST_COMPRESSION = 1032
@@ -251,7 +251,7 @@ def _check_depth(depth: np.ndarray, key: str) -> np.ndarray:
     some = depth[np.unique(np.linspace(0, len(depth) - 1, 16).astype(int))]
     readings = some[(some > 0) & (some < np.inf)]
     median = float(np.median(readings.astype(np.float32))) if readings.size else 0.0
-    if median > _LARGEST_MEDIAN_M:
+    if median > LARGEST_MEDIAN_M:
         raise ToftrackError(
             f"the median of '{key}' is {median:.0f}, which is plainly millimetres, but it must be "
             f"metres; convert with {key} = depth / 1000"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -59,3 +60,11 @@ def open_recording(
     if path.suffix.lower() == ".srs":
         return read_srs(path, modulation_mhz)
     return read_recording(path)
+
+
+def open_source(name: str) -> FrameStore:
+    """What a virtual camera sees: the packaged recording for `sample`, else as `open_recording`."""
+    if name != "sample":
+        return open_recording(name)
+    with resources.as_file(resources.files("toftrack") / "data" / "sample.npz") as path:
+        return open_recording(path)

@@ -7,6 +7,7 @@ Slow and plain on purpose. `step_range_images` is the paper's own way of finding
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -72,17 +73,40 @@ def step_range_images(
     return torch.where(best.isfinite(), best, 0.0).view(-1, height, width)
 
 
-def count_range_images(depth_m: Tensor, wrist: Tensor, evidence: Evidence) -> Counts:
-    """Counts of given range images.
+class PixelClasses(NamedTuple):
+    """What each pixel of N range images is, (N, H, W) bool each (paper, fig. 3); see Counts.
+
+    near: pixels within the evidence's radius of the silhouette, outside of it and of the wrist's:
+        the neighbourhood, in which hand pixels are missed.
+    """
+
+    correct: Tensor
+    false: Tensor
+    missed: Tensor
+    near: Tensor
+
+
+def classify_range_images(
+    depth_m: Tensor, wrist: Tensor, reach: Tensor, evidence: Evidence
+) -> PixelClasses:
+    """Classes of the pixels of given range images.
 
     depth_m: (N, H, W), 0 = no surface.  wrist: (N, H, W) bool, the wrist ellipsoid's silhouette.
+    reach: (N, H, W) bool, pixels within the evidence's radius of the surface.
     """
     model = depth_m > 0
     u = torch.where(model, 1.0 / depth_m, 0.0)
     correct = model & (u >= evidence.low) & (u <= evidence.high)
     false = model & ~correct & (u >= evidence.occluder)
-    near = dilate_disc(model, evidence.radius_px)
-    missed = evidence.hand & near & ~model & ~wrist
+    near = reach & ~model & ~wrist
+    return PixelClasses(correct, false, evidence.hand & near, near)
+
+
+def count_range_images(depth_m: Tensor, wrist: Tensor, evidence: Evidence) -> Counts:
+    """Counts of given range images; depth_m and wrist as for `classify_range_images`."""
+    reach = dilate_disc(depth_m > 0, evidence.radius_px)
+    correct, false, missed, _ = classify_range_images(depth_m, wrist, reach, evidence)
+    u = torch.where(correct, 1.0 / depth_m, 0.0)
     middle, half = (evidence.low + evidence.high) / 2, (evidence.high - evidence.low) / 2
     residual = torch.where(correct, ((u - middle) / half).square(), 0.0)
     return Counts(

@@ -35,7 +35,10 @@ class Moment:
 
 
 class View(Protocol):
-    """Where tracked frames are shown or kept; made with folder, fps and frames (None: unknown)."""
+    """Where tracked frames are shown or kept; made with folder, fps and frames (None: unknown).
+
+    Used with `with`, which closes it. It is left when the results are written, so it may stay.
+    """
 
     def show(self, moment: Moment) -> None:
         """Take one frame; raises ToftrackError when it cannot be kept."""
@@ -45,6 +48,10 @@ class View(Protocol):
 
     def close(self) -> None:
         """Finish what is kept; raises ToftrackError when it cannot be."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *exception: Any) -> None: ...
 
 
 class NoView:

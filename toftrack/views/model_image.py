@@ -2,13 +2,64 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.render.closed_form import render_range_images
+from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
+from toftrack.render.closed_form import project, screen_boxes
+
+
+@functools.lru_cache(maxsize=4)
+def cpu_surface(shape: HandShape) -> HandSurface:
+    """The surface of a hand on the CPU, made once for as long as a run keeps the shape."""
+    return hand_surface(shape.to("cpu", torch.float32))
+
+
+def posed_hand(state: np.ndarray, shape: HandShape) -> Ellipsoids:
+    """One posed hand, (1, E + 1) ellipsoids on the CPU, the wrist's last.  state: (27,), finite."""
+    batch = torch.from_numpy(np.asarray(state, np.float32))[None]
+    pose = forward_kinematics(batch, shape.to("cpu", torch.float32))
+    return cpu_surface(shape).pose(pose)
+
+
+def parted(both: Ellipsoids) -> tuple[Ellipsoids, Ellipsoids]:
+    """The hand's own ellipsoids, and the wrist's."""
+    hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
+    return hand, Ellipsoids(both.centres_m[:, -1:], both.axes_m[:, -1:])
+
+
+def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Z of the nearest surface of one hand, (H, W) float32 metres, 0 = none.
+
+    As `render_range_images`, but each ellipsoid is drawn within its own box only: a view that draws
+    every frame must not take longer than the tracker.
+
+    ellipsoids: (1, E).  k: (3, 3).
+    """
+    conics = project(ellipsoids)
+    k = np.asarray(k, np.float32)
+    # One more pixel all around than the outline needs, which rounding could move.
+    boxes = screen_boxes(conics, torch.from_numpy(k), height, width)[0].numpy()
+    x = (np.arange(width, dtype=np.float32) - k[0, 2]) / k[0, 0]
+    y = ((np.arange(height, dtype=np.float32) - k[1, 2]) / k[1, 1])[:, None]
+    linear, quadratic = conics.linear[0].numpy(), conics.quadratic[0].numpy()
+    inverse = np.zeros((height, width), np.float32)
+    for (left, right, top, bottom), line, q in zip(boxes, linear, quadratic, strict=True):
+        if right <= left or bottom <= top:
+            continue
+        rows, columns = slice(max(0, top - 1), bottom + 1), slice(max(0, left - 1), right + 1)
+        px, py = x[columns], y[rows]
+        square = (q[0, 0] * px + 2 * q[0, 2]) * px + (q[1, 1] * py + 2 * q[1, 2]) * py + q[2, 2]
+        square += 2 * q[0, 1] * px * py
+        hit = square >= 0
+        u = line[0] * px + line[1] * py + line[2] + np.sqrt(np.where(hit, square, 0))
+        part = inverse[rows, columns]
+        np.maximum(part, np.where(hit, u, 0), out=part)
+    return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
 
 
 def model_range_image(
@@ -20,9 +71,5 @@ def model_range_image(
     """
     if not np.isfinite(state).all():
         return np.zeros((height, width), np.float32)
-    shape = shape.to("cpu")
-    posed = forward_kinematics(torch.from_numpy(np.asarray(state, np.float32))[None], shape)
-    both = hand_surface(shape).pose(posed)
-    hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
-    k_t = torch.from_numpy(np.asarray(k, np.float32))
-    return render_range_images(hand, k_t, height, width)[0].numpy()
+    hand, _ = parted(posed_hand(state, shape))
+    return range_image(hand, k, height, width)

@@ -20,10 +20,11 @@ from toftrack.views.base import Moment
 from toftrack.views.model_image import model_range_image
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
-_FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
+FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
 _RED = (40, 40, 220)
 _WHITE = (255, 255, 255)
-_CAPTION_PX = 36
+CAPTION_PX = 36
+"""Height of the caption above a panel's two sides."""
 _BONE_M = 0.004
 _NEAREST_GREY, _FARTHEST_GREY = 40, 215
 _SUBPIXEL_BITS = 3
@@ -151,7 +152,7 @@ class VideoView:
         reader.release()
         if not readable:
             raise _unwritable(self.video_path)
-        if not cv2.imwrite(str(self.strip_path), _filmstrip(self._tiles)):
+        if not cv2.imwrite(str(self.strip_path), filmstrip(self._tiles)):
             raise _unwritable(self.strip_path)
 
     def __enter__(self) -> Self:
@@ -167,7 +168,7 @@ class VideoView:
             self._stride *= 2
             if self._count % self._stride:
                 return
-        self._tiles.append(_tile(panel))
+        self._tiles.append(film_tile(panel))
 
 
 def _amplitude_grey(amplitude: np.ndarray) -> np.ndarray:
@@ -214,7 +215,7 @@ def _draw_skeleton(
     thick = int(np.clip(round(width), 1, max(1, picture.shape[1] // 40)))
     # All of the dark outline first, or each finger's would cross the colour of the one before.
     for outline in (2 * max(1, thick // 3), 0):
-        for finger, rgb in enumerate(_FINGER_RGB):
+        for finger, rgb in enumerate(FINGER_RGB):
             colour = (0, 0, 0) if outline else rgb[::-1]
             chain = (0, *range(4 * finger + 1, 4 * finger + 5))
             for a, b in zip(chain[:-1], chain[1:], strict=True):
@@ -235,7 +236,7 @@ def _draw_skeleton(
 def _caption(estimate: Estimate, half_width: int) -> np.ndarray:
     """A strip of text as wide as the panel; the text fits into its left half, for the filmstrip."""
     colour = _RED if estimate.lost else (48, 48, 48)
-    strip = np.full((_CAPTION_PX, 2 * half_width, 3), colour, np.uint8)
+    strip = np.full((CAPTION_PX, 2 * half_width, 3), colour, np.uint8)
     score = f"{estimate.score:.2f}" if math.isfinite(estimate.score) else "-"
     state = "LOST" if estimate.lost else estimate.state_name
     if estimate.lost and estimate.state_name != "lost":
@@ -244,23 +245,25 @@ def _caption(estimate: Estimate, half_width: int) -> np.ndarray:
     if estimate.gesture:
         text += f"   {estimate.gesture}"
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 8
-    (text_width, _), _ = cv2.getTextSize(text, font, 1.0, 2)
-    size = min(0.8, (half_width - 2 * margin) / text_width)
-    origin = (margin, _CAPTION_PX - 11)
+    size, room = 0.8, half_width - 2 * margin
+    # Step by step, because not every OpenCV's text grows in proportion.
+    while size > 0.2 and cv2.getTextSize(text, font, size, 2 if size > 0.5 else 1)[0][0] > room:
+        size -= 0.02
+    origin = (margin, CAPTION_PX - 11)
     cv2.putText(strip, text, origin, font, size, _WHITE, 2 if size > 0.5 else 1, cv2.LINE_AA)
     return strip
 
 
-def _tile(panel: np.ndarray) -> np.ndarray:
+def film_tile(panel: np.ndarray) -> np.ndarray:
     """A panel with its right side below its left, small."""
     half = panel.shape[1] // 2
-    tile = np.vstack([panel[:, :half], panel[_CAPTION_PX:, half : 2 * half]])
+    tile = np.vstack([panel[:, :half], panel[CAPTION_PX:, half : 2 * half]])
     factor = _STRIP_TILE_PX / half
     size = (_STRIP_TILE_PX, round(tile.shape[0] * factor))
     return cv2.resize(tile, size, interpolation=cv2.INTER_AREA)
 
 
-def _filmstrip(tiles: list[np.ndarray]) -> np.ndarray:
+def filmstrip(tiles: list[np.ndarray]) -> np.ndarray:
     """Ten of the tiles (all, if they are fewer), evenly spread, in rows of five."""
     count = min(_STRIP_TILES, len(tiles))
     chosen = [tiles[i] for i in np.linspace(0, len(tiles) - 1, count).round().astype(int)]

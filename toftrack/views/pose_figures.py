@@ -17,7 +17,7 @@ from toftrack.views.overlay import range_grey
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 # Okabe and Ito's colours, which colour-blind people can tell apart; BGR.
-_BASIC = {"palm": (178, 114, 0), "fist": (0, 94, 213), "gun": (115, 158, 0)}
+BASIC_BGR = {"palm": (178, 114, 0), "fist": (0, 94, 213), "gun": (115, 158, 0)}
 _NEAR_DEGREES = 15.0
 """A pose is coloured as the gesture that it is within this root mean square distance of."""
 _BETWEEN, _THUMB = (150, 150, 150), (167, 121, 204)
@@ -55,10 +55,10 @@ def poses_figure(space: PoseSpace, width: int = 1000, height: int = 720) -> np.n
     cv2.rectangle(picture, corner_low, corner_high, (210, 210, 210), 1)
     for label, point in zip(space.training_labels, points, strict=True):
         colour = _THUMB if "+" in label else _BETWEEN
-        if label not in _BASIC:
+        if label not in BASIC_BGR:
             cv2.circle(picture, place(point), 5, colour, -1, cv2.LINE_AA)
     for label, point in zip(space.training_labels, points, strict=True):
-        if label not in _BASIC:
+        if label not in BASIC_BGR:
             continue
         u, v = place(point)
         index = space.training_labels.index(label)
@@ -66,8 +66,8 @@ def poses_figure(space: PoseSpace, width: int = 1000, height: int = 720) -> np.n
         left, top = np.clip((u - 55, v - 130), 0, (width - 110, height - 110))
         patch = picture[top : top + 110, left : left + 110]
         np.minimum(patch, thumb[..., None], out=patch)
-        cv2.circle(picture, (u, v), 9, _BASIC[label], -1, cv2.LINE_AA)
-        cv2.putText(picture, label, (u + 14, v + 6), _FONT, 0.7, _BASIC[label], 2, cv2.LINE_AA)
+        cv2.circle(picture, (u, v), 9, BASIC_BGR[label], -1, cv2.LINE_AA)
+        cv2.putText(picture, label, (u + 14, v + 6), _FONT, 0.7, BASIC_BGR[label], 2, cv2.LINE_AA)
     for text, x, y in (
         ("component 1 (degrees)", width // 2 - 110, height - 30),
         (f"{low[0]:.0f}", corner_low[0] - 20, height - 60),
@@ -91,7 +91,7 @@ def manifold_figure(space: PoseSpace, size: int = 460) -> np.ndarray:
     where none is near; poses of other sources than the synthetic ones, too. BGR.
     """
     latents = space.training_latents
-    nearest = _gestures(space.decode(latents))
+    nearest = nearest_gestures(space.decode(latents))
     points = latents.cpu().numpy()
     pairs = [(i, j) for i, j in ((0, 1), (0, 2), (1, 2)) if j < space.dims] or [(0, 0)]
     panels = []
@@ -104,20 +104,20 @@ def manifold_figure(space: PoseSpace, size: int = 460) -> np.ndarray:
         for (u, v), gesture in sorted(
             zip(spots, nearest, strict=True), key=lambda item: item[1] is not None
         ):
-            colour = _BETWEEN if gesture is None else _BASIC[gesture]
+            colour = _BETWEEN if gesture is None else BASIC_BGR[gesture]
             cv2.circle(panel, (int(u), int(size - v)), 4, colour, -1, cv2.LINE_AA)
         name = f"{j + 1} against {i + 1}"
         cv2.putText(panel, name, (34, size - 10), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
         panels.append(panel)
     x = 34
-    for name, colour in (*_BASIC.items(), ("other", _BETWEEN)):
+    for name, colour in (*BASIC_BGR.items(), ("other", _BETWEEN)):
         cv2.circle(panels[0], (x, 16), 5, colour, -1, cv2.LINE_AA)
         cv2.putText(panels[0], name, (x + 9, 21), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
         x += 80
     return np.hstack(panels)
 
 
-def _gestures(angles: Tensor) -> list[str | None]:
+def nearest_gestures(angles: Tensor) -> list[str | None]:
     """The gesture nearest to each pose, (N, 21) rad; None where all are far."""
     basic = torch.stack([basic_pose(gesture) for gesture in GESTURES]).to(angles)
     distance = (angles[:, None] - basic).square().mean(-1).sqrt()

@@ -1,0 +1,230 @@
+"""What README.md shows works: its programs run, and its commands are commands that there are."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import os
+import re
+import shlex
+import socket
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.plugins.launcher import Launcher
+from tracking import ROOT, configuration, run
+
+from toftrack import convert
+from toftrack.interface import make_device
+from toftrack.recordings.npz import read_recording
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+
+
+def block(name: str) -> str:
+    """The code after `<!-- test: name -->`."""
+    found = re.findall(rf"<!-- test: {name} -->\n```\w+\n(.*?)```", README, re.DOTALL)
+    assert len(found) == 1, f"README.md has {len(found)} blocks marked {name}"
+    return found[0]
+
+
+def commands() -> Iterator[tuple[str, ...]]:
+    """Every command in a block for the shell or in running text that starts with python."""
+    shell = re.findall(r"```bash\n(.*?)```", README, re.DOTALL)
+    lines = [line for text in shell for line in text.splitlines()]
+    plain = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
+    lines += [" ".join(code.split()) for code in re.findall(r"`(python [^`]+)`", plain)]
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        while words:
+            end = next((i for i, word in enumerate(words) if word in ("&&", "|")), len(words))
+            yield tuple(words[:end])
+            words = words[end + 1 :]
+
+
+COMMANDS = sorted(set(commands()))
+TRACK = [words for words in COMMANDS if words[:2] == ("python", "track.py")]
+TRAIN = [words for words in COMMANDS if words[:2] == ("python", "train_pose_space.py")]
+MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m")]
+OF_HYDRA = ("-m", "--multirun")
+
+
+def overrides_of(words: tuple[str, ...]) -> list[str]:
+    """The overrides; of a sweep those of its first job, and without launchers that are extras."""
+    given = [word for word in words[2:] if word not in OF_HYDRA]
+    launchers = {plugin.__name__ for plugin in Plugins.instance().discover(Launcher)}
+    parsed: list[Override] = OverridesParser.create().parse_overrides(given)
+    kept = []
+    for override in parsed:
+        key = override.get_key_element()
+        launcher = f"{str(override.value()).partition('_')[0]}launcher"
+        if key == "hydra/launcher" and launcher not in {name.lower() for name in launchers}:
+            continue
+        if key.lstrip("+").startswith("hydra.launcher."):
+            continue
+        if override.is_sweep_override():
+            kept.append(f"{key}={next(iter(override.sweep_string_iterator()))}")
+        else:
+            kept.append(override.input_line)
+    return kept
+
+
+def test_there_are_commands_to_look_at() -> None:
+    assert len(TRACK) > 10 and len(TRAIN) >= 1 and len(MODULES) > 4
+
+
+def test_every_command_is_of_a_program_that_there_is() -> None:
+    for words in COMMANDS:
+        if words[0] != "python" or words[1] == "client.py":
+            continue
+        if words[1] == "-m":
+            assert importlib.util.find_spec(words[2]) is not None, words
+        else:
+            assert (ROOT / words[1]).is_file(), words
+
+
+@pytest.mark.parametrize("words", TRACK + TRAIN, ids=" ".join)
+def test_a_command_composes(words: tuple[str, ...]) -> None:
+    if "--config-dir" in words:  # a folder of the reader's own
+        assert OverridesParser.create().parse_overrides(list(words[4:]))
+        return
+    name = "config" if words[1] == "track.py" else "train_pose_space"
+    assert configuration(*overrides_of(words), name=name)
+
+
+class ParsedError(BaseException):
+    """The command line was understood."""
+
+
+@pytest.mark.parametrize("words", MODULES, ids=" ".join)
+def test_a_command_of_a_module_parses(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("parse_args", "parse_intermixed_args"):
+        original = getattr(argparse.ArgumentParser, name)
+
+        def parse(parser: argparse.ArgumentParser, *given: object, original=original) -> None:
+            raise ParsedError(original(parser, *given))
+
+        monkeypatch.setattr(argparse.ArgumentParser, name, parse)
+    with pytest.raises(ParsedError):
+        importlib.import_module(words[2]).main(list(words[3:]))
+
+
+def test_every_extra_that_is_named_is_there() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for names in re.findall(r"\.\[([\w,-]+)\]", README):
+        assert set(names.split(",")) <= set(project["optional-dependencies"]), names
+
+
+def test_every_file_and_picture_that_is_linked_is_there() -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", README):
+        assert target.startswith("http") or (ROOT / target).exists(), target
+    for target in re.findall(r"`((?:toftrack|conf|tests)/[\w/.]+\.\w+)`", README):
+        assert (ROOT / target).exists(), target
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A recording for each of the names that README.md uses, of a few frames."""
+    folder = tmp_path_factory.mktemp("recordings")
+    whole = read_recording(ROOT / "toftrack" / "data" / "sample.npz")
+    part = folder / "FILE.npz"
+    np.savez(part, depth_m=whole.depth[:4], K=whole.camera.K, amplitude=whole.amplitude[:4])
+    for name in ("hand.srs", "FOLDER"):
+        convert.main([str(part), str(folder / name)])
+    return {name: folder / name for name in ("FILE.npz", "hand.srs", "FOLDER")}
+
+
+@pytest.mark.parametrize("name", ["FILE.npz", "hand.srs", "FOLDER"])
+def test_a_recording_of_one_s_own_is_tracked_as_it_is_shown(
+    name: str, recordings: dict[str, Path], tmp_path: Path
+) -> None:
+    (words,) = (words for words in TRACK if words[-1] == f"device.path={name}" and words[2] != "-m")
+    shown = [word.replace(name, str(recordings[name])) for word in words[2:]]
+    run(tmp_path, make_device(*shown, "device.stop=2"), *shown, *QUICK)
+    for made in ("track.npz", "track.jsonl", "summary.json", "overlay.mp4", "overlay.png"):
+        assert (tmp_path / made).stat().st_size > 0
+
+
+def test_a_conversion_works_as_it_is_shown(recordings: dict[str, Path], tmp_path: Path) -> None:
+    (words,) = (words for words in MODULES if words[2] == "toftrack.convert")
+    source, target = words[3:]
+    convert.main([str(recordings[source]), str(tmp_path / target)])
+    assert len(read_recording(tmp_path / target)) == 4
+
+
+def start(*arguments: str, folder: Path, **pipes: object) -> subprocess.Popen[str]:
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+    return subprocess.Popen(
+        [sys.executable, *arguments], cwd=folder, env=environment, text=True, **pipes
+    )
+
+
+def track(stream: str, *overrides: str, folder: Path, **pipes: object) -> subprocess.Popen[str]:
+    (words,) = (words for words in TRACK if f"stream={stream}" in words)
+    few = ("device.stop=6", "view=none", "hydra.run.dir=out")
+    program = str(ROOT / "track.py")
+    return start(program, *words[2:], *few, *QUICK, *overrides, folder=folder, **pipes)
+
+
+def read(printed: list[str]) -> list[int]:
+    """The frames that a client printed, each with a gesture and three coordinates."""
+    rows = [line.split() for line in printed]
+    assert all(len(row) == 5 and 0.3 < float(row[4]) < 1.0 for row in rows)
+    return [int(row[0]) for row in rows]
+
+
+def test_the_client_of_standard_output_gets_every_frame(tmp_path: Path) -> None:
+    (tmp_path / "client.py").write_text(block("stdout-client"))
+    quiet = {"stderr": subprocess.DEVNULL}
+    sender = track("stdout", folder=tmp_path, stdout=subprocess.PIPE, **quiet)
+    client = start(
+        "client.py", folder=tmp_path, stdin=sender.stdout, stdout=subprocess.PIPE, **quiet
+    )
+    sender.stdout.close()
+    printed, _ = client.communicate(timeout=120)
+    assert read(printed.splitlines()) == list(range(6))
+    assert sender.wait(timeout=60) == 0
+
+
+def test_the_client_of_datagrams_gets_every_frame(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    code = block("udp-client")
+    assert "5005" in code and "5005" in " ".join(word for words in TRACK for word in words)
+    ready = code.replace("while True", 'print("ready", flush=True)\nwhile True')
+    (tmp_path / "client.py").write_text(ready.replace("5005", port))
+    client = start("client.py", folder=tmp_path, stdout=subprocess.PIPE)
+    try:
+        assert client.stdout.readline() == "ready\n"
+        quiet = {"stderr": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
+        sender = track("udp", f"stream.port={port}", folder=tmp_path, **quiet)
+        assert sender.wait(timeout=120) == 0
+        assert read([client.stdout.readline() for _ in range(6)]) == list(range(6))
+    finally:
+        client.kill()
+        client.communicate()
+
+
+def test_the_program_in_python_tracks(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = block("python")
+    few = code.replace('"device=sample"', '"device=sample", "device.stop=4"')
+    assert few != code
+    exec(compile(few, "README.md", "exec"), {})
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 4 and all(line.split()[0] != "lost" for line in printed)

@@ -1,0 +1,75 @@
+"""The likelihood's view of one hypothesis, pixel by pixel (paper, fig. 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from toftrack.hand.shape import HandShape
+from toftrack.likelihood import FMeasure
+from toftrack.render.reference import classify_range_images
+from toftrack.segmentation import Observation
+from toftrack.views.model_image import parted, posed_hand, range_image
+
+CLASSES = ("nothing", "neighbourhood", "correct", "false", "missed")
+"""Names of the labels of `Classified.labels`, in order."""
+
+# The paper's red, green and blue in the hues of Okabe and Ito, which colour-blind people can tell
+# apart.
+CLASS_RGB = ((255, 255, 255), (205, 205, 205), (213, 94, 0), (0, 158, 115), (0, 114, 178))
+"""Of each of CLASSES."""
+
+
+@dataclass(frozen=True, eq=False)
+class Classified:
+    """One hypothesis against an observation, on the observation's grid; images are (H, W)."""
+
+    range_m: np.ndarray
+    """float32 metres, the hypothesis's surface, 0 = none."""
+    correct: np.ndarray
+    """bool: surface where the image has the hand, at its depth."""
+    false: np.ndarray
+    """bool: surface where the image has none, and nothing hides it."""
+    missed: np.ndarray
+    """bool: the image's hand in the neighbourhood."""
+    neighbourhood: np.ndarray
+    """bool: around the silhouette, outside of it and of the wrist."""
+
+    def labels(self) -> np.ndarray:
+        """(H, W) uint8, positions in CLASSES."""
+        labels = self.neighbourhood.astype(np.uint8)
+        for label, image in ((2, self.correct), (3, self.false), (4, self.missed)):
+            labels[image] = label
+        return labels
+
+
+def classify(
+    state: np.ndarray, shape: HandShape, observation: Observation, likelihood: FMeasure
+) -> Classified:
+    """Tell the pixels that the likelihood counts; their numbers are the scorer's counts.
+
+    state: (27,) of the hypothesis; where it is NaN there is none, and every image is empty.
+    shape: of the hand.
+    """
+    observation = observation.to(torch.device("cpu"))
+    evidence = likelihood.evidence(observation)
+    height, width = evidence.hand.shape
+    if not np.isfinite(state).all():
+        no = np.zeros((height, width), bool)
+        return Classified(no.astype(np.float32), no, no, no, no)
+    hand, wrist = parted(posed_hand(state, shape))
+    k = evidence.k.numpy()
+    range_m = range_image(hand, k, height, width)
+    on_wrist = range_image(wrist, k, height, width) > 0
+    beside = (range_m == 0).astype(np.uint8)
+    # OpenCV knows no distance where there is nothing to be distant from.
+    reach = np.zeros((height, width), bool)
+    if not beside.all():
+        distance_px = cv2.distanceTransform(beside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        reach = distance_px <= evidence.radius_px
+    images = (torch.from_numpy(image)[None] for image in (range_m, on_wrist, reach))
+    classes = classify_range_images(*images, evidence)
+    return Classified(range_m, *(image[0].numpy() for image in classes))
