@@ -1,7 +1,7 @@
 """A hand hangs on an arm: where the image shows what lies behind it, there is none.
 
-The silhouette of fingers with a piece of forearm looks much like that of a hand the other way round.
-But there the arm would have to be where the fingers end, and the image shows the background.
+The silhouette of fingers with a piece of forearm looks much like a hand the other way round. But
+there the arm would have to be where the fingers end, and the image shows the background.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from toftrack.segmentation import Observation
 _ALONG_M = (0.05, 0.07, 0.09)
 """Points of the forearm's axis, from the wrist."""
 _BENT = 0.7
-"""The wrist bends: so far beside the axis, in parts of the distance from the wrist, is no matter."""
+"""The wrist bends: the arm may be this far beside the axis, in parts of the way from the wrist."""
 _BEHIND_M = 0.06
 """What lies less than this behind the axis may be the arm."""
 
@@ -28,7 +28,7 @@ _BEHIND_M = 0.06
 class ArmSight:
     """What an image says of arms.
 
-    depth_m: (H, W) Z, `inf` where there is no reading, which may be a dark sleeve.
+    depth_m: (H, W) Z, 0 where there is no reading, which may be a dark sleeve.
     gap_px: (H, W) distance to the nearest pixel that is not background.
     k: (3, 3).
     """
@@ -48,14 +48,13 @@ def arm_sight(observation: Observation) -> ArmSight:
     return ArmSight(depth, torch.from_numpy(gap).to(depth.device), observation.k)
 
 
-def seen_through(particles: Tensor, sight: ArmSight, scale: float = 1.0) -> Tensor:
+def seen_through(particles: Tensor, sight: ArmSight) -> Tensor:
     """The share of the forearm where the image shows the background instead, (N,), 0 to 1.
 
-    particles: (N, 6 + d), wrist translation and rotation vector first.  scale: the hand's length in
-    units of the mean hand's.
+    particles: (N, 6 + d), wrist translation and rotation vector first.
     """
     axis = roma.rotvec_to_rotmat(particles[:, 3:6])[:, :, 1]  # from the fingers to the arm
-    along = particles.new_tensor(_ALONG_M) * scale
+    along = particles.new_tensor(_ALONG_M)
     x = particles[:, None, :3] + along[:, None] * axis[:, None]  # (N, 3 points, 3)
     k, z = sight.k, x[..., 2].clamp(min=0.05)
     u = (k[0, 0] * x[..., 0] / z + k[0, 2]).round()

@@ -34,6 +34,8 @@ class HandFit:
     step: ratio of neighbouring sizes, less 1.  largest: the largest ratio to the first size.
     samples: poses tried at each size.
     exponent: a frame's likelihood is its score to this power.
+    beta: of the F-measure that sizes are compared by, in place of the likelihood's: where missed
+        pixels count more than false ones, too large a hand fits best (by 2 to 4 % at 1.5).
     """
 
     frames: int = 30
@@ -42,6 +44,7 @@ class HandFit:
     largest: float = 1.4
     samples: int = 64
     exponent: float = 20.0
+    beta: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,7 @@ def update(
 
     state: (1, 27) refined with a hand of the present size, for which `scorer` was made.
     """
+    likelihood = replace(likelihood, beta=fit.beta)
     sizes = len(belief.log_likelihood)
     around = range(max(0, belief.index - _REACH), min(sizes, belief.index + _REACH + 1))
     noise = torch.randn(fit.samples, 27, generator=generator, device=state.device)

@@ -37,7 +37,6 @@ class FMeasure:
     neighbourhood_m: float = 0.025
     beta: float = 1.5
     naming: str = "standard"
-    forearm: float = 0.5
     residual_weight: float = 0.0
     coverage: float = 0.0
 

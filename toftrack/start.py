@@ -15,6 +15,7 @@ from torch import Tensor
 
 from toftrack import filter as sir
 from toftrack.errors import ToftrackError
+from toftrack.forearm import arm_sight, seen_through
 from toftrack.pose_space.base import PoseSpace
 from toftrack.segmentation import Observation
 
@@ -24,12 +25,29 @@ _DEPTH_M = 0.12
 """How far behind the nearest surface a palm typically lies at most."""
 _DEPTH_EDGE_M = 0.04
 """Between neighbouring pixels of one surface there is less than this."""
+_TURN_RAD = 0.3
+"""Standard deviation of how far a hand has turned since it was lost."""
 
 LogScores = Callable[[Tensor, float], Tensor]
 """(N, 6 + d) hypotheses and the weight of coverage to (N,) log scores of the current frame."""
 
 Improve = Callable[[Tensor], Tensor]
 """(N, 6 + d) hypotheses to (N, 6 + d) brought onto the seen points, as far as the space allows."""
+
+
+Prior = Callable[[Tensor], Tensor]
+"""(N, 6 + d) hypotheses to (N,), added to their log scores."""
+
+
+@dataclass(frozen=True)
+class Lately:
+    """The hand before it was lost.
+
+    particle: (1, 6 + d).  age_s: how long ago.
+    """
+
+    particle: Tensor
+    age_s: float
 
 
 class Start(Protocol):
@@ -41,14 +59,14 @@ class Start(Protocol):
         space: PoseSpace,
         log_scores: LogScores,
         improve: Improve,
+        lately: Lately | None,
         n: int,
         generator: torch.Generator,
-        before: Tensor | None = None,
     ) -> Tensor:
-        """(n, 6 + d) particles on the pose space's device.
+        """(n, 6 + d) particles on the pose space's device."""
 
-        before: (1, 6 + d) the hand as it was lately, if it was; it may be anywhere by now.
-        """
+    def prior(self, observation: Observation, lately: Lately | None) -> Prior:
+        """What speaks for and against a start besides the score of the image."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +95,9 @@ class RoughStart:
         space: PoseSpace,
         log_scores: LogScores,
         improve: Improve,
+        lately: Lately | None,
         n: int,
         generator: torch.Generator,
-        before: Tensor | None = None,
     ) -> Tensor:
         """See Start; nothing is scored."""
         device = space.lower.device
@@ -94,6 +112,10 @@ class RoughStart:
         spread = sir.Spread(self.position_m, self.position_m, self.rotation_rad, 0.0)
         noise = torch.randn(n, 6 + space.dims, generator=generator, device=device)
         return sir.compose(reference, noise * spread.sigmas(space.lower, space.upper))
+
+    def prior(self, observation: Observation, lately: Lately | None) -> Prior:
+        """See Start; nothing is known."""
+        return lambda particles: particles.new_zeros(len(particles))
 
 
 @dataclass(frozen=True)
@@ -113,6 +135,11 @@ class SearchStart:
         image plane.
     arm_rad: spread of the forearm's direction about the way to where the blob leaves the image; a
         fifth of the hypotheses, and all where the blob does not touch the border, point anywhere.
+    forearm: taken from the log score of a hand whose whole forearm the image sees through.
+    memory: added to the log score of a hand that is turned as it was before it was lost ...
+    memory_rad: ... with less the farther it has turned since (standard deviation) ...
+    memory_s: ... and the longer ago it was (to 1/e). While that is less than two such times ago, a
+        quarter of the hypotheses are turned and bent as then.
     """
 
     hypotheses: int = 3000
@@ -123,6 +150,10 @@ class SearchStart:
     position_m: float = 0.02
     tilt_rad: float = 0.5
     arm_rad: float = 0.5
+    forearm: float = 0.5
+    memory: float = 0.2
+    memory_rad: float = 0.7
+    memory_s: float = 2.0
 
     def __call__(
         self,
@@ -130,13 +161,13 @@ class SearchStart:
         space: PoseSpace,
         log_scores: LogScores,
         improve: Improve,
+        lately: Lately | None,
         n: int,
         generator: torch.Generator,
-        before: Tensor | None = None,
     ) -> Tensor:
         """See Start."""
         lower, upper = space.lower, space.upper
-        first = self._draw(observation, space, generator, before)
+        first = self._draw(observation, space, lately, generator)
         scores = log_scores(first, self.coverage)
         best = first[scores.topk(min(self.islands, len(first))).indices]
         best_scores = scores.topk(len(best)).values
@@ -165,12 +196,27 @@ class SearchStart:
             sigmas = sigmas * 0.75
         return sir.diffuse(best.expand(n, -1), 0.5 * sigmas, lower, upper, "reflect", generator)
 
+    def prior(self, observation: Observation, lately: Lately | None) -> Prior:
+        """See Start: a hand hangs on an arm, and it does not turn round all at once."""
+        sight = arm_sight(observation)
+
+        def log_prior(particles: Tensor) -> Tensor:
+            known = -self.forearm * seen_through(particles, sight)
+            if lately is not None:
+                before = lately.particle[:, 3:6].expand(len(particles), -1)
+                turned = roma.rotvec_geodesic_distance(particles[:, 3:6], before)
+                likeness = torch.exp(-0.5 * (turned / self.memory_rad).square())
+                known = known + self.memory * math.exp(-lately.age_s / self.memory_s) * likeness
+            return known
+
+        return log_prior
+
     def _draw(
         self,
         observation: Observation,
         space: PoseSpace,
+        lately: Lately | None,
         generator: torch.Generator,
-        before: Tensor | None,
     ) -> Tensor:
         m, device = self.hypotheses, space.lower.device
 
@@ -194,12 +240,12 @@ class SearchStart:
         )
         rows = torch.randint(len(space.training_latents), (m,), generator=generator, device=device)
         latent = space.training_latents[rows]
-        if before is not None:
-            again = slice(0, m // 4)
-            turn = 0.3 * normal(m // 4, 3)
-            rotation[again] = roma.rotvec_composition((turn, before[:, 3:6].expand(m // 4, -1)))
-            latent = latent.clone()
-            latent[again] = before[:, 6:]
+        if lately is not None and lately.age_s < 2 * self.memory_s:
+            again = m // 4
+            before = lately.particle.expand(again, -1)
+            turn = _TURN_RAD * normal(again, 3)
+            rotation[:again] = roma.rotvec_composition((turn, before[:, 3:6]))
+            latent[:again] = before[:, 6:]
         pivot = roma.rotvec_to_rotmat(rotation) @ rotation.new_tensor(sir.PIVOT_M)
         translation = centre + normal(m, 3) * self.position_m - pivot
         return torch.cat((translation, rotation, latent), 1)

@@ -35,10 +35,10 @@ def steadied(
     """Take less of a change the more it looks like noise, so that a still hand does not tremble.
 
     Of a change of size c in translation, rotation or a finger's angles, c^2 / (c^2 + s^2) is taken,
-    s being the noise of that group: nearly all of a movement, little of a tremble. Noise changes its
-    sign from frame to frame and movement does not, so their running mean, the trend, tells the two
-    apart (a tracking signal as Trigg's, Oper. Res. Q. 15(3), 1964): while it is small in all groups
-    together the hand rests, and s grows.
+    s being the noise of that group: nearly all of a movement, little of a tremble. Noise changes
+    its sign from frame to frame and movement does not, so their running mean, the trend, tells the
+    two apart (a tracking signal as Trigg's, Oper. Res. Q. 15(3), 1964): while it is small in all
+    groups together the hand rests, and s grows.
 
     state, before: (1, 27) this frame's pose and the last one's.
     trend: (27,) mean change a frame as of the last frame; None at the start.

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
@@ -17,7 +15,6 @@ from toftrack import filter as sir
 from toftrack.depth_image import checked_image
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.filter import FilterSettings
-from toftrack.forearm import arm_sight, seen_through
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
@@ -29,70 +26,14 @@ from toftrack.proposals import swap_fingers
 from toftrack.refine import Refinement, make_refiner, surroundings
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
 from toftrack.segmentation import Expected, NearestSurface, Observation
-from toftrack.start import Start
+from toftrack.start import Lately, Start
 from toftrack.steadying import steadied
 from toftrack.threads import small_operations
-
-_APPROACH_M = 0.002
-"""How much nearer than its middle's movement a partly hidden hand may come in a frame."""
-
+from toftrack.track_state import Insight, LostSettings, TrackState, expected_depths
 
 _MODEL_ERROR = sir.Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
-
-
-@dataclass(frozen=True)
-class LostSettings:
-    """When the tracker says that it has lost the hand; see conf/lost for what each does."""
-
-    score: float
-    patience: int
-    start_score: float
-    probation: int
-    rival_gain: float
-    outside_rad: float
-    memory: float = 0.2
-
-
-@dataclass(frozen=True)
-class TrackState:
-    """What the tracker carries from frame to frame.
-
-    particles: (N, 6 + d), after the last observation.  weights: (N,) normalised.
-    mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a frame.
-    state: (1, 27) the last refined hand, None at the start.
-    trend: (27,) its mean change a frame, see steadying.
-    offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
-        displaced by it.
-    age: frames since the start.  bad: frames in a row with a low score.
-    outside: frames in a row out of the pose space.
-    expected: depths where the hand was looked for in the last frame, if something hid part of it.
-    """
-
-    particles: Tensor
-    weights: Tensor
-    mean: Tensor
-    velocity: Tensor
-    offset: Tensor
-    state: Tensor | None = None
-    trend: Tensor | None = None
-    age: int = 0
-    bad: int = 0
-    outside: int = 0
-    expected: Expected | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Insight:
-    """What the tracker saw and believed in a frame, on its own device; for those who watch it.
-
-    particles: (N, 6 + d) before the estimate was refined.  weights: (N,) normalised.
-    """
-
-    observation: Observation
-    particles: Tensor
-    weights: Tensor
 
 
 class Tracker:
@@ -135,15 +76,10 @@ class Tracker:
         self._set_shape(self._first_shape)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.track: TrackState | None = None
-        self._seen = None
+        self._seen: tuple[Tensor, float] | None = None  # the last hand believed, and when
         self.insight: Insight | None = None
         self._model_variance = _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
         self._poses = self.space.decode(self.space.training_latents)
-        from toftrack.pose_space.training_poses import basic_pose, GESTURES
-        nb = int(os.environ.get("NB", "0"))
-        if nb:
-            basic = torch.stack([basic_pose(g) for g in GESTURES]).float()
-            self._poses = torch.cat((self._poses, basic.repeat(nb, 1)))
         self._last: Estimate | None = None
         self._next_index = 0
 
@@ -160,7 +96,7 @@ class Tracker:
         """
         if side is not None:
             self._first_shape = self._first_shape.of_side(side)
-        self.track = None
+        self.track = self._seen = None
         self._size = first_belief(self.fit) if self.fit else None
         self._set_shape(self._first_shape)
 
@@ -202,18 +138,17 @@ class Tracker:
         mean = sir.mean_particle(particles, weights)
         filtered = self.decode(mean, track.offset)
         state = self._refine(filtered, track.state, observation, evidence)
-        trend = track.trend
         if track.state is not None:
-            state, trend = steadied(state, track.state, trend, self.refinement.steadying)
+            state, trend = steadied(state, track.state, track.trend, self.refinement.steadying)
+            track = replace(track, trend=trend)
         score = float(self.likelihood.score(self.scorer(state, evidence)))
 
         estimate = self._estimate(particles, weights, mean, state, score, index, timestamp_s)
-        track = replace(track, trend=trend)
         self.track, name, lost = self._judge(track, particles, weights, mean, state, score)
-        if not lost:
+        if self.track is not None and not lost:
+            self._fit_size(state, evidence)
             if self.track.age > self.lost.probation:
                 self._seen = self.track.mean, timestamp_s
-            self._fit_size(state, observation, evidence)
         if self.track is not None and bool(observation.occluder.any()):
             self.track = replace(self.track, expected=expected)
         estimate = replace(estimate, state_name=name, lost=lost)
@@ -274,25 +209,17 @@ class Tracker:
     ) -> TrackState:
         """A new track; or the given young one, if the search finds nothing better than it."""
         n = self.settings.particles
-        sight = arm_sight(observation)
-        before, fresh = None, 0.0
+        lately = None
         if self._seen is not None:
-            before, when = self._seen
-            fresh = math.exp(-(timestamp_s - when) / 2.0)
-            if fresh < 0.1: before = None
+            lately = Lately(self._seen[0], max(0.0, timestamp_s - self._seen[1]))
+        prior = self.start.prior(observation, lately)
 
         def log_scores(particles: Tensor, coverage: float) -> Tensor:
-            armless = seen_through(particles, sight)
-            scores = self._log_scores(particles, coverage, evidence=evidence)
-            scores = scores - self.likelihood.forearm * armless
-            if before is not None:
-                turned = roma.rotvec_geodesic_distance(particles[:, 3:6], before[:, 3:6].expand(len(particles), -1))
-                scores = scores + self.lost.memory * fresh * torch.exp(-0.5 * (turned / 0.7).square())
-            return scores
+            return self._log_scores(particles, coverage, evidence=evidence) + prior(particles)
 
         improve = partial(self._improved, observation=observation)
         particles = self.start(
-            observation, self.space, log_scores, improve, n, self.generator, before
+            observation, self.space, log_scores, improve, lately, n, self.generator
         )
         if track is not None:
             now = sir.compose(track.particles, track.velocity[None])
@@ -310,14 +237,7 @@ class Tracker:
         if self.track is None:
             return None
         state = self.decode(sir.compose(self.track.mean, self.track.velocity[None]))
-        nearest, farthest = self._refiner.joints(state)[:, 2].aminmax()
-        nearest, farthest = float(nearest), float(farthest)
-        if self.track.expected is not None:
-            # A hidden finger is free to move in front of what hides it, which would then be taken
-            # for the hand: while something hides the hand, it comes nearer only as its middle does.
-            approach = _APPROACH_M + max(0.0, -float(self.track.velocity[2]))
-            nearest = max(nearest, self.track.expected.nearest_m - approach)
-        return Expected(nearest, farthest)
+        return expected_depths(self.track, self._refiner.joints(state))
 
     def _improved(self, particles: Tensor, *, observation: Observation) -> Tensor:
         """Hypotheses brought onto the seen points, each by itself, and back into the pose space."""
@@ -422,28 +342,14 @@ class Tracker:
             return new, "recovering", True
         return new, "initialising" if track.age == 0 else "tracking", outside >= 2
 
-    def _fit_size(self, state: Tensor, observation: Observation, evidence: Evidence) -> None:
+    def _fit_size(self, state: Tensor, evidence: Evidence) -> None:
         """Let a believed estimate say how large the hand is."""
         if self.fit is None or self._size is None or self._size.frames >= self.fit.frames:
             return
         before = self._size.index
-        middle = self._refiner.joints(state).mean(0)
-        seen = surroundings(observation, middle, self.refinement.points)
-
-        def improve(moved, ratio):
-            if len(seen.points_m) == 0:
-                return moved
-            return self._refiner(moved, moved[:, 6:], replace(seen, points_m=seen.points_m / ratio), self.refinement)
-
-        self._size, found, gain = update(
-            self._size, self.fit, state, evidence, self.scorer, replace(self.likelihood, beta=float(os.environ.get("BETA","1.5")), residual_weight=float(os.environ.get("RW","1"))), self._poses, improve, self.generator
+        self._size = update(
+            self._size, self.fit, state, evidence, self.scorer, self.likelihood, self.generator
         )
-        if self._size.index != before and self._size.frames <= self.fit.early and self.track is not None:
-            latent = sir.bound(self.space.encode(found[:, 6:]), self.space.lower, self.space.upper, "truncate")
-            mean = torch.cat((found[:, :6], latent), 1)
-            particles = sir.compose(self.track.particles, sir.difference(mean, self.track.mean))
-            particles[:, 6:] = sir.bound(particles[:, 6:], self.space.lower, self.space.upper, "truncate")
-            self.track = replace(self.track, mean=mean, state=found, particles=particles)
         if self._size.index != before:
             self._set_shape(self._first_shape.scaled(self._size.ratio(self.fit)))
 

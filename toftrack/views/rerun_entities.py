@@ -28,7 +28,7 @@ from toftrack.hand.skeleton import FINGERS
 from toftrack.likelihood import FMeasure
 from toftrack.segmentation import Observation
 from toftrack.threads import small_operations
-from toftrack.tracker import Insight
+from toftrack.track_state import Insight
 from toftrack.views.base import Moment
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.model_image import cpu_surface, parted, posed_hand
