@@ -15,7 +15,7 @@ from torch import Tensor
 
 from toftrack import filter as sir
 from toftrack.errors import ToftrackError
-from toftrack.forearm import arm_sight, seen_through
+from toftrack.forearm import arm_sight, armless, border_pixels
 from toftrack.pose_space.base import PoseSpace
 from toftrack.segmentation import Observation
 
@@ -135,7 +135,7 @@ class SearchStart:
         image plane.
     arm_rad: spread of the forearm's direction about the way to where the blob leaves the image; a
         fifth of the hypotheses, and all where the blob does not touch the border, point anywhere.
-    forearm: taken from the log score of a hand whose whole forearm the image sees through.
+    forearm: taken from the log score of a hand whose forearm cannot be, see toftrack.forearm.
     memory: added to the log score of a hand that is turned as it was before it was lost ...
     memory_rad: ... with less the farther it has turned since (standard deviation) ...
     memory_s: ... and the longer ago it was (to 1/e). While that is less than two such times ago, a
@@ -201,7 +201,7 @@ class SearchStart:
         sight = arm_sight(observation)
 
         def log_prior(particles: Tensor) -> Tensor:
-            known = -self.forearm * seen_through(particles, sight)
+            known = -self.forearm * armless(particles, sight)
             if lately is not None:
                 before = lately.particle[:, 3:6].expand(len(particles), -1)
                 turned = roma.rotvec_geodesic_distance(particles[:, 3:6], before)
@@ -330,10 +330,7 @@ def _ended(silhouette: np.ndarray) -> np.ndarray:
 
 def arm_exits(observation: Observation, n: int, generator: torch.Generator) -> np.ndarray | None:
     """Points where the blob leaves the image, (n, 3) float32 metres; None where it does not."""
-    hand = observation.hand.cpu().numpy()
-    border = np.zeros_like(hand)
-    border[[0, -1], :] = border[:, [0, -1]] = True
-    v, u = np.nonzero(hand & border)
+    v, u = border_pixels(observation)
     if len(v) < 3:
         return None
     rows = torch.randint(len(v), (n,), generator=generator, device=generator.device).cpu().numpy()
