@@ -20,7 +20,15 @@ from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.render.scoring import make_scorer
 from toftrack.segmentation import NearestSurface, Observation
-from toftrack.start import LogScores, RoughStart, SearchStart, Start, arm_exit, palm_centres
+from toftrack.start import (
+    Lately,
+    LogScores,
+    RoughStart,
+    SearchStart,
+    Start,
+    arm_exits,
+    palm_centres,
+)
 
 PALM = [JOINT_NAMES.index(name) for name in ("wrist", "index_mcp", "middle_mcp", "little_mcp")]
 
@@ -71,7 +79,7 @@ def first_error_mm(start: Start, scene: Scene, seed: int, side: str = "right") -
     shape = default_hand_shape(side=side)
     seen = observed(scene)
     scores = log_scores_of(seen, shape)
-    particles = start(seen, pose_space(), scores, unimproved, 50, generator(seed))
+    particles = start(seen, pose_space(), scores, unimproved, None, 50, generator(seed))
     mean = sir.mean_particle(particles, torch.full((50,), 0.02))
     joints = forward_kinematics(states_of(mean), shape).joints_m[0].numpy()
     return 1e3 * float(np.linalg.norm(joints - scene.joints_m[0], axis=-1).mean())
@@ -101,8 +109,8 @@ def test_the_search_beats_the_best_of_as_many_unrefined_hypotheses() -> None:
     seen = observed(sample().cut(0))
     scores = log_scores_of(seen, default_hand_shape())
     search = SearchStart(hypotheses=1000, samples=256)
-    found = search(seen, pose_space(), scores, unimproved, 50, generator())
-    drawn = search._draw(seen, pose_space(), generator())
+    found = search(seen, pose_space(), scores, unimproved, None, 50, generator())
+    drawn = search._draw(seen, pose_space(), None, generator())
     assert scores(found, 1.0).max() > scores(drawn, 1.0).max() + 0.1
 
 
@@ -111,7 +119,7 @@ def test_as_many_particles_as_asked_for_inside_the_pose_space(start: Start) -> N
     seen = observed(sample().cut(0))
     space = pose_space()
     scores = log_scores_of(seen, default_hand_shape())
-    one, two = (start(seen, space, scores, unimproved, 37, generator(5)) for _ in range(2))
+    one, two = (start(seen, space, scores, unimproved, None, 37, generator(5)) for _ in range(2))
     assert one.shape == (37, 6 + space.dims)
     assert one.isfinite().all()
     assert (one[:, 6:] >= space.lower - 1e-5).all() and (one[:, 6:] <= space.upper + 1e-5).all()
@@ -122,7 +130,8 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
     pose = (0.05, -0.02, 0.6, 0.3, -0.4, 1.2)
     start = RoughStart(pose=pose, position_m=0.01, rotation_rad=0.1)
     n = 4000
-    x = start(observed(sample().cut(0)), pose_space(), unscored, unimproved, n, generator())
+    seen = observed(sample().cut(0))
+    x = start(seen, pose_space(), unscored, unimproved, None, n, generator())
     reference = torch.cat((torch.tensor(pose), x[0, 6:]))[None]
     off = sir.difference(x, reference)[:, :6]
     sigma = torch.tensor([0.01] * 3 + [0.1] * 3)
@@ -137,7 +146,7 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
 def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     scene = sample().cut(0)
     seen = observed(scene)
-    x = RoughStart()(seen, pose_space(), unscored, unimproved, 300, generator())
+    x = RoughStart()(seen, pose_space(), unscored, unimproved, None, 300, generator())
     middle = (x[:, :3] + sir.rotated_pivot(x[:, 3:6])).mean(0).numpy()
     true_palm = scene.joints_m[0, PALM].mean(0)
     assert np.linalg.norm(middle - true_palm) < 0.06
@@ -159,7 +168,7 @@ def test_a_pose_can_be_given_on_the_command_line() -> None:
 
     config = configuration("start=rough", "start.pose=[0,0.1,0.5,0,0,0]")
     start = hydra.utils.instantiate(config.start)
-    x = start(observed(sample().cut(0)), pose_space(), unscored, unimproved, 100, generator())
+    x = start(observed(sample().cut(0)), pose_space(), unscored, unimproved, None, 100, generator())
     assert float((x[:, :3].mean(0) - torch.tensor([0, 0.1, 0.5])).norm()) < 0.02
 
 
@@ -168,7 +177,10 @@ def test_palm_centres_lie_on_the_hand_and_often_in_its_palm(frame: int) -> None:
     scene = sample().cut(frame)
     centres = palm_centres(observed(scene), 400, generator(frame))
     off = np.linalg.norm(centres - scene.joints_m[0, PALM].mean(0), axis=1)
-    assert (off < 0.2).all(), "no farther than the fingertips and the forearm beside the wrist"
+    assert (off < 0.35).all()
+    # No farther than the fingertips and the forearm beside the wrist, except for those that follow
+    # the arm out of the image, a third at most.
+    assert (off < 0.2).mean() > 0.6
     # One in four is plenty for thousands of hypotheses. It is above a third in every frame here,
     # from which 400 draws do not fall below a quarter with a probability above 0.999.
     assert (off < 0.06).mean() > 0.25
@@ -209,31 +221,32 @@ def test_the_arm_leaves_the_image_where_the_true_wrist_points_to() -> None:
     for quarters in range(4):
         scene = sample().cut(0).turned(quarters)
         wrist, middle = scene.joints_m[0, 0], scene.joints_m[0, 9]
-        way = arm_exit(observed(scene)) - wrist
-        arm = wrist - middle
-        cosine = way[:2] @ arm[:2] / np.linalg.norm(way[:2]) / np.linalg.norm(arm[:2])
-        assert cosine > math.cos(math.radians(35))
-        pixel = (scene.k @ (way + wrist))[:2] / (way + wrist)[2]
+        exits = arm_exits(observed(scene), 50, generator())
+        way, arm = exits - wrist, wrist - middle
+        cosine = way[:, :2] @ arm[:2] / np.linalg.norm(way[:, :2], axis=1)
+        assert (cosine / np.linalg.norm(arm[:2]) > math.cos(math.radians(45))).all()
+        u, v = (exits @ scene.k.T)[:, :2].T / exits[:, 2]
         height, width = scene.depth_m.shape[1:]
-        edge = min(pixel[0], pixel[1], width - 1 - pixel[0], height - 1 - pixel[1])
-        assert edge < 3
+        assert (np.minimum(np.minimum(u, v), np.minimum(width - 1 - u, height - 1 - v)) < 3).all()
 
 
 def test_a_blob_inside_the_image_has_no_arm_that_leaves_it() -> None:
     depth = np.zeros((60, 80), np.float32)
     depth[20:40, 30:50] = 0.5
     k = np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]])
-    assert arm_exit(NearestSurface()(depth, k)) is None
+    assert arm_exits(NearestSurface()(depth, k), 5, generator()) is None
 
 
 def test_hypotheses_of_the_search_point_along_the_arm_mostly_but_anywhere_too() -> None:
     scene = sample().cut(0)
     seen = observed(scene)
-    x = SearchStart(hypotheses=3000)._draw(seen, pose_space(), generator())
+    x = SearchStart(hypotheses=3000)._draw(seen, pose_space(), None, generator())
     down = roma.rotvec_to_rotmat(x[:, 3:6])[:, :, 1].numpy()  # from the fingers to the wrist
     arm = scene.joints_m[0, 0] - scene.joints_m[0, 9]
     angle = np.degrees(
-        np.arccos(down[:, :2] @ arm[:2] / np.linalg.norm(arm[:2]) / np.hypot(*down[:, :2].T))
+        np.arccos(
+            (down[:, :2] @ arm[:2] / np.linalg.norm(arm[:2]) / np.hypot(*down[:, :2].T)).clip(-1, 1)
+        )
     )
     assert (angle < 60).mean() > 0.6
     # A fifth point anywhere in the plane: a quarter of those away from the arm, 5 % of all. With
@@ -241,3 +254,44 @@ def test_hypotheses_of_the_search_point_along_the_arm_mostly_but_anywhere_too() 
     assert (angle > 135).mean() > 0.025
     facing = roma.rotvec_to_rotmat(x[:, 3:6])[:, 2, 2]
     assert 0.4 < float((facing > 0).float().mean()) < 0.6, "palms and backs alike"
+
+
+def test_a_palm_is_also_looked_for_beyond_the_border_that_cuts_the_hand() -> None:
+    scene = sample().cut(0)
+    palm = scene.joints_m[0, PALM].mean(0)
+    u = int(scene.k[0, 0] * palm[0] / palm[2] + scene.k[0, 2])
+    left = scene.depth_m[0][:, : u - 8]  # the middle of the palm lies outside
+    centres = palm_centres(NearestSurface()(left, scene.k), 1000, generator())
+    pixels = scene.k[0, 0] * centres[:, 0] / centres[:, 2] + scene.k[0, 2]
+    beyond = pixels > left.shape[1]
+    assert 0.02 < beyond.mean() < 0.4
+    assert (np.linalg.norm(centres - palm, axis=1) < 0.04).any()
+
+
+def test_a_hand_as_it_was_lately_is_preferred_and_forgotten_with_time() -> None:
+    seen = observed(sample().cut(0))
+    before = torch.zeros(1, 10)
+    before[:, 2] = 0.5
+    turned = before.clone()
+    turned[:, 5] = 3.0
+    start = SearchStart(forearm=0.0)
+    both = torch.cat((before, turned))
+
+    def gain(age_s: float) -> float:
+        same, other = start.prior(seen, Lately(before, age_s))(both)
+        return float(same - other)
+
+    assert gain(0.0) == pytest.approx(start.memory, abs=0.01)
+    assert gain(start.memory_s) == pytest.approx(start.memory / math.e, abs=0.01)
+    assert not start.prior(seen, None)(both).any()
+    assert not RoughStart().prior(seen, Lately(before, 0.0))(both).any()
+
+
+def test_a_quarter_of_the_hypotheses_is_turned_and_bent_as_the_hand_was_lately() -> None:
+    seen = observed(sample().cut(0))
+    lately = Lately(torch.tensor([[0, 0, 0.5, 0, 0, 2.5, 0.1, 0.1, 0.1, 0.1]]), 1.0)
+    search = SearchStart(hypotheses=400)
+    alike = (search._draw(seen, pose_space(), lately, generator())[:, 6:] == 0.1).all(1)
+    assert int(alike.sum()) == 100
+    old = Lately(lately.particle, 10.0)
+    assert not (search._draw(seen, pose_space(), old, generator())[:, 6:] == 0.1).all(1).any()
