@@ -23,6 +23,7 @@ from toftrack.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer
 
 _REACH = 3  # sizes tried on either side of the present one
+_TRIED = (1.0, 1.12, 0.9, 1.24, 0.8)  # sizes of starts, in turn
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,17 @@ def first_belief(fit: HandFit) -> SizeBelief:
     half = int(math.log(fit.largest) / math.log1p(fit.step))
     log_size = torch.arange(-half, half + 1) * math.log1p(fit.step)
     return SizeBelief(-0.5 * (log_size / fit.prior).square(), half)
+
+
+def retried(fit: HandFit, attempt: int) -> SizeBelief:
+    """The belief to start with after `attempt` starts that were not believed: another size.
+
+    A hand of the wrong size fits so badly that no start is believed, and then nothing is fitted.
+    """
+    belief = first_belief(fit)
+    ratio = _TRIED[attempt % len(_TRIED)]
+    index = belief.index + round(math.log(ratio) / math.log1p(fit.step))
+    return replace(belief, index=min(max(index, 0), len(belief.log_likelihood) - 1))
 
 
 def update(

@@ -18,7 +18,7 @@ from toftrack.filter import FilterSettings
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.hand_fit import HandFit, first_belief, update
+from toftrack.hand_fit import HandFit, first_belief, retried, update
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import latent_density
@@ -73,6 +73,7 @@ class Tracker:
         self._renderer = renderer
         self._first_shape = shape.to(self.device)
         self._size = first_belief(fit) if fit else None
+        self._refused = 0  # starts not believed
         self._set_shape(self._first_shape)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.track: TrackState | None = None
@@ -97,7 +98,7 @@ class Tracker:
         if side is not None:
             self._first_shape = self._first_shape.of_side(side)
         self.track = self._seen = None
-        self._size = first_belief(self.fit) if self.fit else None
+        self._size, self._refused = first_belief(self.fit) if self.fit else None, 0
         self._set_shape(self._first_shape)
 
     @small_operations()
@@ -145,8 +146,8 @@ class Tracker:
 
         estimate = self._estimate(particles, weights, mean, state, score, index, timestamp_s)
         self.track, name, lost = self._judge(track, particles, weights, mean, state, score)
+        self._fit_size(state, evidence, lost)
         if self.track is not None and not lost:
-            self._fit_size(state, evidence)
             if self.track.age > self.lost.probation:
                 self._seen = self.track.mean, timestamp_s
         if self.track is not None and bool(observation.occluder.any()):
@@ -342,14 +343,18 @@ class Tracker:
             return new, "recovering", True
         return new, "initialising" if track.age == 0 else "tracking", outside >= 2
 
-    def _fit_size(self, state: Tensor, evidence: Evidence) -> None:
-        """Let a believed estimate say how large the hand is."""
+    def _fit_size(self, state: Tensor, evidence: Evidence, lost: bool) -> None:
+        """Let a believed estimate say how large the hand is; try another size if none is."""
         if self.fit is None or self._size is None or self._size.frames >= self.fit.frames:
             return
         before = self._size.index
-        self._size = update(
-            self._size, self.fit, state, evidence, self.scorer, self.likelihood, self.generator
-        )
+        if not lost:
+            self._size = update(
+                self._size, self.fit, state, evidence, self.scorer, self.likelihood, self.generator
+            )
+        elif self.track is None and self._size.frames == 0:
+            self._refused += 1
+            self._size = retried(self.fit, self._refused)
         if self._size.index != before:
             self._set_shape(self._first_shape.scaled(self._size.ratio(self.fit)))
 
