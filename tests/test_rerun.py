@@ -19,6 +19,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from tracking import CONF, configuration, make_tracker
 
+import toftrack.views
 from toftrack import cli
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
@@ -32,8 +33,9 @@ FRAMES = 6
 
 def test_without_rerun_a_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for name in ("toftrack.views.rerun_view", "toftrack.views.rerun_entities"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
+    for name in ("rerun_view", "rerun_entities"):  # another test may have imported them
+        monkeypatch.delitem(sys.modules, f"toftrack.views.{name}", raising=False)
+        monkeypatch.delattr(toftrack.views, name, raising=False)
     with pytest.raises(Exception) as error:
         instantiate(configuration("view=rerun").view, _partial_=True)
     assert "needs the package rerun-sdk" in cli.sentence(error.value)
