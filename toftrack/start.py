@@ -146,7 +146,7 @@ class SearchStart:
     islands: int = 64
     coverage: float = 1.0
     samples: int = 1024
-    improved: int = 32
+    improved: int = 16
     position_m: float = 0.02
     tilt_rad: float = 0.5
     arm_rad: float = 0.5
