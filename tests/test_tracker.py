@@ -117,6 +117,15 @@ def test_a_restart_forgets_the_hand_and_may_change_its_side() -> None:
         tracker.restart("middle")
 
 
+def test_the_papers_estimate_is_the_filters_mean_and_nothing_else() -> None:
+    scene = first(4)
+    tracker = make_tracker("experiment=paper", "filter.particles=50")
+    for i, depth in enumerate(scene.depth_m):
+        estimate = tracker.step(depth, scene.k, i, i / 25)
+        mean = tracker.decode(tracker.track.mean)[0].numpy()
+        assert np.array_equal(estimate.state, mean)
+
+
 def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
     scene = first(3)
     quick = ("hand.shape=default", "lost.probation=1", "refine.swaps=8", "filter.particles=60")

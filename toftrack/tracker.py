@@ -139,7 +139,7 @@ class Tracker:
         mean = sir.mean_particle(particles, weights)
         filtered = self.decode(mean, track.offset)
         state = self._refine(filtered, track.state, observation, evidence)
-        if track.state is not None:
+        if track.state is not None and self.refinement.iterations:
             state, trend = steadied(state, track.state, track.trend, self.refinement.steadying)
             track = replace(track, trend=trend)
         score = float(self.likelihood.score(self.scorer(state, evidence)))
