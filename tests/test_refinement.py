@@ -29,18 +29,12 @@ from toftrack.refine import (
 )
 from toftrack.segmentation import NearestSurface
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
 LIMITS = torch.tensor(ANGLE_LIMITS)
 SETTINGS = Refinement()
 FRAMES = range(0, 100, 9)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Idle helpers of torch hold up small work on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def generator(seed: int = 0) -> torch.Generator:

@@ -22,6 +22,9 @@ from toftrack.render.reference import ReferenceScorer, dilate_disc, step_range_i
 from toftrack.render.scoring import Counts, Evidence, make_scorer
 from toftrack.render.torch_scorer import count_bits, dilate_bits, pack_bits
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
 BACK_ENDS = ("torch", "numba")
 CPU = torch.device("cpu")
 SIZES = ((48, 64), (144, 176), (240, 320))
@@ -86,15 +89,6 @@ def check(found: Counts, expected: Counts) -> None:
         assert worst <= 0, f"{name}: {a} is not {b}"
     off = (found.residual - expected.residual).abs()
     assert (off <= 0.01 * expected.residual + 3.0).all()
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Idle helpers of torch hold up small work on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module", params=BACK_ENDS)

@@ -30,16 +30,10 @@ from toftrack.start import (
     palm_centres,
 )
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
 PALM = [JOINT_NAMES.index(name) for name in ("wrist", "index_mcp", "middle_mcp", "little_mcp")]
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Idle helpers of torch hold up small work on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @cache

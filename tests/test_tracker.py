@@ -16,18 +16,12 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.tracker import Tracker
 from toftrack.views.model_image import model_range_image
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
 FRAMES = 40
 QUICK = ("start.hypotheses=1000", "start.samples=256")
 """A start that suffices for the first frames and takes a third of the time."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    """Idle helpers of torch hold up small work on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def first(n: int) -> Scene:

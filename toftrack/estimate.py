@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -59,5 +59,18 @@ def no_estimate(
         score=0.0,
         covariance=np.full((size, size), np.nan, np.float32),
         effective_sample_size=0.0,
+        compute_s=compute_s,
+    )
+
+
+def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: float) -> Estimate:
+    """The estimate of a frame in which no hand can be: the last one stands, and is lost."""
+    return replace(
+        last,
+        index=index,
+        timestamp_s=timestamp_s,
+        state_name="lost",
+        lost=True,
+        score=0.0,
         compute_s=compute_s,
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from toftrack import filter as sir
 from toftrack.depth_image import checked_image
-from toftrack.estimate import Estimate, no_estimate
+from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.filter import FilterSettings
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
@@ -394,14 +394,6 @@ class Tracker:
         seconds = time.perf_counter() - began
         if self._last is None:
             return no_estimate(index, timestamp_s, "lost", self.space.dims, seconds)
-        missing = replace(
-            self._last,
-            index=index,
-            timestamp_s=timestamp_s,
-            state_name="lost",
-            lost=True,
-            score=0.0,
-            compute_s=seconds,
-        )
+        missing = lost_estimate(self._last, index, timestamp_s, seconds)
         self._gesture, missing = tell_gesture(self.gestures, None, missing, self.space)
         return missing
