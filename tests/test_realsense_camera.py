@@ -1,4 +1,4 @@
-"""RealSense cameras through a stand-in for the SDK: what only a camera does, and what goes wrong."""
+"""RealSense cameras through a stand-in for the SDK: what a camera does, and what goes wrong."""
 
 from __future__ import annotations
 
