@@ -1,0 +1,109 @@
+"""What the networks see: a metric crop about a point, and the whole image at one focal length.
+
+Both come from the rectified image as it is, at any resolution, by reading the nearest pixel at the
+points of a grid; nothing is interpolated over depth edges.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+CROP_M = 0.30
+"""Side of the cube that a crop shows."""
+CROP = 64
+"""Cells of a crop, each of 2 x 2 readings."""
+WIDE_F_PX = 100.0
+"""Focal length of the whole image that the finder sees."""
+WIDE_RANGE_M = 1.6
+"""Farther away, all is the same to the finder."""
+
+
+def crop_rotation(centre_m: np.ndarray) -> np.ndarray:
+    """(3, 3) from the crop's frame, whose z axis points at the centre (3,), to the camera's."""
+    ray = np.asarray(centre_m, np.float64)
+    ray = ray / np.linalg.norm(ray)
+    axis = np.array([-ray[1], ray[0], 0.0])  # z cross ray
+    sine, cosine = np.linalg.norm(axis), ray[2]
+    rotation, _ = cv2.Rodrigues(axis / max(sine, 1e-12) * np.arctan2(sine, cosine))
+    return rotation
+
+
+def crop(depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is in the cube about a point.
+
+    depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).  centre_m: (3,) in the camera frame.
+    Returns (3, CROP, CROP) float32, see `channels`, and the crop's rotation (3, 3).
+    """
+    rotation = crop_rotation(centre_m)
+    distance = float(np.linalg.norm(centre_m))
+    samples = 2 * CROP
+    # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.
+    focal = samples * distance / CROP_M
+    middle = (samples - 1) / 2
+    inverse = np.array([[1 / focal, 0, -middle / focal], [0, 1 / focal, -middle / focal], [0, 0, 1]])
+    mapping = np.asarray(k, np.float64) @ rotation @ inverse
+    read = cv2.warpPerspective(
+        depth_m,
+        mapping,
+        (samples, samples),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
+    # Z of the camera to z of the crop: along a ray d of the crop, z_crop = Z / (R d)_z.
+    steps = (np.arange(samples) - middle) / focal
+    slope = rotation[2, 0] * steps[None, :] + rotation[2, 1] * steps[:, None] + rotation[2, 2]
+    read = np.where(slope > 0.05, read / np.maximum(slope, 0.05), 0).astype(np.float32)
+    return channels(read[None], np.array([distance], np.float32))[0], rotation
+
+
+def channels(read_m: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+    """(N, 2 CROP, 2 CROP) readings in crop frames to (N, 3, CROP, CROP) float32.
+
+    distance_m: (N,) of the crops' centres.
+    The channels: mean depth about the centre in half cubes, -1 .. 1 (1 where nothing is read); share
+    of readings in the cube; share without a reading.
+    """
+    n = len(read_m)
+    blocks = np.ascontiguousarray(read_m).reshape(n, CROP, 2, CROP, 2)
+    valid = blocks > 0
+    relative = (blocks - distance_m[:, None, None, None, None]) * np.float32(2 / CROP_M)
+    inside = valid & (np.abs(relative) < 1)
+    count = valid.sum((2, 4), dtype=np.float32)
+    total = np.where(valid, relative.clip(-1, 1), 0).sum((2, 4), dtype=np.float32)
+    out = np.empty((n, 3, CROP, CROP), np.float32)
+    out[:, 0] = np.where(count > 0, total / np.maximum(count, 1), 1.0)
+    out[:, 1] = inside.sum((2, 4), dtype=np.float32) * np.float32(0.25)
+    out[:, 2] = 1 - count * np.float32(0.25)
+    return out
+
+
+def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
+    """The whole image as the finder sees it, (1, 2, h, w), and its intrinsics (3, 3)."""
+    height, width = depth_m.shape
+    scale = np.array([WIDE_F_PX / k[0, 0], WIDE_F_PX / k[1, 1]])
+    # A multiple of 8, for the network's stride; what is added has no reading.
+    w, h = (8 * int(np.ceil(s * f / 8)) for s, f in zip((width, height), scale, strict=True))
+    u = np.rint((np.arange(w) + 0.5) / scale[0] - 0.5).astype(int)
+    v = np.rint((np.arange(h) + 0.5) / scale[1] - 0.5).astype(int)
+    read = np.zeros((h, w), np.float32)
+    rows, columns = v < height, u < width
+    read[np.ix_(rows, columns)] = depth_m[np.ix_(v[rows], u[columns])]
+    new_k = np.array(
+        [
+            [WIDE_F_PX, 0, (k[0, 2] + 0.5) * scale[0] - 0.5],
+            [0, WIDE_F_PX, (k[1, 2] + 0.5) * scale[1] - 0.5],
+            [0, 0, 1],
+        ]
+    )
+    return wide_channels(torch.from_numpy(read)[None]), new_k
+
+
+def wide_channels(read_m: Tensor) -> Tensor:
+    """(N, h, w) readings to (N, 2, h, w): depth in parts of the range, 1 where none; and validity."""
+    valid = read_m > 0
+    far = torch.where(valid, (read_m / WIDE_RANGE_M).clamp(max=1), torch.ones_like(read_m))
+    return torch.stack((far, valid.to(read_m.dtype)), 1)

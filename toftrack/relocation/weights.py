@@ -1,0 +1,111 @@
+"""The relocaliser's weights as a file: arrays of half precision and JSON, with a checksum."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from toftrack.errors import ToftrackError
+from toftrack.relocation.network import Finder, PoseNet, Residual
+
+FORMAT = "toftrack-relocaliser"
+VERSION = 1
+DEFAULT_FILE = Path(__file__).parent.parent / "data" / "relocaliser.npz"
+_LARGEST_BYTES = 64 << 20
+
+
+def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any]) -> None:
+    """Write both networks; `about` says how they were trained."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, network in (("pose", pose), ("finder", finder)):
+        for key, tensor in network.state_dict().items():
+            array = tensor.detach().cpu().numpy()
+            if array.dtype.kind == "f":
+                array = array.astype(np.float16)
+            arrays[f"{name}.{key}"] = array
+    metadata = {
+        "format": FORMAT,
+        "version": VERSION,
+        "sha256": _checksum(arrays),
+        "pose_width": pose.stem[0].out_channels,
+        "finder_width": finder.heads.in_channels,
+        "about": about,
+    }
+    np.savez_compressed(path, metadata=np.array(json.dumps(metadata)), **arrays)
+
+
+def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[str, Any]]:
+    """Both networks ready for use, and how they were trained; None: those of the package.
+
+    Raises ToftrackError when the file is missing, damaged, not weights or of another version.
+    """
+    path = DEFAULT_FILE if path is None else Path(path)
+    again = "train them anew with python -m toftrack.programs.train_relocaliser, or install again"
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise ToftrackError(f"{path} is too large for weights of the relocaliser; {again}")
+        with np.load(path, allow_pickle=False) as content:
+            arrays = {key: content[key] for key in content.files}
+        metadata = json.loads(str(arrays.pop("metadata")))
+    except FileNotFoundError:
+        raise ToftrackError(f"there are no weights of the relocaliser at {path}; {again}") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RecursionError) as error:
+        raise ToftrackError(
+            f"{path} is no file of the relocaliser's weights ({error}); {again}"
+        ) from None
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        raise ToftrackError(f"{path} is no file of the relocaliser's weights; {again}")
+    if metadata.get("version") != VERSION:
+        raise ToftrackError(
+            f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"
+            f" version {VERSION}; {again}"
+        )
+    if metadata.get("sha256") != _checksum(arrays):
+        raise ToftrackError(f"{path} is damaged, its checksum is wrong; {again}")
+    try:
+        pose, finder = PoseNet(int(metadata["pose_width"])), Finder(int(metadata["finder_width"]))
+        for name, network in (("pose", pose), ("finder", finder)):
+            network.load_state_dict(
+                {
+                    key.split(".", 1)[1]: torch.from_numpy(array).float()
+                    if array.dtype.kind == "f"
+                    else torch.from_numpy(array)
+                    for key, array in arrays.items()
+                    if key.startswith(name + ".")
+                }
+            )
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ToftrackError(f"{path} holds weights of another network ({error}); {again}") from None
+    return _ready(pose), _ready(finder), metadata["about"]
+
+
+def _checksum(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for key in sorted(arrays):
+        digest.update(key.encode())
+        digest.update(np.ascontiguousarray(arrays[key]).tobytes())
+    return digest.hexdigest()
+
+
+def _ready(network: nn.Module) -> nn.Module:
+    """For use: without gradients, normalisation folded into the convolutions before it."""
+    network.eval().requires_grad_(False)
+    for module in network.modules():
+        if isinstance(module, Residual):
+            module.first = fuse_conv_bn_eval(module.first, module.norm_1)
+            module.second = fuse_conv_bn_eval(module.second, module.norm_2)
+            module.norm_1 = module.norm_2 = nn.Identity()
+        elif isinstance(module, nn.Sequential):
+            for i in range(len(module) - 1):
+                if isinstance(module[i + 1], nn.BatchNorm2d):
+                    module[i] = fuse_conv_bn_eval(module[i], module[i + 1])
+                    module[i + 1] = nn.Identity()
+    return network.to(memory_format=torch.channels_last)
