@@ -18,7 +18,7 @@ from toftrack.app import build_tracker, track
 from toftrack.devices.base import Device
 from toftrack.devices.sample import Sample
 from toftrack.estimate import Estimate
-from toftrack.tracker import Tracker
+from toftrack.tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"

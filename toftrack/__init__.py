@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.interface import make_device, make_tracker
     from toftrack.results import read_results
-    from toftrack.tracker import Tracker
+    from toftrack.tracking.tracker import Tracker
 
     __version__: str
 
@@ -37,7 +37,7 @@ _PLACES = {
     "Frame": "toftrack.devices.base",
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "ToftrackError": "toftrack.errors",
-    "Tracker": "toftrack.tracker",
+    "Tracker": "toftrack.tracking.tracker",
     "make_device": "toftrack.interface",
     "make_tracker": "toftrack.interface",
     "read_results": "toftrack.results",

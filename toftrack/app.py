@@ -22,7 +22,7 @@ from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.results import ResultWriter
 from toftrack.smoothing import OneEuro, smooth
 from toftrack.stream import ReaderGoneError, Stream
-from toftrack.tracker import Tracker
+from toftrack.tracking.tracker import Tracker
 from toftrack.views.base import Moment, View
 
 

@@ -20,7 +20,7 @@ from toftrack.errors import ToftrackError
 from toftrack.interface import configuration_folder
 from toftrack.likelihood import FMeasure
 from toftrack.segmentation import NearestSurface
-from toftrack.tracker import Tracker
+from toftrack.tracking.tracker import Tracker
 
 CONFIGURATIONS: dict[str, tuple[str, ...]] = {
     "default": (),

@@ -24,7 +24,7 @@ from toftrack.errors import ToftrackError
 
 if TYPE_CHECKING:
     from toftrack.devices.base import Device
-    from toftrack.tracker import Tracker
+    from toftrack.tracking.tracker import Tracker
 
 _ROOT = "config.yaml"
 _composing = threading.Lock()

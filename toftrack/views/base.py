@@ -12,7 +12,7 @@ from toftrack.camera import Camera
 from toftrack.devices.base import Frame
 from toftrack.estimate import Estimate
 from toftrack.hand.shape import HandShape
-from toftrack.track_state import Insight
+from toftrack.tracking.state import Insight
 
 COMMANDS = ("restart", "right", "left")
 """What a view may ask: a new start, or another hand (which starts anew)."""

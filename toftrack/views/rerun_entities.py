@@ -22,13 +22,13 @@ import torch
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.filter import rotated_pivot
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
 from toftrack.likelihood import FMeasure
 from toftrack.segmentation import Observation
 from toftrack.threads import small_operations
-from toftrack.track_state import Insight
+from toftrack.tracking.particle_filter import rotated_pivot
+from toftrack.tracking.state import Insight
 from toftrack.views.base import Moment
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.model_image import cpu_surface, parted, posed_hand

@@ -13,7 +13,7 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.tracker import Tracker
+from toftrack.tracking.tracker import Tracker
 from toftrack.views.model_image import model_range_image
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -11,7 +11,6 @@ import roma
 import torch
 from tracking import Scene, configuration, sample
 
-from toftrack import filter as sir
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES, forward_kinematics
@@ -20,7 +19,8 @@ from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.render.scoring import make_scorer
 from toftrack.segmentation import NearestSurface, Observation
-from toftrack.start import (
+from toftrack.tracking import particle_filter as sir
+from toftrack.tracking.search import (
     Lately,
     LogScores,
     RoughStart,

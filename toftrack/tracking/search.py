@@ -13,11 +13,11 @@ import roma
 import torch
 from torch import Tensor
 
-from toftrack import filter as sir
 from toftrack.errors import ToftrackError
-from toftrack.forearm import arm_sight, armless, border_pixels
 from toftrack.pose_space.base import PoseSpace
 from toftrack.segmentation import Observation
+from toftrack.tracking import particle_filter as sir
+from toftrack.tracking.forearm import arm_sight, armless, border_pixels
 
 _WIDEST_PALM_M = 0.06
 """Half the breadth of the broadest hand's palm with the ball of the thumb."""
@@ -135,7 +135,7 @@ class SearchStart:
         image plane.
     arm_rad: spread of the forearm's direction about the way to where the blob leaves the image; a
         fifth of the hypotheses, and all where the blob does not touch the border, point anywhere.
-    forearm: taken from the log score of a hand whose forearm cannot be, see toftrack.forearm.
+    forearm: taken from the log score of a hand whose forearm cannot be, see forearm.py.
     memory: added to the log score of a hand that is turned as it was before it was lost ...
     memory_rad: ... with less the farther it has turned since (standard deviation) ...
     memory_s: ... and the longer ago it was (to 1/e). While that is less than two such times ago, a

@@ -11,14 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack import filter as sir
 from toftrack.depth_image import checked_image
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
-from toftrack.filter import FilterSettings
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.hand_fit import HandFit, first_belief, retried, update
 from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import latent_density
@@ -26,10 +23,13 @@ from toftrack.proposals import swap_fingers
 from toftrack.refine import Refinement, make_refiner, surroundings
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
 from toftrack.segmentation import Expected, NearestSurface, Observation
-from toftrack.start import Lately, Start
 from toftrack.steadying import steadied
 from toftrack.threads import small_operations
-from toftrack.track_state import Insight, LostSettings, TrackState, expected_depths
+from toftrack.tracking import particle_filter as sir
+from toftrack.tracking.particle_filter import FilterSettings
+from toftrack.tracking.search import Lately, Start
+from toftrack.tracking.size_fit import HandFit, first_belief, retried, update
+from toftrack.tracking.state import Insight, LostSettings, TrackState, expected_depths
 
 _MODEL_ERROR = sir.Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
