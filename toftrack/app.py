@@ -22,6 +22,7 @@ from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.results import ResultWriter
 from toftrack.smoothing import OneEuro, smooth
 from toftrack.stream import ReaderGoneError, Stream
+from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.tracker import Tracker
 from toftrack.views.base import Moment, View
 
@@ -40,22 +41,23 @@ def compute_device(name: str) -> torch.device:
 def build_tracker(config: DictConfig) -> Tracker:
     """The tracker of a configuration (conf/config.yaml composed)."""
     make = hydra.utils.instantiate
-    hand = make(config.hand)
-    return Tracker(
-        shape=hand.shape,
-        space=make(config.pose_space),
+    hand, refinement = make(config.hand), make(config.refine)
+    device = compute_device(config.compute)
+    model = TrackerModel(
+        shape=hand.shape.to(device),
+        space=make(config.pose_space).to(device),
         segmentation=make(config.segmentation),
         likelihood=make(config.likelihood),
-        settings=make(config.filter),
-        refinement=make(config.refine),
+        filter=make(config.filter),
+        refinement=refinement if refinement.iterations else None,
         start=make(config.start),
         lost=make(config.lost),
         fit=hand.fit,
         gestures=make(config.gestures),
         renderer=config.renderer,
-        device=compute_device(config.compute),
-        seed=config.seed,
+        device=device,
     )
+    return Tracker(model, config.seed)
 
 
 def track(config: DictConfig, device: Device) -> float:

@@ -28,7 +28,7 @@ from toftrack.likelihood import FMeasure
 from toftrack.segmentation import Observation
 from toftrack.threads import small_operations
 from toftrack.tracking.particle_filter import rotated_pivot
-from toftrack.tracking.state import Insight
+from toftrack.tracking.state import StepInfo
 from toftrack.views.base import Moment
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.model_image import cpu_surface, parted, posed_hand
@@ -144,7 +144,7 @@ class Entities:
         labels = rr.SegmentationImage(pixels.labels())
         self._stream.log("world/tracker/classified", labels)
 
-    def _log_particles(self, insight: Insight) -> None:
+    def _log_particles(self, insight: StepInfo) -> None:
         """The middles of the hands that the particles stand for, brighter with their weight."""
         particles = insight.particles.detach().cpu()
         middles = particles[:, :3] + rotated_pivot(particles[:, 3:6])
