@@ -18,8 +18,8 @@ from omegaconf import DictConfig
 from toftrack.app import build_tracker
 from toftrack.errors import ToftrackError
 from toftrack.interface import configuration_folder
-from toftrack.likelihood import FMeasure
-from toftrack.segmentation import NearestSurface
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import NearestSurface
 from toftrack.tracker import Tracker
 
 CONFIGURATIONS: dict[str, tuple[str, ...]] = {
