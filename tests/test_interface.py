@@ -17,8 +17,8 @@ from hydra.core.global_hydra import GlobalHydra
 from tracking import CONF, ROOT, sample
 
 import toftrack
+from toftrack.compute.threads import small_operations, threads
 from toftrack.interface import configuration
-from toftrack.threads import small_operations, threads
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 

@@ -23,7 +23,7 @@ import toftrack.views
 from toftrack import cli
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
-from toftrack.likelihood import FMeasure
+from toftrack.render.likelihood import FMeasure
 from toftrack.views.base import Moment
 from toftrack.views.classified import classify
 

@@ -10,7 +10,7 @@ import roma
 import torch
 from tracking import sample
 
-from toftrack.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.forearm import arm_sight, forearm_conflict
 
 K = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])

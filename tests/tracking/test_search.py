@@ -14,11 +14,11 @@ from tracking import Scene, configuration, sample
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES, forward_kinematics
-from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import make_scorer
-from toftrack.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking import particle_filter as sir
 from toftrack.tracking.palm_places import arm_exits, palm_centres
 from toftrack.tracking.search import (

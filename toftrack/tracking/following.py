@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from toftrack.segmentation import Expected
+from toftrack.render.segmentation import Expected
 from toftrack.tracking import particle_filter
 from toftrack.tracking.life_cycle import Belief, LostSettings
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel

@@ -12,12 +12,12 @@ from torch import Tensor
 from toftrack.gestures import Gestures
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import LatentDensity, latent_density
-from toftrack.refine import Refinement, Refiner, make_refiner
+from toftrack.refinement.gauss_newton import Refinement, Refiner, make_refiner
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
-from toftrack.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
 from toftrack.tracking.search import Start

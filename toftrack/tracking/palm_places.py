@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 from toftrack.tracking.forearm import border_pixels
 
 _WIDEST_PALM_M = 0.06

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from toftrack.proposals import swap_fingers
-from toftrack.refine import Refinement, surroundings
-from toftrack.steadying import steadied
+from toftrack.refinement.gauss_newton import Refinement, surroundings
+from toftrack.refinement.proposals import swap_fingers
+from toftrack.refinement.steadying import steadied
 from toftrack.tracking.model import ObservedFrame
 from toftrack.tracking.state import Track
 

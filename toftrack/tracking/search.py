@@ -13,7 +13,7 @@ from torch import Tensor
 
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.base import PoseSpace
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter as sir
 from toftrack.tracking.forearm import arm_sight, forearm_conflict
 from toftrack.tracking.palm_places import arm_exits, palm_centres

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
-from toftrack.likelihood import FMeasure
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer
 from toftrack.tracking import particle_filter as sir
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from toftrack.estimate import Estimate
 from toftrack.gestures import GestureState
-from toftrack.segmentation import Expected, Observation
+from toftrack.render.segmentation import Expected, Observation
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.size_fit import SizeBelief
 

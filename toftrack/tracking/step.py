@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.gestures import tell_gesture
-from toftrack.segmentation import Observation
-from toftrack.threads import small_operations
+from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter, size_fit
 from toftrack.tracking.following import (
     Found,

@@ -20,13 +20,13 @@ import numpy as np
 import roma
 import torch
 
+from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
-from toftrack.likelihood import FMeasure
-from toftrack.segmentation import Observation
-from toftrack.threads import small_operations
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import Observation
 from toftrack.tracking.particle_filter import rotated_pivot
 from toftrack.tracking.state import StepInfo
 from toftrack.views.base import Moment

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from toftrack.pose_space.base import PoseSpace
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 from toftrack.views import chart
 from toftrack.views.chart import Axes
 from toftrack.views.classified import CLASS_RGB, CLASSES, Classified

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from toftrack.proposals import FINGER_OF_ANGLE
+from toftrack.refinement.proposals import FINGER_OF_ANGLE
 from toftrack.tracking import particle_filter as sir
 
 
