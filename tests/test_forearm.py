@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from tracking import sample
+from helpers.tracking import sample
 
 from toftrack.forearm import arm_sight, armless
 from toftrack.segmentation import NearestSurface, Observation

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.tracking import ROOT, configuration, run
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
-from tracking import ROOT, configuration, run
 
-from toftrack import convert
-from toftrack.interface import make_device
+from toftrack.api import make_device
+from toftrack.programs import convert
 from toftrack.recordings.npz import read_recording
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")

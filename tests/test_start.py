@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from tracking import Scene, configuration, sample
+from helpers.tracking import Scene, configuration, sample
 
 from toftrack import filter as sir
 from toftrack.errors import ToftrackError

@@ -17,13 +17,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from toftrack.api import make_device, make_tracker
     from toftrack.camera import Camera
-    from toftrack.devices.base import BaseDevice, Frame
+    from toftrack.devices.base import BaseDevice
     from toftrack.errors import ToftrackError
     from toftrack.estimate import Estimate
+    from toftrack.frames import Frame
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
-    from toftrack.interface import make_device, make_tracker
-    from toftrack.results import read_results
+    from toftrack.output.results import read_results
     from toftrack.tracker import Tracker
 
     __version__: str

@@ -19,8 +19,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 import toftrack
-from toftrack.cli import sentence
 from toftrack.errors import ToftrackError
+from toftrack.programs.command_line import sentence
 
 if TYPE_CHECKING:
     from toftrack.devices.base import Device
@@ -45,7 +45,9 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
     """
     config = configuration(*overrides, config_dir=config_dir)
     with _one_sentence():
-        from toftrack.app import build_tracker  # takes seconds: an override's error comes before
+        from toftrack.programs.track import (
+            build_tracker,  # takes seconds: an override's error comes before
+        )
 
         return build_tracker(config)
 

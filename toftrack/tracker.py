@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from toftrack import filter as sir
-from toftrack.depth_image import checked_image
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.filter import FilterSettings
-from toftrack.gestures import Gestures, GestureState, tell_gesture
+from toftrack.frames import checked_image
+from toftrack.gestures.recognition import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
 from toftrack.hand_fit import HandFit, first_belief, retried, update

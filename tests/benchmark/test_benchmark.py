@@ -7,7 +7,8 @@ import json
 import pytest
 import torch
 
-from toftrack import benchmark, frame_timing
+from toftrack.benchmark import frames as frame_timing
+from toftrack.benchmark import scoring as benchmark
 from toftrack.errors import ToftrackError
 
 

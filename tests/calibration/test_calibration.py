@@ -9,12 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from chequerboard import RANGE_M, board_poses, render_board, wiggle
+from helpers.chequerboard import RANGE_M, board_poses, render_board, wiggle
 
-from toftrack import calibrate, calibration, cli
-from toftrack.calibration import DepthPairs, View
+from toftrack.calibration import fitting as calibration
+from toftrack.calibration.fitting import DepthPairs, View
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.programs import calibrate
+from toftrack.programs import command_line as cli
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsFacts, SrsWriter
 
@@ -186,7 +188,7 @@ def test_errors_are_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["calibrate", str(recording), *arguments])
-    assert cli.run(calibrate.main) == 1
+    assert command_line.run(calibrate.main) == 1
     last = capfd.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("error: ")
     assert words in last

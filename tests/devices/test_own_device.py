@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.tracking import ROOT
 from hydra.errors import HydraException
 from hydra.utils import instantiate
-from tracking import ROOT
 
 from toftrack.camera import Camera
-from toftrack.cli import sentence
 from toftrack.devices.base import BaseDevice, Device
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
+from toftrack.programs.command_line import sentence
 
 FRAMES = 12
 

@@ -13,13 +13,13 @@ import cv2
 import hydra
 import numpy as np
 import pytest
-from tracking import ROOT, configuration, make_tracker
+from helpers.tracking import ROOT, configuration, make_tracker
 
 from toftrack.camera import Camera
 from toftrack.devices.base import Device
-from toftrack.devices.realsense import RealSense
-from toftrack.devices.realsense_emulator import EmulatedCamera, EmulatorSettings
-from toftrack.devices.realsense_sdk import camera_of, load_sdk
+from toftrack.devices.realsense.device import RealSense
+from toftrack.devices.realsense.emulator import EmulatedCamera, EmulatorSettings
+from toftrack.devices.realsense.sdk import camera_of, load_sdk
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 

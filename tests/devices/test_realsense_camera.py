@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_realsense import Camera as FakeCamera
-from fake_realsense import Profile, Sdk
-from tracking import ROOT
+from helpers.fake_realsense import Camera as FakeCamera
+from helpers.fake_realsense import Profile, Sdk
+from helpers.tracking import ROOT
 
-from toftrack.devices.realsense import RealSense
-from toftrack.devices.realsense_emulator import EmulatorSettings
+from toftrack.devices.realsense.device import RealSense
+from toftrack.devices.realsense.emulator import EmulatorSettings
 from toftrack.errors import ToftrackError
 
 

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 import usb.core
-from sr3000_camera import STEP_M, camera, read
+from helpers.sr3000_camera import STEP_M, camera, read
 
-from toftrack.devices import sr3000_usb
 from toftrack.devices.base import Device
 from toftrack.devices.sample import Sample
-from toftrack.devices.sr3000 import Sr3000
-from toftrack.devices.sr3000_faults import REQUEST_FAULTS
+from toftrack.devices.sr3000 import usb as sr3000_usb
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.faults import REQUEST_FAULTS
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES, unambiguous_range_m
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toftrack.devices.sr3000 import Sr3000
-from toftrack.devices.sr3000_transport import MesaSettings, Persistence
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.transport import MesaSettings, Persistence
 from toftrack.errors import ToftrackError
 
 SOURCE = r"""

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import usb.core
-from sr3000_camera import STEP_M, camera, read
+from helpers.sr3000_camera import STEP_M, camera, read
 
 from toftrack.camera import Camera
 from toftrack.devices.sample import Sample
-from toftrack.devices.sr3000 import Sr3000
-from toftrack.devices.sr3000_emulator import EmulatedBackend, EmulatorSettings
-from toftrack.devices.sr3000_transport import Exposure, Persistence, UsbSettings
-from toftrack.devices.sr3000_usb import UsbTransport
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
+from toftrack.devices.sr3000.transport import Exposure, Persistence, UsbSettings
+from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.recordings.store import open_source
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toftrack.devices.sr3000 import Sr3000
-from toftrack.devices.sr3000_emulator import EmulatorSettings
-from toftrack.devices.sr3000_transport import UsbSettings
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.emulator import EmulatorSettings
+from toftrack.devices.sr3000.transport import UsbSettings
 
 ROOT = Path(__file__).parents[1]
 EMULATED = ("device=sr3000", "device.transport=emulated", "view=none")

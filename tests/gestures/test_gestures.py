@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.tracking import configuration, make_tracker, sample
+from helpers.tracking import follow as follow_scene
 from hydra.utils import instantiate
-from tracking import configuration, make_tracker, sample
-from tracking import follow as follow_scene
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.gesture_files import read_poses
-from toftrack.gestures import (
+from toftrack.gestures.files import read_poses
+from toftrack.gestures.recognition import (
     Gestures,
     GestureState,
     make_gestures,
@@ -26,9 +26,9 @@ from toftrack.gestures import (
 )
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
+from toftrack.output.results import ResultWriter, read_results
+from toftrack.pose_space.data.training_poses import basic_pose, synthetic_training_poses
 from toftrack.pose_space.files import make_pose_space
-from toftrack.pose_space.training_poses import basic_pose, synthetic_training_poses
-from toftrack.results import ResultWriter, read_results
 
 SURE, ON = 0.9, 0.0
 """A good score, and no distance from the pose space."""

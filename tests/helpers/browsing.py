@@ -14,24 +14,24 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
-from tracking import make_tracker
+from helpers.tracking import make_tracker
 
 from toftrack.devices.sample import Sample
-from toftrack.views.base import Moment
-from toftrack.views.browser import BrowserView, browser_view
+from toftrack.views.base import TrackedFrame
+from toftrack.views.browser.view import BrowserView, browser_view
 
 PATIENCE_S = 20
 
 
 @cache
-def moments() -> tuple[Moment, ...]:
+def moments() -> tuple[TrackedFrame, ...]:
     """Two tracked frames of the sample, which look different."""
     device, tracker = Sample(start=40, stop=46), make_tracker()
     kept = []
     for frame in device:
         depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
         estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        kept.append(Moment(frame, depth, device.camera, estimate, shape, tracker.insight))
+        kept.append(TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight))
     return kept[0], kept[-1]
 
 

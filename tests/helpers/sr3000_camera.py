@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from toftrack.devices.sr3000 import Sr3000
-from toftrack.devices.sr3000_emulator import EmulatorSettings
-from toftrack.devices.sr3000_transport import Persistence, UsbSettings
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.emulator import EmulatorSettings
+from toftrack.devices.sr3000.transport import Persistence, UsbSettings
 from toftrack.recordings.sr_frame import unambiguous_range_m
 
 FAST = {"fps": 1000.0, "replug_s": 0.02, "late_s": 0.06}

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toftrack.devices.base import Truth
 from toftrack.errors import ToftrackError
-from toftrack.evaluation import evaluate, metrics_table
+from toftrack.frames import Truth
+from toftrack.output.evaluation import evaluate, metrics_table
 
 
 def random_case(seed: int) -> tuple[np.ndarray, np.ndarray, Truth]:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toftrack.devices.base import Truth
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.evaluation import evaluate
-from toftrack.results import ResultWriter, read_results
+from toftrack.frames import Truth
+from toftrack.output.evaluation import evaluate
+from toftrack.output.results import ResultWriter, read_results
 
 NAMES = tuple(f"joint_{i}" for i in range(21))
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import roma
 import torch
-from tracking import configuration
+from helpers.tracking import configuration
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.gestures import pointing_ray
+from toftrack.gestures.recognition import pointing_ray
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.smoothing import OneEuro, SmoothState, smooth
+from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 
 SHAPE = default_hand_shape()
 REST = np.concatenate(([0.02, -0.05, 0.5], [0.3, -0.2, 1.0], np.full(21, 0.2)))

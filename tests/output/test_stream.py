@@ -18,13 +18,13 @@ from pathlib import Path
 import hydra
 import numpy as np
 import pytest
-from tracking import CONF, ROOT, configuration, run
+from helpers.tracking import CONF, ROOT, configuration, run
 
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.results import LINE_FIELDS, json_line, read_results
-from toftrack.stream import NoStream, ReaderGoneError, StdoutStream, UdpStream
+from toftrack.output.results import LINE_FIELDS, json_line, read_results
+from toftrack.output.stream import NoStream, ReaderGoneError, StdoutStream, UdpStream
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 NUMBERS = np.random.default_rng(0)
@@ -91,7 +91,7 @@ def test_nothing_else_gets_to_standard_output() -> None:
     script = """
 import os
 from toftrack.estimate import no_estimate
-from toftrack.stream import StdoutStream
+from toftrack.output.stream import StdoutStream
 with StdoutStream() as stream:
     print("printed")
     os.system("echo from below")

@@ -10,6 +10,8 @@ import torch
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.pose_space.base import PoseSpace
+from toftrack.pose_space.data.pose_data import PoseData
+from toftrack.pose_space.data.training_poses import GESTURES, basic_pose, synthetic_training_poses
 from toftrack.pose_space.files import (
     fit_pose_space,
     load_pose_space,
@@ -17,8 +19,6 @@ from toftrack.pose_space.files import (
     save_pose_space,
 )
 from toftrack.pose_space.pca import fit_pca
-from toftrack.pose_space.pose_data import PoseData
-from toftrack.pose_space.training_poses import GESTURES, basic_pose, synthetic_training_poses
 
 LIMITS = torch.tensor(ANGLE_LIMITS)
 

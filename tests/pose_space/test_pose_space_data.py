@@ -15,12 +15,12 @@ import torch
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
+from toftrack.pose_space.data.pose_data import PoseData, mixed_data, spread_out, synthetic_data
+from toftrack.pose_space.data.pose_files import file_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, pose_space_sources
 from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
-from toftrack.pose_space.pose_data import PoseData, mixed_data, spread_out, synthetic_data
-from toftrack.pose_space.pose_files import file_data
 from toftrack.pose_space.reach import nearest_latents
-from toftrack.views.pose_figures import corners_figure, manifold_figure, traversals_figure
+from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
 
 ROOT = Path(__file__).parents[1]
 LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)

@@ -11,10 +11,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from toftrack.benchmark.decoding import AIMS_MS, decode_times
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.pose_space import isomap, kernel_pca, lle
 from toftrack.pose_space.base import PoseSpace, clamped_share
+from toftrack.pose_space.data.pose_data import synthetic_data
 from toftrack.pose_space.density import latent_density
 from toftrack.pose_space.files import (
     fit_pose_space,
@@ -24,8 +26,6 @@ from toftrack.pose_space.files import (
     save_pose_space,
 )
 from toftrack.pose_space.neighbours import barycentric_weights
-from toftrack.pose_space.pose_data import synthetic_data
-from toftrack.pose_space.timing import AIMS_MS, decode_times
 
 CONF = str(Path(__file__).parents[1] / "conf")
 KINDS = ("pca", "kernel_pca", "lle", "isomap")

@@ -14,8 +14,8 @@ from hydra import compose, initialize_config_dir
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, forward_kinematics
+from toftrack.pose_space.data.leap import leap_data
 from toftrack.pose_space.inverse_kinematics import fit_angles, joint_jacobian, shape_of_joints
-from toftrack.pose_space.leap import leap_data
 
 CONF = str(Path(__file__).parents[1] / "conf")
 LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)

@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 
 import toftrack
-from toftrack.cli import run, sentence
 from toftrack.errors import ToftrackError
+from toftrack.programs.command_line import run, sentence
 
 APP = """
 import functools, pathlib, sys, time
 import hydra
 from hydra.utils import instantiate
-from toftrack.cli import job, run
+from toftrack.programs.command_line import run, sweep_job
 from toftrack.errors import ToftrackError
 
 def tell(task):
@@ -34,7 +34,7 @@ def tell(task):
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="app")
 @tell
-@job
+@sweep_job
 def main(config):
     if config.fail == "clear":
         raise ToftrackError("the reason, and what to do")

@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from toftrack import cli, convert, record
 from toftrack.camera import Camera
 from toftrack.devices.folder import Folder
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
+from toftrack.programs import command_line as cli
+from toftrack.programs import convert, record
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import PngFolderWriter, read_png_folder
 from toftrack.recordings.srs import read_srs
@@ -132,7 +133,7 @@ def test_record_errors_are_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["record", *arguments])
-    assert cli.run(record.main) == 1
+    assert command_line.run(record.main) == 1
     error = capsys.readouterr().err
     assert words in error
     assert error.startswith("error: ")

@@ -13,20 +13,21 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tracking import ROOT, make_tracker, sample
+from helpers.tracking import ROOT, make_tracker, sample
 
-from toftrack import cli, figures
 from toftrack.errors import ToftrackError
-from toftrack.figures import draw_figures
 from toftrack.hand.shape import default_hand_shape
 from toftrack.likelihood import FMeasure
+from toftrack.output.run_folder import open_footage, read_run
+from toftrack.programs import command_line as cli
+from toftrack.programs import figures
+from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import make_scorer
-from toftrack.run_folder import open_footage, read_run
 from toftrack.segmentation import Expected, NearestSurface
-from toftrack.views import chart
 from toftrack.views.classified import CLASSES, classify
+from toftrack.views.figures import chart
 from toftrack.views.model_image import model_range_image, parted, posed_hand
 
 NAMES = ("measurement", "filmstrip", "lost", "course", "latent")
@@ -282,12 +283,12 @@ def test_a_run_says_no_code_to_execute(run: Path) -> None:
 def test_the_command_answers_errors_with_a_sentence(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.run(lambda: figures.main([str(run), "--frame", "99"])) == 1
+    assert command_line.run(lambda: figures.main([str(run), "--frame", "99"])) == 1
     assert "error: the run has no frame 99; give --frame from 0 to 11" in capsys.readouterr().err
     (run / "file").touch()
-    assert cli.run(lambda: figures.main([str(run), "--out", str(run / "file")])) == 1
+    assert command_line.run(lambda: figures.main([str(run), "--out", str(run / "file")])) == 1
     assert "cannot be written" in capsys.readouterr().err
-    assert cli.run(lambda: figures.main([str(run), "--out", str(run / "own")])) == 0
+    assert command_line.run(lambda: figures.main([str(run), "--out", str(run / "own")])) == 0
     assert str(run / "own" / "latent.png") in capsys.readouterr().out
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.report import group_runs, main, read_runs, report
-from toftrack.views.sweep_figure import sweep_figure
+from toftrack.programs.report import group_runs, main, read_runs, report
+from toftrack.views.figures.sweep import sweep_figure
 
 
 def job(

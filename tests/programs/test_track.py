@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.tracking import ROOT
 from hydra.core.singleton import Singleton
-from tracking import ROOT
 
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output.results import read_results
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
-from toftrack.results import read_results
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])

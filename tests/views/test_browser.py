@@ -17,7 +17,7 @@ from urllib.request import urlopen
 import cv2
 import numpy as np
 import pytest
-from browsing import (
+from helpers.browsing import (
     PATIENCE_S,
     eventually,
     get,
@@ -32,9 +32,9 @@ from browsing import (
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import no_estimate
-from toftrack.views import browser
-from toftrack.views.browser import BrowserView, LivePicture, browser_view
-from toftrack.views.overlay import CAPTION_PX, draw_moment
+from toftrack.views.browser import view as browser
+from toftrack.views.browser.view import BrowserView, LivePicture, browser_view
+from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
 
 @pytest.fixture
@@ -59,10 +59,10 @@ def test_the_picture_is_the_overlay_of_the_newest_frame(view) -> None:
     view.show(second)
     facts, body = next_picture(view, {})
     picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
-    panel = draw_moment(second)[CAPTION_PX:]
+    panel = draw_tracked(second)[CAPTION_PX:]
     assert picture.shape == panel.shape
     assert np.abs(picture.astype(int) - panel).mean() < 3
-    assert np.abs(picture.astype(int) - draw_moment(first)[CAPTION_PX:]).mean() > 3
+    assert np.abs(picture.astype(int) - draw_tracked(first)[CAPTION_PX:]).mean() > 3
     estimate = second.estimate
     assert (facts["phase"], facts["index"]) == ("live", estimate.index)
     assert facts["score"] == pytest.approx(estimate.score, abs=1e-3)

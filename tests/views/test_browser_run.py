@@ -20,7 +20,7 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from browsing import (
+from helpers.browsing import (
     PATIENCE_S,
     eventually,
     made,
@@ -28,14 +28,14 @@ from browsing import (
     ours,
     shown_again_and_again,
 )
-from tracking import ROOT, configuration
+from helpers.tracking import ROOT, configuration
 
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.estimate import no_estimate
-from toftrack.results import read_results
-from toftrack.views import browser
-from toftrack.views.browser import BrowserView, browser_view
+from toftrack.output.results import read_results
+from toftrack.views.browser import view as browser
+from toftrack.views.browser.view import BrowserView, browser_view
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Frame
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
+from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
-from toftrack.views.base import Moment, NoView
+from toftrack.views.base import TrackedFrame, NoView
 from toftrack.views.overlay import VideoView, draw_panel, panel_scale
 
 W, H = 176, 144
@@ -43,9 +43,9 @@ def lost_hand() -> Estimate:
     return no_estimate(7, 0.28, "lost", 4, 0.01)
 
 
-def moment() -> Moment:
+def moment() -> TrackedFrame:
     frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
-    return Moment(frame, DEPTH, CAMERA, hand(), default_hand_shape(), None)
+    return TrackedFrame(frame, DEPTH, CAMERA, hand(), default_hand_shape(), None)
 
 
 def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

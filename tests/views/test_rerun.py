@@ -15,16 +15,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.tracking import CONF, configuration, make_tracker
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from tracking import CONF, configuration, make_tracker
 
 import toftrack.views
-from toftrack import cli
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.likelihood import FMeasure
-from toftrack.views.base import Moment
+from toftrack.programs import command_line as cli
+from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import classify
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
@@ -38,8 +38,8 @@ def test_without_rerun_a_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatc
         monkeypatch.delattr(toftrack.views, name, raising=False)
     with pytest.raises(Exception) as error:
         instantiate(configuration("view=rerun").view, _partial_=True)
-    assert "needs the package rerun-sdk" in cli.sentence(error.value)
-    assert "'.[rerun]'" in cli.sentence(error.value)
+    assert "needs the package rerun-sdk" in command_line.sentence(error.value)
+    assert "'.[rerun]'" in command_line.sentence(error.value)
 
 
 def test_other_views_do_not_import_rerun() -> None:
@@ -51,20 +51,20 @@ def test_other_views_do_not_import_rerun() -> None:
 def rerun_view():
     """The module, where rerun-sdk is installed."""
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install -e '.[rerun]')")
-    from toftrack.views import rerun_view
+    from toftrack.views.rerun import view as rerun_view
 
     return rerun_view
 
 
 @cache
-def moments() -> tuple[Moment, ...]:
+def moments() -> tuple[TrackedFrame, ...]:
     """Six tracked frames; then one without an estimate, and one where nothing is in range."""
     tracker, device = make_tracker(*QUICK), Sample(stop=FRAMES)
     tracked = []
     for frame in device:
         depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
         estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        tracked.append(Moment(frame, depth, device.camera, estimate, shape, tracker.insight))
+        tracked.append(TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight))
     last = tracked[-1]
     nan = dataclasses.replace(
         last.estimate, index=6, timestamp_s=0.24, state=np.full(27, np.nan, np.float32), lost=True
@@ -132,7 +132,7 @@ def test_every_frames_estimate_can_be_read_back(written: Path) -> None:
 
 
 def test_ellipsoids_have_the_sizes_of_the_hand_on_either_side(rerun_view) -> None:
-    from toftrack.views.rerun_entities import ellipsoids
+    from toftrack.views.rerun.entities import ellipsoids
 
     one = moments()[0]
     right, left = (ellipsoids(one.estimate, one.shape.of_side(side)) for side in ("right", "left"))
@@ -270,7 +270,7 @@ def test_a_viewer_that_takes_nothing_does_not_hold_up_the_tracker(
 def test_a_failure_in_the_thread_is_raised_where_the_frame_was_shown(
     rerun_view, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(moment: Moment) -> None:
+    def fail(moment: TrackedFrame) -> None:
         raise RuntimeError("no space")
 
     view = rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure())

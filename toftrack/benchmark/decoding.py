@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import torch
 
+from toftrack.benchmark.timing import interleaved
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import fit_pose_space
-from toftrack.timing import interleaved
 
 AIMS_MS = {"pca": 2.0, "kernel_pca": 15.0, "lle": 15.0}
 """What decoding 10 000 latents should take at most on two cores, median."""

@@ -15,10 +15,10 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from toftrack.app import build_tracker
+from toftrack.api import configuration_folder
 from toftrack.errors import ToftrackError
-from toftrack.interface import configuration_folder
 from toftrack.likelihood import FMeasure
+from toftrack.programs.track import build_tracker
 from toftrack.segmentation import NearestSurface
 from toftrack.tracker import Tracker
 

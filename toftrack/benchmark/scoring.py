@@ -30,16 +30,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from toftrack.errors import ToftrackError
-from toftrack.frame_timing import FrameRow, frame_times
-from toftrack.hand.shape import default_hand_shape
-from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import HandSurface, hand_surface
-from toftrack.pose_space.timing import decode_times
-from toftrack.render.closed_form import project
-from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import BACK_ENDS, Evidence, Scorer, make_scorer
-from toftrack.timing import (
+from toftrack.benchmark.decoding import decode_times
+from toftrack.benchmark.frames import FrameRow, frame_times
+from toftrack.benchmark.timing import (
     Row,
     check_against_reference,
     fastest_chunk,
@@ -49,6 +42,13 @@ from toftrack.timing import (
     to_device,
     wait_for,
 )
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.render.closed_form import project
+from toftrack.render.reference import ReferenceScorer
+from toftrack.render.scoring import BACK_ENDS, Evidence, Scorer, make_scorer
 
 PARTICLES = (100, 300, 1000, 3000, 10_000)
 BASELINES = ("stepping", "naive")

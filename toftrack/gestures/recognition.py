@@ -22,10 +22,10 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.gesture_files import NamedPose, read_poses
+from toftrack.gestures.files import NamedPose, read_poses
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, JOINT_NAMES
 from toftrack.pose_space.base import PoseSpace
-from toftrack.pose_space.training_poses import basic_pose
+from toftrack.pose_space.data.training_poses import basic_pose
 
 OTHER = "other"
 POINTING = "pointing"

@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.devices.base import Truth
 from toftrack.errors import ToftrackError
+from toftrack.frames import Truth
 
 TIPS = (4, 8, 12, 16, 20)
 """Rows of the fingertips among the 21 joints."""

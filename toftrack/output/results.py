@@ -17,10 +17,10 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from toftrack.devices.base import Truth
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.evaluation import evaluate
+from toftrack.frames import Truth
+from toftrack.output.evaluation import evaluate
 
 _ARRAYS: dict[str, type] = {
     "joints_m": np.float32,

@@ -22,7 +22,7 @@ import torch
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.gestures import pointing_ray
+from toftrack.gestures.recognition import pointing_ray
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 

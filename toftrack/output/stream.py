@@ -19,7 +19,7 @@ from typing import Any, Protocol, Self
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.results import LINE_FIELDS, json_line
+from toftrack.output.results import LINE_FIELDS, json_line
 
 _log = logging.getLogger(__name__)
 

@@ -19,13 +19,14 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from toftrack import calibration, cli
-from toftrack.calibration import DepthFit, DepthPairs, Lens, View
+from toftrack.calibration import fitting as calibration
+from toftrack.calibration.fitting import DepthFit, DepthPairs, Lens, View
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.programs import command_line as cli
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import FrameStore, open_recording
-from toftrack.views.calibration_figures import corner_sheet, error_plot
+from toftrack.views.figures.calibration import corner_sheet, error_plot
 
 _PICTURES = 12
 
@@ -234,4 +235,4 @@ def _board(text: str) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(command_line.run(main))

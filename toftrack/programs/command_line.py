@@ -3,7 +3,7 @@
 A program is a thin script:
 
     @hydra.main(version_base="1.3", config_path="conf", config_name="track")
-    @job
+    @sweep_job
     def main(config: DictConfig) -> float: ...
 
     if __name__ == "__main__":
@@ -63,7 +63,7 @@ def run(main: Callable[[], object]) -> int:
     With HYDRA_FULL_ERROR=1 in the environment the traceback comes before the sentence.
 
     Args:
-        main: usually a function under `@hydra.main` and `@job`.
+        main: usually a function under `@hydra.main` and `@sweep_job`.
 
     Returns:
         0 done, 1 after an error (also of one job of a sweep), 130 after Ctrl-C.
@@ -100,7 +100,7 @@ def run(main: Callable[[], object]) -> int:
     return 0
 
 
-def job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
+def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
     """Decorate the function under `@hydra.main` so that a failing job does not stop a sweep.
 
     In a sweep (`-m`) an error is told in one sentence, also as `error` in the summary.json of the

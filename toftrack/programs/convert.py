@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from toftrack import cli
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.programs import command_line as cli
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.npz_stream import write_npz_streamed
 from toftrack.recordings.png_folder import PngFolderWriter
@@ -170,4 +170,4 @@ def _warn(text: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(command_line.run(main))

@@ -26,19 +26,19 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from toftrack import cli
 from toftrack.errors import ToftrackError
-from toftrack.run_folder import Footage, Run, observe, open_footage, read_run
+from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
+from toftrack.programs import command_line as cli
 from toftrack.views.classified import classify
-from toftrack.views.model_image import model_range_image
-from toftrack.views.overlay import draw_panel, panel_scale
-from toftrack.views.run_figures import (
+from toftrack.views.figures.runs import (
     course_figure,
     filmstrip_figure,
     latent_figure,
     lost_figure,
     measurement_figure,
 )
+from toftrack.views.model_image import model_range_image
+from toftrack.views.overlay import draw_panel, panel_scale
 
 _FILM_FRAMES = 10
 _LOST_FRAMES = 5
@@ -231,4 +231,4 @@ def _time(run: Run) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(command_line.run(main))

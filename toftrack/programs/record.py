@@ -19,10 +19,10 @@ import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from toftrack import cli
-from toftrack.devices.sr3000 import Sr3000
+from toftrack.api import configuration_folder
+from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
-from toftrack.interface import configuration_folder
+from toftrack.programs import command_line as cli
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
 
@@ -157,4 +157,4 @@ def _digits(serial: str | None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(command_line.run(main))

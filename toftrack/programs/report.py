@@ -218,7 +218,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     """
     import cv2  # slow to import
 
-    from toftrack.views.sweep_figure import sweep_figure
+    from toftrack.views.figures.sweep import sweep_figure
 
     folder = Path(folder)
     runs = read_runs(folder)

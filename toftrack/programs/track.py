@@ -17,13 +17,13 @@ from tqdm import tqdm
 
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
-from toftrack.evaluation import metrics_table
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.results import ResultWriter
-from toftrack.smoothing import OneEuro, smooth
-from toftrack.stream import ReaderGoneError, Stream
+from toftrack.output.evaluation import metrics_table
+from toftrack.output.results import ResultWriter
+from toftrack.output.smoothing import OneEuro, smooth
+from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.tracker import Tracker
-from toftrack.views.base import Moment, View
+from toftrack.views.base import TrackedFrame, View
 
 
 def compute_device(name: str) -> torch.device:
@@ -118,7 +118,7 @@ def _loop(
                 estimate = calm
             results.append(estimate)
             stream.send(calm)
-            view.show(Moment(frame, depth, device.camera, estimate, shape, tracker.insight))
+            view.show(TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight))
             bar.update()
             bar.set_postfix_str(f"score {estimate.score:.2f} {estimate.state_name}", refresh=False)
 

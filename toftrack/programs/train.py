@@ -11,10 +11,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from toftrack.errors import ToftrackError
+from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space
-from toftrack.pose_space.pose_data import PoseData
-from toftrack.views.pose_figures import (
+from toftrack.views.figures.poses import (
     corners_figure,
     manifold_figure,
     poses_figure,

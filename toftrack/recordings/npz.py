@@ -30,8 +30,8 @@ from typing import IO, Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Truth
 from toftrack.errors import ToftrackError
+from toftrack.frames import Truth
 
 DEFAULT_FPS = 25.0
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Truth
+from toftrack.frames import Truth
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import read_png_folder
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ

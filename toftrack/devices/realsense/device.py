@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices import realsense_sdk as sdk
-from toftrack.devices.base import BaseDevice, Frame
-from toftrack.devices.realsense_emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
+from toftrack.devices.base import BaseDevice
+from toftrack.devices.realsense import sdk
+from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
 from toftrack.errors import ToftrackError
+from toftrack.frames import Frame
 
 _log = logging.getLogger(__name__)
 _SUFFIXES = (".bag", ".db3")

@@ -12,19 +12,20 @@ from pathlib import Path
 from typing import Any
 
 from toftrack.camera import Camera
-from toftrack.devices.base import BaseDevice, Frame
-from toftrack.devices.sr3000_emulator import EmulatedBackend, EmulatorSettings
-from toftrack.devices.sr3000_libmesasr import MesaTransport
-from toftrack.devices.sr3000_reader import Capture, Counts, Reader
-from toftrack.devices.sr3000_transport import (
+from toftrack.devices.base import BaseDevice
+from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
+from toftrack.devices.sr3000.libmesasr import MesaTransport
+from toftrack.devices.sr3000.reader import Capture, Counts, Reader
+from toftrack.devices.sr3000.transport import (
     Exposure,
     MesaSettings,
     Persistence,
     Transport,
     UsbSettings,
 )
-from toftrack.devices.sr3000_usb import UsbTransport
+from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
+from toftrack.frames import Frame
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     HEIGHT,

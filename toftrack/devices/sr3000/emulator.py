@@ -21,8 +21,8 @@ import numpy as np
 import usb.core
 from usb.backend import IBackend
 
-from toftrack.devices import sr3000_descriptors as descriptors
-from toftrack.devices.sr3000_faults import (
+from toftrack.devices.sr3000 import descriptors
+from toftrack.devices.sr3000.faults import (
     HARMLESS,
     OPEN_FAULTS,
     REQUEST_FAULTS,
@@ -30,7 +30,7 @@ from toftrack.devices.sr3000_faults import (
     parse_faults,
     transfer,
 )
-from toftrack.devices.sr3000_transport import UsbSettings, parse_id
+from toftrack.devices.sr3000.transport import UsbSettings, parse_id
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import REGISTERS, encode_frame, to_radial
 from toftrack.recordings.store import FrameStore

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toftrack.devices.sr3000_descriptors import PACKET_BYTES
+from toftrack.devices.sr3000.descriptors import PACKET_BYTES
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES
 

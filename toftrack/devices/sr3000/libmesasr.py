@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from toftrack.devices.sr3000_transport import Exposure, MesaSettings, NoAnswerError, UnpluggedError
+from toftrack.devices.sr3000.transport import Exposure, MesaSettings, NoAnswerError, UnpluggedError
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import HEIGHT, IMAGE_BYTES, WIDTH
 

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 
-from toftrack.devices.sr3000_transport import (
+from toftrack.devices.sr3000.transport import (
     CameraError,
     DamagedFrameError,
     EndOfStreamError,
@@ -17,7 +17,7 @@ from toftrack.devices.sr3000_transport import (
     Transport,
     UnpluggedError,
 )
-from toftrack.devices.sr3000_usb import WHEN_IT_DOES_NOT_ANSWER
+from toftrack.devices.sr3000.usb import WHEN_IT_DOES_NOT_ANSWER
 from toftrack.errors import ToftrackError
 
 _log = logging.getLogger(__name__)

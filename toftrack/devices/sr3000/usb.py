@@ -18,7 +18,7 @@ import usb.core
 import usb.util
 from usb.backend import IBackend
 
-from toftrack.devices.sr3000_transport import (
+from toftrack.devices.sr3000.transport import (
     DamagedFrameError,
     EndOfStreamError,
     Exposure,

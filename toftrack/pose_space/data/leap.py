@@ -17,12 +17,12 @@ from torch import Tensor
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.pose_space.archives import read_archive
+from toftrack.pose_space.data.pose_data import PoseData, spread_out
 from toftrack.pose_space.inverse_kinematics import (
     fit_angles,
     shape_of_joints,
     straight_finger_directions,
 )
-from toftrack.pose_space.pose_data import PoseData, spread_out
 
 _SAME_MM = 1.0
 """Frames whose joints differ less than this about the hand's middle are the same frame."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.training_poses import synthetic_training_poses
+from toftrack.pose_space.data.training_poses import synthetic_training_poses
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import torch
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.pose_space.archives import read_archive
-from toftrack.pose_space.pose_data import PoseData
+from toftrack.pose_space.data.pose_data import PoseData
 
 UNITS = ("degrees", "radians")
 _SLACK_DEGREES = 10.0

@@ -20,9 +20,9 @@ import cv2
 
 from toftrack.errors import ToftrackError
 from toftrack.threads import small_operations
-from toftrack.views.base import Moment
-from toftrack.views.browser_server import BrowserServer, News
-from toftrack.views.overlay import CAPTION_PX, draw_moment
+from toftrack.views.base import TrackedFrame
+from toftrack.views.browser.server import BrowserServer, News
+from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
 _STILL_WATCHED_S = 1.0
 """Drawing goes on for so long after the last request, so that pictures are ready for the next."""
@@ -98,9 +98,9 @@ class BrowserView:
         """Wait until somebody has opened the page; False when nobody did in time."""
         return self._picture.visited.wait(min(timeout_s, threading.TIMEOUT_MAX))
 
-    def show(self, moment: Moment) -> None:
+    def show(self, tracked: TrackedFrame) -> None:
         """Leave the moment for those who watch; returns at once."""
-        self._picture.put(moment)
+        self._picture.put(tracked)
 
     def commands(self) -> Sequence[str]:
         """What the visitors asked for since the last call."""
@@ -157,7 +157,7 @@ class LivePicture:
         self._lock = threading.Lock()
         self._work = threading.Condition(self._lock)  # the drawing thread waits for it
         self._news = threading.Condition(self._lock)  # visitors wait for it
-        self._moment: Moment | None = None
+        self._tracked: TrackedFrame | None = None
         self._times_s: deque[float] = deque(maxlen=200)
         self._undrawn, self._closed = False, False
         self._phase, self._version = "starting", 0
@@ -173,12 +173,12 @@ class LivePicture:
         """Somebody waits for news, or asked a moment ago."""
         return self._waiting > 0 or time.monotonic() - self._asked_s < _STILL_WATCHED_S
 
-    def put(self, moment: Moment) -> None:
+    def put(self, tracked: TrackedFrame) -> None:
         """Make a moment the newest one; raises what went wrong when the last one was drawn."""
         with self._lock:
             if self._error is not None:
                 raise self._error
-            self._moment, self._undrawn, self._phase = moment, True, "live"
+            self._tracked, self._undrawn, self._phase = tracked, True, "live"
             self._times_s.append(time.monotonic())
             self._work.notify()
 
@@ -226,15 +226,15 @@ class LivePicture:
 
     def _draw_all(self) -> None:
         with small_operations():
-            while (moment := self._next()) is not None:
+            while (tracked := self._next()) is not None:
                 began = time.monotonic()
                 try:
-                    jpeg = _encode(moment, self._quality)
+                    jpeg = _encode(tracked, self._quality)
                 except Exception as error:  # the tracker's thread raises it
                     with self._lock:
                         self._error = error
                     return
-                self._publish(moment, jpeg)
+                self._publish(tracked, jpeg)
                 with self._lock:
                     rest = began + self._least_s - time.monotonic()
                     self._work.wait_for(lambda: self._closed, max(0.0, rest))
@@ -244,18 +244,18 @@ class LivePicture:
                     self._work.wait_for(lambda: self._closed or self._undrawn, self._least_s)
                     self._undrawn |= before
 
-    def _next(self) -> Moment | None:
+    def _next(self) -> TrackedFrame | None:
         """Wait for a moment that somebody wants to see; None at the end."""
         with self._lock:
             self._work.wait_for(lambda: self._closed or (self._undrawn and self.watched))
             self._undrawn = False
-            return None if self._closed else self._moment
+            return None if self._closed else self._tracked
 
-    def _publish(self, moment: Moment, jpeg: bytes) -> None:
+    def _publish(self, tracked: TrackedFrame, jpeg: bytes) -> None:
         with self._lock:
             self._version += 1
             self._jpeg, self._jpeg_version = jpeg, self._version
-            self._facts = _facts(moment) | {"fps": _rate(self._times_s)}
+            self._facts = _facts(tracked) | {"fps": _rate(self._times_s)}
             self._news.notify_all()
 
 
@@ -263,18 +263,18 @@ def _stay(seconds: float) -> None:
     threading.Event().wait(min(seconds, threading.TIMEOUT_MAX))
 
 
-def _encode(moment: Moment, quality: int) -> bytes:
+def _encode(tracked: TrackedFrame, quality: int) -> bytes:
     # The page writes larger and sharper what the caption says.
-    panel = draw_moment(moment)[CAPTION_PX:]
+    panel = draw_tracked(tracked)[CAPTION_PX:]
     done, jpeg = cv2.imencode(".jpg", panel, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ToftrackError("the picture cannot be encoded as JPEG; choose view=none")
     return jpeg.tobytes()
 
 
-def _facts(moment: Moment) -> dict[str, Any]:
+def _facts(tracked: TrackedFrame) -> dict[str, Any]:
     """What the page writes beside the picture, JSON-able."""
-    estimate = moment.estimate
+    estimate = tracked.estimate
 
     def number(value: float) -> float | None:
         return round(float(value), 6) if math.isfinite(value) else None
@@ -287,7 +287,7 @@ def _facts(moment: Moment) -> dict[str, Any]:
         "gesture": estimate.gesture,
         "gesture_probability": number(estimate.gesture_probability),
         "ms": number(1e3 * estimate.compute_s),
-        "side": moment.shape.side,
+        "side": tracked.shape.side,
     }
 
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from toftrack.pose_space.base import PoseSpace
 from toftrack.segmentation import Observation
-from toftrack.views import chart
-from toftrack.views.chart import Axes
 from toftrack.views.classified import CLASS_RGB, CLASSES, Classified
+from toftrack.views.figures import chart
+from toftrack.views.figures.chart import Axes
+from toftrack.views.figures.poses import BASIC_BGR, nearest_gestures
 from toftrack.views.overlay import film_tile, filmstrip, range_grey
-from toftrack.views.pose_figures import BASIC_BGR, nearest_gestures
 
 _MARGIN_PX = 8
 _GAP = 16

@@ -29,7 +29,7 @@ from toftrack.likelihood import FMeasure
 from toftrack.segmentation import Observation
 from toftrack.threads import small_operations
 from toftrack.track_state import Insight
-from toftrack.views.base import Moment
+from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.model_image import cpu_surface, parted, posed_hand
 from toftrack.views.overlay import FINGER_RGB
@@ -73,20 +73,20 @@ class Entities:
         self._log_constants()
 
     @small_operations()
-    def log(self, moment: Moment) -> None:
+    def log(self, tracked: TrackedFrame) -> None:
         """Log one frame."""
-        estimate = moment.estimate
+        estimate = tracked.estimate
         self._stream.set_time("frame", sequence=estimate.index)
         self._stream.set_time("time", duration=estimate.timestamp_s)
-        self._log_images(moment)
-        if moment.insight is None:
+        self._log_images(tracked)
+        if tracked.insight is None:
             for gone in ("world/tracker/segmentation", "world/tracker/classified"):
                 self._stream.log(gone, rr.Clear(recursive=False))
             self._stream.log("world/hand/particles", rr.Clear(recursive=False))
         else:
-            self._log_observation(moment, moment.insight.observation)
-            self._log_particles(moment.insight)
-        self._log_hand(moment)
+            self._log_observation(tracked, tracked.insight.observation)
+            self._log_particles(tracked.insight)
+        self._log_hand(tracked)
         self._log_plots(estimate)
         self._log_changes(estimate)
 
@@ -115,8 +115,8 @@ class Entities:
         )
         self._stream.log(entity, pinhole)
 
-    def _log_images(self, moment: Moment) -> None:
-        depth, camera = moment.depth_m, moment.camera
+    def _log_images(self, tracked: TrackedFrame) -> None:
+        depth, camera = tracked.depth_m, tracked.camera
         self._log_pinhole("world/camera", camera.K, *depth.shape)
         steps = _STEPS_A_METRE * depth
         near, far = (_STEPS_A_METRE * limit for limit in _SHOWN_M)
@@ -128,11 +128,11 @@ class Entities:
             point_fill_ratio=0.4,
         )
         self._stream.log("world/camera/depth", image)
-        amplitude = camera.undistort_amplitude(moment.frame.amplitude)
+        amplitude = camera.undistort_amplitude(tracked.frame.amplitude)
         if amplitude is not None:
             self._stream.log("world/camera/amplitude", rr.Image(amplitude))
 
-    def _log_observation(self, moment: Moment, observation: Observation) -> None:
+    def _log_observation(self, tracked: TrackedFrame, observation: Observation) -> None:
         """How each pixel of the tracker's own image counts."""
         observation = observation.to(torch.device("cpu"))
         hand, occluder = observation.hand.numpy(), observation.occluder.numpy()
@@ -140,7 +140,7 @@ class Entities:
         segments = hand.astype(np.uint8)
         segments[occluder] = 2
         self._stream.log("world/tracker/segmentation", rr.SegmentationImage(segments))
-        pixels = classify(moment.estimate.state, moment.shape, observation, self._likelihood)
+        pixels = classify(tracked.estimate.state, tracked.shape, observation, self._likelihood)
         labels = rr.SegmentationImage(pixels.labels())
         self._stream.log("world/tracker/classified", labels)
 
@@ -154,13 +154,13 @@ class Entities:
         points = rr.Points3D(middles.numpy(), colors=colours, radii=_PARTICLE_M)
         self._stream.log("world/hand/particles", points)
 
-    def _log_hand(self, moment: Moment) -> None:
-        estimate, log = moment.estimate, self._stream.log
+    def _log_hand(self, tracked: TrackedFrame) -> None:
+        estimate, log = tracked.estimate, self._stream.log
         if not np.isfinite(estimate.state).all():
             for part in ("ellipsoids", "skeleton", "joints"):
                 log(f"world/hand/{part}", rr.Clear(recursive=False))
             return
-        log("world/hand/ellipsoids", ellipsoids(estimate, moment.shape))
+        log("world/hand/ellipsoids", ellipsoids(estimate, tracked.shape))
         joints = estimate.joints_m
         strips = [joints[[0, *range(4 * f + 1, 4 * f + 5)]] for f in range(len(FINGERS))]
         lines = rr.LineStrips3D(strips, colors=FINGER_RGB, radii=_BONE_M / 2)

@@ -13,8 +13,8 @@ from urllib.parse import urlsplit
 
 from toftrack.errors import ToftrackError
 from toftrack.likelihood import FMeasure
-from toftrack.views.base import Moment
-from toftrack.views.rerun_entities import Entities, blueprint, rr
+from toftrack.views.base import TrackedFrame
+from toftrack.views.rerun.entities import Entities, blueprint, rr
 
 FILE_NAME = "track.rrd"
 
@@ -71,21 +71,21 @@ class RerunView:
             except _RERUN_ERRORS as error:
                 raise _unwritable(self._path) from error
         self._entities = Entities(self._stream, likelihood)
-        self._moments: queue.Queue[Moment | None] = queue.Queue(_FRAMES_AHEAD)
+        self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_FRAMES_AHEAD)
         self._left_out = 0
         self._failure: Exception | None = None
         # A daemon, because nothing frees a thread that waits for a viewer that is stuck.
         self._thread = threading.Thread(target=self._work, name="toftrack-rerun", daemon=True)
         self._thread.start()
 
-    def show(self, moment: Moment) -> None:
+    def show(self, tracked: TrackedFrame) -> None:
         """Hand one frame over; raises ToftrackError when one before it could not be logged."""
         self._raise_failure()
         if self._path is not None:
-            self._moments.put(moment)
+            self._frames.put(tracked)
             return
         try:
-            self._moments.put_nowait(moment)
+            self._frames.put_nowait(tracked)
         except queue.Full:
             self._left_out += 1
 
@@ -101,7 +101,7 @@ class RerunView:
         patience_s = None if self._path is not None else _ANSWER_S
         if self._thread.is_alive():
             try:
-                self._moments.put(None, timeout=patience_s)
+                self._frames.put(None, timeout=patience_s)
                 self._thread.join(patience_s and 2 * patience_s)
             except queue.Full:
                 pass  # the thread is stuck, as is seen below
@@ -123,10 +123,10 @@ class RerunView:
     def _work(self) -> None:
         """In the thread: log the frames that come, until None, then finish."""
         # After a failure, frames are still taken, so that nobody waits for room.
-        for moment in iter(self._moments.get, None):
+        for tracked in iter(self._frames.get, None):
             if self._failure is None:
                 try:
-                    self._entities.log(moment)
+                    self._entities.log(tracked)
                 except Exception as error:
                     self._failure = error
         try:
