@@ -5,7 +5,7 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from toftrack.programs import command_line as cli
+from toftrack.programs import command_line
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")

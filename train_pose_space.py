@@ -5,7 +5,7 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from toftrack.programs import command_line as cli
+from toftrack.programs import command_line
 from toftrack.programs.train import train
 
 

@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import toftrack
-from toftrack.api import configuration
+from toftrack.configuration.compose import configuration
 from toftrack.threads import small_operations, threads
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
@@ -272,7 +272,7 @@ import sys
 sys.path.insert(0, {str(built)!r})
 sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder)]
 import toftrack
-from toftrack.api import configuration
+from toftrack.configuration.compose import configuration
 print(toftrack.__file__, configuration("smooth=one_euro").smooth.results)
 """
     path, smooth = python(code, folder=tmp_path).split()

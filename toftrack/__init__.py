@@ -35,13 +35,13 @@ _PLACES = {
     "BaseDevice": "toftrack.devices.base",
     "Camera": "toftrack.camera",
     "Estimate": "toftrack.estimate",
-    "Frame": "toftrack.devices.base",
+    "Frame": "toftrack.frames",
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "ToftrackError": "toftrack.errors",
     "Tracker": "toftrack.tracker",
-    "make_device": "toftrack.interface",
-    "make_tracker": "toftrack.interface",
-    "read_results": "toftrack.results",
+    "make_device": "toftrack.api",
+    "make_tracker": "toftrack.api",
+    "read_results": "toftrack.output.results",
 }
 
 __all__ = [

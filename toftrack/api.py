@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.singleton import Singleton
-from hydra.core.utils import JobRuntime
-from hydra.errors import HydraException
 from hydra.utils import instantiate
-from hydra.version import VersionBase
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
-import toftrack
+from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
-from toftrack.programs.command_line import sentence
 
 if TYPE_CHECKING:
+    import torch
+
     from toftrack.devices.base import Device
     from toftrack.tracker import Tracker
-
-_ROOT = "config.yaml"
-_composing = threading.Lock()
 
 
 def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Tracker:
@@ -44,11 +32,7 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
         ToftrackError: an override or a file that it names cannot be used.
     """
     config = configuration(*overrides, config_dir=config_dir)
-    with _one_sentence():
-        from toftrack.programs.track import (
-            build_tracker,  # takes seconds: an override's error comes before
-        )
-
+    with one_sentence():
         return build_tracker(config)
 
 
@@ -66,63 +50,40 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
         ToftrackError: an override cannot be used, or the device cannot deliver.
     """
     config = configuration(*overrides, config_dir=config_dir)
-    with _one_sentence():
+    with one_sentence():
         return instantiate(config.device)
 
 
-def configuration(*overrides: str, config_dir: str | Path | None = None) -> DictConfig:
-    """The configuration of `python track.py` with overrides.
+def build_tracker(config: DictConfig) -> Tracker:
+    """The tracker of a configuration (conf/config.yaml composed)."""
+    from toftrack.tracker import Tracker  # takes seconds: an override's error comes before
 
-    A Hydra application that calls this keeps its own state of Hydra.
-
-    Raises ToftrackError when it cannot be composed.
-    """
-    folder = (
-        configuration_folder() if config_dir is None else Path(config_dir).expanduser().resolve()
+    hand = instantiate(config.hand)
+    return Tracker(
+        shape=hand.shape,
+        space=instantiate(config.pose_space),
+        segmentation=instantiate(config.segmentation),
+        likelihood=instantiate(config.likelihood),
+        settings=instantiate(config.filter),
+        refinement=instantiate(config.refine),
+        start=instantiate(config.start),
+        lost=instantiate(config.lost),
+        fit=hand.fit,
+        gestures=instantiate(config.gestures),
+        renderer=config.renderer,
+        device=compute_device(config.compute),
+        seed=config.seed,
     )
-    if not (folder / _ROOT).is_file():
-        raise ToftrackError(
-            f"there is no {_ROOT} in the folder '{folder}'; give config_dir=FOLDER, a folder laid "
-            "out as toftrack's conf/"
-        )
-    for override in overrides:
-        if not isinstance(override, str):
-            raise ToftrackError(
-                f"the override {override!r} is no text; give overrides as on the command line, "
-                "'hand.side=left'"
-            )
-    with _one_sentence(), _own_hydra(), initialize_config_dir(str(folder), version_base="1.3"):
-        return compose(_ROOT.removesuffix(".yaml"), overrides=list(overrides))
 
 
-def configuration_folder() -> Path:
-    """toftrack's own conf/: in the package where a wheel was installed, beside it in a checkout."""
-    package = Path(toftrack.__file__).parent
-    inside = package / "conf"
-    return inside if inside.is_dir() else package.parent / "conf"
+def compute_device(name: str) -> torch.device:
+    """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
+    import torch
 
-
-@contextmanager
-def _own_hydra() -> Iterator[None]:
-    """Hydra has one state a process, which may be that of an application around us."""
-    kinds = (GlobalHydra, JobRuntime, VersionBase)
-    instances = Singleton._instances
-    with _composing:
-        kept = {kind: instances.pop(kind) for kind in kinds if kind in instances}
-        try:
-            yield
-        finally:
-            for kind in kinds:
-                instances.pop(kind, None)
-            instances.update(kept)
-
-
-@contextmanager
-def _one_sentence() -> Iterator[None]:
-    """Hydra wraps errors, those of ToftrackError too; callers get one they can catch and show."""
-    try:
-        yield
-    except ToftrackError:
-        raise
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ToftrackError(sentence(error)) from error
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ToftrackError("compute=cuda, but torch finds no CUDA GPU here; give compute=cpu")
+    if name not in ("cpu", "cuda"):
+        raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
+    return torch.device(name)

@@ -10,7 +10,8 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 
-LARGEST_MEDIAN_M = 65.0
+# No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
+LARGEST_MEDIAN_M = 20.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,7 @@ from toftrack.calibration import fitting as calibration
 from toftrack.calibration.fitting import DepthPairs, View
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.programs import calibrate
-from toftrack.programs import command_line as cli
+from toftrack.programs import calibrate, command_line
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsFacts, SrsWriter
 

@@ -15,10 +15,10 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 
 from toftrack.camera import Camera
+from toftrack.configuration.sentences import sentence
 from toftrack.devices.base import BaseDevice, Device
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
-from toftrack.programs.command_line import sentence
 
 FRAMES = 12
 

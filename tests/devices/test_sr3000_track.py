@@ -17,7 +17,7 @@ from toftrack.devices.sr3000.device import Sr3000
 from toftrack.devices.sr3000.emulator import EmulatorSettings
 from toftrack.devices.sr3000.transport import UsbSettings
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 EMULATED = ("device=sr3000", "device.transport=emulated", "view=none")
 
 

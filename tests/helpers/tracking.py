@@ -14,13 +14,14 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from toftrack.api import build_tracker
 from toftrack.devices.base import Device
 from toftrack.devices.sample import Sample
 from toftrack.estimate import Estimate
-from toftrack.programs.track import build_tracker, track
+from toftrack.programs.track import track
 from toftrack.tracker import Tracker
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf"
 
 

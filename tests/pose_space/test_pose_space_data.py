@@ -22,7 +22,7 @@ from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_spac
 from toftrack.pose_space.reach import nearest_latents
 from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
 
 

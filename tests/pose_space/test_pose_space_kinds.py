@@ -27,7 +27,7 @@ from toftrack.pose_space.files import (
 )
 from toftrack.pose_space.neighbours import barycentric_weights
 
-CONF = str(Path(__file__).parents[1] / "conf")
+CONF = str(Path(__file__).parents[2] / "conf")
 KINDS = ("pca", "kernel_pca", "lle", "isomap")
 CURVED = KINDS[1:]
 LIMITS = torch.tensor(ANGLE_LIMITS)

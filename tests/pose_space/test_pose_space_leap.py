@@ -17,7 +17,7 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, forward_kinematics
 from toftrack.pose_space.data.leap import leap_data
 from toftrack.pose_space.inverse_kinematics import fit_angles, joint_jacobian, shape_of_joints
 
-CONF = str(Path(__file__).parents[1] / "conf")
+CONF = str(Path(__file__).parents[2] / "conf")
 LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
 
 

@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 
 import toftrack
+from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
-from toftrack.programs.command_line import run, sentence
+from toftrack.programs.command_line import run
 
 APP = """
 import functools, pathlib, sys, time

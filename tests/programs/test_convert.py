@@ -10,14 +10,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.tracking import ROOT
 
 from toftrack.camera import Camera
 from toftrack.devices.folder import Folder
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
-from toftrack.programs import command_line as cli
-from toftrack.programs import convert, record
+from toftrack.programs import command_line, convert, record
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import PngFolderWriter, read_png_folder
 from toftrack.recordings.srs import read_srs
@@ -68,7 +68,7 @@ def test_srs_to_srs_copies_the_words(srs: Path, tmp_path: Path) -> None:
 
 
 def test_npz_to_npz_keeps_the_truth(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    source = Path(convert.__file__).parent / "data" / "sample.npz"
+    source = ROOT / "toftrack" / "data" / "sample.npz"
     convert.convert(source, tmp_path / "copy.npz")
     assert read_recording(tmp_path / "copy.npz").truth is not None
     convert.convert(source, tmp_path / "copy.srs")
@@ -76,7 +76,7 @@ def test_npz_to_npz_keeps_the_truth(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_depth_in_a_folder_is_millimetres(tmp_path: Path) -> None:
-    convert.convert(Path(convert.__file__).parent / "data" / "sample.npz", tmp_path / "folder")
+    convert.convert(ROOT / "toftrack" / "data" / "sample.npz", tmp_path / "folder")
     image = cv2.imread(str(tmp_path / "folder" / "depth_000003.png"), cv2.IMREAD_UNCHANGED)
     expected = list(Sample(stop=4))[3].depth
     assert image.dtype == np.uint16

@@ -19,8 +19,7 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.likelihood import FMeasure
 from toftrack.output.run_folder import open_footage, read_run
-from toftrack.programs import command_line as cli
-from toftrack.programs import figures
+from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.reference import ReferenceScorer

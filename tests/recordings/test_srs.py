@@ -301,7 +301,7 @@ def test_kill_9_while_recording_keeps_every_whole_frame(path: Path) -> None:
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-    recording, sample = read_srs(path), Path(__file__).parents[1] / "toftrack/data/sample.npz"
+    recording, sample = read_srs(path), Path(__file__).parents[2] / "toftrack/data/sample.npz"
     truth = read_recording(sample)
     lengths = np.sqrt(1 + (truth.camera.normalised_rays() ** 2).sum(-1)).astype(np.float32)
     assert len(recording) == (path.stat().st_size - 600) // (FRAME_BYTES + 24)

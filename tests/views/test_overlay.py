@@ -15,7 +15,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
-from toftrack.views.base import TrackedFrame, NoView
+from toftrack.views.base import NoView, TrackedFrame
 from toftrack.views.overlay import VideoView, draw_panel, panel_scale
 
 W, H = 176, 144

@@ -19,11 +19,11 @@ from helpers.tracking import CONF, configuration, make_tracker
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-import toftrack.views
+import toftrack.views.rerun
+from toftrack.configuration.sentences import sentence
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.likelihood import FMeasure
-from toftrack.programs import command_line as cli
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import classify
 
@@ -33,17 +33,18 @@ FRAMES = 6
 
 def test_without_rerun_a_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for name in ("rerun_view", "rerun_entities"):  # another test may have imported them
-        monkeypatch.delitem(sys.modules, f"toftrack.views.{name}", raising=False)
-        monkeypatch.delattr(toftrack.views, name, raising=False)
+    for name in ("view", "entities"):  # another test may have imported them
+        monkeypatch.delitem(sys.modules, f"toftrack.views.rerun.{name}", raising=False)
+        monkeypatch.delattr(toftrack.views.rerun, name, raising=False)
     with pytest.raises(Exception) as error:
         instantiate(configuration("view=rerun").view, _partial_=True)
-    assert "needs the package rerun-sdk" in command_line.sentence(error.value)
-    assert "'.[rerun]'" in command_line.sentence(error.value)
+    assert "needs the package rerun-sdk" in sentence(error.value)
+    assert "'.[rerun]'" in sentence(error.value)
 
 
 def test_other_views_do_not_import_rerun() -> None:
-    code = "import sys, toftrack.app, toftrack.views.overlay; sys.exit('rerun' in sys.modules)"
+    modules = "sys, toftrack.programs.track, toftrack.views.overlay"
+    code = f"import {modules}; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

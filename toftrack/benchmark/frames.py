@@ -1,4 +1,4 @@
-"""How long whole frames take, from a depth image to an estimate, and on what: see benchmark.py."""
+"""How long whole frames take, from a depth image to an estimate, and on what: see scoring.py."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from toftrack.api import configuration_folder
+from toftrack.api import build_tracker
+from toftrack.configuration.compose import configuration_folder
 from toftrack.errors import ToftrackError
 from toftrack.likelihood import FMeasure
-from toftrack.programs.track import build_tracker
 from toftrack.segmentation import NearestSurface
 from toftrack.tracker import Tracker
 

@@ -1,11 +1,10 @@
-"""What the benchmark times its methods on, and how: see benchmark.py."""
+"""What the benchmark times its methods on, and how: see scoring.py."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from tqdm import tqdm
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.likelihood import FMeasure
+from toftrack.recordings.store import open_source
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import Evidence, Scorer
 from toftrack.segmentation import NearestSurface
@@ -42,9 +42,9 @@ def sample_evidence(upsample: float = 1.0) -> tuple[Evidence, Tensor]:
     upsample: scales the number of pixels along each side (nearest neighbour), for the growth with
     the number of pixels.
     """
-    with np.load(Path(__file__).with_name("data") / "sample.npz") as sample:
-        depth, k = sample["depth_m"][0].astype(np.float32), sample["K"].copy()
-        wrist = torch.from_numpy(sample["joints_m"][0, 0].copy())
+    sample = open_source("sample")
+    depth, k = sample.image(0)[0], sample.camera.K.copy()
+    wrist = torch.from_numpy(sample.truth.joints_m[0, 0])
     if upsample != 1:
         height, width = (round(size * upsample) for size in depth.shape)
         rows = (np.arange(height) / upsample).astype(int)

@@ -23,7 +23,6 @@ from toftrack.calibration import fitting as calibration
 from toftrack.calibration.fitting import DepthFit, DepthPairs, Lens, View
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.programs import command_line as cli
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import FrameStore, open_recording
 from toftrack.views.figures.calibration import corner_sheet, error_plot
@@ -232,7 +231,3 @@ def _board(text: str) -> tuple[int, int]:
         f"--board {text} is not COLUMNSxROWS of inner corners, each from 3 to 50; a board of 8x6 "
         "squares is 7x5"
     )
-
-
-if __name__ == "__main__":
-    sys.exit(command_line.run(main))

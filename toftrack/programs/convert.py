@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.programs import command_line as cli
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.npz_stream import write_npz_streamed
 from toftrack.recordings.png_folder import PngFolderWriter
@@ -167,7 +166,3 @@ def _with_camera(store: FrameStore, camera: Camera, path: str | Path) -> FrameSt
 
 def _warn(text: str) -> None:
     print(f"note: {text}", file=sys.stderr)
-
-
-if __name__ == "__main__":
-    sys.exit(command_line.run(main))

@@ -28,7 +28,6 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
 from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
-from toftrack.programs import command_line as cli
 from toftrack.views.classified import classify
 from toftrack.views.figures.runs import (
     course_figure,
@@ -228,7 +227,3 @@ def _latent(run: Run) -> np.ndarray:
 def _time(run: Run) -> np.ndarray:
     """(T,) seconds since the first frame."""
     return run.results["timestamp_s"] - run.results["timestamp_s"][0]
-
-
-if __name__ == "__main__":
-    sys.exit(command_line.run(main))

@@ -19,10 +19,9 @@ import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from toftrack.api import configuration_folder
+from toftrack.configuration.compose import configuration_folder
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
-from toftrack.programs import command_line as cli
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
 
@@ -154,7 +153,3 @@ def _compose(conf: str | Path, overrides: Sequence[str]) -> DictConfig:
 
 def _digits(serial: str | None) -> int:
     return int(serial) & 0xFFFFFFFF if serial is not None and str(serial).isdecimal() else 0
-
-
-if __name__ == "__main__":
-    sys.exit(command_line.run(main))

@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from toftrack.api import build_tracker
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import JOINT_NAMES
@@ -24,38 +25,6 @@ from toftrack.output.smoothing import OneEuro, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.tracker import Tracker
 from toftrack.views.base import TrackedFrame, View
-
-
-def compute_device(name: str) -> torch.device:
-    """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ToftrackError("compute=cuda, but torch finds no CUDA GPU here; give compute=cpu")
-    if name not in ("cpu", "cuda"):
-        raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
-    return torch.device(name)
-
-
-def build_tracker(config: DictConfig) -> Tracker:
-    """The tracker of a configuration (conf/config.yaml composed)."""
-    make = hydra.utils.instantiate
-    hand = make(config.hand)
-    return Tracker(
-        shape=hand.shape,
-        space=make(config.pose_space),
-        segmentation=make(config.segmentation),
-        likelihood=make(config.likelihood),
-        settings=make(config.filter),
-        refinement=make(config.refine),
-        start=make(config.start),
-        lost=make(config.lost),
-        fit=hand.fit,
-        gestures=make(config.gestures),
-        renderer=config.renderer,
-        device=compute_device(config.compute),
-        seed=config.seed,
-    )
 
 
 def track(config: DictConfig, device: Device) -> float:

@@ -91,7 +91,9 @@ def draw_tracked(tracked: TrackedFrame) -> np.ndarray:
     height, width = tracked.depth_m.shape
     model = model_range_image(tracked.estimate.state, tracked.shape, camera.K, height, width)
     amplitude = camera.undistort_amplitude(tracked.frame.amplitude)
-    return draw_panel(tracked.depth_m, amplitude, camera, tracked.estimate, model, panel_scale(width))
+    return draw_panel(
+        tracked.depth_m, amplitude, camera, tracked.estimate, model, panel_scale(width)
+    )
 
 
 class VideoView:

@@ -50,7 +50,7 @@ class EmulatorSettings:
     loop: bool = False
     """Begin again at the end; otherwise the stream ends there."""
     faults: tuple[str, ...] = ()
-    """See `toftrack.devices.sr3000_faults`."""
+    """See `toftrack.devices.sr3000.faults`."""
     fault_every: int = 0
     """Each n-th request goes wrong, in all ways in turn; 0 = none."""
     replug_s: float = 0.3

@@ -1,6 +1,6 @@
 """The SR3000 through the vendor's library `libmesasr`, which also loads the camera's firmware.
 
-The C interface is that of the vendor's public header; see `toftrack.devices.sr3000` for use.
+The C interface is that of the vendor's public header; see `toftrack.devices.sr3000.device` for use.
 """
 
 from __future__ import annotations

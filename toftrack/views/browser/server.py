@@ -119,7 +119,7 @@ class _Server(ThreadingHTTPServer):
         self.address_family = family
         self.source, self.host = source, host
         self.run = secrets.token_hex(4)
-        self.page = (resources.files("toftrack.views") / "page.html").read_bytes()
+        self.page = (resources.files("toftrack.views.browser") / "page.html").read_bytes()
         self._connections: dict[threading.Thread, socket.socket] = {}
         self._lock = threading.Lock()
         super().__init__(address, _Handler)
