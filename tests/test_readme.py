@@ -14,6 +14,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -102,6 +103,12 @@ def test_a_command_composes(words: tuple[str, ...]) -> None:
     assert configuration(*overrides_of(words), name=name)
 
 
+def program(name: str) -> ModuleType:
+    """The module that `python -m NAME` runs."""
+    module = importlib.import_module(name)
+    return importlib.import_module(f"{name}.__main__") if hasattr(module, "__path__") else module
+
+
 class ParsedError(BaseException):
     """The command line was understood."""
 
@@ -118,7 +125,7 @@ def test_a_command_of_a_module_parses(
 
         monkeypatch.setattr(argparse.ArgumentParser, name, parse)
     with pytest.raises(ParsedError):
-        importlib.import_module(words[2]).main(list(words[3:]))
+        program(words[2]).main(list(words[3:]))
 
 
 def test_every_extra_that_is_named_is_there() -> None:
