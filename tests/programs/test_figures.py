@@ -130,7 +130,7 @@ def test_a_range_image_is_that_of_the_closed_form(side: str) -> None:
         exact = render_range_images(hand, torch.tensor(k, dtype=torch.float32), 144, 176)[0]
         drawn = model_range_image(state, shape, k, 144, 176)
         assert drawn.any()
-        # A tenth of a millimetre: at the rim a ray only just meets the surface, and rounding counts.
+        # A tenth of a millimetre: at the rim a ray only just meets the surface.
         np.testing.assert_allclose(drawn, exact.numpy(), rtol=0, atol=1e-4)
 
 
