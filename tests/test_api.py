@@ -17,8 +17,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import toftrack
+from toftrack.compute.threads import small_operations, threads
 from toftrack.configuration.compose import configuration
-from toftrack.threads import small_operations, threads
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 

@@ -11,7 +11,7 @@ import torch
 from helpers.tracking import sample
 
 from toftrack.forearm import arm_sight, armless
-from toftrack.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import NearestSurface, Observation
 
 K = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
 

@@ -15,11 +15,11 @@ from toftrack import filter as sir
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES, forward_kinematics
-from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import make_scorer
-from toftrack.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.start import (
     Lately,
     LogScores,

@@ -16,18 +16,15 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 
-import numpy as np
-import roma
 import torch
 from torch import Tensor
 
+from toftrack.compute.backend import Motions
+from toftrack.compute.rigid import MOTIONS, PIVOT_M, mean_rotation, rotated_pivot
 from toftrack.errors import ToftrackError
 
-PIVOT_M = (0.0, -0.085, 0.0)
-"""The middle of the hand in the hand frame: near the knuckles of an adult hand."""
-_PIVOT = np.array(PIVOT_M)
+__all__ = ["PIVOT_M", "mean_rotation", "rotated_pivot"]
 
 
 @dataclass(frozen=True)
@@ -140,63 +137,28 @@ RESAMPLERS: dict[str, Callable[[Tensor, int, torch.Generator], Tensor]] = {
 
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
-    """Particles at tangent offsets from reference particles; (N, 6 + d) or broadcast, each."""
-    reference, tangent = torch.broadcast_tensors(reference, tangent)
-    if (kernels := _compiled(reference)) is not None:
-        return _called(kernels.compose, reference, tangent)
-    pivot = _pivot(reference)
-    rotvec = roma.rotvec_composition((tangent[:, 3:6], reference[:, 3:6]))
-    turned = rotated_pivot(rotvec)
-    translation = pivot + tangent[:, :3] - turned
-    return torch.cat((translation, rotvec, reference[:, 6:] + tangent[:, 6:]), 1)
+    """See rigid.compose."""
+    return _motions(reference).compose(reference, tangent)
 
 
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
-    """Tangent offsets of particles from one reference, (N, 6 + d) and (1, 6 + d) to (N, 6 + d)."""
-    if (kernels := _compiled(particles)) is not None:
-        return _called(kernels.difference, particles, reference)
-    inverse = -reference[:, 3:6].expand(len(particles), 3)
-    turn = roma.rotvec_composition((particles[:, 3:6], inverse))
-    move = _pivot(particles) - _pivot(reference)
-    return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
+    """See rigid.difference."""
+    return _motions(particles).difference(particles, reference)
 
 
-def _compiled(particles: Tensor) -> ModuleType | None:
-    """The compiled versions of compose and difference, for what they can do."""
+def _motions(particles: Tensor) -> Motions:
     if particles.device.type != "cpu" or particles.dtype != torch.float32:
-        return None
-    return _kernels()
+        return MOTIONS
+    return _compiled()
 
 
 @functools.cache
-def _kernels() -> ModuleType | None:
+def _compiled() -> Motions:
     try:
-        from toftrack import rigid_numba
+        from toftrack.compute import rigid_numba
     except ImportError:
-        return None
-    rigid_numba.load()
-    return rigid_numba
-
-
-def _called(kernel: Callable[..., None], left: Tensor, right: Tensor) -> Tensor:
-    out = torch.empty(left.shape)
-    left, right = left.detach().contiguous(), right.detach().contiguous()
-    kernel(left.numpy(), right.numpy(), _PIVOT, out.numpy())
-    return out
-
-
-def rotated_pivot(rotvec: Tensor) -> Tensor:
-    """The pivot's offset from the wrist, by Rodrigues' formula, (N, 3) to (N, 3)."""
-    p = rotvec.new_tensor(PIVOT_M).expand_as(rotvec)
-    square = rotvec.square().sum(1, keepdim=True)
-    angle = square.clamp(min=1e-12).sqrt()
-    cross = torch.linalg.cross(rotvec, p)
-    along = torch.linalg.cross(rotvec, cross)
-    return p + angle.sin() / angle * cross + (1 - angle.cos()) / angle.square() * along
-
-
-def _pivot(particles: Tensor) -> Tensor:
-    return particles[:, :3] + rotated_pivot(particles[:, 3:6])
+        return MOTIONS
+    return rigid_numba.motions()
 
 
 def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
@@ -233,20 +195,6 @@ def diffuse(
     moved = compose(particles, noise * scale if scale.dim() == 1 else noise @ scale.mT)
     moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
     return moved
-
-
-def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean on SO(3): the rotation nearest to the mean matrix (chordal L2 mean; Hartley et
-    al., "Rotation averaging", IJCV 2013). (N, 3) and (N,) to (3,).
-    """
-    half = 0.5 * rotvec.double()
-    angle = half.norm(dim=1, keepdim=True)
-    q = torch.cat((half * (angle / torch.pi).sinc(), angle.cos()), 1)
-    # The nearest rotation's quaternion is the main axis of all quaternions (Markley et al., JGCD
-    # 2007), whatever their signs.
-    scatter = (q * weights[:, None]).mT @ q
-    main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
-    return roma.unitquat_to_rotvec(main).to(rotvec.dtype)
 
 
 def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:

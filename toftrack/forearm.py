@@ -15,7 +15,7 @@ import roma
 import torch
 from torch import Tensor
 
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 
 _ALONG_M = (0.05, 0.07, 0.09)
 """Points of the forearm's axis, from the wrist."""

@@ -26,7 +26,7 @@ from torch import Tensor
 from toftrack import filter as sir
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
-from toftrack.likelihood import FMeasure
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer
 
 _REACH = 3  # sizes tried on either side of the present one

@@ -17,7 +17,7 @@ from toftrack import filter as sir
 from toftrack.errors import ToftrackError
 from toftrack.forearm import arm_sight, armless, border_pixels
 from toftrack.pose_space.base import PoseSpace
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 
 _WIDEST_PALM_M = 0.06
 """Half the breadth of the broadest hand's palm with the ball of the thumb."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from toftrack.segmentation import Expected, Observation
+from toftrack.render.segmentation import Expected, Observation
 
 _APPROACH_M = 0.002
 """How much nearer than its middle's movement a partly hidden hand may come in a frame."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from toftrack import filter as sir
+from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.filter import FilterSettings
 from toftrack.frames import checked_image
@@ -19,16 +20,15 @@ from toftrack.gestures.recognition import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
 from toftrack.hand_fit import HandFit, first_belief, retried, update
-from toftrack.likelihood import FMeasure
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import latent_density
-from toftrack.proposals import swap_fingers
-from toftrack.refine import Refinement, make_refiner, surroundings
+from toftrack.refinement.gauss_newton import Refinement, make_refiner, surroundings
+from toftrack.refinement.proposals import swap_fingers
+from toftrack.refinement.steadying import steadied
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer, make_scorer
-from toftrack.segmentation import Expected, NearestSurface, Observation
+from toftrack.render.segmentation import Expected, NearestSurface, Observation
 from toftrack.start import Lately, Start
-from toftrack.steadying import steadied
-from toftrack.threads import small_operations
 from toftrack.track_state import Insight, LostSettings, TrackState, expected_depths
 
 _MODEL_ERROR = sir.Spread(0.002, 0.002, 0.015, 0.015)

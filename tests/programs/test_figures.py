@@ -17,14 +17,14 @@ from helpers.tracking import ROOT, make_tracker, sample
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
-from toftrack.likelihood import FMeasure
 from toftrack.output.run_folder import open_footage, read_run
 from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import make_scorer
-from toftrack.segmentation import Expected, NearestSurface
+from toftrack.render.segmentation import Expected, NearestSurface
 from toftrack.views.classified import CLASSES, classify
 from toftrack.views.figures import chart
 from toftrack.views.model_image import model_range_image, parted, posed_hand

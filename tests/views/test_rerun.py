@@ -23,7 +23,7 @@ import toftrack.views.rerun
 from toftrack.configuration.sentences import sentence
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
-from toftrack.likelihood import FMeasure
+from toftrack.render.likelihood import FMeasure
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import classify
 

@@ -18,8 +18,8 @@ from omegaconf import DictConfig
 from toftrack.api import build_tracker
 from toftrack.configuration.compose import configuration_folder
 from toftrack.errors import ToftrackError
-from toftrack.likelihood import FMeasure
-from toftrack.segmentation import NearestSurface
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import NearestSurface
 from toftrack.tracker import Tracker
 
 CONFIGURATIONS: dict[str, tuple[str, ...]] = {

@@ -179,12 +179,12 @@ class Benchmark:
         return rows
 
     def _with_surface(self, name: str, surface: HandSurface) -> Scorer:
-        from toftrack.render.numba_scorer import NumbaScorer
+        from toftrack.render.numba.scorer import NumbaScorer
         from toftrack.render.torch_scorer import TorchScorer
 
         kinds: dict[str, Callable[..., Scorer]] = {"torch": TorchScorer, "numba": NumbaScorer}
         if name == "triton":
-            from toftrack.render.triton_scorer import TritonScorer
+            from toftrack.render.triton.scorer import TritonScorer
 
             kinds[name] = TritonScorer
         return kinds[name](self.shape, surface=surface)

@@ -13,11 +13,11 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
-from toftrack.likelihood import FMeasure
 from toftrack.recordings.store import open_source
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import Evidence, Scorer
-from toftrack.segmentation import NearestSurface
+from toftrack.render.segmentation import NearestSurface
 
 _MARGIN_PX = 12
 

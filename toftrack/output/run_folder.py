@@ -16,14 +16,14 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
-from toftrack.likelihood import FMeasure
 from toftrack.output.results import read_results
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording, open_source
-from toftrack.segmentation import Expected, NearestSurface, Observation
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import Expected, NearestSurface, Observation
 
 FILES = ("track.npz", "track.jsonl", "summary.json", "hand_shape.json")
 """What a folder must hold to be a run's."""

@@ -18,8 +18,8 @@ from typing import Any, Self
 
 import cv2
 
+from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
-from toftrack.threads import small_operations
 from toftrack.views.base import TrackedFrame
 from toftrack.views.browser.server import BrowserServer, News
 from toftrack.views.overlay import CAPTION_PX, draw_tracked

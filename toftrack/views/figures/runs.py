@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from toftrack.pose_space.base import PoseSpace
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 from toftrack.views.classified import CLASS_RGB, CLASSES, Classified
 from toftrack.views.figures import chart
 from toftrack.views.figures.chart import Axes

@@ -20,14 +20,14 @@ import numpy as np
 import roma
 import torch
 
+from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.filter import rotated_pivot
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
-from toftrack.likelihood import FMeasure
-from toftrack.segmentation import Observation
-from toftrack.threads import small_operations
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import Observation
 from toftrack.track_state import Insight
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify

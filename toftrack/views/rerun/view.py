@@ -12,7 +12,7 @@ from typing import Self
 from urllib.parse import urlsplit
 
 from toftrack.errors import ToftrackError
-from toftrack.likelihood import FMeasure
+from toftrack.render.likelihood import FMeasure
 from toftrack.views.base import TrackedFrame
 from toftrack.views.rerun.entities import Entities, blueprint, rr
 

@@ -20,7 +20,7 @@ from toftrack.render.closed_form import _NEAREST_M
 from toftrack.render.disc import disc_steps
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.torch_scorer import TorchScorer
-from toftrack.render.triton_kernel import (
+from toftrack.render.triton.kernel import (
     TERMS,
     count_kernel,
     missed_kernel,

@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from toftrack.compiling import compiled
+from toftrack.compute.compiling import compiled
 from toftrack.render.closed_form import _NEAREST_M
 
 LANES = 16

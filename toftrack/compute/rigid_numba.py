@@ -1,18 +1,24 @@
 """Compiled scalar geometry on the CPU: rotations, tangent offsets of particles, one hand's pose.
 
-The same formulas as in filter.py and hand/skeleton.py, without the microseconds that every eager
+The same formulas as in rigid.py and hand/skeleton.py, without the microseconds that every eager
 operation costs on a few numbers. Quaternions are (x, y, z, w); everything is computed in float64.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from toftrack.compiling import announced, compiled, entry_point
+from toftrack.compute.backend import Motions
+from toftrack.compute.compiling import announced, compiled, entry_point
+from toftrack.compute.rigid import PIVOT_M
 
 _cached = entry_point(__file__)
+_PIVOT = np.array(PIVOT_M)
 
 
 @compiled
@@ -59,8 +65,8 @@ def turned(q, x, y, z):
 
 
 @_cached
-def compose(reference, tangent, pivot, out):
-    """See filter.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
+def compose_rows(reference, tangent, pivot, out):
+    """See rigid.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
     for i in range(len(out)):
         r, t = reference[i], tangent[i]
         before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
@@ -77,8 +83,8 @@ def compose(reference, tangent, pivot, out):
 
 
 @_cached
-def difference(particles, reference, pivot, out):
-    """See filter.difference; particles, out: (N, 6 + d), reference: (1, 6 + d), float32."""
+def difference_rows(particles, reference, pivot, out):
+    """See rigid.difference; particles, out: (N, 6 + d), reference: (1, 6 + d), float32."""
     r = reference[0]
     before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
     old = turned(before, pivot[0], pivot[1], pivot[2])
@@ -150,16 +156,34 @@ def mix_columns(frame, column, angle):
 
 
 @_cached
-def joints_of(state, base_frames, base, lengths, mirror, joints):
-    """The joints of one hand alone; see pose_hand."""
-    pose_hand(state, base_frames, base, lengths, mirror, np.empty((16, 3, 3)), joints)
+def joints_of(states, base_frames, base, lengths, mirror, joints):
+    """The joints of N hands alone, see pose_hand; states: (N, 27).  joints: (N, 21, 3)."""
+    frames = np.empty((16, 3, 3))
+    for i in range(len(states)):
+        pose_hand(states[i], base_frames, base, lengths, mirror, frames, joints[i])
 
 
-def load() -> None:
-    """Compile the particles' entry points if need be, about a second once on a machine."""
-    if difference.signatures:
-        return
-    with announced("filter: compiling its numba kernels (once, about 1 s)"):
-        rows, pivot = np.zeros((1, 7), np.float32), np.zeros(3)
-        compose(rows, rows, pivot, np.empty_like(rows))
-        difference(rows, rows, pivot, np.empty_like(rows))
+def compose(reference: Tensor, tangent: Tensor) -> Tensor:
+    """See rigid.compose; on the CPU, in float32."""
+    return _called(compose_rows, *torch.broadcast_tensors(reference, tangent))
+
+
+def difference(particles: Tensor, reference: Tensor) -> Tensor:
+    """See rigid.difference; on the CPU, in float32."""
+    return _called(difference_rows, particles, reference)
+
+
+def _called(kernel: Callable[..., None], left: Tensor, right: Tensor) -> Tensor:
+    out = torch.empty(left.shape)
+    left, right = (t.detach().to("cpu", torch.float32).contiguous() for t in (left, right))
+    kernel(left.numpy(), right.numpy(), _PIVOT, out.numpy())
+    return out
+
+
+def motions() -> Motions:
+    """The compiled motions; compiles them if need be, about a second once on a machine."""
+    if not difference_rows.signatures:
+        with announced("filter: compiling its numba kernels (once, about 1 s)"):
+            row = torch.zeros(1, 7)
+            difference(compose(row, row), row)
+    return Motions(compose, difference)

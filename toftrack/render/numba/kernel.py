@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.compiling import compiled, entry_point
-from toftrack.render.numba_hand import (
+from toftrack.compute.compiling import compiled, entry_point
+from toftrack.render.numba.hand import (
     DU,
     DX,
     HX,
@@ -29,7 +29,7 @@ from toftrack.render.numba_hand import (
     pose_hands,
     project_hands,
 )
-from toftrack.render.numba_vector import (
+from toftrack.render.numba.vector import (
     BLOCK,
     WORDS,
     count,
@@ -42,7 +42,7 @@ from toftrack.render.numba_vector import (
 )
 
 _cached = entry_point(
-    *(Path(__file__).with_name(f"numba_{part}.py") for part in ("hand", "kernel", "vector"))
+    *(Path(__file__).with_name(f"{part}.py") for part in ("hand", "kernel", "vector"))
 )
 
 _ROWS = 16

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from toftrack import filter as sir
+from toftrack.compute.threads import small_operations, threads
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.refine import (
+from toftrack.refinement.gauss_newton import (
     Refinement,
     Refiner,
     Surroundings,
@@ -18,10 +19,9 @@ from toftrack.refine import (
     make_refiner,
     surroundings,
 )
-from toftrack.refine_numba import CompiledRefiner
+from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 from toftrack.render.closed_form import render_range_images
-from toftrack.segmentation import Observation
-from toftrack.threads import small_operations, threads
+from toftrack.render.segmentation import Observation
 
 K = torch.tensor([[220.0, 0.0, 88.0], [0.0, 220.0, 72.0], [0.0, 0.0, 1.0]])
 

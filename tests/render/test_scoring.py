@@ -223,7 +223,7 @@ def test_the_compiled_kernel_is_cached_and_announced(tmp_path):
     """A first process compiles, with a message; a second one does not."""
     code = (
         "import logging, time; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
-        "from toftrack.render.numba_scorer import NumbaScorer\n"
+        "from toftrack.render.numba.scorer import NumbaScorer\n"
         "from toftrack.hand.shape import default_hand_shape\n"
         "t = time.perf_counter(); NumbaScorer(default_hand_shape())\n"
         "print('seconds', time.perf_counter() - t)"
@@ -243,9 +243,9 @@ def test_triton_agrees_as_far_as_its_interpreter_goes():
     """The CUDA kernels, interpreted on the CPU in a process of its own."""
     pytest.importorskip("triton", reason="triton is not installed")
     code = (
-        "import torch, sys; sys.path.insert(0, 'tests')\n"
+        "import torch, sys; sys.path.insert(0, 'tests/render')\n"
         "from test_scoring import *\n"
-        "from toftrack.render.triton_scorer import TritonScorer\n"
+        "from toftrack.render.triton.scorer import TritonScorer\n"
         "shape = default_hand_shape(side='left')\n"
         "evidence = random_evidence(shape, 48, 64, 6.5, 0.4, 1)\n"
         "states = random_states(4, (0.3, 0.5), 1)\n"

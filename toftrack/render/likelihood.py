@@ -15,7 +15,7 @@ from torch import Tensor
 
 from toftrack.errors import ToftrackError
 from toftrack.render.scoring import Counts, Evidence
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 
 NAMINGS = ("printed", "standard")
 

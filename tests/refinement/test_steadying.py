@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from toftrack.steadying import Steadying, steadied
+from toftrack.refinement.steadying import Steadying, steadied
 
 SETTINGS = Steadying()
 

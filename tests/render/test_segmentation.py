@@ -11,7 +11,7 @@ import torch
 from helpers.tracking import sample
 
 from toftrack.output.evaluation import TIPS
-from toftrack.segmentation import Expected, NearestSurface, Observation, reduce_image
+from toftrack.render.segmentation import Expected, NearestSurface, Observation, reduce_image
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 100.0
 K = np.array([[FOCAL, 0, 39.0], [0, FOCAL, 31.0], [0, 0, 1]])

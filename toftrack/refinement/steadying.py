@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from toftrack import filter as sir
-from toftrack.proposals import FINGER_OF_ANGLE
+from toftrack.refinement.proposals import FINGER_OF_ANGLE
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import hand_surface
-from toftrack.likelihood import FMeasure
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import Counts, Scorer, make_scorer
-from toftrack.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import NearestSurface, Observation
 
 HEIGHT, WIDTH = 36, 48
 K = torch.tensor([[50.0, 0.0, 23.4], [0.0, 52.0, 17.8], [0.0, 0.0, 1.0]])

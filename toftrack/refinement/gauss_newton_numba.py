@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack import rigid_numba
-from toftrack.compiling import announced, compiled, entry_point
+from toftrack.compute import rigid_numba
+from toftrack.compute.compiling import announced, compiled, entry_point
+from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.hand.surface import HandSurface
-from toftrack.refine import Refinement, Surroundings
-from toftrack.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
+from toftrack.refinement.gauss_newton import Refinement, Surroundings
 
 _cached = entry_point(__file__, rigid_numba.__file__)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
@@ -314,9 +314,9 @@ class CompiledRefiner:
 
     def joints(self, state: Tensor) -> Tensor:
         """(1, 27) to the joints (21, 3), camera frame, metres."""
-        joints = np.empty((21, 3))
-        joints_of(_array(state[0]), *self._hand, joints)
-        return torch.from_numpy(joints.astype(np.float32))
+        joints = np.empty((1, 21, 3))
+        joints_of(_array(state), *self._hand, joints)
+        return torch.from_numpy(joints.astype(np.float32))[0]
 
     def __call__(
         self, state: Tensor, prior_angles: Tensor, seen: Surroundings, settings: Refinement

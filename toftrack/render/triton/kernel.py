@@ -1,4 +1,4 @@
-"""The kernels of the CUDA back end; see triton_scorer.py. Formulas are those of numba_hand.py."""
+"""The kernels of the CUDA back end; see scorer.py. Formulas are those of numba/hand.py."""
 
 from __future__ import annotations
 
@@ -296,7 +296,7 @@ def missed_kernel(
 ):
     """Hand pixels within the disc around one particle's silhouette, outside of it and the wrist's.
 
-    The dilation is that of numba_kernel._missed. A lane works on one word and its two neighbours by
+    The dilation is that of numba/kernel.py. A lane works on one word and its two neighbours by
     itself: what is wrong at their outer edges does not get through a word of 64 columns.
     """
     i = tl.program_id(0)

@@ -18,8 +18,7 @@ from toftrack.hand.surface import hand_surface
 from toftrack.output.evaluation import TIPS
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
-from toftrack.proposals import swap_fingers
-from toftrack.refine import (
+from toftrack.refinement.gauss_newton import (
     Refinement,
     Surroundings,
     make_refiner,
@@ -27,7 +26,8 @@ from toftrack.refine import (
     refine,
     surroundings,
 )
-from toftrack.segmentation import NearestSurface
+from toftrack.refinement.proposals import swap_fingers
+from toftrack.render.segmentation import NearestSurface
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -27,8 +27,8 @@ from torch import Tensor
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface
-from toftrack.segmentation import Observation
-from toftrack.steadying import Steadying
+from toftrack.refinement.steadying import Steadying
+from toftrack.render.segmentation import Observation
 
 # The joints of the 21 angles: (finger, bone that moves first, is it an abduction).
 _JOINTS = [
@@ -186,7 +186,7 @@ class TorchRefiner:
 def make_refiner(shape: HandShape, surface: HandSurface, scorer: str) -> Refiner:
     """The refiner that goes with a scoring back end: compiled where that is "numba"."""
     if scorer == "numba" and shape.base_m.device.type == "cpu":
-        from toftrack.refine_numba import CompiledRefiner
+        from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 
         return CompiledRefiner(shape, surface)
     return TorchRefiner(shape, surface)

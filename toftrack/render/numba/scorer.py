@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compiling import announced
+from toftrack.compute.compiling import announced
+from toftrack.compute.threads import threads
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.render.disc import disc_steps
-from toftrack.render.numba_hand import LANES
-from toftrack.render.numba_kernel import pack_evidence, score_hands
+from toftrack.render.numba.hand import LANES
+from toftrack.render.numba.kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence
-from toftrack.threads import threads
 
 
 @functools.cache
