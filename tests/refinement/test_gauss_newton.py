@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import roma
 import torch
+from helpers.tracking import sample
 from torch import Tensor
-from tracking import sample
 
-from toftrack.evaluation import TIPS
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, FINGERS, forward_kinematics
 from toftrack.hand.surface import hand_surface
+from toftrack.output.evaluation import TIPS
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
 from toftrack.refinement.gauss_newton import (

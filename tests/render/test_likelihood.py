@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tracking import sample
+from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape

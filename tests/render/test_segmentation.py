@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tracking import sample
+from helpers.tracking import sample
 
-from toftrack.evaluation import TIPS
+from toftrack.output.evaluation import TIPS
 from toftrack.render.segmentation import Expected, NearestSurface, Observation, reduce_image
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 100.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.tracking import make_tracker, sample
 from hydra.errors import InstantiationException
-from tracking import make_tracker, sample
 
 from toftrack.pose_space.density import latent_density
 from toftrack.tracking import particle_filter as sir

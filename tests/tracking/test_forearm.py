@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from tracking import sample
+from helpers.tracking import sample
 
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.forearm import arm_sight, forearm_conflict

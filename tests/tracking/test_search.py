@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from tracking import Scene, configuration, sample
+from helpers.tracking import Scene, configuration, sample
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape

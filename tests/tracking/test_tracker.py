@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from tracking import Scene, configuration, errors_mm, follow, make_tracker, sample
+from helpers.tracking import Scene, configuration, errors_mm, follow, make_tracker, sample
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError

@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache, partial
 import torch
 from torch import Tensor
 
-from toftrack.gestures import Gestures
+from toftrack.gestures.recognition import Gestures
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits

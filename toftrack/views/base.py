@@ -9,8 +9,8 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Frame
 from toftrack.estimate import Estimate
+from toftrack.frames import Frame
 from toftrack.hand.shape import HandShape
 from toftrack.tracking.state import StepInfo
 
@@ -19,7 +19,7 @@ COMMANDS = ("restart", "right", "left")
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class TrackedFrame:
     """One tracked frame. Nothing in it changes later, so a view may keep it for its own thread."""
 
     frame: Frame
@@ -40,7 +40,7 @@ class View(Protocol):
     Used with `with`, which closes it. It is left when the results are written, so it may stay.
     """
 
-    def show(self, moment: Moment) -> None:
+    def show(self, tracked: TrackedFrame) -> None:
         """Take one frame; raises ToftrackError when it cannot be kept."""
 
     def commands(self) -> Sequence[str]:
@@ -59,7 +59,7 @@ class NoView:
 
     def __init__(self, *_: Any, **__: Any) -> None: ...
 
-    def show(self, moment: Moment) -> None:
+    def show(self, tracked: TrackedFrame) -> None:
         """Do nothing."""
 
     def commands(self) -> Sequence[str]:
