@@ -6,7 +6,6 @@ import pytest
 import roma
 import torch
 
-from toftrack.errors import ToftrackError
 from toftrack.tracking import particle_filter as sir
 
 LOWER, UPPER = torch.tensor([-1.0, -2.0, 0.0, -0.5]), torch.tensor([1.0, 2.0, 3.0, 0.5])
@@ -143,11 +142,6 @@ def test_reflection_does_not_push_a_particle_at_the_bound_inwards_as_truncation_
     reflected = sir.bound(latent, LOWER, UPPER, "reflect")
     assert 0.4 < (truncated == UPPER).float().mean() < 0.6
     assert (reflected == UPPER).float().mean() < 0.01
-
-
-def test_an_unknown_bounds_mode_is_refused() -> None:
-    with pytest.raises(ToftrackError, match="filter.bounds"):
-        sir.bound(torch.zeros(1, 4), LOWER, UPPER, "clip")
 
 
 def test_the_mean_rotation_is_taken_on_the_rotations_not_on_their_coordinates() -> None:

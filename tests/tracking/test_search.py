@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import roma
 import torch
 from helpers.tracking import Scene, configuration, sample
+from hydra.utils import instantiate
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape
@@ -33,6 +35,16 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 PALM = [JOINT_NAMES.index(name) for name in ("wrist", "index_mcp", "middle_mcp", "little_mcp")]
+
+
+def search_start(**changes: float) -> SearchStart:
+    """As configured, but for some settings."""
+    return replace(instantiate(configuration("start=search").start), **changes)
+
+
+def rough_start(**changes: object) -> RoughStart:
+    """As configured, but for some settings."""
+    return replace(instantiate(configuration("start=rough").start), **changes)
 
 
 @cache
@@ -80,34 +92,34 @@ def first_error_mm(start: Start, scene: Scene, seed: int, side: str = "right") -
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_search_finds_the_hand_with_any_seed(seed: int) -> None:
-    assert first_error_mm(SearchStart(), sample().cut(0), seed) < 20
+    assert first_error_mm(search_start(), sample().cut(0), seed) < 20
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_the_search_finds_a_hand_that_is_turned_in_the_image(quarters: int) -> None:
     scene = sample().cut(0).turned(quarters)
-    assert first_error_mm(SearchStart(), scene, seed=0) < 20
+    assert first_error_mm(search_start(), scene, seed=0) < 20
 
 
 def test_the_search_finds_a_left_hand_in_the_mirrored_image() -> None:
-    assert first_error_mm(SearchStart(), sample().cut(0).mirrored(), 0, "left") < 20
+    assert first_error_mm(search_start(), sample().cut(0).mirrored(), 0, "left") < 20
 
 
 def test_the_search_finds_most_hands_that_turn_away_from_the_camera() -> None:
-    found = [first_error_mm(SearchStart(), sample().cut(f), seed=1) for f in range(0, 60, 10)]
+    found = [first_error_mm(search_start(), sample().cut(f), seed=1) for f in range(0, 60, 10)]
     assert sum(error < 30 for error in found) >= 5, found
 
 
 def test_the_search_beats_the_best_of_as_many_unrefined_hypotheses() -> None:
     seen = observed(sample().cut(0))
     scores = log_scores_of(seen, default_hand_shape())
-    search = SearchStart(hypotheses=1000, samples=256)
+    search = search_start(hypotheses=1000, samples=256)
     found = search(seen, pose_space(), scores, unimproved, None, 50, generator())
     drawn = search._draw(seen, pose_space(), None, generator())
     assert scores(found, 1.0).max() > scores(drawn, 1.0).max() + 0.1
 
 
-@pytest.mark.parametrize("start", [SearchStart(hypotheses=200, samples=64), RoughStart()])
+@pytest.mark.parametrize("start", [search_start(hypotheses=200, samples=64), rough_start()])
 def test_as_many_particles_as_asked_for_inside_the_pose_space(start: Start) -> None:
     seen = observed(sample().cut(0))
     space = pose_space()
@@ -121,7 +133,7 @@ def test_as_many_particles_as_asked_for_inside_the_pose_space(start: Start) -> N
 
 def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
     pose = (0.05, -0.02, 0.6, 0.3, -0.4, 1.2)
-    start = RoughStart(pose=pose, position_m=0.01, rotation_rad=0.1)
+    start = rough_start(pose=pose, position_m=0.01, rotation_rad=0.1)
     n = 4000
     seen = observed(sample().cut(0))
     x = start(seen, pose_space(), unscored, unimproved, None, n, generator())
@@ -139,7 +151,7 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
 def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     scene = sample().cut(0)
     seen = observed(scene)
-    x = RoughStart()(seen, pose_space(), unscored, unimproved, None, 300, generator())
+    x = rough_start()(seen, pose_space(), unscored, unimproved, None, 300, generator())
     middle = (x[:, :3] + sir.rotated_pivot(x[:, 3:6])).mean(0).numpy()
     true_palm = scene.joints_m[0, PALM].mean(0)
     assert np.linalg.norm(middle - true_palm) < 0.06
@@ -153,7 +165,7 @@ def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
 @pytest.mark.parametrize("pose", [(), (0.0, 0.0, 0.5), (0.0,) * 7])
 def test_a_pose_that_is_not_six_numbers_is_refused(pose: tuple[float, ...]) -> None:
     with pytest.raises(ToftrackError, match=f"start.pose has {len(pose)} numbers"):
-        RoughStart(pose=pose)
+        rough_start(pose=pose)
 
 
 def test_a_pose_can_be_given_on_the_command_line() -> None:
@@ -233,7 +245,7 @@ def test_a_blob_inside_the_image_has_no_arm_that_leaves_it() -> None:
 def test_hypotheses_of_the_search_point_along_the_arm_mostly_but_anywhere_too() -> None:
     scene = sample().cut(0)
     seen = observed(scene)
-    x = SearchStart(hypotheses=3000)._draw(seen, pose_space(), None, generator())
+    x = search_start(hypotheses=3000)._draw(seen, pose_space(), None, generator())
     down = roma.rotvec_to_rotmat(x[:, 3:6])[:, :, 1].numpy()  # from the fingers to the wrist
     arm = scene.joints_m[0, 0] - scene.joints_m[0, 9]
     angle = np.degrees(
@@ -267,7 +279,7 @@ def test_a_hand_as_last_seen_is_preferred_and_forgotten_with_time() -> None:
     before[:, 2] = 0.5
     turned = before.clone()
     turned[:, 5] = 3.0
-    start = SearchStart(forearm=0.0)
+    start = search_start(forearm=0.0)
     both = torch.cat((before, turned))
 
     def gain(age_s: float) -> float:
@@ -277,13 +289,13 @@ def test_a_hand_as_last_seen_is_preferred_and_forgotten_with_time() -> None:
     assert gain(0.0) == pytest.approx(start.memory, abs=0.01)
     assert gain(start.memory_s) == pytest.approx(start.memory / math.e, abs=0.01)
     assert not start.prior(seen, None)(both).any()
-    assert not RoughStart().prior(seen, LastSeen(before, 0.0))(both).any()
+    assert not rough_start().prior(seen, LastSeen(before, 0.0))(both).any()
 
 
 def test_a_quarter_of_the_hypotheses_is_turned_and_bent_as_the_hand_last_seen() -> None:
     seen = observed(sample().cut(0))
     last = LastSeen(torch.tensor([[0, 0, 0.5, 0, 0, 2.5, 0.1, 0.1, 0.1, 0.1]]), 1.0)
-    search = SearchStart(hypotheses=400)
+    search = search_start(hypotheses=400)
     alike = (search._draw(seen, pose_space(), last, generator())[:, 6:] == 0.1).all(1)
     assert int(alike.sum()) == 100
     old = LastSeen(last.particle, 10.0)

@@ -1,13 +1,9 @@
 """Sequential importance resampling as pure functions on tensors (paper, section 2.3).
 
-A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector (3,
-rad)
-and d latent coordinates. Weights are kept as logarithms until they are used. Every function that
-draws takes an explicit generator on the particles' device.
-
-Differences between particles are taken in the tangent space of a reference: translation of the
-pivot, rotation vector of R R_ref', latent difference. The pivot is a point in the middle of the
-hand, so that turning the hand does not also carry it away, as turning about the wrist would.
+A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector
+(3, rad) and d latent coordinates; compute/rigid.py says how it is moved. Weights are kept as
+logarithms until they are used. Every function that draws takes an explicit generator on the
+particles' device.
 """
 
 from __future__ import annotations
@@ -15,11 +11,12 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
 from toftrack.compute.rigid import MOTIONS, PIVOT_M, mean_rotation, rotated_pivot
 from toftrack.errors import ToftrackError
@@ -39,6 +36,10 @@ class Spread:
     depth_m: float
     rotation_rad: float
     latent: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            check_number(f"filter.spread.{field.name}", getattr(self, field.name), 0)
 
     def sigmas(self, lower: Tensor, upper: Tensor) -> Tensor:
         """(6 + d,) standard deviations in tangent coordinates."""
@@ -63,7 +64,7 @@ class FilterSettings:
     velocity_smoothing: float
     resampling: str
     bounds: str
-    density: float = 0.0
+    density: float
 
     def __post_init__(self) -> None:
         if self.resampling not in RESAMPLERS:
@@ -71,10 +72,17 @@ class FilterSettings:
                 f"filter.resampling={self.resampling} is unknown; give one of"
                 f" {', '.join(RESAMPLERS)}"
             )
-        if self.particles < 1 or self.passes < 1:
-            raise ToftrackError("filter.particles and filter.passes must be at least 1")
-        if not 0 <= self.density < math.inf:
-            raise ToftrackError("filter.density must be 0 or more")
+        if self.bounds not in BOUNDS:
+            raise ToftrackError(
+                f"filter.bounds={self.bounds} is unknown; give {' or '.join(BOUNDS)}"
+            )
+        for name in ("particles", "passes"):
+            check_number(f"filter.{name}", getattr(self, name), 1, whole=True)
+        for name in ("exponent", "exponent_growth", "shrink"):
+            check_number(f"filter.{name}", getattr(self, name), 0, above=True)
+        for name in ("rest", "speed_gain", "velocity", "density"):
+            check_number(f"filter.{name}", getattr(self, name), 0)
+        check_number("filter.velocity_smoothing", self.velocity_smoothing, 0, 1)
 
 
 def widened(sigmas: Tensor, velocity: Tensor, rest: float, gain: float) -> Tensor:
@@ -161,19 +169,21 @@ def _compiled() -> Motions:
     return rigid_numba.motions()
 
 
+BOUNDS = ("truncate", "reflect")
+
+
 def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
     """Keep latent coordinates in their box, (N, d).
 
-    "truncate" moves what is outside onto the bound, as the paper, which draws estimates near a
-    bound away from where they should be and piles particles up on it; "reflect" folds it back.
+    mode: of BOUNDS. "truncate" moves what is outside onto the bound, as the paper, which draws
+        estimates near a bound away from where they should be and piles particles up on it;
+        "reflect" folds it back.
     """
     if mode == "truncate":
         return torch.minimum(torch.maximum(latent, lower), upper)
-    if mode == "reflect":
-        width = upper - lower
-        folded = torch.remainder(latent - lower, 2 * width)
-        return lower + torch.minimum(folded, 2 * width - folded)
-    raise ToftrackError(f"filter.bounds={mode} is unknown; give truncate or reflect")
+    width = upper - lower
+    folded = torch.remainder(latent - lower, 2 * width)
+    return lower + torch.minimum(folded, 2 * width - folded)
 
 
 def diffuse(

@@ -11,6 +11,7 @@ import roma
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.segmentation import Observation
@@ -71,9 +72,9 @@ class RoughStart:
     position_m, rotation_rad: standard deviations of the particles about it.
     """
 
-    pose: tuple[float, ...] | None = None
-    position_m: float = 0.01
-    rotation_rad: float = 0.1
+    pose: tuple[float, ...] | None
+    position_m: float
+    rotation_rad: float
 
     def __post_init__(self) -> None:
         if self.pose is not None and len(self.pose) != 6:
@@ -81,6 +82,10 @@ class RoughStart:
                 f"start.pose has {len(self.pose)} numbers; give six: translation in metres and"
                 " rotation vector in radians"
             )
+        for number, value in enumerate(self.pose or ()):
+            check_number(f"start.pose[{number}]", value)
+        for name in ("position_m", "rotation_rad"):
+            check_number(f"start.{name}", getattr(self, name), 0)
 
     def __call__(
         self,
@@ -135,18 +140,26 @@ class SearchStart:
         quarter of the hypotheses are turned and bent as then.
     """
 
-    hypotheses: int = 3000
-    islands: int = 64
-    coverage: float = 1.0
-    samples: int = 1024
-    improved: int = 16
-    position_m: float = 0.02
-    tilt_rad: float = 0.5
-    arm_rad: float = 0.5
-    forearm: float = 0.5
-    memory: float = 0.2
-    memory_rad: float = 0.7
-    memory_s: float = 2.0
+    hypotheses: int
+    islands: int
+    coverage: float
+    samples: int
+    improved: int
+    position_m: float
+    tilt_rad: float
+    arm_rad: float
+    forearm: float
+    memory: float
+    memory_rad: float
+    memory_s: float
+
+    def __post_init__(self) -> None:
+        for name, least in (("hypotheses", 1), ("islands", 1), ("samples", 1), ("improved", 0)):
+            check_number(f"start.{name}", getattr(self, name), least, whole=True)
+        for name in ("coverage", "position_m", "tilt_rad", "arm_rad", "forearm", "memory"):
+            check_number(f"start.{name}", getattr(self, name), 0)
+        for name in ("memory_rad", "memory_s"):
+            check_number(f"start.{name}", getattr(self, name), 0, above=True)
 
     def __call__(
         self,

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import FMeasure
@@ -46,13 +47,20 @@ class HandFit:
         pixels count more than false ones, too large a hand fits best (by 2 to 4 % at 1.5).
     """
 
-    frames: int = 30
-    prior: float = 0.12
-    step: float = 0.02
-    largest: float = 1.4
-    samples: int = 64
-    exponent: float = 20.0
-    beta: float = 1.0
+    frames: int
+    prior: float
+    step: float
+    largest: float
+    samples: int
+    exponent: float
+    beta: float
+
+    def __post_init__(self) -> None:
+        for name, least in (("frames", 0), ("samples", 1)):
+            check_number(f"hand.fit.{name}", getattr(self, name), least, whole=True)
+        for name in ("prior", "step", "exponent", "beta"):
+            check_number(f"hand.fit.{name}", getattr(self, name), 0, above=True)
+        check_number("hand.fit.largest", self.largest, 1)
 
 
 @dataclass(frozen=True)
