@@ -5,16 +5,16 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from toftrack import cli
-from toftrack.pose_space.training import train
+from toftrack.programs import command_line
+from toftrack.programs.train import train
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train_pose_space")
-@cli.job
+@command_line.sweep_job
 def main(config: DictConfig) -> float:
     """Train, write the model and its figures, and return what a sweep minimises."""
     return train(config)
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(command_line.run(main))

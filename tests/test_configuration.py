@@ -8,19 +8,19 @@ import sys
 from pathlib import Path
 
 import cv2
-import fake_realsense
 import hydra
 import numpy as np
 import pytest
 import torch
 import yaml
+from helpers import fake_realsense
+from helpers.tracking import CONF, ROOT, configuration
 from omegaconf import DictConfig, OmegaConf
-from tracking import CONF, ROOT, configuration
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
-from toftrack.pose_space.pose_data import synthetic_data
+from toftrack.pose_space.data.pose_data import synthetic_data
 
 OPTIONS = sorted(
     (path.parent.name, path.stem) for path in CONF.glob("*/*.yaml") if path.parent != CONF

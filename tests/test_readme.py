@@ -14,17 +14,18 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
+from helpers.tracking import ROOT, configuration, run
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
-from tracking import ROOT, configuration, run
 
-from toftrack import convert
-from toftrack.interface import make_device
+from toftrack.api import make_device
+from toftrack.programs import convert
 from toftrack.recordings.npz import read_recording
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -102,6 +103,12 @@ def test_a_command_composes(words: tuple[str, ...]) -> None:
     assert configuration(*overrides_of(words), name=name)
 
 
+def program(name: str) -> ModuleType:
+    """The module that `python -m NAME` runs."""
+    module = importlib.import_module(name)
+    return importlib.import_module(f"{name}.__main__") if hasattr(module, "__path__") else module
+
+
 class ParsedError(BaseException):
     """The command line was understood."""
 
@@ -118,7 +125,7 @@ def test_a_command_of_a_module_parses(
 
         monkeypatch.setattr(argparse.ArgumentParser, name, parse)
     with pytest.raises(ParsedError):
-        importlib.import_module(words[2]).main(list(words[3:]))
+        program(words[2]).main(list(words[3:]))
 
 
 def test_every_extra_that_is_named_is_there() -> None:

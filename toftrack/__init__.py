@@ -17,14 +17,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from toftrack.api import make_device, make_tracker
     from toftrack.camera import Camera
-    from toftrack.devices.base import BaseDevice, Frame
+    from toftrack.devices.base import BaseDevice
     from toftrack.errors import ToftrackError
     from toftrack.estimate import Estimate
+    from toftrack.frames import Frame
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
-    from toftrack.interface import make_device, make_tracker
-    from toftrack.results import read_results
-    from toftrack.tracker import Tracker
+    from toftrack.output.results import read_results
+    from toftrack.tracking.tracker import Tracker
 
     __version__: str
 
@@ -34,13 +35,13 @@ _PLACES = {
     "BaseDevice": "toftrack.devices.base",
     "Camera": "toftrack.camera",
     "Estimate": "toftrack.estimate",
-    "Frame": "toftrack.devices.base",
+    "Frame": "toftrack.frames",
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "ToftrackError": "toftrack.errors",
-    "Tracker": "toftrack.tracker",
-    "make_device": "toftrack.interface",
-    "make_tracker": "toftrack.interface",
-    "read_results": "toftrack.results",
+    "Tracker": "toftrack.tracking.tracker",
+    "make_device": "toftrack.api",
+    "make_tracker": "toftrack.api",
+    "read_results": "toftrack.output.results",
 }
 
 __all__ = [

@@ -3,61 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
-
-import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One image as the device delivered it: neither rectified nor cleaned up."""
-
-    index: int
-    """Number of the frame within its recording, or since a live camera was opened."""
-    timestamp_s: float
-    depth: np.ndarray
-    """(H, W) float32 metres; 0, NaN, infinities and negative values are no reading."""
-    amplitude: np.ndarray | None
-    """(H, W) uint16."""
-    radial: bool
-    """True: `depth` is the distance along the pixel's ray; False: Z along the optical axis."""
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """Ground truth of T frames, in the order in which the device yields them."""
-
-    joints_m: np.ndarray
-    """(T, 21, 3) metres, camera frame."""
-    visible: np.ndarray
-    """(T,) bool: the hand is in view."""
-    in_space: np.ndarray
-    """(T,) bool: the pose lies in the palm-fist-pointing space."""
-    visible_fraction: np.ndarray | None = None
-    """(T,) share of the hand that is in view and uncovered, 0..1."""
-    joint_visible: np.ndarray | None = None
-    """(T, 21) bool."""
-
-    def __len__(self) -> int:
-        return len(self.joints_m)
-
-    def __getitem__(self, rows: slice) -> Truth:
-        """The truth of a range of frames."""
-
-        def cut(values: np.ndarray | None) -> np.ndarray | None:
-            return None if values is None else values[rows]
-
-        return Truth(
-            joints_m=self.joints_m[rows],
-            visible=self.visible[rows],
-            in_space=self.in_space[rows],
-            visible_fraction=cut(self.visible_fraction),
-            joint_visible=cut(self.joint_visible),
-        )
+from toftrack.frames import Frame, Truth
 
 
 @runtime_checkable

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import BaseDevice, Frame
+from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
+from toftrack.frames import Frame
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording
 

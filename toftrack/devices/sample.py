@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 from toftrack.devices.replay import Replay
+from toftrack.recordings.store import packaged_sample
 
 
 class Sample(Replay):
@@ -19,8 +19,7 @@ class Sample(Replay):
         repeat: bool = False,
         camera_file: str | Path | None = None,
     ) -> None:
-        packaged = resources.files("toftrack") / "data" / "sample.npz"
-        with resources.as_file(packaged) as path:
+        with packaged_sample() as path:
             super().__init__(path, start, stop, realtime, repeat, camera_file)
         # Where the package happens to be installed says nothing about the result.
         self.description |= {"device": "sample", "recording": "toftrack/data/sample.npz"}

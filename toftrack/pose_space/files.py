@@ -19,7 +19,7 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.pose_space.archives import read_archive
 from toftrack.pose_space.base import PoseSpace
-from toftrack.pose_space.pose_data import PoseData, synthetic_data
+from toftrack.pose_space.data.pose_data import PoseData, synthetic_data
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1

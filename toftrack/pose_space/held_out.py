@@ -13,8 +13,8 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.pose_space.base import PoseSpace, TensorSpace, clamped_share
+from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space
-from toftrack.pose_space.pose_data import PoseData
 from toftrack.pose_space.reach import nearest_latents
 
 DIMENSIONS = (2, 3, 4, 6, 8)

@@ -30,12 +30,10 @@ from typing import IO, Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Truth
 from toftrack.errors import ToftrackError
+from toftrack.frames import LARGEST_MEDIAN_M, Truth
 
 DEFAULT_FPS = 25.0
-# No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
-LARGEST_MEDIAN_M = 20.0
 _JOINTS = 21
 # Of zip's usual method; nothing shrinks to less than a 1032th.
 _MOST_COMPRESSION = 1032

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Truth
+from toftrack.frames import Truth
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import read_png_folder
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
@@ -66,5 +67,10 @@ def open_source(name: str) -> FrameStore:
     """What a virtual camera sees: the packaged recording for `sample`, else as `open_recording`."""
     if name != "sample":
         return open_recording(name)
-    with resources.as_file(resources.files("toftrack") / "data" / "sample.npz") as path:
+    with packaged_sample() as path:
         return open_recording(path)
+
+
+def packaged_sample() -> AbstractContextManager[Path]:
+    """The recording that comes with the package, as a file while the context is open."""
+    return resources.as_file(resources.files("toftrack") / "data" / "sample.npz")

@@ -98,10 +98,10 @@ def make_scorer(name: str, shape: HandShape, device: torch.device) -> Scorer:
         raise ToftrackError(f"renderer={name} is unknown; give one of auto, {', '.join(BACK_ENDS)}")
     try:
         if wanted == "numba":
-            from toftrack.render.numba_scorer import NumbaScorer
+            from toftrack.render.numba.scorer import NumbaScorer
 
             return NumbaScorer(shape)
-        from toftrack.render.triton_scorer import TritonScorer
+        from toftrack.render.triton.scorer import TritonScorer
 
         return TritonScorer(shape)
     except ImportError as error:

@@ -1,8 +1,8 @@
 """The scoring back end in plain torch: runs on any device, without anything to compile.
 
-The surface is the ellipsoid in (column, row, inverse depth) of numba_hand.py; here it is evaluated
+The surface is the ellipsoid in (column, row, inverse depth) of numba/hand.py; here it is evaluated
 over the screen box of each ellipsoid (all particles at once, a loop over ellipsoids), and the disc
-around the silhouette is built from rows of bits, as in numba_kernel.py.
+around the silhouette is built from rows of bits, as in numba/kernel.py.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def count_bits(words: Tensor) -> Tensor:
 
 
 def dilate_bits(words: Tensor, radius_px: float) -> Tensor:
-    """Exact Euclidean disc dilation of bit images (N, H, words), see numba_kernel._missed."""
+    """Exact Euclidean disc dilation of bit images (N, H, words), see numba/kernel.py, _missed."""
     n, height, count = words.shape
     full = (1 << _BITS) - 1
     radius = min(max(float(radius_px), 0.0), math.hypot(height, count * _BITS))

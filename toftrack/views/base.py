@@ -9,17 +9,17 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.base import Frame
 from toftrack.estimate import Estimate
+from toftrack.frames import Frame
 from toftrack.hand.shape import HandShape
-from toftrack.track_state import Insight
+from toftrack.tracking.state import StepInfo
 
 COMMANDS = ("restart", "right", "left")
 """What a view may ask: a new start, or another hand (which starts anew)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class TrackedFrame:
     """One tracked frame. Nothing in it changes later, so a view may keep it for its own thread."""
 
     frame: Frame
@@ -30,7 +30,7 @@ class Moment:
     estimate: Estimate
     shape: HandShape
     """The hand of the estimate."""
-    insight: Insight | None
+    insight: StepInfo | None
     """What the tracker saw and believed; None where there was nothing to track."""
 
 
@@ -40,7 +40,7 @@ class View(Protocol):
     Used with `with`, which closes it. It is left when the results are written, so it may stay.
     """
 
-    def show(self, moment: Moment) -> None:
+    def show(self, tracked: TrackedFrame) -> None:
         """Take one frame; raises ToftrackError when it cannot be kept."""
 
     def commands(self) -> Sequence[str]:
@@ -59,7 +59,7 @@ class NoView:
 
     def __init__(self, *_: Any, **__: Any) -> None: ...
 
-    def show(self, moment: Moment) -> None:
+    def show(self, tracked: TrackedFrame) -> None:
         """Do nothing."""
 
     def commands(self) -> Sequence[str]:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from toftrack.hand.shape import HandShape
-from toftrack.likelihood import FMeasure
+from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import classify_range_images
-from toftrack.segmentation import Observation
+from toftrack.render.segmentation import Observation
 from toftrack.views.model_image import parted, posed_hand, range_image
 
 CLASSES = ("nothing", "neighbourhood", "correct", "false", "missed")

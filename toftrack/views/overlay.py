@@ -16,7 +16,7 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.views.base import Moment
+from toftrack.views.base import TrackedFrame
 from toftrack.views.model_image import model_range_image
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
@@ -85,13 +85,15 @@ def draw_panel(
     return np.vstack([_caption(estimate, size[0]), np.hstack([left, right])])
 
 
-def draw_moment(moment: Moment) -> np.ndarray:
+def draw_tracked(tracked: TrackedFrame) -> np.ndarray:
     """The panel of a tracked frame, (h, w, 3); see draw_panel."""
-    camera = moment.camera
-    height, width = moment.depth_m.shape
-    model = model_range_image(moment.estimate.state, moment.shape, camera.K, height, width)
-    amplitude = camera.undistort_amplitude(moment.frame.amplitude)
-    return draw_panel(moment.depth_m, amplitude, camera, moment.estimate, model, panel_scale(width))
+    camera = tracked.camera
+    height, width = tracked.depth_m.shape
+    model = model_range_image(tracked.estimate.state, tracked.shape, camera.K, height, width)
+    amplitude = camera.undistort_amplitude(tracked.frame.amplitude)
+    return draw_panel(
+        tracked.depth_m, amplitude, camera, tracked.estimate, model, panel_scale(width)
+    )
 
 
 class VideoView:
@@ -117,9 +119,9 @@ class VideoView:
         self._tiles: list[np.ndarray] = []
         self._stride = 1 if frames is None else max(1, math.ceil(frames / _STRIP_KEPT))
 
-    def show(self, moment: Moment) -> None:
+    def show(self, tracked: TrackedFrame) -> None:
         """Append the frame's panel."""
-        self.add(draw_moment(moment))
+        self.add(draw_tracked(tracked))
 
     def commands(self) -> Sequence[str]:
         """A file asks for nothing."""

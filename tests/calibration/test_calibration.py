@@ -1,0 +1,206 @@
+"""The calibration finds a known camera again, from chequerboards that are rendered for it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.chequerboard import RANGE_M, board_poses, render_board, wiggle
+
+from toftrack.calibration import fitting as calibration
+from toftrack.calibration.fitting import DepthPairs, View
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.programs import calibrate, command_line
+from toftrack.recordings.sr_frame import encode_frame, nominal_camera
+from toftrack.recordings.srs import SrsFacts, SrsWriter
+
+BOARD, SQUARE_M = (7, 5), 0.03
+# The nominal camera, off by 5 %, and a barrel distortion.
+TRUE = Camera(np.array([[210.0, 0, 96.6], [0, 210.0, 63], [0, 0, 1]]), 176, 144, [-0.2, 0, 0, 0, 0])
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A board from 0.33 to 1.5 m, with noise and a depth error; nothing is said of the camera."""
+    path, rng = tmp_path_factory.mktemp("calibration") / "board.srs", np.random.default_rng(0)
+    with SrsWriter(path, facts=SrsFacts(RANGE_M)) as writer:
+        for number, pose in enumerate(board_poses(24, 0.33, 1.5, (0.27, 0.21))):
+            images = render_board(TRUE, BOARD, SQUARE_M, pose, rng, wiggle)
+            writer.append(encode_frame(*images, RANGE_M), number / 25)
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibrated(recording: Path) -> tuple[Camera, Path]:
+    """The camera file's camera, and the folder of the report."""
+    folder = recording.parent
+    out, report = folder / "camera.json", folder / "report"
+    calibrate.main(
+        [str(recording), "--board", "7x5", "--square", "0.03", "--out", str(out)]
+        + ["--report", str(report)]
+    )
+    return Camera.load(out), report
+
+
+def depth_error_m(camera: Camera) -> np.ndarray:
+    """What is left of the depth error from 0.3 to 1.5 m."""
+    true = np.linspace(0.3, 1.5, 500)
+    flat = Camera(
+        np.diag((1e9, 1e9, 1)),
+        500,
+        1,
+        depth_polynomial=camera.depth_polynomial,
+        depth_polynomial_range_m=camera.depth_polynomial_range_m,
+    )
+    return flat.rectify((true + wiggle(true))[None].astype(np.float32), True)[0] - true
+
+
+def test_finds_the_lens_again(calibrated: tuple[Camera, Path]) -> None:
+    camera, _ = calibrated
+    np.testing.assert_allclose(camera.K[[0, 1], [0, 1]], 210, rtol=0.005)
+    np.testing.assert_allclose(camera.K[:2, 2], (96.6, 63), atol=1.0)
+    gap = camera.normalised_rays() - TRUE.normalised_rays()
+    assert np.abs(gap).max() < 0.008  # the corners are beyond most boards
+    assert np.sqrt((gap**2).mean()) < 0.002
+
+
+def test_takes_the_depth_error_away(calibrated: tuple[Camera, Path]) -> None:
+    rms = np.sqrt((depth_error_m(calibrated[0]) ** 2).mean())
+    assert rms < 0.002
+    true = np.linspace(0.3, 1.5, 500)
+    assert np.sqrt((wiggle(true) ** 2).mean()) > 0.008
+
+
+def test_report_tells_before_and_after(calibrated: tuple[Camera, Path]) -> None:
+    camera, folder = calibrated
+    facts = json.loads((folder / "report.json").read_text())
+    assert facts["before"]["fx"] == 200
+    assert facts["after"]["fx"] == camera.K[0, 0]
+    assert facts["before"]["board_rms_mm"] > 5
+    assert facts["after"]["board_rms_mm"] < 2
+    assert facts["order"] in range(1, 8)
+    assert facts["frames_used"] >= 20
+    text = (folder / "report.txt").read_text()
+    assert "before" in text
+    assert "depth, boards" in text
+    for name in ("corners.png", "depth_error.png"):
+        picture = cv2.imread(str(folder / name))
+        assert picture.std() > 10
+
+
+def test_a_known_lens_is_kept(recording: Path, tmp_path: Path) -> None:
+    TRUE.save(tmp_path / "start.json")
+    out = tmp_path / "camera.json"
+    calibrate.main(
+        [str(recording), "--board", "7x5", "--square", "0.03", "--keep-lens", "--frames", "14"]
+        + ["--camera", str(tmp_path / "start.json"), "--out", str(out)]
+    )
+    camera = Camera.load(out)
+    np.testing.assert_array_equal(camera.K, TRUE.K)
+    np.testing.assert_array_equal(camera.distortion, TRUE.distortion)
+    assert np.sqrt((depth_error_m(camera) ** 2).mean()) < 0.002
+    assert (tmp_path / "camera.report" / "report.txt").exists()
+
+
+def exact_views(camera: Camera, count: int = 12) -> list[View]:
+    points, views = calibration.board_points(BOARD, SQUARE_M), []
+    middle = points.mean(0)
+    for index, (rotation, place) in enumerate(board_poses(count, 0.35, 1.2, (0.27, 0.21))):
+        origin = place - rotation @ middle
+        pixels, _ = cv2.projectPoints(
+            points, cv2.Rodrigues(rotation)[0], origin, camera.K, camera.distortion
+        )
+        views.append(View(index, pixels.reshape(-1, 2)))
+    return views
+
+
+def test_exact_corners_give_the_exact_lens_and_planes() -> None:
+    views = exact_views(TRUE)
+    lens = calibration.fit_lens(views, BOARD, SQUARE_M, nominal_camera())
+    np.testing.assert_allclose(lens.camera.K, TRUE.K, atol=0.01)
+    known = calibration.known_lens(views, BOARD, SQUARE_M, TRUE)
+    assert known.errors_px.max() < 1e-3
+    for number, pose in enumerate(board_poses(12, 0.35, 1.2, (0.27, 0.21))):
+        distance = calibration.true_distances(known, number, BOARD, SQUARE_M)
+        radial, _ = render_board(TRUE, BOARD, SQUARE_M, pose)
+        on_board = np.isfinite(distance)
+        assert on_board.sum() > 300
+        # Rendered from samples within each pixel; slanted pixels differ a little.
+        assert np.abs(distance - radial)[on_board].max() < 0.002
+
+
+def test_a_view_that_does_not_fit_is_left_out() -> None:
+    views = exact_views(TRUE)
+    views[3] = View(3, views[3].corners_px + np.random.default_rng(0).normal(size=(35, 2)) * 4)
+    lens = calibration.fit_lens(views, BOARD, SQUARE_M, nominal_camera())
+    assert 3 not in [view.index for view in lens.views]
+    np.testing.assert_allclose(lens.camera.K, TRUE.K, atol=0.05)
+
+
+def test_the_polynomial_ignores_the_noise_of_single_pixels() -> None:
+    rng = np.random.default_rng(0)
+    view = np.repeat(np.arange(30), 400)
+    true = np.repeat(np.linspace(0.4, 1.4, 30), 400) + rng.uniform(-0.01, 0.01, len(view))
+    measured = true + 0.01 * true + rng.normal(size=len(view)) * 0.02
+    fit = calibration.fit_depth(DepthPairs(measured, true, np.ones(len(view)), view))
+    _, error = calibration.frame_errors(
+        DepthPairs(1.01 * true, true, np.ones(len(view)), view), fit.polynomial
+    )
+    assert np.abs(error).max() < 0.002
+
+
+def test_beyond_its_range_the_correction_stays_what_it_was() -> None:
+    camera = Camera(
+        np.diag((1e9, 1e9, 1)), 4, 1, depth_polynomial=(0, 0, 0, 1), depth_polynomial_range_m=(1, 2)
+    )
+    depth = camera.rectify(np.array([[0.5, 1.0, 2.0, 5.0]], np.float32), True)
+    np.testing.assert_allclose(depth, [[1.5, 2.0, 10.0, 13.0]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("image", [np.zeros((144, 176)), np.full((144, 176), 900)])
+def test_no_board_no_corners(image: np.ndarray) -> None:
+    assert calibration.find_corners(image.astype(np.uint16), BOARD) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--board", "7", "--square", "0.03"], "COLUMNSxROWS"),
+        (["--board", "2x5", "--square", "0.03"], "3 to 50"),
+        (["--board", "7x5", "--square", "30"], "metres"),
+        (["--board", "9x6", "--square", "0.03", "--frames", "3"], "found in 0 frames"),
+        (["--board", "7x5", "--square", "0.03", "--camera", "nope.json"], "nope.json"),
+    ],
+)
+def test_errors_are_one_sentence(
+    recording: Path,
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["calibrate", str(recording), *arguments])
+    assert command_line.run(calibrate.main) == 1
+    last = capfd.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("error: ")
+    assert words in last
+
+
+def test_a_recording_without_amplitude_is_told(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", depth_m=np.ones((2, 6, 8), np.float32), K=np.diag((9.0, 9, 1)))
+    with pytest.raises(ToftrackError, match="no amplitude"):
+        calibrate.main([str(tmp_path / "a.npz"), "--board", "7x5", "--square", "0.03"])
+
+
+def test_boards_at_one_distance_are_told() -> None:
+    view = np.repeat(np.arange(9), 50)
+    pairs = DepthPairs(np.full(450, 0.8), np.full(450, 0.81), np.ones(450), view)
+    with pytest.raises(ToftrackError, match="near and far"):
+        calibration.fit_depth(pairs)

@@ -1,0 +1,125 @@
+"""A camera of one's own: the README's code and configuration, as they stand there."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.tracking import ROOT
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+
+from toftrack.camera import Camera
+from toftrack.configuration.sentences import sentence
+from toftrack.devices.base import BaseDevice, Device
+from toftrack.devices.sample import Sample
+from toftrack.errors import ToftrackError
+
+FRAMES = 12
+
+
+def from_readme(name: str) -> str:
+    """The block of code that follows the README's marker of that name."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(rf"<!-- test: {name} -->\n```\w+\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) == 1, f"the README has {len(blocks)} blocks marked {name}"
+    return blocks[0]
+
+
+@pytest.fixture
+def workplace(tmp_path: Path) -> Path:
+    """A user's folder: the device, its configuration, and images in the sample's words."""
+    (tmp_path / "my_device.py").write_text(from_readme("own-device"), encoding="utf-8")
+    conf = tmp_path / "my_conf" / "device"
+    conf.mkdir(parents=True)
+    (conf / "raw.yaml").write_text(from_readme("own-device-configuration"), encoding="utf-8")
+    with open(tmp_path / "images.raw", "wb") as images:
+        for frame in Sample(stop=FRAMES):
+            words = np.rint(np.minimum(frame.depth, 65) * 1000).astype(np.uint16)
+            images.write(words.tobytes())
+        images.write(b"the beginning of another")
+    return tmp_path
+
+
+def track(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """`python track.py` as it is run in the user's folder."""
+    command = [sys.executable, str(ROOT / "track.py"), "--config-dir", "my_conf", "device=raw"]
+    return subprocess.run(
+        [*command, *arguments, "view=none", f"hydra.run.dir={folder / 'out'}"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_the_readmes_camera_is_tracked(workplace: Path) -> None:
+    sample = Sample(stop=FRAMES)
+    K = sample.camera.K
+    assert len(from_readme("own-device").splitlines()) <= 35
+    done = track(workplace, "device.path=images.raw", f"device.focal_px={K[0, 0]}")
+    assert done.returncode == 0, done.stderr
+    with np.load(workplace / "out" / "track.npz") as result:
+        found = result["joints_m"]
+        assert not result["lost"].any()
+        assert (np.diff(result["timestamp_s"]) > 0).all()
+    # The sample's centre is not that of the image; the depth does not care.
+    assert found.shape == (FRAMES, 21, 3)
+    assert np.abs(found[..., 2] - sample.truth.joints_m[..., 2]).mean() < 0.01
+
+
+def test_its_own_error_is_told_in_one_sentence(
+    workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(workplace)
+    monkeypatch.delitem(sys.modules, "my_device", raising=False)
+    settings = {"path": "nowhere.raw", "width": 176, "height": 144, "focal_px": 200.0}
+    device = instantiate({"_target_": "my_device.RawImages"} | settings)
+    with pytest.raises(ToftrackError) as caught, device:
+        next(iter(device))
+    assert sentence(caught.value) == "'nowhere.raw' cannot be opened: No such file or directory"
+
+
+def test_a_missing_argument_is_told(workplace: Path) -> None:
+    done = track(workplace)
+    assert done.returncode == 1
+    assert "device.path=" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (None, "No module named 'my_device'"),
+        ("import nothing_like_this", "No module named 'nothing_like_this'"),
+        ("class RawImages(:", "invalid syntax (my_device.py, line 1)"),
+        ("class Other: ...", "my_device.RawImages"),
+    ],
+)
+def test_code_that_cannot_be_imported_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: str | None, reason: str
+) -> None:
+    if code is not None:
+        (tmp_path / "my_device.py").write_text(code + "\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_device", raising=False)
+    with pytest.raises(HydraException) as caught:
+        instantiate({"_target_": "my_device.RawImages"})
+    told = sentence(caught.value)
+    assert told.startswith("the _target_ my_device.RawImages cannot be imported (")
+    assert reason in told
+    assert "PYTHONPATH" in told
+
+
+def test_a_device_without_frames_is_told() -> None:
+    class Empty(BaseDevice): ...
+
+    with Empty(Camera(np.eye(3), 4, 3)) as device:
+        assert isinstance(device, Device)
+        with pytest.raises(ToftrackError, match="Empty has no frames; write its method __iter__"):
+            next(iter(device))

@@ -1,0 +1,263 @@
+"""RealSense cameras through the SDK's software device; skipped where the SDK cannot be loaded."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import hydra
+import numpy as np
+import pytest
+from helpers.tracking import ROOT, configuration, make_tracker
+
+from toftrack.camera import Camera
+from toftrack.devices.base import Device
+from toftrack.devices.realsense.device import RealSense
+from toftrack.devices.realsense.emulator import EmulatedCamera, EmulatorSettings
+from toftrack.devices.realsense.sdk import camera_of, load_sdk
+from toftrack.devices.sample import Sample
+from toftrack.errors import ToftrackError
+
+FINE = EmulatorSettings(fps=500.0, unit_m=0.0001)
+
+
+@pytest.fixture(scope="module")
+def rs() -> ModuleType:
+    try:
+        return load_sdk()
+    except ToftrackError as error:
+        pytest.skip(str(error))
+
+
+def emulated(**changes: Any) -> RealSense:
+    settings = {"transport": "emulated", "keep": "every", "emulated": FINE} | changes
+    return RealSense(**settings)
+
+
+def test_the_software_device_delivers_the_samples_frames(rs: ModuleType) -> None:
+    device, sample = emulated(stop=30), Sample(stop=30)
+    assert isinstance(device, Device)
+    assert (device.frames, len(device.truth)) == (30, 30)
+    np.testing.assert_allclose(device.camera.K, sample.camera.K, rtol=1e-6)
+    frames = list(device)
+    assert [frame.index for frame in frames] == list(range(30))
+    assert device.dropped == 0
+    for got, true in zip(frames, sample, strict=True):
+        assert got.depth.dtype == np.float32
+        assert not got.radial
+        near = true.depth < 6.5  # what 16 bits of 0.1 mm hold
+        np.testing.assert_allclose(got.depth[near], true.depth[near], atol=6e-5)
+        np.testing.assert_array_equal(got.amplitude, true.amplitude)
+        assert got.timestamp_s == pytest.approx(got.index / 500, abs=1e-6)
+
+
+def test_tracks_as_well_through_the_sdk_as_the_recording_itself(rs: ModuleType) -> None:
+    def error_mm(device: Device) -> float:
+        tracker, errors = make_tracker(), []
+        for row, frame in enumerate(device):
+            depth = device.camera.rectify(frame.depth, frame.radial)
+            estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+            errors.append(np.linalg.norm(estimate.joints_m - device.truth.joints_m[row], axis=-1))
+        assert len(errors) == 25
+        return 1e3 * float(np.mean(errors))
+
+    straight = error_mm(Sample(stop=25))
+    for unit_m in (0.001, 0.0001):
+        settings = EmulatorSettings(fps=500.0, unit_m=unit_m)
+        assert error_mm(emulated(stop=25, emulated=settings)) == pytest.approx(straight, abs=1)
+
+
+def test_the_configuration_makes_the_device(rs: ModuleType) -> None:
+    config = configuration(
+        "device=realsense",
+        "device.transport=emulated",
+        "device.keep=every",
+        "device.start=2",
+        "device.stop=4",
+        "device.emulated.fps=500",
+    )
+    assert [frame.index for frame in hydra.utils.instantiate(config.device)] == [2, 3]
+
+
+def test_newest_drops_what_nobody_took_and_leaves_a_gap(rs: ModuleType) -> None:
+    device = emulated(keep="newest", emulated=EmulatorSettings(fps=200.0, loop=True))
+    assert device.frames is None and device.truth is None
+    indices = []
+    for frame in device:
+        indices.append(frame.index)
+        time.sleep(0.03)
+        if len(indices) == 6:
+            break
+    assert indices == sorted(set(indices))
+    assert device.dropped == indices[-1] - 5 > 6
+
+
+def test_leaving_stops_the_camera_and_iterating_again_starts_it_again(rs: ModuleType) -> None:
+    device = emulated()
+    for _ in range(2):
+        indices = []
+        for frame in device:
+            indices.append(frame.index)
+            if len(indices) == 3:
+                break
+        assert indices == [0, 1, 2]
+
+
+def record(rs: ModuleType, path: Path, camera: EmulatedCamera) -> Path:
+    """What a virtual camera sends, written by the SDK."""
+    try:
+        recorder = rs.recorder(str(path), camera.device)
+    except RuntimeError:  # this SDK writes the other kind
+        path = path.with_suffix(".bag")
+        recorder = rs.recorder(str(path), camera.device)
+    sensor = recorder.query_sensors()[0]
+    sensor.open(sensor.get_stream_profiles())
+    sensor.start(rs.frame_queue(1000, True))
+    camera.start(busy=lambda: False)
+    assert camera.ended.wait(20)
+    time.sleep(0.2)  # the recorder writes in a thread of its own
+    camera.stop()
+    sensor.stop()
+    sensor.close()
+    recorder.pause()
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording(rs: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    return record(rs, folder / "hand.db3", EmulatedCamera(rs, EmulatorSettings(fps=100.0)))
+
+
+def test_a_recording_gives_every_frame_in_order_however_slow_its_reader(recording: Path) -> None:
+    device = RealSense(bag=recording)
+    sample = Sample()
+    np.testing.assert_allclose(device.camera.K, sample.camera.K, rtol=1e-6)
+    count = 0
+    for got, true in zip(device, sample, strict=True):
+        assert got.index == true.index
+        near = true.depth < 65
+        np.testing.assert_allclose(got.depth[near], true.depth[near], atol=6e-4)
+        np.testing.assert_array_equal(got.amplitude, true.amplitude)
+        count += 1
+        if count % 20 == 0:
+            time.sleep(0.05)
+    assert (count, device.dropped) == (100, 0)
+
+
+def test_a_part_of_a_recording_keeps_its_indices_and_can_be_read_again(recording: Path) -> None:
+    device = RealSense(bag=recording, start=40, stop=43, infrared=False)
+    for _ in range(2):
+        frames = list(device)
+        assert [frame.index for frame in frames] == [40, 41, 42]
+        assert frames[0].amplitude is None
+
+
+def test_a_recording_at_its_own_pace_drops_what_comes_too_late(recording: Path) -> None:
+    device = RealSense(bag=recording, realtime=True)
+    indices = []
+    for frame in device:
+        indices.append(frame.index)
+        time.sleep(0.05)
+    assert indices == sorted(set(indices))
+    assert 5 < len(indices) < 60
+    assert device.dropped > 30
+
+
+def test_a_start_behind_the_end_is_told(recording: Path) -> None:
+    with pytest.raises(ToftrackError, match="no frame from start=100 on, but 100 before"):
+        list(RealSense(bag=recording, start=100))
+
+
+def test_a_recording_without_depth_is_told(rs: ModuleType, tmp_path: Path) -> None:
+    class InfraredOnly(EmulatedCamera):
+        def _stream(self, uid: int, kind: Any, index: int, pixel_format: Any) -> Any:
+            if kind == rs.stream.depth:
+                return None
+            return super()._stream(uid, kind, index, pixel_format)
+
+        def _deliver(self, profile: Any, pixels: np.ndarray, number: int) -> None:
+            if profile is not None:
+                super()._deliver(profile, pixels, number)
+
+    path = record(rs, tmp_path / "infrared.db3", InfraredOnly(rs, FINE))
+    with pytest.raises(ToftrackError, match="infrared.* has no depth images"):
+        RealSense(bag=path)
+
+
+def test_a_recording_without_a_frame_is_told(rs: ModuleType, tmp_path: Path) -> None:
+    class Silent(EmulatedCamera):
+        def _send(self, number: int) -> None: ...
+
+    path = record(rs, tmp_path / "silent.db3", Silent(rs, FINE))
+    with pytest.raises(ToftrackError, match="silent.*has no (depth images|frame with depth)"):
+        list(RealSense(bag=path))
+
+
+@pytest.mark.parametrize("name", ["text.bag", "text.db3", "empty.bag", "empty.db3", "cut"])
+def test_what_is_no_recording_is_told(
+    rs: ModuleType, tmp_path: Path, recording: Path, name: str
+) -> None:
+    path = tmp_path / (f"cut{recording.suffix}" if name == "cut" else name)
+    content = recording.read_bytes()[:5000] if name == "cut" else b"text" * ("text" in name)
+    path.write_bytes(content)
+    with pytest.raises(ToftrackError, match=rf"{path.name}' is not a recording of a RealSense"):
+        RealSense(bag=path)
+
+
+MODELS = ("brown_conrady", "modified_brown_conrady", "inverse_brown_conrady")
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_cameras_lens_becomes_opencvs(rs: ModuleType, model: str) -> None:
+    intrinsics = some_intrinsics(rs, model, [0.1, -0.2, 0.001, -0.002, 0.05])
+    camera = camera_of(rs, intrinsics)
+    if model == "brown_conrady":
+        np.testing.assert_allclose(camera.distortion, intrinsics.coeffs, atol=1e-5)
+    points = np.random.default_rng(0).uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (50, 3))
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, camera.distortion)[0]
+    true = [rs.rs2_project_point_to_pixel(intrinsics, list(point)) for point in points]
+    np.testing.assert_allclose(seen[:, 0], true, atol=0.05)
+
+
+def test_a_camera_without_distortion_has_none(rs: ModuleType) -> None:
+    for model, coefficients in (("brown_conrady", [0.0] * 5), ("none", [0.3] * 5)):
+        assert not camera_of(rs, some_intrinsics(rs, model, coefficients)).distortion.any()
+
+
+def test_a_lens_unlike_opencvs_is_told(rs: ModuleType) -> None:
+    with pytest.raises(ToftrackError, match="kannala.*pixels.*camera.file"):
+        camera_of(rs, some_intrinsics(rs, "kannala_brandt4", [0.9, -3.0, 9.0, -20.0, 0.0]))
+
+
+def some_intrinsics(rs: ModuleType, model: str, coefficients: list[float]) -> Any:
+    intrinsics = rs.intrinsics()
+    intrinsics.width, intrinsics.height, intrinsics.ppx, intrinsics.ppy = 640, 480, 321.0, 238.0
+    intrinsics.fx, intrinsics.fy = 600.0, 610.0
+    intrinsics.model, intrinsics.coeffs = getattr(rs.distortion, model), coefficients
+    return intrinsics
+
+
+def test_a_camera_file_of_another_size_is_told(rs: ModuleType, tmp_path: Path) -> None:
+    Camera(np.diag([200.0, 200, 1]), 320, 240).save(tmp_path / "camera.json")
+    with pytest.raises(ToftrackError, match="320x240.*176x144"):
+        emulated(camera_file=tmp_path / "camera.json")
+
+
+def test_without_a_camera_the_user_is_told_at_once(rs: ModuleType, tmp_path: Path) -> None:
+    if len(rs.context().devices):
+        pytest.skip("a camera is plugged in")
+    done = subprocess.run(
+        [sys.executable, "track.py", "device=realsense", f"hydra.run.dir={tmp_path}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: no RealSense camera")
+    assert done.stderr.count("\n") == 1

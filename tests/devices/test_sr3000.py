@@ -1,0 +1,316 @@
+"""The SR3000: the real driver against a virtual camera that misbehaves in every way known."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import usb.core
+from helpers.sr3000_camera import STEP_M, camera, read
+
+from toftrack.devices.base import Device
+from toftrack.devices.sample import Sample
+from toftrack.devices.sr3000 import usb as sr3000_usb
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.faults import REQUEST_FAULTS
+from toftrack.errors import ToftrackError
+from toftrack.recordings.sr_frame import FRAME_BYTES, unambiguous_range_m
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left() -> Iterator[None]:
+    """After each test: no thread, and (see `read`) no handle."""
+    yield
+    assert not [t for t in threading.enumerate() if t.name == "sr3000-reader"]
+
+
+@pytest.fixture(scope="module")
+def sample() -> list[Any]:
+    return list(Sample())
+
+
+def assert_is_the_sample(device: Sr3000, frames: list[Any], sample: list[Any]) -> None:
+    """Every frame is the sample's of its index, to the rounding of the distance word."""
+    for frame in frames:
+        depth = device.camera.rectify(frame.depth, frame.radial)
+        np.testing.assert_allclose(depth, sample[frame.index].depth, atol=0.51 * STEP_M)
+        np.testing.assert_array_equal(frame.amplitude, sample[frame.index].amplitude)
+
+
+def test_serves_the_sample_whole_and_in_order(sample: list[Any]) -> None:
+    device = camera()
+    assert isinstance(device, Device)
+    frames = read(device)
+    assert [frame.index for frame in frames] == list(range(100))
+    assert (np.diff([frame.timestamp_s for frame in frames]) >= 0).all()
+    assert frames[0].radial
+    assert_is_the_sample(device, frames, sample)
+    assert device.counts.received == device.counts.delivered == device.emulator.served == 100
+    assert device.truth.joints_m.shape == (100, 21, 3)
+    assert device.frames == 100
+
+
+# Kind of fault, how often, whether the frame is lost and so leaves a gap.
+PASSING = [
+    ("timeout", 1, False),
+    ("timeout", 10, False),
+    ("refuse", 1, False),
+    ("stall", 1, False),
+    ("stall", 7, False),
+    ("io_error", 2, False),
+    ("overflow", 1, True),
+    ("short", 1, True),
+    ("short", 6, True),
+    ("cut", 1, True),
+    ("empty", 1, True),
+    ("long", 1, True),
+    ("unplug_before", 1, True),
+    ("unplug_during", 1, True),
+    ("unplug_after", 1, False),
+    ("unplug_before", 3, True),
+    ("unplug_during", 3, True),
+]
+
+
+@pytest.mark.parametrize("first", [0, 5])
+@pytest.mark.parametrize(("kind", "count", "lost"), PASSING)
+def test_recovers(kind: str, count: int, lost: bool, first: int, sample: list[Any]) -> None:
+    device = camera(f"{kind}@{first}x{count}", stop=30)
+    frames = read(device)
+    expected = [i for i in range(30) if not (lost and first <= i < first + count)]
+    if kind == "unplug_after":  # the frame came, and the break behind it takes an index
+        expected.remove(first + 1)
+    assert [frame.index for frame in frames] == expected
+    assert_is_the_sample(device, frames, sample)
+
+
+def test_a_late_frame_is_not_taken_for_the_next(sample: list[Any]) -> None:
+    for late_s in (0.02, 0.05, 0.1):
+        device = camera("late@5", "late@11", late_s=late_s, stop=40)
+        indices = [frame.index for frame in read(device)]
+        assert indices == sorted(set(indices))
+        assert len(indices) > 25
+
+
+def test_a_frame_in_two_transfers_at_every_packet(sample: list[Any]) -> None:
+    packets = FRAME_BYTES // 512
+    device = camera(f"split@0x{packets - 1}", loop=True, fps=5000.0, stop=packets - 1)
+    frames = read(device)
+    assert [frame.index for frame in frames] == list(range(packets - 1))
+    for frame in frames:
+        assert np.array_equal(frame.amplitude, sample[frame.index % 100].amplitude)
+    assert device.counts.damaged == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "distance"), [("zeros", 0.0), ("ones", unambiguous_range_m(20)), ("garbage", None)]
+)
+def test_nonsense_of_the_right_length_is_a_frame(kind: str, distance: float | None) -> None:
+    device = camera(f"{kind}@1", stop=3)
+    frames = read(device)
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    depth = device.camera.rectify(frames[1].depth, True)
+    assert np.isfinite(depth).all()
+    if distance is not None:
+        np.testing.assert_allclose(frames[1].depth, distance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["timeout", "refuse", "stall", "short", "empty", "long", "cut"])
+def test_a_camera_that_never_answers_is_told(kind: str) -> None:
+    with pytest.raises(ToftrackError, match="libmesasr.*emulated"):
+        read(camera(kind))
+
+
+@pytest.mark.parametrize("kind", ["timeout", "stall", "short"])
+def test_a_camera_that_falls_silent_is_told_after_its_last_frame(kind: str) -> None:
+    device, seen = camera(f"{kind}@4+"), []
+    with pytest.raises(ToftrackError, match="cable and power"), device:
+        for frame in device:
+            seen.append(frame.index)
+    assert seen == [0, 1, 2, 3]
+    assert device.emulator.open_handles == set()
+
+
+def test_unplugged_for_ever_is_given_up_after_its_last_frame() -> None:
+    device, seen = camera("unplug_during@4", replug_s=100.0), []
+    with pytest.raises(ToftrackError, match="gone.*no SR3000"), device:
+        for frame in device:
+            seen.append(frame.index)
+    assert seen == [0, 1, 2, 3]
+    assert device.emulator.open_handles == set()
+
+
+def test_unplugged_between_frames_by_hand() -> None:
+    device, indices = camera(keep="newest", loop=True, fps=200.0), []
+    with device:
+        for frame in device:
+            indices.append(frame.index)
+            if len(indices) == 5:
+                device.emulator.unplug()
+                threading.Timer(0.05, device.emulator.plug_in).start()
+            if len(indices) == 10:
+                break
+    assert indices == sorted(set(indices))
+    assert device.counts.unplugged == 1
+
+
+def test_never_gives_up_when_told_so() -> None:
+    device = camera("timeout@2x30", persistence={"give_up_s": None, "first_frame_s": 0.1}, stop=4)
+    assert [frame.index for frame in read(device)] == [0, 1, 2, 3]
+
+
+def no_library(**_: Any) -> None:
+    raise usb.core.NoBackendError("No backend available")
+
+
+def test_no_library_is_told_with_the_ids(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sr3000_usb.usb.core, "find", no_library)
+    with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*libusb.*libmesasr.*emulated"):
+        Sr3000()
+
+
+def test_no_camera_is_told_with_the_ids() -> None:
+    with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*plug.*libmesasr.*emulated"):
+        camera("missing")
+
+
+def test_usb_that_cannot_be_listed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(**_: Any) -> None:
+        raise usb.core.USBError("no access", None, 13)
+
+    monkeypatch.setattr(sr3000_usb.usb.core, "find", fails)
+    with pytest.raises(ToftrackError, match="cannot be listed"):
+        Sr3000()
+
+
+@pytest.mark.parametrize(("kind", "words"), [("permission", "udev"), ("busy", "another program")])
+def test_a_camera_that_cannot_be_opened_is_told(kind: str, words: str) -> None:
+    device = camera(kind)
+    with pytest.raises(ToftrackError, match=words):
+        device.open()
+    assert device.emulator.open_handles == set()
+    assert device.emulator.misuse == []
+
+
+@pytest.mark.parametrize("kind", ["permission", "busy"])
+def test_after_plugging_in_again_it_may_take_a_while_to_open(kind: str) -> None:
+    # The udev rule, or another program, comes first: the attempts after the first one fail.
+    device = camera("unplug_before@3", f"{kind}@1x3", stop=8)
+    assert [frame.index for frame in read(device)] == [0, 1, 2, 4, 5, 6, 7]
+
+
+def test_two_cameras_need_a_choice() -> None:
+    with pytest.raises(ToftrackError, match="2 cameras.*A1, B2.*device.serial"):
+        camera(serials=("A1", "B2"))
+    device = camera(serials=("A1", "B2"), serial="B2", stop=3)
+    assert len(read(device)) == 3
+    assert device.description["serial"] == "B2"
+    with pytest.raises(ToftrackError, match="serial number C3"):
+        camera(serials=("A1", "B2"), serial="C3")
+
+
+def test_close_twice_and_open_again() -> None:
+    device = camera(loop=True)
+    for _ in range(2):
+        device.open()
+        assert next(iter(device)).index == 0
+        device.close()
+        device.close()
+        assert device.emulator.open_handles == set()
+    assert device.emulator.misuse == []
+
+
+def test_iterating_again_goes_on() -> None:
+    device = camera(stop=6)
+    with device:
+        first = [frame.index for frame, _ in zip(device, range(3), strict=False)]
+        gc.collect()  # the first iteration is over
+        second = [frame.index for frame in device]
+    assert first == [0, 1, 2]
+    assert second[-1] == 5
+    assert second[0] > 2
+
+
+def test_an_exception_in_the_consumer_releases_the_camera() -> None:
+    device = camera(loop=True)
+
+    def consume() -> None:
+        with device:
+            for _ in device:
+                raise RuntimeError("the consumer's own")
+
+    with pytest.raises(RuntimeError, match="the consumer's own"):
+        consume()
+    assert device.emulator.open_handles == set()
+    assert device.emulator.misuse == []
+
+
+def test_ctrl_c_during_a_transfer_releases_the_camera() -> None:
+    device = camera(loop=True, fps=2.0, usb={"timeout_ms": 1000})
+    threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), device:
+        for _ in device:
+            pass
+    assert time.monotonic() - began < 2.5
+    assert device.emulator.open_handles == set()
+    assert device.emulator.misuse == []
+
+
+def test_a_slow_consumer_gets_the_newest_frame_and_the_rest_is_counted() -> None:
+    device, frames = camera(keep="newest", fps=200.0), []
+    with device:
+        for frame in device:
+            frames.append(frame)
+            time.sleep(0.02)
+    indices = [frame.index for frame in frames]
+    assert indices[0] == 0
+    assert indices[-1] == 99
+    assert indices == sorted(set(indices))
+    assert len(indices) < 60
+    counts = device.counts
+    assert counts.delivered == len(indices)
+    assert counts.delivered + counts.dropped == counts.received == device.emulator.served == 100
+
+
+def test_a_slow_consumer_gets_every_frame_if_wanted_so() -> None:
+    device, count = camera(queue_frames=3, stop=40), 0
+    with device:
+        for _ in device:
+            count += 1
+            time.sleep(0.002)
+    assert (count, device.counts.dropped) == (40, 0)
+
+
+def test_stopping_delivers_what_was_received() -> None:
+    device, indices = camera(loop=True, queue_frames=20), []
+    with device:
+        for frame in device:
+            indices.append(frame.index)
+            if frame.index == 0:
+                time.sleep(0.1)
+                device.request_stop()
+    assert len(indices) == device.counts.received > 15
+    assert indices == list(range(len(indices)))
+
+
+def test_every_kind_of_fault_in_turn_and_every_good_frame_accounted_for() -> None:
+    device = camera(keep="newest", loop=True, fps=500.0, fault_every=7, stop=7 * 40)
+    frames = read(device)
+    counts = device.counts
+    assert counts.delivered + counts.dropped == counts.received
+    assert counts.received == device.emulator.served
+    assert counts.unplugged >= 6
+    assert len(frames) > 100
+
+
+def test_every_kind_of_fault_is_tested() -> None:
+    tested = {kind for kind, *_ in PASSING} | {"late", "split", "zeros", "ones", "garbage"}
+    assert tested == set(REQUEST_FAULTS)

@@ -1,0 +1,174 @@
+"""The vendor's library: against a stand-in that is compiled here."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.transport import MesaSettings, Persistence
+from toftrack.errors import ToftrackError
+
+SOURCE = r"""
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+/* Counts frames; the environment tells which call goes wrong. */
+typedef struct { uint16_t images[2][144 * 176]; int acquired; } Camera;
+static int opened = 0;
+static int wrong(const char *what) {
+    const char *given = getenv("STAND_IN_FAULT");
+    if (!given) return 0;
+    while (*what && *given == *what) { ++given; ++what; }
+    return *given == 0 && *what == 0;
+}
+static void log_call(const char *name, int value) {
+    const char *path = getenv("STAND_IN_LOG");
+    FILE *file = path ? fopen(path, "a") : 0;
+    if (file) { fprintf(file, "%s %d\n", name, value); fclose(file); }
+}
+int SR_OpenUSB(Camera **camera, unsigned serial) {
+    log_call("open", (int)serial);
+    if (wrong("open") || (wrong("gone") && opened > 0 && opened < 3)) { ++opened; return -1; }
+    ++opened;
+    *camera = calloc(1, sizeof(Camera));
+    return 1;
+}
+int SR_Close(Camera *camera) { log_call("close", 0); free(camera); return 0; }
+int SR_Acquire(Camera *camera) {
+    int i;
+    ++camera->acquired;
+    if (wrong("acquire")) return -5;
+    if (wrong("once") && camera->acquired == 3) return -5;
+    if (wrong("gone") && opened == 1 && camera->acquired > 3) return -5;
+    for (i = 0; i < 144 * 176; ++i) {
+        camera->images[0][i] = (uint16_t)(i + camera->acquired);
+        camera->images[1][i] = (uint16_t)(7 * camera->acquired);
+    }
+    return 101376;
+}
+void *SR_GetImage(Camera *camera, unsigned char index) {
+    return wrong("image") ? 0 : camera->images[index];
+}
+int SR_GetRows(Camera *camera) { (void)camera; return wrong("rows") ? 200 : 144; }
+int SR_GetCols(Camera *camera) { (void)camera; return 176; }
+int SR_SetTimeout(Camera *camera, int ms) { (void)camera; log_call("timeout", ms); return 0; }
+int SR_SetIntegrationTime(Camera *c, unsigned char n) { (void)c; log_call("time", n); return 0; }
+int SR_SetAmplitudeThreshold(Camera *c, uint16_t n) { (void)c; log_call("floor", n); return 0; }
+int SR_SetMode(Camera *c, int n) { (void)c; log_call("mode", n); return 0; }
+#ifndef INCOMPLETE
+int SR_SetModulationFrequency(Camera *c, int code) {
+    (void)c;
+    log_call("modulation", code);
+    return wrong("modulation") ? -1 : 0;
+}
+#endif
+"""
+
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
+
+
+@pytest.fixture(scope="module")
+def libraries(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("library")
+    (folder / "mesa.c").write_text(SOURCE)
+    paths = {}
+    for name, flags in {"whole": [], "incomplete": ["-DINCOMPLETE"]}.items():
+        paths[name] = folder / f"lib{name}.so"
+        command = [COMPILER, "-shared", "-fPIC", *flags, "mesa.c", "-o", str(paths[name])]
+        subprocess.run(command, cwd=folder, check=True)
+    return paths
+
+
+def camera(library: Path | str, **changes: object) -> Sr3000:
+    persistence = Persistence(
+        first_frame_s=0.3, give_up_s=0.5, backoff_s=0.01, longest_backoff_s=0.05, reopen_after=2
+    )
+    settings = {"keep": "every", "stop": 5} | changes
+    mesa = MesaSettings(library=str(library), timeout_ms=50)
+    return Sr3000("libmesasr", libmesasr=mesa, persistence=persistence, **settings)
+
+
+@needs_compiler
+def test_reads_frames_and_sets_the_camera_up(
+    libraries: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "calls"
+    monkeypatch.setenv("STAND_IN_LOG", str(log))
+    device = camera(
+        libraries["whole"],
+        serial="0x2a",
+        modulation_mhz=30,
+        integration_time=12,
+        amplitude_threshold=3,
+    )
+    with device:
+        frames = list(device)
+    assert [frame.index for frame in frames] == [0, 1, 2, 3, 4]
+    for number, frame in enumerate(frames, start=1):
+        words = frame.depth.ravel()[:100] / (device.exposure.range_m / 0xFFFF)
+        np.testing.assert_allclose(words, np.arange(100) + number, atol=1e-3)
+        assert (frame.amplitude == 7 * number).all()
+    assert log.read_text().split("\n")[:-1] == [
+        "open 42",
+        "timeout 50",
+        "mode 5",
+        "modulation 1",
+        "floor 3",
+        "time 12",
+        "close 0",
+    ]
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("open", "found no camera"),
+        ("rows", "176x200"),
+        ("modulation", "SR_SetModulationFrequency"),
+        ("acquire", "sent no frame.*SR_Acquire"),
+        ("image", "sent no frame.*SR_GetImage"),
+    ],
+)
+def test_what_goes_wrong_is_told(
+    libraries: dict[str, Path], fault: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STAND_IN_FAULT", fault)
+    with pytest.raises(ToftrackError, match=words), camera(libraries["whole"]) as device:
+        list(device)
+
+
+@needs_compiler
+@pytest.mark.parametrize(("fault", "unanswered"), [("once", 1), ("gone", 2)])
+def test_recovers(
+    libraries: dict[str, Path], fault: str, unanswered: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STAND_IN_FAULT", fault)
+    # The stand-in counts how often it was opened, so each fault needs a copy of its own.
+    library = libraries["whole"].with_name(f"lib{fault}.so")
+    shutil.copy(libraries["whole"], library)
+    with camera(library) as device:
+        assert [frame.index for frame in device] == [0, 1, 2, 3, 4]
+    assert device.counts.unanswered == unanswered
+
+
+@needs_compiler
+def test_a_library_that_lacks_a_function_is_told(libraries: dict[str, Path]) -> None:
+    with pytest.raises(ToftrackError, match="no function SR_SetModulationFrequency"):
+        camera(libraries["incomplete"])
+
+
+def test_no_library_is_told() -> None:
+    with pytest.raises(ToftrackError, match="libnowhere.so.*vendor's package.*transport=usb"):
+        camera("libnowhere.so")
+
+
+def test_a_serial_that_is_no_number_is_told() -> None:
+    with pytest.raises(ToftrackError, match="SN-12 is not a number"):
+        camera("libnowhere.so", serial="SN-12")

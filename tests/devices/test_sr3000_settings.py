@@ -1,0 +1,133 @@
+"""The SR3000: settings that reach the camera, and those that cannot be."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import usb.core
+from helpers.sr3000_camera import STEP_M, camera, read
+
+from toftrack.camera import Camera
+from toftrack.devices.sample import Sample
+from toftrack.devices.sr3000.device import Sr3000
+from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
+from toftrack.devices.sr3000.transport import Exposure, Persistence, UsbSettings
+from toftrack.devices.sr3000.usb import UsbTransport
+from toftrack.errors import ToftrackError
+from toftrack.recordings.store import open_source
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left() -> Iterator[None]:
+    """After each test: no thread, and (see `read`) no handle."""
+    yield
+    assert not [t for t in threading.enumerate() if t.name == "sr3000-reader"]
+
+
+@pytest.fixture(scope="module")
+def sample() -> list[Any]:
+    return list(Sample())
+
+
+def test_settings_reach_the_camera() -> None:
+    device = camera(
+        modulation_mhz=30,
+        integration_time=20,
+        usb={"registers": {"3": 7}, "integration_time_register": 5, "modulation_register": 6},
+        stop=2,
+    )
+    read(device)
+    assert bytes(device.emulator.registers[:8]) == bytes((0, 0, 0, 7, 0, 20, 1, 0))
+
+
+def test_modulation_frequency_sets_the_range(sample: list[Any]) -> None:
+    device = camera(modulation_mhz=40, stop=1)
+    frame = read(device)[0]
+    depth = device.camera.rectify(frame.depth, True)
+    np.testing.assert_allclose(depth, sample[0].depth, atol=0.51 * STEP_M)
+    assert device.exposure.range_m == pytest.approx(3.747, abs=1e-3)
+
+
+def test_amplitude_threshold_takes_the_distance_of_dim_pixels() -> None:
+    dim = read(camera(stop=1))[0].amplitude < 500
+    frame = read(camera(amplitude_threshold=500, stop=1))[0]
+    assert dim.any()
+    assert (frame.depth[dim] == 0).all()
+    assert (frame.depth[~dim] > 0).mean() > 0.9
+
+
+def test_a_camera_with_other_endpoints_is_told() -> None:
+    source, settings = open_source("sample"), EmulatorSettings()
+    backend = EmulatedBackend(source, settings, 7.5, UsbSettings(endpoint_in=0x81))
+    transport = UsbTransport(UsbSettings(), Exposure(), None, backend)
+    with pytest.raises(ToftrackError, match="no endpoint 0x86 .it has 0x02, 0x81"):
+        transport.open()
+    assert backend.open_handles == set()
+
+
+def test_a_register_that_the_camera_refuses_is_told() -> None:
+    source, settings = open_source("sample"), EmulatorSettings()
+    backend = EmulatedBackend(source, settings, 7.5, UsbSettings(endpoint_out=0x02))
+    backend.bulk_write = lambda *_: (_ for _ in ()).throw(usb.core.USBError("Pipe error", -9, 32))
+    transport = UsbTransport(UsbSettings(registers={1: 2}), Exposure(), None, backend)
+    with pytest.raises(ToftrackError, match="register 1"):
+        transport.open()
+    assert backend.open_handles == set()
+
+
+def test_what_a_killed_program_left_in_the_camera_is_not_a_frame(sample: list[Any]) -> None:
+    device = camera(stop=3)
+    device.emulator._request()  # asked for, but never fetched
+    time.sleep(0.01)
+    frames = read(device)
+    assert np.array_equal(frames[0].amplitude, sample[1].amplitude)
+
+
+def test_camera_file_replaces_the_optics(tmp_path: Any) -> None:
+    path = tmp_path / "camera.json"
+    Camera(np.array([[210.0, 0, 90], [0, 210, 70], [0, 0, 1]]), 176, 144).save(path)
+    assert camera(camera_file=path).camera.K[0, 0] == 210
+    Camera(np.eye(3), 10, 10).save(path)
+    with pytest.raises(ToftrackError, match="10x10"):
+        camera(camera_file=path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"transport": "ethernet"}, "usb, libmesasr or emulated"),
+        ({"keep": "oldest"}, "newest or every"),
+        ({"modulation_mhz": 25}, "40, 30, 21, 20, 19"),
+        ({"integration_time": 256}, "0 to 255"),
+        ({"amplitude_threshold": -1}, "amplitude_threshold"),
+        ({"stop": 0}, "at least 1"),
+    ],
+)
+def test_bad_settings_are_told(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        Sr3000(**({"transport": "emulated"} | settings))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: UsbSettings(ids=("1ad2",)), "VENDOR:PRODUCT"),
+        (lambda: UsbSettings(ids=()), "empty"),
+        (lambda: UsbSettings(timeout_ms=0), "timeout_ms"),
+        (lambda: UsbSettings(registers={64: 0}), "0 to 63"),
+        (lambda: UsbSettings(registers={1: 256}), "0 to 255"),
+        (lambda: EmulatorSettings(faults=("explode@3",)), "explode"),
+        (lambda: EmulatorSettings(faults=("timeout@x",)), "timeout@x"),
+        (lambda: EmulatorSettings(fps=0.0), "fps"),
+        (lambda: Persistence(give_up_s=0), "give_up_s"),
+        (lambda: Persistence(backoff_s="soon"), "backoff_s"),
+    ],
+)
+def test_bad_settings_of_the_parts_are_told(make: Any, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        make()

@@ -1,0 +1,390 @@
+"""Gestures: labels that follow from the angles, do not flicker, and can be taught by a file."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.tracking import configuration, make_tracker, sample
+from helpers.tracking import follow as follow_scene
+from hydra.utils import instantiate
+
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate, no_estimate
+from toftrack.gestures.files import read_poses
+from toftrack.gestures.recognition import (
+    Gestures,
+    GestureState,
+    make_gestures,
+    pointing_ray,
+    tell_gesture,
+    update,
+)
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
+from toftrack.output.results import ResultWriter, read_results
+from toftrack.pose_space.data.training_poses import basic_pose, synthetic_training_poses
+from toftrack.pose_space.files import make_pose_space
+
+SURE, ON = 0.9, 0.0
+"""A good score, and no distance from the pose space."""
+GESTURES = make_gestures()
+SPACE = make_pose_space("pca", 4)
+
+
+def pose(name: str, thumb: str | None = None) -> np.ndarray:
+    return basic_pose(name, thumb).numpy()
+
+
+def fingers(*curled: int) -> np.ndarray:
+    """(21,) rad: the palm with some fingers (0 = index .. 3 = little) as in the fist."""
+    angles = pose("palm")
+    for finger in curled:
+        part = slice(5 + 4 * finger, 9 + 4 * finger)
+        angles[part] = pose("fist")[part]
+    return angles
+
+
+def label_of(angles: np.ndarray, gestures: Gestures = GESTURES, off: float = ON) -> str:
+    return update(None, angles, SURE, off, gestures)[1]
+
+
+def follow(frames: list[np.ndarray], score: float = SURE) -> list[tuple[str, float]]:
+    state: GestureState | None = None
+    told = []
+    for angles in frames:
+        state, label, probability = update(state, angles, score, ON, GESTURES)
+        told.append((label, probability))
+    return told
+
+
+def estimate(angles: np.ndarray, name: str = "tracking", lost: bool = False) -> Estimate:
+    state = torch.zeros(1, 27)
+    state[0, 2] = 0.5
+    state[0, 6:] = torch.from_numpy(angles)
+    joints = forward_kinematics(state, default_hand_shape()).joints_m[0].numpy()
+    return Estimate(
+        index=0,
+        timestamp_s=0.0,
+        state_name=name,
+        lost=lost,
+        joints_m=joints,
+        state=state[0].numpy(),
+        latent=SPACE.encode(state[:, 6:])[0].numpy(),
+        score=SURE,
+        covariance=np.zeros((10, 10), np.float32),
+        effective_sample_size=1.0,
+        compute_s=0.0,
+    )
+
+
+@pytest.mark.parametrize("thumb", [None, "out", "up", "beside", "across", "tucked"])
+@pytest.mark.parametrize(("basic", "label"), [("palm",) * 2, ("fist",) * 2, ("gun", "pointing")])
+def test_basic_poses_have_their_names_whatever_the_thumb_does(
+    basic: str, label: str, thumb: str | None
+) -> None:
+    _, told, probability = update(None, pose(basic, thumb), SURE, ON, GESTURES)
+    assert told == label
+    assert probability > 0.95
+
+
+def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
+    names = {"palm": "palm", "fist": "fist", "gun": "pointing"}
+    poses = synthetic_training_poses()
+    for way in ("palm-fist", "palm-gun", "gun-fist"):
+        first, last = (names[end] for end in way.split("-"))
+        rows = [a.numpy() for a, b in zip(*poses, strict=True) if b == way]
+        labels = [label_of(angles) for angles in rows]
+        assert labels[0] == first and labels[-1] == last
+        assert labels.index(last) > len(labels) // 3
+        # The little finger leads, so that a closing hand passes a pose like pointing.
+        assert set(labels) <= {"other", "pointing", first, last}
+
+
+@pytest.mark.parametrize(
+    "curled", [(2, 3), (0, 1, 2), (1, 2), (3,), (1, 3)], ids=["V", "little", "rock", "3", "odd"]
+)
+def test_poses_that_are_none_of_the_classes_are_other(curled: tuple[int, ...]) -> None:
+    assert label_of(fingers(*curled)) == "other"
+
+
+def test_the_half_way_pose_is_other_and_noise_leaves_a_gesture_what_it_is() -> None:
+    assert label_of((pose("palm") + pose("fist")) / 2) == "other"
+    rng = np.random.default_rng(0)
+    for basic, label in (("palm", "palm"), ("fist", "fist"), ("gun", "pointing")):
+        for _ in range(50):
+            noisy = pose(basic) + rng.normal(0, math.radians(12), 21)
+            assert label_of(noisy) == label
+
+
+def test_a_pose_far_off_the_pose_space_is_less_of_a_gesture() -> None:
+    probabilities = [update(None, pose("palm"), SURE, off, GESTURES)[2] for off in (0.0, 0.2, 0.3)]
+    assert probabilities[0] > probabilities[1] > probabilities[2]
+    assert label_of(pose("palm"), off=0.5) == "other"
+    assert update(None, pose("palm"), SURE, math.nan, GESTURES)[1] == "palm"
+
+
+def test_a_bad_score_says_nothing() -> None:
+    _, _, probability = update(None, pose("fist"), 0.3, ON, GESTURES)
+    assert probability == pytest.approx(1 / 4)
+    frames = follow([pose("palm")] * 3)
+    assert frames[-1][0] == "palm"
+    state = update(None, pose("palm"), SURE, ON, GESTURES)[0]
+    for _ in range(10):
+        state, label, probability = update(state, pose("fist"), 0.4, ON, GESTURES)
+    assert label == "palm" and probability == pytest.approx(0.25, abs=0.01)
+
+
+def test_labels_do_not_flicker_at_a_border() -> None:
+    rng = np.random.default_rng(1)
+    fist, palm = pose("fist"), pose("palm")
+    mixtures = [palm + part * (fist - palm) for part in np.linspace(1, 0.5, 101)]
+    border = next(angles for angles in mixtures if label_of(angles) != "fist")
+    between = [border + rng.normal(0, 0.15, 21) for _ in range(200)]
+    alone = [label_of(angles) for angles in between]
+    followed = [label for label, _ in follow(between)]
+
+    def changes(labels: list[str]) -> int:
+        return sum(a != b for a, b in zip(labels, labels[1:], strict=False))
+
+    assert changes(alone) > 20, "a border worth testing"
+    assert changes(followed) < changes(alone) / 4
+
+
+def test_a_new_gesture_is_told_within_three_frames_and_one_odd_frame_changes_nothing() -> None:
+    labels = [label for label, _ in follow([pose("palm")] * 5 + [pose("gun")] * 4)]
+    assert labels[:5] == ["palm"] * 5 and labels[7:] == ["pointing"] * 2
+    labels = [
+        label for label, _ in follow([pose("palm")] * 5 + [pose("fist")] + [pose("palm")] * 5)
+    ]
+    assert labels == ["palm"] * 11
+
+
+def test_update_does_not_change_its_state() -> None:
+    state = update(None, pose("palm"), SURE, ON, GESTURES)[0]
+    before = state.probabilities.copy()
+    update(state, pose("fist"), SURE, ON, GESTURES)
+    assert (state.probabilities == before).all()
+    assert state.probabilities.sum() == pytest.approx(1)
+
+
+def test_the_pointing_ray_runs_along_the_index_finger() -> None:
+    _, told = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
+    assert told.gesture == "pointing"
+    assert told.pointing_origin_m == pytest.approx(told.joints_m[5])
+    assert np.linalg.norm(told.pointing_direction) == pytest.approx(1)
+    reach = told.joints_m[8] - told.joints_m[5]
+    assert np.cross(told.pointing_direction, reach) == pytest.approx(0, abs=1e-6)
+    assert told.pointing_direction @ reach > 0
+    assert told.pointing_direction[1] < -0.95, "a hand held up points up"
+    origin, _ = pointing_ray(told.joints_m)
+    origin += 1.0
+    assert told.pointing_origin_m == pytest.approx(told.joints_m[5]), "the ray is a copy"
+
+
+def test_only_a_pointing_hand_that_is_followed_has_a_ray() -> None:
+    state, palm = tell_gesture(GESTURES, None, estimate(pose("palm")), SPACE)
+    assert palm.gesture == "palm" and np.isnan(palm.pointing_direction).all()
+    pointing = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)[1]
+    for lost in (
+        estimate(pose("gun"), "lost", True),
+        estimate(pose("gun"), "recovering", True),
+        # As for a frame without a hand: the last estimate repeated.
+        Estimate(**{**vars(pointing), "state_name": "lost", "lost": True}),
+        no_estimate(0, 0.0, "lost", 4, 0.0),
+    ):
+        state, told = tell_gesture(GESTURES, state, lost, SPACE)
+        assert state is None
+        assert told.gesture == "" and math.isnan(told.gesture_probability)
+        assert np.isnan(told.pointing_origin_m).all() and np.isnan(told.pointing_direction).all()
+
+
+def test_a_followed_hand_out_of_the_pose_space_is_other() -> None:
+    _, told = tell_gesture(GESTURES, None, estimate(fingers(2, 3), "tracking", True), SPACE)
+    assert told.lost and told.gesture == "other"
+
+
+def test_without_gestures_there_are_no_labels() -> None:
+    state, told = tell_gesture(None, None, estimate(pose("gun")), SPACE)
+    assert state is None and told.gesture == "" and math.isnan(told.gesture_probability)
+
+
+def test_results_carry_the_gesture_and_the_ray(tmp_path: Path) -> None:
+    _, told = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
+    with ResultWriter(tmp_path, {}, ["joint"] * 21) as writer:
+        writer.append(told)
+        writer.append(no_estimate(1, 0.04, "lost", 4, 0.0))
+    found = read_results(tmp_path / "track.npz")
+    assert found["gesture"].tolist() == ["pointing", ""]
+    assert found["pointing_direction"][0] == pytest.approx(told.pointing_direction)
+    assert np.isnan(found["pointing_origin_m"][1]).all()
+    lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
+    assert lines[0]["pointing_origin_m"] == pytest.approx(told.pointing_origin_m.tolist())
+    assert lines[1]["pointing_direction"] == [None] * 3
+
+
+V_SIGN = {name: 0.0 for name in ANGLE_NAMES if name.startswith(("index", "middle"))} | {
+    f"{finger}_{joint}_flexion": value
+    for finger in ("ring", "little")
+    for joint, value in (("mcp", 90.0), ("pip", 102.0), ("dip", 50.0))
+}
+
+
+def write_json(folder: Path, poses: object, units: str | None = "degrees") -> Path:
+    path = folder / "mine.json"
+    path.write_text(json.dumps({"poses": poses} | ({"units": units} if units else {})))
+    return path
+
+
+def write_csv(folder: Path, text: str) -> Path:
+    path = folder / "mine.csv"
+    path.write_text(text)
+    return path
+
+
+def test_a_json_file_names_further_gestures(tmp_path: Path) -> None:
+    path = write_json(tmp_path, [{"name": "vsign", "angles": V_SIGN}])
+    mine = make_gestures(str(path))
+    assert mine.names == ("palm", "fist", "pointing", "vsign", "other")
+    # Such a pose lies off the pose space, which must not speak against it.
+    assert label_of(fingers(2, 3), mine, off=0.4) == "vsign"
+    assert label_of(fingers(2, 3)) == "other"
+    for basic, label in (("palm", "palm"), ("fist", "fist"), ("gun", "pointing")):
+        assert label_of(pose(basic), mine) == label
+
+
+def test_a_gesture_that_says_more_is_preferred_where_it_holds(tmp_path: Path) -> None:
+    thumbs_up = np.degrees(pose("fist", "up")).tolist()
+    mine = make_gestures(str(write_json(tmp_path, [{"name": "good", "angles": thumbs_up}])))
+    assert label_of(pose("fist", "up"), mine) == "good"
+    assert label_of(pose("fist"), mine) == "fist"
+
+
+def test_poses_of_one_name_are_one_gesture_and_a_basic_name_is_replaced(tmp_path: Path) -> None:
+    half = {name: 45.0 for name in ANGLE_NAMES if name.endswith(("mcp_flexion", "pip_flexion"))}
+    poses = [
+        {"name": "fist", "angles": np.degrees(pose("fist")).tolist()},
+        {"name": "fist", "angles": half},
+    ]
+    mine = make_gestures(str(write_json(tmp_path, poses[:1])))
+    assert mine.names == ("palm", "pointing", "fist", "other")
+    half |= {name: 20.0 for name in ANGLE_NAMES if name.endswith("dip_flexion")}
+    both = make_gestures(str(write_json(tmp_path, poses)))
+    assert both.names == mine.names
+    loose = np.zeros(21)
+    loose[[ANGLE_NAMES.index(name) for name in half]] = np.radians(list(half.values()))
+    assert label_of(loose, both) == "fist"
+    assert label_of(pose("fist"), both) == "fist"
+    assert label_of(loose) == "other"
+
+
+def test_a_csv_file_reads_as_the_json_file(tmp_path: Path) -> None:
+    names, values = list(V_SIGN), [math.radians(value) for value in V_SIGN.values()]
+    text = f"# units: radians\nname,{','.join(names)},thumb_ip_flexion\n"
+    text += f"vsign,{','.join(map(str, values))},\n"
+    from_csv = read_poses(write_csv(tmp_path, text))
+    from_json = read_poses(write_json(tmp_path, [{"name": "vsign", "angles": V_SIGN}]))
+    assert [one.name for one in from_csv] == ["vsign"]
+    np.testing.assert_allclose(from_csv[0].angles_rad, from_json[0].angles_rad)
+    assert np.isnan(from_csv[0].angles_rad).sum() == 7, "thumb, and two abductions"
+
+
+@pytest.mark.parametrize(
+    ("poses", "units", "words"),
+    [
+        ([{"name": "v", "angles": V_SIGN}], None, "does not say its units"),
+        ([{"name": "v", "angles": V_SIGN}], "turns", "unknown units 'turns'"),
+        ([{"name": "v", "angles": V_SIGN}], "radians", "if they are degrees"),
+        ([{"name": "v", "angles": {"index_mcp_flexion": 1.2}}], "degrees", "if they are radians"),
+        ([{"angles": V_SIGN}], "degrees", "pose 1 has no name"),
+        ([{"name": "v", "angles": {"index_flexion": 9}}], "degrees", "unknown angle"),
+        (
+            [{"name": "v", "angles": {"index_mcp_flexion": "bent"}}],
+            "degrees",
+            "'bent', not a finite",
+        ),
+        ([{"name": "v", "angles": [math.nan] * 21}], "degrees", "nan, not a finite"),
+        ([{"name": "v", "angles": [0] * 20}], "degrees", "a list of 21"),
+        ([{"name": "v", "angles": {"index_mcp_flexion": -80}}], "degrees", "joint limits"),
+        ([{"name": "v", "angles": {"index_mcp_flexion": 80}}], "degrees", "any finger's flexion"),
+        ([{"name": "other", "angles": V_SIGN}], "degrees", "none of the classes"),
+        ([{"name": n, "angles": V_SIGN} for n in "ab"], "degrees", "too much alike"),
+        ([], "degrees", "names no pose"),
+        ("v", "degrees", "no list 'poses'"),
+    ],
+)
+def test_bad_json_is_told_in_one_sentence(
+    tmp_path: Path, poses: object, units: str | None, words: str
+) -> None:
+    path = write_json(tmp_path, poses, units)
+    with pytest.raises(ToftrackError) as caught:
+        make_gestures(str(path))
+    assert words in str(caught.value) and "mine.json" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("# units: degrees\nindex_mcp_flexion\n80\n", "no column 'name'"),
+        ("# units: degrees\nname,index_mcp_flexion\nv\n", "1 values for 2 columns"),
+        ("name,index_mcp_flexion\nv,80\n", "does not say its units"),
+        ("# units: degrees\nname,index_mcp_flexion\nv,inf\n", "'inf', not a finite number"),
+        ("# units: degrees\nname,index_mcp_flexion\n", "names no pose"),
+        ("", "no column 'name'"),
+    ],
+)
+def test_bad_csv_is_told_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        make_gestures(str(write_csv(tmp_path, text)))
+
+
+def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="no file of gestures"):
+        make_gestures(str(tmp_path / "none.json"))
+    with pytest.raises(ToftrackError, match="neither .json nor .csv"):
+        make_gestures(str(tmp_path / "poses.txt"))
+    (tmp_path / "broken.json").write_text("{")
+    with pytest.raises(ToftrackError, match="cannot be read as a file of gestures"):
+        make_gestures(str(tmp_path / "broken.json"))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"flexion_rad": 0.0}, {"other": -1.0}, {"smoothing": 1.0}, {"doubtful_score": 0.8}],
+)
+def test_settings_out_of_range_are_told(bad: dict[str, float]) -> None:
+    with pytest.raises(ToftrackError, match="gestures"):
+        make_gestures(**bad)
+
+
+def test_the_configurations_make_the_defaults() -> None:
+    made = instantiate(configuration().gestures)
+    assert made.names == GESTURES.names and made.settings == GESTURES.settings
+    assert instantiate(configuration("gestures=none").gestures) is None
+
+
+def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
+    scene = sample()
+    rows = range(55, 98)  # from the palm on; "" until the hand is found
+    told = follow_scene(scene.cut(*rows))
+    labels = [one.gesture for one in told]
+    assert "palm" in labels[:9] and set(labels[:9]) <= {"palm", ""}
+    assert labels[-10:] == ["pointing"] * 10
+    assert min(one.gesture_probability for one in told[-10:]) > 0.9
+    last = told[-1]
+    reach = scene.joints_m[rows[-1], 8] - scene.joints_m[rows[-1], 5]
+    cosine = last.pointing_direction @ reach / np.linalg.norm(reach)
+    assert cosine > math.cos(math.radians(15))
+
+
+def test_a_frame_without_a_hand_has_no_gesture() -> None:
+    scene, tracker = sample(), make_tracker()
+    first = tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
+    empty = tracker.step(np.zeros_like(scene.depth_m[0]), scene.k, 1, 0.04)
+    assert (first.gesture, empty.gesture) == ("palm", "")
+    assert math.isnan(empty.gesture_probability)
+    assert make_tracker("gestures=none").step(scene.depth_m[0], scene.k, 0, 0.0).gesture == ""

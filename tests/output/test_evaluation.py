@@ -1,0 +1,258 @@
+"""Evaluation: against a second implementation, frame by frame, and against cases done by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toftrack.errors import ToftrackError
+from toftrack.frames import Truth
+from toftrack.output.evaluation import evaluate, metrics_table
+
+
+def random_case(seed: int) -> tuple[np.ndarray, np.ndarray, Truth]:
+    """Estimates, lost flags and truth with gaps, occlusions, failures and other poses."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(20, 80))
+
+    def blocks(probability: float) -> np.ndarray:
+        changes = rng.random(count) < probability
+        return (np.cumsum(changes) % 2).astype(bool)
+
+    visible, in_space = ~blocks(0.08), ~blocks(0.05)
+    fraction = np.where(visible, rng.choice([0.5, 0.8, 0.95, 1.0], count), 0.0)
+    truth = Truth(
+        joints_m=rng.normal(0, 0.1, (count, 21, 3)) + (0, 0, 0.6),
+        visible=visible,
+        in_space=in_space,
+        visible_fraction=fraction if seed % 3 else None,
+        joint_visible=rng.random((count, 21)) < 0.8 if seed % 2 else None,
+    )
+    size = rng.choice([0.005, 0.02, 0.05], (count, 1, 1))
+    joints = truth.joints_m + rng.normal(0, 1, (count, 21, 3)) * size / 2
+    joints[rng.random(count) < 0.1] = np.nan
+    joints[rng.random(count) < 0.03, 5, 2] = np.inf
+    lost = (~visible) ^ (rng.random(count) < 0.2)
+    return joints, lost, truth
+
+
+def by_loops(
+    joints: np.ndarray, lost: np.ndarray, truth: Truth, skip: int, ok: float, near: float, hold: int
+) -> dict[str, Any]:
+    """The definitions, spelled out a frame and a joint at a time."""
+    count = len(truth.joints_m)
+    errors: dict[int, list[float]] = {}
+    aligned: dict[int, list[float]] = {}
+    for t in range(count):
+        if not np.isfinite(joints[t]).all():
+            continue
+        shift = joints[t, 0] - truth.joints_m[t, 0]
+        errors[t], aligned[t] = [], []
+        for j in range(21):
+            away = joints[t, j] - truth.joints_m[t, j]
+            errors[t].append(1000 * math.sqrt(sum(away**2)))
+            if j > 0:
+                aligned[t].append(1000 * math.sqrt(sum((away - shift) ** 2)))
+    present = [bool(truth.visible[t] and truth.in_space[t]) for t in range(count)]
+    used = [t for t in range(skip, count) if present[t]]
+    there = [t for t in used if t in errors]
+
+    def mean(values: list[float]) -> float | None:
+        return sum(values) / len(values) if values else None
+
+    def of(frames: list[int], rows: Any) -> list[float]:
+        return [errors[t][j] for t in frames for j in rows]
+
+    def in_view(t: int, j: int) -> bool:
+        return truth.joint_visible is None or bool(truth.joint_visible[t, j])
+
+    every = of(there, range(21))
+    result = {
+        "frames": len(used),
+        "missing_pct": 100 * (len(used) - len(there)) / max(1, len(used)),
+        "mean_mm": mean(every),
+        "median_mm": float(np.median(every)) if every else None,
+        "p90_mm": float(np.percentile(every, 90)) if every else None,
+        "fingertip_mm": mean(of(there, (4, 8, 12, 16, 20))),
+        "wrist_aligned_mm": mean([e for t in there for e in aligned[t]]),
+        "visible_joints_mm": mean(
+            [errors[t][j] for t in there for j in range(21) if in_view(t, j)]
+        ),
+        f"frames_max_below_{ok:g}mm_pct": 100
+        * sum(max(errors[t]) < ok for t in there)
+        / max(1, len(used)),
+        "mean_not_lost_mm": mean(of([t for t in there if not lost[t]], range(21))),
+    }
+
+    def tracked(t: int) -> bool:
+        return t in errors and sum(errors[t]) / 21 < near and not lost[t]
+
+    def delay(start: int) -> int | None:
+        for t in range(start, count):
+            if not present[t]:
+                return None
+            if all(tracked(s) for s in range(t, min(t + hold, count))):
+                return t - start
+        return None
+
+    fraction = truth.visible_fraction
+    fraction = truth.visible.astype(float) if fraction is None else fraction
+    events = []
+    for t in range(1, count):
+        if truth.visible[t] and not truth.visible[t - 1]:
+            events.append(("return", t))
+            first = next((s for s in range(t, count) if fraction[s] >= 0.9), None)
+            if first is not None:
+                events.append(("entered", first))
+        if truth.in_space[t] and not truth.in_space[t - 1]:
+            events.append(("in_space", t))
+    since = 0  # first frame after the hand was last in full view
+    for t in range(count):
+        if fraction[t] >= 0.9:
+            before = range(since, t)
+            if any(fraction[s] < 0.7 for s in before) and all(truth.visible[s] for s in before):
+                events.append(("unoccluded", t))
+            if any(fraction[s] < 0.7 for s in before):
+                since = t + 1
+    result["reacquisition"] = sorted((frame, event, delay(frame)) for event, frame in events)
+    return result
+
+
+def lost_by_loops(
+    lost: np.ndarray, truth: Truth, skip: int, tolerance: int
+) -> tuple[float | None, float | None]:
+    count = len(lost)
+    absent = [not (truth.visible[t] and truth.in_space[t]) for t in range(count)]
+    hits = flagged = positive = 0
+    for t in range(skip, count):
+        # A change lies between two frames, half a frame from each.
+        if any(
+            absent[c] != absent[c - 1] and abs(t - (c - 0.5)) <= tolerance for c in range(1, count)
+        ):
+            continue
+        hits += bool(lost[t] and absent[t])
+        flagged += bool(lost[t])
+        positive += bool(absent[t])
+    return hits / flagged if flagged else None, hits / positive if positive else None
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_agrees_with_a_second_implementation(seed: int) -> None:
+    joints, lost, truth = random_case(seed)
+    skip, ok, near, hold = (
+        seed % 7,
+        (40.0, 25.0)[seed % 2],
+        (25.0, 60.0)[seed % 3 > 0],
+        1 + seed % 4,
+    )
+    found = evaluate(joints, lost, truth, skip, ok, near, hold, tolerance=seed % 5)
+    expected = by_loops(joints, lost, truth, skip, ok, near, hold)
+    events = sorted((e["frame"], e["event"], e["delay"]) for e in found.pop("reacquisition"))
+    assert events == expected.pop("reacquisition")
+    for tolerance, suffix in ((seed % 5, ""), (None, "_strict")):
+        pair = lost_by_loops(lost, truth, skip, -1 if tolerance is None else tolerance)
+        expected[f"lost_precision{suffix}"], expected[f"lost_recall{suffix}"] = pair
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert found[name] == (None if value is None else pytest.approx(value, rel=1e-9)), name
+
+
+def still_hand(count: int, **flags: Any) -> Truth:
+    ones = np.ones(count, bool)
+    joints = np.random.default_rng(0).normal(0, 0.1, (1, 21, 3)).repeat(count, axis=0)
+    return Truth(**({"joints_m": joints, "visible": ones, "in_space": ones} | flags))
+
+
+def test_a_shift_is_its_length_and_vanishes_when_aligned() -> None:
+    truth = still_hand(10)
+    metrics = evaluate(truth.joints_m + (0.003, 0, 0.004), np.zeros(10, bool), truth)
+    assert metrics["frames"] == 5
+    for name in ("mean_mm", "median_mm", "p90_mm", "fingertip_mm", "mean_not_lost_mm"):
+        assert metrics[name] == pytest.approx(5.0)
+    assert metrics["wrist_aligned_mm"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["frames_max_below_40mm_pct"] == 100
+    assert metrics["lost_precision"] is None
+    assert metrics["reacquisition"] == []
+
+
+def test_flagging_cannot_improve_the_error() -> None:
+    truth = still_hand(20)
+    joints = truth.joints_m.copy()
+    joints[10:] += 0.1
+    honest = evaluate(joints, np.zeros(20, bool), truth)
+    flagged = evaluate(joints, np.arange(20) >= 10, truth)
+    assert flagged["mean_mm"] == honest["mean_mm"]
+    assert flagged["frames_max_below_40mm_pct"] == honest["frames_max_below_40mm_pct"]
+    assert flagged["mean_not_lost_mm"] == pytest.approx(0)
+
+
+def test_missing_estimates_count_as_failures() -> None:
+    truth = still_hand(15)
+    joints = truth.joints_m.copy()
+    joints[5:10, 7] = np.nan
+    metrics = evaluate(joints, None, truth)
+    assert metrics["missing_pct"] == 50
+    assert metrics["frames_max_below_40mm_pct"] == 50
+    assert metrics["mean_mm"] == 0
+    assert "lost_precision" not in metrics
+
+
+def test_no_estimate_at_all_has_no_error() -> None:
+    truth = still_hand(10)
+    metrics = evaluate(np.full((10, 21, 3), np.nan), np.ones(10, bool), truth)
+    assert metrics["mean_mm"] is None
+    assert metrics["missing_pct"] == 100
+
+
+def test_reacquisition_counts_frames_until_it_holds() -> None:
+    visible = np.ones(30, bool)
+    visible[10:15] = False
+    truth = still_hand(30, visible=visible, visible_fraction=visible * 1.0)
+    joints = truth.joints_m.copy()
+    joints[10:20] += 0.1
+    joints[21] += 0.1  # one good frame, 20, does not hold
+    assert evaluate(joints, np.zeros(30, bool), truth)["reacquisition"] == [
+        {"event": "return", "frame": 15, "delay": 7},
+        {"event": "entered", "frame": 15, "delay": 7},
+    ]
+    never = evaluate(joints, np.ones(30, bool), truth)["reacquisition"]
+    assert [event["delay"] for event in never] == [None, None]
+
+
+def test_lost_tolerance_forgives_only_near_a_change() -> None:
+    visible = np.ones(30, bool)
+    visible[10:20] = False
+    truth = still_hand(30, visible=visible)
+    late = np.zeros(30, bool)
+    late[13:23] = True  # three frames late at both ends
+    metrics = evaluate(truth.joints_m, late, truth, tolerance=3)
+    assert (metrics["lost_precision"], metrics["lost_recall"]) == (1.0, 1.0)
+    assert (metrics["lost_precision_strict"], metrics["lost_recall_strict"]) == (0.7, 0.7)
+    stricter = evaluate(truth.joints_m, late, truth, tolerance=2)
+    assert stricter["lost_recall"] == pytest.approx(5 / 6)
+
+
+@pytest.mark.parametrize("shape", [(9, 21, 3), (10, 20, 3), (10, 63)])
+def test_other_shapes_than_the_truth_are_told(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ToftrackError, match="shape"):
+        evaluate(np.zeros(shape), None, still_hand(10))
+
+
+def test_table_shows_the_figures() -> None:
+    truth = still_hand(10)
+    summary = {
+        "frames": 10,
+        "lost_frames": 2,
+        "mean_ms": 12.34,
+        "fps": 81.0,
+        "mean_score": None,
+        "metrics": evaluate(truth.joints_m + (0.003, 0, 0.004), np.zeros(10, bool), truth),
+    }
+    table = metrics_table(summary)
+    for words in ("2 of them lost", "12.3 ms", "81.0 frames/s", "5.0 mm", "40 mm", "100.0 %"):
+        assert words in table
+    del summary["metrics"]
+    assert "joint error" not in metrics_table(summary)

@@ -1,0 +1,237 @@
+"""Results: the promised files with the promised content, also for a run that ended early."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate, no_estimate
+from toftrack.frames import Truth
+from toftrack.output.evaluation import evaluate
+from toftrack.output.results import ResultWriter, read_results
+
+NAMES = tuple(f"joint_{i}" for i in range(21))
+
+
+def estimate(index: int, **changes: Any) -> Estimate:
+    rng = np.random.default_rng(index)
+    whole = Estimate(
+        index=index,
+        timestamp_s=index / 25,
+        state_name="tracking",
+        lost=index % 4 == 3,
+        joints_m=rng.normal(size=(21, 3)).astype(np.float32),
+        state=rng.normal(size=27).astype(np.float32),
+        latent=rng.normal(size=4).astype(np.float32),
+        score=0.5 + index / 100,
+        covariance=rng.normal(size=(10, 10)).astype(np.float32),
+        effective_sample_size=100.0 + index,
+        compute_s=0.01 * (1 + index),
+        gesture="palm",
+        gesture_probability=0.75,
+    )
+    return dataclasses.replace(whole, **changes)
+
+
+def write(folder: Path, estimates: list[Estimate], truth: Truth | None = None) -> ResultWriter:
+    with ResultWriter(folder, {"seed": 1}, NAMES, truth) as writer:
+        for one in estimates:
+            writer.append(one)
+    return writer
+
+
+def truth_of(estimates: list[Estimate], frames: int) -> Truth:
+    joints = np.zeros((frames, 21, 3), np.float32)
+    for one in estimates:
+        joints[one.index] = one.joints_m + np.float32(0.01)
+    return Truth(joints, np.ones(frames, bool), np.ones(frames, bool))
+
+
+def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(i) for i in range(6)])
+    promised = {
+        "joints_m": ((6, 21, 3), "f4"),
+        "lost": ((6,), "?"),
+        "state": ((6, 27), "f4"),
+        "latent": ((6, 4), "f4"),
+        "score": ((6,), "f4"),
+        "covariance": ((6, 10, 10), "f4"),
+        "effective_sample_size": ((6,), "f4"),
+        "gesture_probability": ((6,), "f4"),
+        "pointing_origin_m": ((6, 3), "f4"),
+        "pointing_direction": ((6, 3), "f4"),
+        "timestamp_s": ((6,), "f8"),
+        "compute_s": ((6,), "f4"),
+    }
+    with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
+        assert set(archive.files) == {*promised, "gesture", "joint_names", "metadata"}
+        for name, (shape, kind) in promised.items():
+            assert archive[name].shape == shape, name
+            assert archive[name].dtype == np.dtype(kind), name
+        assert archive["gesture"].dtype.kind == "U"
+        assert archive["joint_names"].tolist() == list(NAMES)
+        assert json.loads(archive["metadata"].item()) == {"seed": 1}
+
+
+def test_read_results_gives_back_what_was_appended(tmp_path: Path) -> None:
+    estimates = [estimate(i) for i in range(3)]
+    write(tmp_path, estimates)
+    content = read_results(tmp_path / "track.npz")
+    assert content["joint_names"] == NAMES
+    assert content["metadata"] == {"seed": 1}
+    for row, one in enumerate(estimates):
+        for name in ("joints_m", "state", "latent", "covariance", "lost", "gesture"):
+            np.testing.assert_array_equal(content[name][row], getattr(one, name))
+        assert content["score"][row] == pytest.approx(one.score)
+
+
+def test_each_line_is_on_disk_when_its_frame_is_done(tmp_path: Path) -> None:
+    writer = ResultWriter(tmp_path, {}, NAMES, None)
+    for i in range(3):
+        writer.append(estimate(i))
+        lines = (tmp_path / "track.jsonl").read_text().splitlines()
+        assert [json.loads(line)["index"] for line in lines] == list(range(i + 1))
+    assert not (tmp_path / "track.npz").exists()
+    writer.close()
+    line = json.loads(lines[1])
+    one = estimate(1)
+    np.testing.assert_allclose(line["joints_m"], one.joints_m, rtol=1e-6)
+    np.testing.assert_allclose(line["covariance"], one.covariance, rtol=1e-6)
+    assert (line["state_name"], line["lost"], line["gesture"]) == ("tracking", False, "palm")
+
+
+def test_frames_without_estimate_are_null_in_lines_and_nan_in_arrays(tmp_path: Path) -> None:
+    write(tmp_path, [no_estimate(0, 0.0, "initialising", 4, 0.01), estimate(1)])
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is not JSON")
+
+    text = (tmp_path / "track.jsonl").read_text()
+    first, second = (json.loads(line, parse_constant=refuse) for line in text.splitlines())
+    assert first["joints_m"][0] == [None] * 3
+    assert first["gesture_probability"] is None
+    assert first["lost"] is True
+    assert second["joints_m"][0][0] is not None
+    content = read_results(tmp_path / "track.npz")
+    assert np.isnan(content["joints_m"][0]).all()
+    assert np.isfinite(content["joints_m"][1]).all()
+    json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
+
+
+def test_summary_counts_and_averages(tmp_path: Path) -> None:
+    writer = write(tmp_path, [estimate(i) for i in range(5)])
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary == writer.summary
+    assert summary["frames"] == 5
+    assert summary["lost_frames"] == 1
+    assert summary["mean_ms"] == pytest.approx(30)
+    assert summary["median_ms"] == pytest.approx(30)
+    assert summary["fps"] == pytest.approx(100 / 3)
+    assert summary["mean_score"] == pytest.approx(0.52)
+    assert "metrics" not in summary
+
+
+def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
+    estimates = [estimate(i) for i in range(12)]
+    truth = truth_of(estimates, frames=20)  # the run was interrupted after 12 of 20
+    summary = write(tmp_path, estimates, truth).summary
+    joints = np.array([one.joints_m for one in estimates])
+    lost = np.array([one.lost for one in estimates])
+    assert summary["metrics"] == evaluate(joints, lost, truth[:12])
+    assert summary["metrics"]["mean_mm"] == pytest.approx(10 * math.sqrt(3), rel=1e-4)
+
+
+def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        with ResultWriter(tmp_path, {}, NAMES, None) as writer:
+            writer.append(estimate(0))
+            writer.append(estimate(1))
+            raise KeyboardInterrupt
+    assert read_results(tmp_path / "track.npz")["joints_m"].shape == (2, 21, 3)
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
+
+
+def test_no_frame_at_all_still_gives_whole_files(tmp_path: Path) -> None:
+    write(tmp_path, [], truth_of([], 5))
+    assert read_results(tmp_path / "track.npz")["joints_m"].shape == (0, 21, 3)
+    assert json.loads((tmp_path / "summary.json").read_text())["mean_ms"] is None
+
+
+def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
+    done = [estimate(i) for i in (2, 3, 6, 7)]
+    truth = Truth(np.zeros((6, 21, 3)), np.ones(6, bool), np.ones(6, bool))
+    summary = write(tmp_path, done, truth).summary
+    content = read_results(tmp_path / "track.npz")
+    rows = [2, 3, 3, 3, 6, 7]
+    np.testing.assert_array_equal(
+        content["joints_m"], np.array([estimate(i).joints_m for i in rows])
+    )
+    np.testing.assert_allclose(content["timestamp_s"], np.arange(2, 8) / 25)
+    assert content["compute_s"][2:4].tolist() == [0, 0]
+    assert content["metadata"]["held_frames"] == [4, 5]
+    assert summary["frames"] == 6
+    assert summary["mean_ms"] == pytest.approx(1e3 * np.mean([one.compute_s for one in done]))
+
+
+def test_closing_twice_writes_once(tmp_path: Path) -> None:
+    writer = write(tmp_path, [estimate(0)])
+    (tmp_path / "summary.json").unlink()
+    writer.close()
+    assert not (tmp_path / "summary.json").exists()
+
+
+def test_no_partial_file_is_left(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(0)])
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "summary.json",
+        "track.jsonl",
+        "track.npz",
+    ]
+
+
+def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
+    metadata = {"K": np.eye(2), "file": Path("a"), "unknown": math.nan, "n": np.int64(3)}
+    ResultWriter(tmp_path, metadata, NAMES, None).close()
+    assert read_results(tmp_path / "track.npz")["metadata"] == {
+        "K": [[1, 0], [0, 1]],
+        "file": "a",
+        "unknown": None,
+        "n": 3,
+    }
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ToftrackError, match="file.*cannot be written.*hydra.run.dir"):
+        ResultWriter(tmp_path / "file" / "out", {}, NAMES, None)
+
+
+def test_a_result_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    writer = ResultWriter(tmp_path, {}, NAMES, None)
+    writer.append(estimate(0))
+    (tmp_path / "track.npz.part").mkdir()
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        writer.close()
+    assert (tmp_path / "track.jsonl").read_text().count("\n") == 1
+
+
+@pytest.mark.parametrize("content", [None, b"", b"text", b"PK\x03\x04broken"])
+def test_a_file_that_is_no_result_is_told(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "track.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ToftrackError, match="track.npz"):
+        read_results(path)
+
+
+def test_a_result_without_a_key_is_told(tmp_path: Path) -> None:
+    np.savez(tmp_path / "track.npz", lost=np.zeros(3, bool))
+    with pytest.raises(ToftrackError, match="joints_m"):
+        read_results(tmp_path / "track.npz")

@@ -1,0 +1,286 @@
+"""Estimates for other programs: as lines on standard output, as datagrams, never in the way."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+from helpers.tracking import CONF, ROOT, configuration, run
+
+from toftrack.devices.sample import Sample
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate, no_estimate
+from toftrack.output.results import LINE_FIELDS, json_line, read_results
+from toftrack.output.stream import NoStream, ReaderGoneError, StdoutStream, UdpStream
+
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+NUMBERS = np.random.default_rng(0)
+
+
+def estimate(index: int) -> Estimate:
+    """As long a line as of a tracked hand."""
+    return replace(
+        no_estimate(index, index / 25, "tracking", 4, 0.01),
+        joints_m=NUMBERS.random((21, 3), np.float32),
+        covariance=NUMBERS.random((10, 10), np.float32),
+    )
+
+
+@contextmanager
+def piped() -> Iterator[int]:
+    """The reading end of a pipe that is this process's standard output meanwhile.
+
+    No fixture: pytest's own capturing begins anew between a fixture and its test.
+    """
+    sys.stdout.flush()
+    kept = os.dup(1)
+    reading, writing = os.pipe()
+    os.dup2(writing, 1)
+    os.close(writing)
+    try:
+        yield reading
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(reading)
+
+
+def lines_of(reading: int, until: Callable[[bytes], bool]) -> list[dict]:
+    content = b""
+    while not until(content):
+        assert select.select((reading,), (), (), 20)[0], "nothing more comes"
+        content += os.read(reading, 1 << 16)
+    return [json.loads(line) for line in content.splitlines()]
+
+
+def ends_with(index: int) -> Callable[[bytes], bool]:
+    start = f'{{"index":{index},'.encode()
+    return lambda content: content.endswith(b"\n") and content.splitlines()[-1].startswith(start)
+
+
+@pytest.fixture
+def receiver() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.settimeout(20)
+        yield listening
+
+
+def test_a_reader_of_standard_output_gets_every_line_as_in_track_jsonl() -> None:
+    sent = [estimate(i) for i in range(5)]
+    with piped() as pipe, StdoutStream() as stream:
+        for one in sent:
+            stream.send(one)
+            assert lines_of(pipe, ends_with(one.index)) == [json.loads(json_line(one))]
+
+
+def test_nothing_else_gets_to_standard_output() -> None:
+    script = """
+import os
+from toftrack.estimate import no_estimate
+from toftrack.output.stream import StdoutStream
+with StdoutStream() as stream:
+    print("printed")
+    os.system("echo from below")
+    stream.send(no_estimate(1, 0.0, 'lost', 4, 0.0))
+print("after")
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    first, second = told.stdout.splitlines()
+    assert json.loads(first)["index"] == 1 and second == "after"
+    assert "printed" in told.stderr and "from below" in told.stderr
+
+
+def test_a_reader_that_falls_behind_gets_the_newest_and_whole_lines(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    found: list[dict] = []
+    with piped() as pipe:
+        reader = threading.Thread(target=lambda: found.extend(lines_of(pipe, ends_with(299))))
+        with StdoutStream(waiting=3) as stream:
+            for i in range(300):
+                stream.send(estimate(i))
+            reader.start()
+        reader.join(20)
+    indices = [line["index"] for line in found]
+    assert indices == sorted(set(indices)) and indices[-3:] == [297, 298, 299]
+    assert indices[0] == 0 and 5 < len(indices) < 200
+    assert f"{len(indices)} estimates sent" in caplog.text
+    assert f"{300 - len(indices)} dropped (the reader was too slow)" in caplog.text
+
+
+def test_a_reader_that_never_reads_stops_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    with piped(), StdoutStream(waiting=1) as stream:
+        for i in range(300):
+            stream.send(estimate(i))
+    words = caplog.text.split()
+    sent, dropped = (int(words[words.index(word) - 1]) for word in ("estimates", "dropped"))
+    assert sent + dropped == 300 and dropped > 100
+
+
+def test_a_reader_that_goes_away_is_told_at_once() -> None:
+    reading, writing = os.pipe()
+    kept = os.dup(1)
+    os.dup2(writing, 1)
+    try:
+        with pytest.raises(ReaderGoneError, match="Broken pipe"), StdoutStream() as stream:
+            stream.send(estimate(0))
+            os.close(reading)
+            stream.send(estimate(1))
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(writing)
+
+
+def test_a_datagram_is_a_whole_line(receiver: socket.socket) -> None:
+    with UdpStream(*receiver.getsockname()) as stream:
+        for i in range(3):
+            stream.send(one := estimate(i))
+            assert receiver.recv(65535).decode() == json_line(one) + "\n"
+
+
+def test_datagrams_that_nobody_wants_stop_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with UdpStream("127.0.0.1", port) as stream:
+        for i in range(50):
+            stream.send(estimate(i))
+    assert f"50 estimates sent to 127.0.0.1 port {port}, 0 dropped" in caplog.text
+
+
+def test_datagrams_that_the_system_refuses_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    """A broadcast address, which needs a permission that the stream does not ask for."""
+    caplog.set_level(logging.INFO)
+    with UdpStream("255.255.255.255", 5005) as stream:
+        for i in range(3):
+            stream.send(estimate(i))
+    assert "0 estimates sent" in caplog.text and "3 dropped (" in caplog.text
+
+
+def test_a_receiver_that_never_reads_stops_nothing(receiver: socket.socket) -> None:
+    with UdpStream(*receiver.getsockname()) as stream:
+        for i in range(1000):
+            stream.send(estimate(i))
+    assert json.loads(receiver.recv(65535))["index"] == 0
+
+
+def test_only_the_wanted_fields_are_sent(receiver: socket.socket) -> None:
+    with UdpStream(*receiver.getsockname(), fields=["lost", "joints_m", "index"]) as stream:
+        stream.send(estimate(7))
+    line = json.loads(receiver.recv(65535))
+    assert list(line) == ["lost", "joints_m", "index"] and line["index"] == 7
+
+
+def test_the_fields_that_the_configuration_advises_fit_into_one_ethernet_frame() -> None:
+    text = (CONF / "stream" / "udp.yaml").read_text()
+    assert "[index,timestamp_s,lost,joints_m]" in text
+    found = estimate(10000)
+    # Numbers of as many digits as there are; only depth is never negative.
+    joints = np.full((21, 3), -0.12345678, np.float32) * np.float32([1, 1, -1])
+    wanted = ("index", "timestamp_s", "lost", "joints_m")
+    line = json_line(replace(found, joints_m=joints, timestamp_s=12345.678901), wanted)
+    assert len(line) + 1 <= 1472
+    assert len(json_line(found)) < 6000, "and all fields are as long as it says"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["stream=udp", "stream.port=0"], "stream.port=0"),
+        (["stream=udp", "stream.port=70000"], "stream.port=70000"),
+        (["stream=udp", "stream.port=none"], "stream.port='none'"),
+        (["stream=udp", "stream.host=" + "a" * 70], "stream.host=aaa"),
+        (["stream=udp", "stream.fields=[joints]"], "'joints'"),
+        (["stream=stdout", "stream.fields=[]"], "stream.fields is empty"),
+        (["stream=stdout", "stream.waiting=0"], "stream.waiting=0"),
+    ],
+)
+def test_a_bad_setting_is_one_clear_error(overrides: list[str], words: str) -> None:
+    with pytest.raises(hydra.errors.InstantiationException) as caught:
+        hydra.utils.instantiate(configuration(*overrides).stream)
+    assert isinstance(caught.value.__cause__, ToftrackError)
+    assert words in str(caught.value.__cause__)
+
+
+def test_no_stream_takes_everything() -> None:
+    with hydra.utils.instantiate(configuration().stream) as stream:
+        assert isinstance(stream, NoStream)
+        stream.send(estimate(0))
+
+
+def program(*arguments: str, folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "track.py"), "view=none", "hydra.run.dir=out", *arguments],
+        cwd=folder,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_standard_output_is_the_stream_s_alone_and_the_table_goes_to_standard_error(
+    tmp_path: Path,
+) -> None:
+    process = program("stream=stdout", "device.stop=6", *QUICK, folder=tmp_path)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert out == (tmp_path / "out" / "track.jsonl").read_text()
+    assert tuple(json.loads(out.splitlines()[0])) == LINE_FIELDS
+    assert "joint error, mean" in err and "track.npz" in err
+    assert "stream: 6 estimates sent to standard output, 0 dropped" in err
+
+
+def test_a_reader_that_has_enough_ends_the_tracking_and_its_results_are_kept(
+    tmp_path: Path,
+) -> None:
+    process = program("stream=stdout", *QUICK, folder=tmp_path)
+    first = [json.loads(process.stdout.readline()) for _ in range(2)]
+    process.stdout.close()
+    err = process.stderr.read()
+    assert process.wait(timeout=120) == 0, err
+    assert "standard output takes no more lines (Broken pipe): tracking ends here" in err
+    assert "Traceback" not in err and "error:" not in err
+    lines = (tmp_path / "out" / "track.jsonl").read_text().splitlines()
+    assert [json.loads(line) for line in lines[:2]] == first
+    done = read_results(tmp_path / "out" / "track.npz")
+    assert len(done["lost"]) == len(lines) < 100
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["frames"] == len(lines)
+
+
+@pytest.mark.parametrize("results", [False, True])
+def test_what_is_streamed_is_smooth_and_the_files_are_only_if_asked(
+    tmp_path: Path, receiver: socket.socket, results: bool
+) -> None:
+    port = f"stream.port={receiver.getsockname()[1]}"
+    smooth = ("smooth=one_euro", f"smooth.results={results}")
+    run(tmp_path, Sample(stop=5), "stream=udp", port, *smooth, "view=none", *QUICK)
+    sent = [json.loads(receiver.recv(65535)) for _ in range(5)]
+    kept = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
+    assert (sent == kept) == results
+    assert [line["score"] for line in sent] == [line["score"] for line in kept]

@@ -1,0 +1,273 @@
+"""Poses to learn from: users' files, mixtures, held-out clips, the command."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
+from toftrack.pose_space.data.pose_data import PoseData, mixed_data, spread_out, synthetic_data
+from toftrack.pose_space.data.pose_files import file_data
+from toftrack.pose_space.files import fit_pose_space, load_pose_space, pose_space_sources
+from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
+from toftrack.pose_space.reach import nearest_latents
+from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
+
+ROOT = Path(__file__).parents[2]
+LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
+
+
+def random_angles(count: int, seed: int = 0, part: float = 0.6) -> torch.Tensor:
+    """Poses in the inner part of the joint limits, (count, 21) float64."""
+    unit = torch.rand(count, 21, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return LIMITS.mean(1) + part * (unit - 0.5) * (LIMITS[:, 1] - LIMITS[:, 0])
+
+
+def write_csv(path: Path, angles: np.ndarray, names=ANGLE_NAMES, units="degrees") -> str:
+    lines = [f"# units: {units}"] if units else []
+    lines.append(",".join(names))
+    lines += [",".join(f"{value:.6f}" for value in row) for row in angles]
+    path.write_text("\n".join(lines) + "\n")
+    return str(path)
+
+
+@pytest.mark.parametrize("units", ["degrees", "radians"])
+@pytest.mark.parametrize("said_by", ["file", "setting"])
+def test_a_csv_of_angles_is_read_in_its_units_and_any_order(
+    tmp_path: Path, units: str, said_by: str
+) -> None:
+    radians = random_angles(6)
+    values = (radians.rad2deg() if units == "degrees" else radians).numpy()
+    path = write_csv(
+        tmp_path / "mine.csv",
+        values[:, ::-1],
+        ANGLE_NAMES[::-1],
+        units if said_by == "file" else None,
+    )
+    data = file_data(path, None if said_by == "file" else units)
+    torch.testing.assert_close(data.angles_rad, radians, atol=1e-5, rtol=0)
+    assert data.labels == ("mine",) * 6
+
+
+def test_labels_and_clips_beside_the_angles_are_read_and_other_columns_left_alone(
+    tmp_path: Path,
+) -> None:
+    rows = random_angles(3).rad2deg().tolist()
+    lines = ["# units: degrees", ",".join(("label", "clip", "note", *ANGLE_NAMES))]
+    for label, clip, row in zip("xyx", "112", rows, strict=True):
+        lines.append(",".join((label, clip, "hello", *map(str, row))))
+    (tmp_path / "mine.csv").write_text("\n".join(lines))
+    data = file_data(str(tmp_path / "mine.csv"))
+    assert data.labels == ("x", "y", "x")
+    assert data.clips.tolist() == [0, 0, 1]
+
+
+def test_an_npz_of_angles_is_read(tmp_path: Path) -> None:
+    radians = random_angles(4)
+    np.savez(
+        tmp_path / "mine.npz",
+        angles=radians.numpy()[:, ::-1],
+        angle_names=np.array(ANGLE_NAMES[::-1]),
+        units=np.array("radians"),
+        labels=np.array(["p", "q", "p", "q"]),
+    )
+    data = file_data(str(tmp_path / "mine.npz"))
+    torch.testing.assert_close(data.angles_rad, radians)
+    assert data.clips.tolist() == [0, 1, 0, 1]
+
+
+def broken(kind: str, path: Path) -> str:
+    values = random_angles(5).rad2deg().numpy()
+    if kind == "missing column":
+        return write_csv(path, values[:, :-1], ANGLE_NAMES[:-1])
+    if kind == "radians as degrees":
+        return write_csv(path, np.radians(values))
+    if kind == "degrees as radians":
+        return write_csv(path, values, units="radians")
+    if kind == "no units":
+        return write_csv(path, values, units=None)
+    if kind == "odd units":
+        return write_csv(path, values, units="gradians")
+    if kind == "nan":
+        values[3, 2] = np.nan
+    if kind == "other signs":
+        values[:, 6::4] = -80.0
+    if kind == "one pose":
+        values = values[:1]
+    write_csv(path, values)
+    if kind == "text":
+        path.write_text(path.read_text() + ",".join(["1"] * 20 + ["much"]) + "\n")
+    if kind == "short row":
+        path.write_text(path.read_text() + "1,2,3\n")
+    if kind == "semicolons":
+        path.write_text(path.read_text().replace(",", ";"))
+    if kind == "column twice":
+        path.write_text(path.read_text().replace("index_mcp_abduction", "thumb_ip_flexion"))
+    if kind == "infinite":
+        path.write_text(path.read_text() + ",".join(["1"] * 20 + ["inf"]) + "\n")
+    if kind == "no value":
+        path.write_text(path.read_text() + "1," * 20 + "\n")
+    if kind == "empty":
+        path.write_text("")
+    if kind == "binary":
+        path.write_bytes(bytes(range(256)))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "part"),
+    [
+        ("missing column", "no column 'little_dip_flexion'"),
+        ("text", "little_dip_flexion of pose 6 is 'much', not a number"),
+        ("nan", "thumb_mcp_abduction of pose 4 is not a finite number"),
+        ("radians as degrees", "data.units=radians"),
+        ("degrees as radians", "data.units=degrees"),
+        ("no units", "does not say its units"),
+        ("odd units", "unknown units 'gradians'"),
+        ("other signs", "beyond a hand's joint limits"),
+        ("short row", "pose 6 has 3 values for 21 columns"),
+        ("one pose", "holds 1 poses"),
+        ("infinite", "little_dip_flexion of pose 6 is not a finite number"),
+        ("no value", "little_dip_flexion of pose 6 is '', not a number"),
+        ("semicolons", "no header of comma-separated names"),
+        ("column twice", "2 columns 'thumb_ip_flexion'"),
+        ("empty", "is empty"),
+        ("binary", "comma-separated text in UTF-8"),
+    ],
+)
+def test_a_bad_csv_is_one_clear_sentence(tmp_path: Path, kind: str, part: str) -> None:
+    path = broken(kind, tmp_path / "mine.csv")
+    with pytest.raises(ToftrackError, match=part) as error:
+        file_data(path)
+    assert path in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "part"),
+    [
+        ({"poses": np.zeros((3, 21))}, "no array 'angles'"),
+        ({"angles": np.zeros((3, 20))}, "of the shape"),
+        ({"angles": np.array([["a"] * 21])}, "must be numbers"),
+        ({"angles": np.array([{}] * 21, dtype=object)}, "'angles' holds pickled objects"),
+        ({"angles": np.ones((3, 21)), "labels": np.array(["a"])}, "1 'labels' for 3 poses"),
+        ({"angles": np.ones((3, 21)), "angle_names": np.array(["a"] * 21)}, "does not name"),
+    ],
+)
+def test_a_bad_npz_is_one_clear_sentence(tmp_path: Path, content: dict, part: str) -> None:
+    np.savez(tmp_path / "mine.npz", **content)
+    with pytest.raises(ToftrackError, match=part):
+        file_data(str(tmp_path / "mine.npz"), "radians")
+
+
+def test_a_file_that_is_missing_or_of_another_kind_is_one_clear_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="data.path=FILE"):
+        file_data(str(tmp_path / "nothing.csv"))
+    with pytest.raises(ToftrackError, match="neither .csv nor .npz"):
+        file_data(str(tmp_path / "mine.xlsx"))
+
+
+def test_poses_a_little_beyond_the_limits_are_clamped_and_counted(tmp_path: Path) -> None:
+    values = random_angles(4).rad2deg().numpy()
+    values[2, 5] = 29.0
+    data = file_data(write_csv(tmp_path / "mine.csv", values))
+    assert float(data.angles_rad[2, 5]) == pytest.approx(math.radians(25))
+    assert "1 of them clamped" in data.notes[0]
+
+
+def test_the_poses_that_cover_a_set_are_its_extremes_first() -> None:
+    line = torch.linspace(0, 1, 101).double()[:, None]
+    assert spread_out(line, 3).tolist() == [0, 50, 100]
+    assert spread_out(line, 500).tolist() == list(range(101))
+
+
+def test_a_mixture_keeps_clips_and_sources_apart(tmp_path: Path) -> None:
+    mine = file_data(write_csv(tmp_path / "mine.csv", random_angles(300).rad2deg().numpy()))
+    both = mixed_data({"synthetic": synthetic_data(), "mine": mine}, poses=100)
+    assert len(both) == 179
+    assert both.labels.count("mine") == 100
+    assert len(both.clips.unique()) == len(synthetic_data().clips.unique()) + 1
+    assert [source["data"] for source in both.sources] == ["synthetic", "file"]
+    with pytest.raises(ToftrackError, match="data.parts"):
+        mixed_data({})
+
+
+def test_folds_hold_out_whole_clips_and_every_pose_once() -> None:
+    clips = torch.tensor([0] * 50 + [1] * 3 + [2] * 20 + [3] * 20 + [4])
+    seen = []
+    for training, out in clip_folds(clips, 3):
+        assert not set(clips[training].tolist()) & set(clips[out].tolist())
+        assert len(training) + len(out) == len(clips)
+        seen += out.tolist()
+    assert sorted(seen) == list(range(len(clips)))
+    assert list(clip_folds(torch.zeros(9))) == []
+
+
+def test_held_out_clips_are_described_worse_than_training_poses() -> None:
+    row = evaluate_space("pca", 4, synthetic_data())
+    assert row.variance == pytest.approx(0.9788, abs=0.001)
+    assert row.training.degrees == pytest.approx(2.96, abs=0.03)
+    assert row.held_out is not None and row.held_out.degrees > row.training.degrees
+    assert 0 < row.training.mm < row.held_out.mm
+    # The projection of PCA may leave the box, but not by more than a little.
+    assert row.reached is not None and row.reached.degrees > 0.98 * row.held_out.degrees
+    text = errors_table([row])
+    assert f"{row.held_out.degrees:.2f} deg" in text and f"{row.held_out.mm:.2f} mm" in text
+
+
+def test_the_nearest_point_of_the_box_is_no_worse_than_the_encoded_one_moved_into_it() -> None:
+    poses = synthetic_data()
+    space = fit_pose_space("lle", 3)
+    found = nearest_latents(space, poses.angles_rad[::4])
+    assert (found >= space.lower - 1e-6).all() and (found <= space.upper + 1e-6).all()
+    encoded = space.encode(poses.angles_rad[::4].float()).clamp(space.lower, space.upper)
+    with_search, _ = reconstruction(space, poses.angles_rad[::4], found)
+    without, _ = reconstruction(space, poses.angles_rad[::4], encoded)
+    assert (with_search.sum(1) <= without.sum(1) + 1e-6).all()
+
+
+def test_the_nearest_point_of_a_linear_box_is_the_projection_where_that_lies_inside() -> None:
+    space = fit_pose_space("pca", 2)
+    inside = 0.3 * space.lower + 0.7 * space.upper
+    angles = space.decode_freely(inside[None]) + 0.0
+    torch.testing.assert_close(nearest_latents(space, angles)[0].float(), inside, atol=1e-3, rtol=0)
+
+
+def test_a_single_clip_has_no_held_out_figures() -> None:
+    data = PoseData(random_angles(30), ("mine",) * 30, torch.zeros(30), ({},))
+    row = evaluate_space("pca", 2, data)
+    assert row.held_out is None
+    assert " - " in errors_table([row])
+
+
+@pytest.mark.parametrize("dims", [1, 4])
+def test_figures_of_any_data_are_drawn(dims: int) -> None:
+    data = PoseData(random_angles(30), ("mine",) * 30, torch.zeros(30), ({},))
+    space = fit_pose_space("pca", dims, data)
+    assert manifold_figure(space).shape[2] == 3
+    assert traversals_figure(space, steps=3, size=60).shape == (dims * 92, 180, 3)
+    assert corners_figure(space, size=60).std() > 0
+
+
+def test_the_command_trains_on_a_users_file_and_records_it(tmp_path: Path) -> None:
+    mine = write_csv(tmp_path / "mine.csv", random_angles(40).rad2deg().numpy())
+    out = tmp_path / "out"
+    command = [sys.executable, "train_pose_space.py", "pose_space=lle", "pose_space.dims=2"]
+    command += ["data=file", f"data.path={mine}", "compare=[1]", f"hydra.run.dir={out}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "40 training poses" in done.stdout and " deg," in done.stdout
+    assert load_pose_space(out / "pose_space.npz").dims == 2
+    assert pose_space_sources(out / "pose_space.npz")[0]["file"] == "mine.csv"
+    for name in ("poses.png", "manifold.png", "traversals.png", "corners.png"):
+        assert cv2.imread(str(out / name)).std() > 0
+    errors = json.loads((out / "summary.json").read_text())["errors"]
+    assert [row["dims"] for row in errors] == [1, 2]

@@ -1,0 +1,206 @@
+"""The command line: one clear sentence for every error, and sweeps that carry on."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import toftrack
+from toftrack.configuration.sentences import sentence
+from toftrack.errors import ToftrackError
+from toftrack.programs.command_line import run
+
+APP = """
+import functools, pathlib, sys, time
+import hydra
+from hydra.utils import instantiate
+from toftrack.programs.command_line import run, sweep_job
+from toftrack.errors import ToftrackError
+
+def tell(task):
+    @functools.wraps(task)
+    def telling(config):
+        value = task(config)
+        print("value", value)
+        return value
+    return telling
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="app")
+@tell
+@sweep_job
+def main(config):
+    if config.fail == "clear":
+        raise ToftrackError("the reason, and what to do")
+    if config.fail == "unexpected":
+        raise ValueError("two\\nlines")
+    if config.fail == "wait":
+        print("waiting", flush=True)
+        time.sleep(60)
+    if config.fail == "late":
+        folder = pathlib.Path(hydra.core.hydra_config.HydraConfig.get().runtime.output_dir)
+        (folder / "summary.json").write_text('{"frames": 3}')
+        raise ToftrackError("after three frames")
+    print("replayed", instantiate(config.device).frames)
+    return 1.0
+
+if __name__ == "__main__":
+    sys.exit(run(main))
+"""
+
+
+@pytest.fixture
+def app(tmp_path: Path) -> Path:
+    folder = tmp_path / "app"
+    (folder / "conf" / "device").mkdir(parents=True)
+    (folder / "app.py").write_text(APP)
+    (folder / "conf" / "app.yaml").write_text(
+        'defaults: [_self_, {device: sample}]\nfail: ""\nseed: 1\n'
+    )
+    (folder / "conf" / "device" / "sample.yaml").write_text(
+        "_target_: toftrack.devices.sample.Sample\n"
+    )
+    (folder / "conf" / "device" / "replay.yaml").write_text(
+        "_target_: toftrack.devices.replay.Replay\npath: ???\n"
+    )
+    return folder
+
+
+def start(app: Path, *arguments: str, **environment: str) -> subprocess.Popen[str]:
+    root = str(Path(toftrack.__file__).parents[1])
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    return subprocess.Popen(
+        [sys.executable, "app.py", *arguments],
+        cwd=app,
+        env=clean | {"PYTHONPATH": root} | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def call(app: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
+    process = start(app, *arguments, **environment)
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out, err
+
+
+def test_a_run_without_error_exits_with_zero(app: Path) -> None:
+    status, out, err = call(app)
+    assert (status, err) == (0, "")
+    assert "replayed 100" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["fail=clear"], "error: the reason, and what to do"),
+        (["fail=unexpected"], "ValueError: two lines (HYDRA_FULL_ERROR=1 shows the traceback)"),
+        (["device=replay", "device.path=gone.npz"], "error: there is no file 'gone.npz'"),
+        (["device=replay"], "device.path is missing; give it on the command line"),
+        (["device=nope"], "'device/nope'; Available options in 'device': replay, sample"),
+        (["nope=1"], "Could not override 'nope'"),
+        (["seed=[1"], "'[1'"),
+        (["hydra.run.dir=app.py/out"], "'app.py/out' cannot be read or written"),
+        (["+device.bogus=1"], "unexpected keyword argument 'bogus'"),
+    ],
+)
+def test_an_error_is_one_sentence(app: Path, arguments: list[str], words: str) -> None:
+    status, out, err = call(app, *arguments)
+    assert status == 1
+    assert words in err
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1, "one line, and no traceback"
+    assert "replayed" not in out
+
+
+def test_full_errors_show_the_traceback_and_the_sentence(app: Path) -> None:
+    status, _, err = call(app, "fail=clear", HYDRA_FULL_ERROR="1")
+    assert status == 1
+    assert "Traceback" in err
+    assert "in main" in err
+    assert err.splitlines()[-1] == "error: the reason, and what to do"
+
+
+def test_ctrl_c_exits_with_130(app: Path) -> None:
+    process = start(app, "fail=wait")
+    assert process.stdout.readline() == "waiting\n"
+    process.send_signal(signal.SIGINT)
+    begin = time.monotonic()
+    _, err = process.communicate(timeout=30)
+    assert time.monotonic() - begin < 20
+    assert process.returncode == 130
+    assert err.startswith("interrupted: ")
+    assert "Traceback" not in err
+
+
+def test_one_failing_job_does_not_stop_the_others(app: Path) -> None:
+    arguments = ["-m", "hydra.sweep.dir=sweep", "fail=clear,late,unexpected,''"]
+    status, out, err = call(app, *arguments)
+    assert status == 1, "a sweep with failed jobs is not a success"
+    assert "replayed 100" in out, "the last job ran"
+    values = [line for line in out.splitlines() if line.startswith("value ")]
+    assert values == ["value inf"] * 3 + ["value 1.0"], "a sweeper dies of NaN"
+    assert "Traceback" not in err
+    assert err.splitlines() == [
+        "error: the reason, and what to do",
+        "error: after three frames",
+        "error: unexpected ValueError: two lines (HYDRA_FULL_ERROR=1 shows the traceback)",
+        "error: 3 of the jobs failed, see above",
+    ]
+
+    def summary(number: int) -> dict[str, object]:
+        return json.loads((app / "sweep" / str(number) / "summary.json").read_text())
+
+    assert summary(0) == {"error": "the reason, and what to do"}
+    assert summary(1) == {"frames": 3, "error": "after three frames"}
+    assert not (app / "sweep" / "3" / "summary.json").exists()
+
+
+def test_a_sweep_of_good_jobs_exits_with_zero(app: Path) -> None:
+    status, out, err = call(app, "-m", "seed=1,2")
+    assert (status, err) == (0, "")
+    assert out.count("replayed 100") == 2
+
+
+def test_environment_is_as_before_after_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    assert run(lambda: None) == 0
+    assert "HYDRA_FULL_ERROR" not in os.environ
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    assert run(lambda: None) == 0
+    assert os.environ["HYDRA_FULL_ERROR"] == "0"
+
+
+@pytest.mark.parametrize(("code", "status"), [(None, 0), (0, 0), (1, 1), (2, 1), ("text", 1)])
+def test_exit_requests_keep_to_the_promised_statuses(code: object, status: int) -> None:
+    def main() -> None:
+        raise SystemExit(code)
+
+    assert run(main) == status
+
+
+def test_a_cause_deep_inside_is_what_is_told() -> None:
+    try:
+        try:
+            try:
+                raise ToftrackError("the\n cause")
+            except ToftrackError as error:
+                raise RuntimeError("wrapped") from error
+        except RuntimeError as error:
+            raise TypeError("wrapped again") from error
+    except TypeError as error:
+        assert sentence(error) == "the cause"
+
+
+def test_a_full_disk_is_told_without_a_path() -> None:
+    text = sentence(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert "No space left" in text
+    assert "hydra.run.dir" in text

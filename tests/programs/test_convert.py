@@ -1,0 +1,249 @@
+"""Converting, recording, and folders of images: nothing is lost that need not be."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.tracking import ROOT
+
+from toftrack.camera import Camera
+from toftrack.devices.folder import Folder
+from toftrack.devices.replay import Replay
+from toftrack.devices.sample import Sample
+from toftrack.errors import ToftrackError
+from toftrack.programs import command_line, convert, record
+from toftrack.recordings.npz import read_recording
+from toftrack.recordings.png_folder import PngFolderWriter, read_png_folder
+from toftrack.recordings.srs import read_srs
+
+EMULATED = ("device.transport=emulated", "device.emulated.fps=500")
+
+
+@pytest.fixture(scope="module")
+def srs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve frames of the sample, recorded from the virtual camera."""
+    path = tmp_path_factory.mktemp("recorded") / "sample.srs"
+    record.main([str(path), "--frames", "12", *EMULATED])
+    return path
+
+
+def raw(path: Path) -> list[bytes]:
+    recording = read_srs(path)
+    frames = [recording.raw(index) for index in range(len(recording))]
+    recording.close()
+    return frames
+
+
+def test_record_then_replay_is_the_sample(srs: Path) -> None:
+    device = Replay(srs)
+    assert device.frames == 12
+    assert device.metadata == Sample().metadata
+    for frame, expected in zip(device, Sample(stop=12), strict=True):
+        depth = device.camera.rectify(frame.depth, frame.radial)
+        np.testing.assert_allclose(depth, expected.depth, atol=6e-5)
+        np.testing.assert_array_equal(frame.amplitude, expected.amplitude)
+
+
+@pytest.mark.parametrize("between", ["between.npz", "between"])
+def test_there_and_back_is_bit_exact(srs: Path, tmp_path: Path, between: str) -> None:
+    convert.main([str(srs), str(tmp_path / between)])
+    convert.main([str(tmp_path / between), str(tmp_path / "back.srs")])
+    assert raw(tmp_path / "back.srs") == raw(srs)
+    first, second = read_srs(srs), read_srs(tmp_path / "back.srs")
+    np.testing.assert_array_equal(first.timestamp_s, second.timestamp_s)
+    np.testing.assert_array_equal(first.camera.K, second.camera.K)
+    assert first.metadata == second.metadata
+
+
+def test_srs_to_srs_copies_the_words(srs: Path, tmp_path: Path) -> None:
+    convert.convert(srs, tmp_path / "copy.srs")
+    assert raw(tmp_path / "copy.srs") == raw(srs)
+    assert read_srs(tmp_path / "copy.srs").init == read_srs(srs).init
+
+
+def test_npz_to_npz_keeps_the_truth(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    source = ROOT / "toftrack" / "data" / "sample.npz"
+    convert.convert(source, tmp_path / "copy.npz")
+    assert read_recording(tmp_path / "copy.npz").truth is not None
+    convert.convert(source, tmp_path / "copy.srs")
+    assert "ground truth" in capsys.readouterr().err
+
+
+def test_depth_in_a_folder_is_millimetres(tmp_path: Path) -> None:
+    convert.convert(ROOT / "toftrack" / "data" / "sample.npz", tmp_path / "folder")
+    image = cv2.imread(str(tmp_path / "folder" / "depth_000003.png"), cv2.IMREAD_UNCHANGED)
+    expected = list(Sample(stop=4))[3].depth
+    assert image.dtype == np.uint16
+    np.testing.assert_array_equal(image, np.rint(1000 * expected.astype(np.float64)))
+
+
+def test_the_polynomial_is_not_lost_in_npz(srs: Path, tmp_path: Path) -> None:
+    camera = Camera(np.diag((200.0, 200, 1)), 176, 144, depth_polynomial=(0.01,))
+    camera.save(tmp_path / "camera.json")
+    convert.convert(srs, tmp_path / "a.npz", camera_file=tmp_path / "camera.json")
+    assert Camera.load(tmp_path / "a.camera.json").depth_polynomial == (0.01,)
+
+
+def test_convert_errors(srs: Path, tmp_path: Path) -> None:
+    (tmp_path / "there.npz").write_bytes(b"")
+    Camera(np.eye(3), 8, 6).save(tmp_path / "camera.json")
+    for arguments, words in (
+        ((srs, tmp_path / "there.npz"), "exists already"),
+        ((srs, tmp_path / "a.bag"), "neither"),
+        ((srs, srs), "itself"),
+        ((tmp_path / "no.srs", tmp_path / "a.npz"), "no file"),
+        ((srs, tmp_path / "a.npz", tmp_path / "camera.json"), "8x6"),
+        ((srs, tmp_path / "a.npz", None, 25), "25 MHz"),
+        ((srs, tmp_path / "a", None, 20, 2.0), "--unit"),
+    ):
+        with pytest.raises(ToftrackError, match=words):
+            convert.convert(*arguments)
+
+
+def test_recordings_of_another_size_do_not_fit_the_camera(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", depth_m=np.ones((2, 6, 8), np.float32), K=np.diag((9.0, 9, 1)))
+    with pytest.raises(ToftrackError, match="176x144"):
+        convert.convert(tmp_path / "a.npz", tmp_path / "a.srs")
+    assert convert.convert(tmp_path / "a.npz", tmp_path / "folder") == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["a.npz"], "is recorded to .srs"),
+        (["a.srs", "--frames", "0"], "--frames"),
+        (["a.srs", "device=sample"], "only the SR3000"),
+        (["a.srs", "--conf", "nowhere"], "no configuration"),
+        (["a.srs", "device.transport=emulated", "device.emulated.faults=[missing]"], "1ad2:0074"),
+        (["a.srs", "device.unknown=3"], "unknown"),
+    ],
+)
+def test_record_errors_are_one_sentence(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["record", *arguments])
+    assert command_line.run(record.main) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+
+
+def test_record_survives_faults_with_every_whole_frame(tmp_path: Path) -> None:
+    path = tmp_path / "a.srs"
+    faults = "device.emulated.faults=[unplug_during@5,short@8,stall@11]"
+    record.main([str(path), *EMULATED, faults, "device.emulated.replug_s=0.05"])
+    recording = read_srs(path)
+    assert len(recording) == 98  # of the sample's 100, two were damaged; a stall costs none
+
+
+# Folders of images.
+
+
+def images(folder: Path, **changes: Any) -> Path:
+    """Three images of 8 x 6 pixels whose names sort by number."""
+    folder.mkdir()
+    for number in (1, 2, 10):
+        image = np.full((6, 8), 100 * number, np.uint16)
+        cv2.imwrite(str(folder / f"{number}.png"), changes.get(f"image_{number}", image))
+    content = Camera(np.diag((9.0, 9, 1)), 8, 6).to_dict() | changes.get("camera", {})
+    (folder / "camera.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_a_folder_of_images(tmp_path: Path) -> None:
+    device = Folder(images(tmp_path / "f"))
+    frames = list(device)
+    assert [float(frame.depth[0, 0]) for frame in frames] == pytest.approx([0.1, 0.2, 1.0])
+    assert [frame.timestamp_s for frame in frames] == pytest.approx([0, 0.04, 0.08])
+    assert not frames[0].radial
+    assert frames[0].amplitude is None
+    assert list(Replay(tmp_path / "f"))[2].depth[0, 0] == pytest.approx(1.0)
+
+
+def test_what_a_folder_states_and_what_is_given(tmp_path: Path) -> None:
+    folder = images(tmp_path / "f", camera={"depth_unit_m": 0.0002, "fps": 10, "radial": True})
+    device = Folder(folder)
+    assert next(iter(device)).radial
+    assert (device.fps, next(iter(device)).depth[0, 0]) == (10, pytest.approx(0.02))
+    device = Folder(folder, unit_m=0.01, fps=50)
+    assert (device.fps, next(iter(device)).depth[0, 0]) == (50, pytest.approx(1.0))
+
+
+def test_a_folder_without_a_camera_takes_a_given_one(tmp_path: Path) -> None:
+    folder = images(tmp_path / "f")
+    (folder / "camera.json").rename(tmp_path / "mine.json")
+    with pytest.raises(ToftrackError, match=r"camera\.file"):
+        Folder(folder)
+    assert Folder(folder, camera_file=tmp_path / "mine.json").camera.K[0, 0] == 9
+
+
+def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
+    camera = Camera(np.diag((9.0, 9, 1)), 8, 6)
+    depth = np.random.default_rng(0).uniform(0.2, 3, (2, 6, 8)).astype(np.float32)
+    depth[0, 0] = (0, np.nan, np.inf, -1, 70, 1, 1, 1)
+    amplitude = np.arange(48, dtype=np.uint16).reshape(6, 8)
+    with PngFolderWriter(tmp_path / "f", camera, 0.0005, True, 30.0, {"a": 1}) as writer:
+        for number in range(2):
+            writer.append(depth[number], amplitude, number / 7)
+    folder = read_png_folder(tmp_path / "f")
+    np.testing.assert_array_equal(folder.image(0)[0][0, :5], 0)
+    np.testing.assert_allclose(folder.image(1)[0], depth[1], atol=0.00026)
+    np.testing.assert_array_equal(folder.image(1)[1], amplitude)
+    np.testing.assert_array_equal(folder.timestamp_s, [0, 1 / 7])
+    assert (folder.radial, folder.fps, folder.metadata) == (True, 30, {"a": 1})
+    with pytest.raises(ToftrackError, match="contains PNG"):
+        PngFolderWriter(tmp_path / "f", camera)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"image_2": np.ones((6, 9), np.uint16)}, "2.png.*9x6"),
+        ({"image_2": np.ones((6, 8), np.uint8)}, "2.png.*16-bit"),
+        ({"image_2": np.ones((6, 8, 3), np.uint16)}, "2.png.*16-bit"),
+        ({"camera": {"depth_unit_m": 0}}, "depth_unit_m"),
+        ({"camera": {"fps": "fast"}}, "fps"),
+        ({"camera": {"radial": 1}}, "radial"),
+        ({"camera": {"K": [[1]]}}, "3x3"),
+    ],
+)
+def test_broken_folders_are_told(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        read_png_folder(images(tmp_path / "f", **changes))
+
+
+def test_more_broken_folders_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="no folder"):
+        read_png_folder(tmp_path / "nope")
+    with pytest.raises(ToftrackError, match="no depth image"):
+        read_png_folder(tmp_path)
+    folder = images(tmp_path / "f")
+    (folder / "timestamps.txt").write_text("0\n1\n")
+    with pytest.raises(ToftrackError, match="3 finite times"):
+        read_png_folder(folder)
+    (folder / "timestamps.txt").unlink()
+    (folder / "amplitude_1.png").write_bytes((folder / "1.png").read_bytes())
+    with pytest.raises(ToftrackError, match="3 depth and 1 amplitude"):
+        read_png_folder(folder)
+    (folder / "amplitude_1.png").unlink()
+    (folder / "10.png").write_bytes((folder / "10.png").read_bytes()[:40])
+    with pytest.raises(ToftrackError, match="10.png.*damaged"):
+        read_png_folder(folder).image(2)
+    (folder / "10.png").write_bytes(b"")
+    with pytest.raises(ToftrackError, match="not a PNG"):
+        read_png_folder(folder)
+    (folder / "camera.json").write_text("{")
+    with pytest.raises(ToftrackError, match="not JSON"):
+        read_png_folder(folder)

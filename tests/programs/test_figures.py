@@ -1,0 +1,316 @@
+"""The figures of a finished run: what they count, what they show, and how the command fails."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers.tracking import ROOT, make_tracker, sample
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.output.run_folder import open_footage, read_run
+from toftrack.programs import command_line, figures
+from toftrack.programs.figures import draw_figures
+from toftrack.render.closed_form import render_range_images
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.reference import ReferenceScorer
+from toftrack.render.scoring import make_scorer
+from toftrack.render.segmentation import Expected, NearestSurface
+from toftrack.views.classified import CLASSES, classify
+from toftrack.views.figures import chart
+from toftrack.views.model_image import model_range_image, parted, posed_hand
+
+NAMES = ("measurement", "filmstrip", "lost", "course", "latent")
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+FRAMES = 12
+
+
+def packaged() -> Path:
+    return ROOT / "toftrack" / "data" / "sample.npz"
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run over a recording of twelve frames, which lies beside it."""
+    folder = tmp_path_factory.mktemp("tracked")
+    with np.load(packaged()) as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    rows = len(arrays["depth_m"])
+    short = {key: v[:FRAMES] if v.ndim and len(v) == rows else v for key, v in arrays.items()}
+    np.savez(folder / "hand.npz", **short)
+    done = subprocess.run(
+        [
+            *(sys.executable, str(ROOT / "track.py"), "device=replay", "device.path=hand.npz"),
+            *("view=none", "hydra.run.dir=run", *QUICK),
+        ],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+@pytest.fixture
+def run(tracked: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may spoil, with its recording."""
+    shutil.copy(tracked.parent / "hand.npz", tmp_path / "hand.npz")
+    return Path(shutil.copytree(tracked, tmp_path / "run"))
+
+
+def change(run: Path, **arrays: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Change arrays of the run's track.npz."""
+    with np.load(run / "track.npz") as archive:
+        content = {key: archive[key] for key in archive.files}
+    content |= {key: edit(content[key]) for key, edit in arrays.items()}
+    np.savez(run / "track.npz", **content)
+
+
+def share(picture: np.ndarray, bgr: tuple[int, ...]) -> float:
+    return float((picture == np.array(bgr, np.uint8)).all(-1).mean())
+
+
+def states() -> list[np.ndarray]:
+    """Hands near the sample's 30th frame: one that fits, one beside it, one half out of sight."""
+    tracker, scene = make_tracker(*QUICK), sample()
+    state = tracker.step(scene.depth_m[30], scene.k, 30, 0.0).state
+    moved = [state.copy() for _ in range(3)]
+    moved[1][0] += 0.03
+    moved[2][0] -= 0.13
+    return moved
+
+
+def test_classified_pixels_are_those_that_the_scorers_count() -> None:
+    scene, shape, likelihood = sample(), default_hand_shape(), FMeasure(residual_weight=1.0)
+    plain = NearestSurface()(scene.depth_m[30], scene.k)
+    hidden = NearestSurface()(
+        np.where(np.arange(176) < 60, np.float32(0.3), scene.depth_m[30]),
+        scene.k,
+        Expected(plain.nearest_m, plain.nearest_m + 0.1),
+    )
+    assert hidden.occluder.any()
+    fast = make_scorer("numba", shape, torch.device("cpu"))
+    for observation in (plain, hidden):
+        evidence = likelihood.evidence(observation)
+        for state in states():
+            pixels = classify(state, shape, observation, likelihood)
+            found = [int(i.sum()) for i in (pixels.correct, pixels.false, pixels.missed)]
+            batch = torch.from_numpy(state)[None]
+            exact = [int(count) for count in ReferenceScorer(shape)(batch, evidence)[:3]]
+            assert found == exact
+            assert sum(found) > 100 or observation is hidden  # all of it may be
+            np.testing.assert_allclose(found, [float(c) for c in fast(batch, evidence)[:3]], atol=3)
+            labels = np.bincount(pixels.labels().ravel(), minlength=len(CLASSES))
+            assert labels[2:].tolist() == found
+            # Missed pixels are part of the neighbourhood, and drawn over it.
+            assert labels[1] + labels[4] == pixels.neighbourhood.sum()
+
+
+def test_without_an_estimate_no_pixel_is_of_a_class() -> None:
+    scene = sample()
+    observation = NearestSurface()(scene.depth_m[0], scene.k)
+    pixels = classify(np.full(27, np.nan), default_hand_shape(), observation, FMeasure())
+    assert not pixels.labels().any() and not pixels.range_m.any()
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_range_image_is_that_of_the_closed_form(side: str) -> None:
+    shape, k = default_hand_shape(side=side), sample().k
+    for state in states():
+        hand, _ = parted(posed_hand(state, shape))
+        exact = render_range_images(hand, torch.tensor(k, dtype=torch.float32), 144, 176)[0]
+        drawn = model_range_image(state, shape, k, 144, 176)
+        assert drawn.any()
+        # A tenth of a millimetre: at the rim a ray only just meets the surface.
+        np.testing.assert_allclose(drawn, exact.numpy(), rtol=0, atol=1e-4)
+
+
+def test_five_figures_are_written_that_show_something(run: Path) -> None:
+    written = draw_figures(run)
+    assert [path.name for path in written] == [f"{name}.png" for name in NAMES]
+    assert all(path.parent == run / "figures" for path in written)
+    for path in written:
+        picture = cv2.imread(str(path))
+        assert min(picture.shape[:2]) > 250 and picture.std() > 10, path.name
+
+
+def test_the_recording_is_found_from_another_folder(
+    run: Path, tracked: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    # The configuration says `hand.npz`, and .hydra where that was.
+    footage = open_footage(read_run(tracked))
+    assert footage is not None and len(footage.truth) == FRAMES
+
+
+def test_the_numbers_of_a_frame_stand_in_its_figure(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts: list[str] = []
+    true_write = chart.write
+    monkeypatch.setattr(
+        chart,
+        "write",
+        lambda picture, text, *a, **k: (texts.append(text), true_write(picture, text, *a, **k)),
+    )
+    draw_figures(run, frame=3, out=tmp_path / "out")
+    score = read_run(run).results["score"][3]
+    assert f"Frame 3: score {score:.2f}" in texts
+    assert any(text.endswith(" missed") for text in texts)
+    mean = json.loads((run / "summary.json").read_text())["metrics"]["mean_mm"]
+    assert any(f"mean joint error {mean:.1f} mm" in text for text in texts)
+    assert "No frame was lost: the 4 frames of the lowest score" in texts
+
+
+def test_lost_frames_are_shown_and_shaded(run: Path, tmp_path: Path) -> None:
+    before = draw_figures(run, out=tmp_path / "before")
+    change(run, lost=lambda lost: np.arange(len(lost)) >= 8)
+    after = draw_figures(run, out=tmp_path / "after")
+    for name in ("lost", "course"):
+        old, new = (
+            cv2.imread(str(next(p for p in paths if p.stem == name))) for paths in (before, after)
+        )
+        assert share(new, chart.SHADE) > share(old, chart.SHADE) + 0.01, name
+
+
+def test_without_truth_the_score_stands_alone(run: Path, tmp_path: Path) -> None:
+    with np.load(run.parent / "hand.npz") as archive:
+        kept = {key: archive[key] for key in archive.files if key != "joints_m"}
+    np.savez(run.parent / "hand.npz", **kept)
+    course = next(p for p in draw_figures(run, run.parent / "hand.npz") if p.stem == "course")
+    picture = cv2.imread(str(course))
+    assert share(picture, chart.GREEN) > 0 and share(picture, chart.BLUE) == 0
+
+
+def test_a_space_that_has_changed_is_told_and_used_anew(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[np.ndarray, str]] = []
+    picture = np.zeros((9, 9, 3), np.uint8)
+    monkeypatch.setattr(
+        figures,
+        "latent_figure",
+        lambda space, latent, *a: (seen.append((latent, a[-1])), picture)[1],
+    )
+    draw_figures(run)
+    true = read_run(run).results["latent"]
+    change(run, latent=lambda latent: latent + 1)
+    draw_figures(run)
+    assert seen[0][1] == "" and "changed" in seen[1][1]
+    for latent, _ in seen:
+        np.testing.assert_allclose(latent, true, atol=1e-3)
+
+
+def test_a_live_run_gets_the_figures_that_need_no_images(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def live(metadata: np.ndarray) -> np.ndarray:
+        content = json.loads(metadata.item())
+        content["device"] = {"device": "sr3000"}
+        return np.array(json.dumps(content))
+
+    change(run, metadata=live)
+    assert [path.stem for path in draw_figures(run)] == ["course", "latent"]
+    assert "live camera" in capsys.readouterr().err
+    # A recording that was made beside it can be named.
+    assert len(draw_figures(run, run.parent / "hand.npz")) == 5
+
+
+@pytest.mark.parametrize("gone", ["track.npz", "track.jsonl", "summary.json", "hand_shape.json"])
+def test_a_missing_file_is_named(run: Path, gone: str) -> None:
+    (run / gone).unlink()
+    with pytest.raises(ToftrackError, match=f"lacks {gone}"):
+        draw_figures(run)
+
+
+def test_a_folder_that_is_no_runs_is_said_to_be_none(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="not the output folder of a run"):
+        draw_figures(tmp_path)
+    with pytest.raises(ToftrackError, match="no folder"):
+        draw_figures(tmp_path / "nowhere")
+
+
+def test_a_recording_that_moved_is_asked_for(run: Path, tracked: Path) -> None:
+    absent = run.parent / "else.npz"
+    with pytest.raises(ToftrackError, match="is not there; say where .* --recording"):
+        draw_figures(run, absent)
+    (run / ".hydra" / "hydra.yaml").unlink()  # so that only the path itself is left
+    (tracked.parent / "hand.npz").rename(absent)
+    try:
+        with pytest.raises(ToftrackError, match="not there any more; say where it is"):
+            draw_figures(run)
+        assert len(draw_figures(run, absent)) == 5
+    finally:
+        absent.rename(tracked.parent / "hand.npz")
+
+
+def test_another_recording_is_refused(run: Path) -> None:
+    with pytest.raises(ToftrackError, match="has 100 frames instead of 12"):
+        draw_figures(run, packaged())
+    path = run.parent / "hand.npz"
+    with np.load(path) as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    np.savez(path, **arrays | {"fps": 10.0})
+    with pytest.raises(ToftrackError, match="other times"):
+        draw_figures(run, path)
+    half = {key: arrays[key][..., ::2, ::2] for key in ("depth_m", "amplitude")}
+    np.savez(path, **arrays | half)
+    with pytest.raises(ToftrackError, match="88x72 pixels, but the run tracked 176x144"):
+        draw_figures(run, path)
+
+
+def test_a_run_says_no_code_to_execute(run: Path) -> None:
+    def spoilt(metadata: np.ndarray) -> np.ndarray:
+        content = json.loads(metadata.item())
+        content["config"]["likelihood"] = {"_target_": "os.system", "command": "true"}
+        return np.array(json.dumps(content))
+
+    change(run, metadata=spoilt)
+    with pytest.raises(ToftrackError, match="likelihood of its own: os.system"):
+        draw_figures(run)
+
+
+def test_the_command_answers_errors_with_a_sentence(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command_line.run(lambda: figures.main([str(run), "--frame", "99"])) == 1
+    assert "error: the run has no frame 99; give --frame from 0 to 11" in capsys.readouterr().err
+    (run / "file").touch()
+    assert command_line.run(lambda: figures.main([str(run), "--out", str(run / "file")])) == 1
+    assert "cannot be written" in capsys.readouterr().err
+    assert command_line.run(lambda: figures.main([str(run), "--out", str(run / "own")])) == 0
+    assert str(run / "own" / "latent.png") in capsys.readouterr().out
+
+
+def test_axes_place_values_and_keep_those_beyond_on_the_edge() -> None:
+    axes = chart.Axes(10, 110, 20, 220, (0.0, 2.0), (1.0, 100.0), log_y=True)
+    np.testing.assert_allclose(axes.place(1.0, 10.0), (60, 120))
+    np.testing.assert_allclose(axes.place(3.0, 0.1), (110, 220))
+    picture = chart.canvas(240, 120)
+    axes.line(picture, np.arange(3.0), np.array([10.0, np.nan, 10.0]), chart.BLUE)
+    drawn = np.flatnonzero((picture == chart.BLUE).all(-1).any(0))
+    assert 10 in drawn and 110 in drawn and not ((drawn > 15) & (drawn < 105)).any()
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-63.0, 137.0), (0.0, 0.12), (3.0, 9e5)])
+def test_ticks_are_round_few_and_within(low: float, high: float) -> None:
+    ticks = chart.ticks(low, high)
+    assert 2 <= len(ticks) <= 8
+    assert min(ticks) >= low - 1e-9 and max(ticks) <= high + 1e-9
+    steps = np.diff(ticks)
+    np.testing.assert_allclose(steps, steps[0])
+
+
+def test_long_notes_are_broken_into_lines_that_fit() -> None:
+    lines = chart.wrapped("a note of many words that does not fit into a line " * 3, 300)
+    assert len(lines) > 2 and all(chart.text_width(line) <= 300 for line in lines)

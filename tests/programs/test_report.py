@@ -1,0 +1,132 @@
+"""The report of a sweep: gathering jobs, means and spreads, failures, the table and the plot."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from toftrack.errors import ToftrackError
+from toftrack.programs.report import group_runs, main, read_runs, report
+from toftrack.views.figures.sweep import sweep_figure
+
+
+def job(
+    folder: Path, number: int, overrides: list[str], error: float | None, ms: float = 20.0
+) -> Path:
+    """A job's folder as track.py leaves it; no truth without an error."""
+    path = folder / str(number)
+    (path / ".hydra").mkdir(parents=True)
+    (path / ".hydra" / "overrides.yaml").write_text("".join(f"- {o}\n" for o in overrides))
+    summary = {"frames": 10, "mean_ms": ms, "mean_score": 0.9, "metrics": {"mean_mm": error}}
+    if error is None:
+        del summary["metrics"]
+    (path / "summary.json").write_text(json.dumps(summary))
+    return path
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    """Two spaces, two seeds, two recordings."""
+    number = 0
+    for space, base, ms in (("pca", 10.0, 20.0), ("lle", 14.0, 30.0)):
+        for seed in (0, 1):
+            for name, harder in (("one", 0.0), ("two", 4.0)):
+                given = [f"pose_space={space}", f"seed={seed}", f"device.path=d/{name}.npz"]
+                job(tmp_path, number, [*given, "view=none"], base + 2 * seed + harder, ms)
+                number += 1
+    return tmp_path
+
+
+def test_jobs_that_differ_only_in_seed_and_recording_are_one_group(sweep: Path) -> None:
+    runs = read_runs(sweep)
+    assert len(runs) == 8
+    pca, lle = group_runs(runs, "metrics.mean_mm")
+    assert (pca.settings, lle.settings) == ("pose_space=pca", "pose_space=lle")
+    assert pca.error == pytest.approx(13.0) and lle.error == pytest.approx(17.0)
+    assert pca.spread == pytest.approx(2**0.5)  # of the seeds' means 12 and 14
+    assert (pca.cost_ms, lle.cost_ms) == (20.0, 30.0)
+    assert pca.recordings == pytest.approx({"one": 11.0, "two": 15.0})
+
+
+def test_the_report_writes_a_table_a_csv_and_a_plot(sweep: Path, capsys) -> None:
+    assert main([str(sweep)]) == 0
+    text = capsys.readouterr().out
+    assert "13.00" in text and "pose_space=lle" in text and "view=none" not in text
+    assert "one" in text and "11.00" in text
+    with open(sweep / "sweep.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 8
+    assert rows[7]["device.path"] == "d/two.npz" and float(rows[7]["metrics.mean_mm"]) == 20.0
+    assert cv2.imread(str(sweep / "sweep.png")).std() > 0
+
+
+def test_jobs_that_failed_are_named_and_left_out_of_the_means(sweep: Path, capsys) -> None:
+    (sweep / "2" / "summary.json").write_text('{"frames": 3, "error": "no hand anywhere"}')
+    (sweep / "4" / "summary.json").unlink()
+    (sweep / "5" / "summary.json").write_text("{broken")
+    assert main([str(sweep)]) == 0
+    text = capsys.readouterr().out
+    assert "3 of 8 jobs failed" in text
+    assert "2 (pose_space=pca seed=1 device.path=d/one.npz): no hand anywhere" in text
+    assert "it did not finish" in text and "cannot be read" in text
+    pca, lle = group_runs(read_runs(sweep), "metrics.mean_mm")
+    assert pca.error == pytest.approx((10 + 14 + 16) / 3)
+    assert pca.spread is None  # one seed lacks a recording: its mean is of something else
+    assert sum(run.error is not None for run in lle.runs) == 2
+
+
+def test_a_sweep_in_which_all_failed_is_still_reported(sweep: Path, capsys) -> None:
+    for path in sweep.glob("*/summary.json"):
+        path.write_text('{"error": "no camera"}')
+    assert main([str(sweep)]) == 0
+    assert "8 of 8 jobs failed" in capsys.readouterr().out
+    assert not (sweep / "sweep.png").exists()
+
+
+def test_without_truth_the_score_is_compared(tmp_path: Path, capsys) -> None:
+    job(tmp_path, 0, ["seed=0"], None)
+    job(tmp_path, 1, ["seed=1"], None)
+    _, (group,) = report(tmp_path)
+    assert group.error == pytest.approx(0.9) and group.settings == "all alike"
+    assert "mean_score" in capsys.readouterr().out
+
+
+def test_sweeps_of_training_compare_held_out_degrees_and_have_no_plot(tmp_path: Path) -> None:
+    for number, kind in enumerate(("pca", "lle")):
+        path = job(tmp_path, number, [f"pose_space={kind}"], None)
+        (path / "summary.json").write_text(json.dumps({"reached_degrees": 5.0 + number}))
+    _, groups = report(tmp_path)
+    assert [group.error for group in groups] == [5.0, 6.0]
+    assert (tmp_path / "sweep.csv").exists() and not (tmp_path / "sweep.png").exists()
+
+
+def test_another_figure_can_be_asked_for(sweep: Path, capsys) -> None:
+    _, groups = report(sweep, "mean_ms")
+    assert [group.error for group in groups] == [20.0, 30.0]
+    assert main([str(sweep), "--figure", "beauty"]) == 1
+    assert "no job has the figure beauty" in capsys.readouterr().err
+
+
+def test_jobs_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (10, 2, 1):
+        job(tmp_path, number, [f"seed={number}"], 1.0)
+    assert [run.name for run in read_runs(tmp_path)] == ["1", "2", "10"]
+
+
+def test_a_folder_without_jobs_is_one_clear_error(tmp_path: Path, capsys) -> None:
+    with pytest.raises(ToftrackError, match="no job below"):
+        read_runs(tmp_path)
+    assert main([str(tmp_path / "nothing")]) == 1
+    assert capsys.readouterr().err.startswith("error: no folder")
+
+
+@pytest.mark.parametrize("error", [0.0, 0.004, 12.0, 3e4])
+def test_the_plot_holds_errors_of_any_size(error: float) -> None:
+    points = [("one", 20.0, error, None), ("two", 20.0, error, error / 2), ("three", 0.0, 1.0, 0)]
+    picture = sweep_figure(points, "mm")
+    assert picture.dtype == np.uint8 and picture.std() > 0

@@ -1,0 +1,324 @@
+"""`python track.py` from end to end: what it writes, what it says, and how it fails."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import pickle
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.tracking import ROOT
+from hydra.core.singleton import Singleton
+
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output.results import read_results
+from toftrack.pose_space.files import fit_pose_space, save_pose_space
+
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])
+
+
+def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+    """`python track.py` in a process of its own, started in another folder."""
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "track.py"), *arguments],
+        cwd=cwd,
+        env=clean | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def call(*arguments: str, cwd: Path) -> tuple[int, str, str]:
+    process = start(*arguments, cwd=cwd)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+@pytest.fixture
+def here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Callable[..., tuple[int, str, str]]]:
+    """`python track.py` within this process, which has loaded everything already."""
+    kept, root = Singleton.get_state(), logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["track.py", "hydra.run.dir=out", *arguments])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(ROOT / "track.py"), run_name="__main__")
+        return end.value.code, *capsys.readouterr()
+
+    yield run
+    Singleton.set_state(kept)
+    root.handlers[:], root.level = handlers, level
+
+
+def save(path: Path, drop: tuple[str, ...] = (), **changes: object) -> Path:
+    """A small recording, with changes and without some of its keys."""
+    arrays = {"depth_m": np.full((3, 30, 40), 0.6, np.float32), "K": K} | changes
+    np.savez(path, **{key: value for key, value in arrays.items() if key not in drop})
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str, str]:
+    """The output folder, status, standard output and standard error of one ordinary run."""
+    folder = tmp_path_factory.mktemp("whole")
+    told = call("device.stop=12", "hydra.run.dir=deep/er", *QUICK, cwd=folder)
+    return folder / "deep" / "er", *told
+
+
+def test_a_run_writes_its_files_directly_into_its_folder(whole) -> None:
+    folder, status, _, err = whole
+    assert status == 0, err
+    for name in ("track.npz", "track.jsonl", "summary.json", "overlay.mp4", "overlay.png"):
+        assert (folder / name).stat().st_size > 0, name
+    assert not list(folder.glob("*.part"))
+
+
+def test_track_npz_is_as_promised(whole) -> None:
+    promised = {
+        "joints_m": ((12, 21, 3), np.float32),
+        "lost": ((12,), np.bool_),
+        "state": ((12, 27), np.float32),
+        "latent": ((12, 4), np.float32),
+        "score": ((12,), np.float32),
+        "covariance": ((12, 10, 10), np.float32),
+        "effective_sample_size": ((12,), np.float32),
+        "gesture_probability": ((12,), np.float32),
+        "timestamp_s": ((12,), np.float64),
+        "compute_s": ((12,), np.float32),
+    }
+    with np.load(whole[0] / "track.npz", allow_pickle=False) as archive:
+        for key, (shape, kind) in promised.items():
+            assert archive[key].shape == shape, key
+            assert archive[key].dtype == kind, key
+        assert archive["gesture"].shape == (12,) and archive["gesture"].dtype.kind == "U"
+        assert archive["joint_names"].tolist() == list(JOINT_NAMES)
+        metadata = json.loads(archive["metadata"].item())
+        assert np.isfinite(archive["joints_m"]).all()
+        assert np.allclose(archive["timestamp_s"], np.arange(12) / 25)
+        assert ((archive["score"] >= 0) & (archive["score"] <= 1)).all()
+    assert {"toftrack", "torch", "numpy", "seed", "device"} <= set(metadata)
+    assert {"pose_space", "hand_shape", "camera"} <= set(metadata)
+    assert metadata["seed"] == 0
+    assert metadata["device"]["device"] == "sample" and metadata["device"]["stop"] == 12
+    assert metadata["pose_space"] == {"kind": "pca", "dims": 4}
+    assert metadata["camera"]["width"] == 176 and metadata["camera"]["K"][0][0] == 200
+    assert metadata["hand_shape"]["side"] == "right"
+
+
+def test_track_jsonl_says_the_same_a_line_a_frame(whole) -> None:
+    lines = [json.loads(line) for line in (whole[0] / "track.jsonl").read_text().splitlines()]
+    result = read_results(whole[0] / "track.npz")
+    assert [line["index"] for line in lines] == list(range(12))
+    for name in ("joints_m", "lost", "state", "latent", "score", "covariance", "timestamp_s"):
+        told = np.array([line[name] for line in lines], result[name].dtype)
+        assert np.array_equal(told, result[name]), name
+    assert {line["state_name"] for line in lines} <= {"initialising", "tracking", "recovering"}
+
+
+def test_the_summary_is_of_the_same_frames_and_holds_the_metrics(whole) -> None:
+    summary = json.loads((whole[0] / "summary.json").read_text())
+    result = read_results(whole[0] / "track.npz")
+    assert summary["frames"] == 12 and summary["lost_frames"] == int(result["lost"].sum())
+    assert summary["mean_ms"] == pytest.approx(1e3 * result["compute_s"].mean(), rel=1e-4)
+    assert summary["median_ms"] == pytest.approx(1e3 * np.median(result["compute_s"]), rel=1e-4)
+    assert summary["fps"] == pytest.approx(1e3 / summary["mean_ms"], rel=1e-4)
+    assert summary["mean_score"] == pytest.approx(result["score"].mean(), rel=1e-4)
+    with np.load(ROOT / "toftrack" / "data" / "sample.npz") as sample:
+        truth = sample["joints_m"][5:12]
+    error = 1e3 * np.linalg.norm(result["joints_m"][5:] - truth, axis=-1)
+    assert summary["metrics"]["mean_mm"] == pytest.approx(error.mean(), rel=1e-4)
+    assert summary["metrics"]["mean_mm"] < 15
+
+
+def test_the_table_goes_to_standard_output_and_the_progress_to_standard_error(whole) -> None:
+    folder, _, out, err = whole
+    assert "joint error, mean" in out and "time a frame" in out
+    for name in ("track.npz", "track.jsonl", "summary.json", "overlay.mp4", "overlay.png"):
+        assert f"{folder.name}/{name}" in out
+    assert "frames/s" not in out.split("time a frame")[0]
+    assert "12/12" in err and "score" in err
+    assert "error" not in err and "Traceback" not in err
+
+
+def test_ctrl_c_keeps_what_was_done(tmp_path: Path) -> None:
+    process = start("hydra.run.dir=out", "view=none", *QUICK, cwd=tmp_path)
+    lines, deadline = tmp_path / "out" / "track.jsonl", time.monotonic() + 200
+    while time.monotonic() < deadline:
+        if lines.exists() and lines.read_text().count("\n") >= 3:
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "interrupted" in err and "Traceback" not in err
+    done = [json.loads(line) for line in lines.read_text().splitlines()]
+    assert 3 <= len(done) < 100
+    result = read_results(tmp_path / "out" / "track.npz")
+    assert len(result["joints_m"]) == len(done)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["frames"] == len(done)
+
+
+def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
+    sweep = ("-m", "seed=1,2", "hydra.sweep.dir=sweep", "device.stop=3", "view=none")
+    status, out, err = call(*sweep, *QUICK, cwd=tmp_path)
+    assert status == 0, err
+    assert out.count("time a frame") == 2
+    one, two = (read_results(tmp_path / "sweep" / n / "track.npz") for n in ("0", "1"))
+    assert (one["metadata"]["seed"], two["metadata"]["seed"]) == (1, 2)
+    assert not np.array_equal(one["joints_m"], two["joints_m"])
+
+
+def test_a_missing_recording_is_told_in_one_line_by_the_program_itself(tmp_path: Path) -> None:
+    status, out, err = call("device=replay", "device.path=gone.npz", cwd=tmp_path)
+    assert (status, out) == (1, "")
+    assert err == "error: there is no file 'gone.npz'; give the path of a recording (.npz)\n"
+
+
+MILLIMETRES = np.full((3, 30, 40), 600.0, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("name", "drop", "changes", "words"),
+    [
+        ("no depth", ("depth_m",), {}, "'depth_m'"),
+        ("no camera", ("K",), {}, "'K'"),
+        ("one image", (), {"depth_m": MILLIMETRES[0] / 1000}, "dimensions"),
+        ("wrong camera", (), {"K": np.eye(4)}, "3x3"),
+        ("no frames", (), {"depth_m": np.zeros((0, 30, 40), np.float32)}, "zero frames"),
+        ("millimetres", (), {"depth_m": MILLIMETRES}, "/ 1000"),
+        ("whole millimetres", (), {"depth_m": MILLIMETRES.astype(np.uint16)}, "/ 1000"),
+        ("pickled", (), {"K": np.array([{"fx": 1}], object)}, "pickled"),
+    ],
+)
+def test_a_bad_recording_is_one_clear_sentence(
+    here, tmp_path, name: str, drop, changes: dict, words: str
+) -> None:
+    save(tmp_path / "bad.npz", drop, **changes)
+    status, out, err = here("device=replay", "device.path=bad.npz")
+    assert (status, out) == (1, "")
+    assert err.startswith("error: ") and err.count("\n") == 1
+    assert words in err and "bad.npz" in err
+    assert not (tmp_path / "out" / "track.npz").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut off"])
+def test_what_is_no_archive_is_one_clear_sentence(here, tmp_path, content: bytes) -> None:
+    (tmp_path / "bad.npz").write_bytes(content)
+    status, out, err = here("device=replay", "device.path=bad.npz")
+    assert (status, out) == (1, "")
+    assert err.startswith("error: 'bad.npz' is not an .npz archive") and err.count("\n") == 1
+
+
+def test_a_pickle_by_itself_is_refused_and_not_loaded(here, tmp_path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple:
+            return Path.touch, (tmp_path / "sprung",)
+
+    np.savez(tmp_path / "bad.npz", K=K, depth_m=np.array([Trap()], object))
+    (tmp_path / "plain.npz").write_bytes(pickle.dumps(Trap()))
+    for file in ("bad.npz", "plain.npz"):
+        status, _, err = here("device=replay", f"device.path={file}")
+        assert status == 1 and err.startswith("error: ") and err.count("\n") == 1
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here, tmp_path) -> None:
+    save_pose_space(fit_pose_space("pca", 3), tmp_path / "small.npz")
+    status, _, err = here("pose_space.file=small.npz")
+    assert status == 1 and "3-dimensional" in err and "pose_space.dims=3" in err
+    with np.load(tmp_path / "small.npz") as archive:
+        arrays = dict(archive)
+    arrays["header"] = np.array(str(arrays["header"]).replace('"version": 1', '"version": 99'))
+    np.savez(tmp_path / "newer.npz", **arrays)
+    status, _, err = here("pose_space.file=newer.npz")
+    assert status == 1 and "version 99" in err and err.count("\n") == 1
+    for path, words in (("gone.npz", "no pose-space file"), (__file__, "not a pose-space file")):
+        status, _, err = here(f"pose_space.file={path}")
+        assert status == 1 and words in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["device.start=100"], "start=100"),
+        (["device.stop=101"], "stop=101"),
+        (["compute=tpu"], "compute=tpu is unknown"),
+        (["renderer=opengl"], "renderer=opengl is unknown"),
+        (["hand.shape=gone.json"], "gone.json"),
+        (["hand.side=both"], "hand.side"),
+        (["camera.file=gone.json"], "gone.json"),
+        (["filter.particles=0"], "filter.particles"),
+        (["device=replay"], "device.path"),
+        (["device=telescope"], "device/telescope"),
+        (["experiment=other"], "experiment/other"),
+        (["particles=3"], "particles"),
+    ],
+)
+def test_a_bad_setting_is_one_clear_sentence(here, overrides: list[str], words: str) -> None:
+    status, out, err = here("view=none", *overrides)
+    assert (status, out) == (1, "")
+    assert err.startswith("error: ") and err.count("\n") == 1
+    assert words in err
+
+
+def test_an_output_folder_that_cannot_be_written_is_one_clear_sentence(here, tmp_path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    status, out, err = here("hydra.run.dir=file/out")
+    assert (status, out) == (1, "")
+    assert err.startswith("error: ") and err.count("\n") == 1 and "hydra.run.dir" in err
+    (tmp_path / "out" / "track.jsonl").mkdir(parents=True)
+    status, out, err = here("device.stop=2", "view=none")
+    assert (status, out) == (1, "")
+    assert err.splitlines()[-1].startswith("error: the output folder")
+
+
+def test_a_recording_without_a_hand_is_lost_and_no_error(here, tmp_path) -> None:
+    depth = np.full((3, 30, 40), 1.5, np.float32)
+    depth[1], depth[2] = np.nan, -1
+    save(tmp_path / "empty.npz", depth_m=depth)
+    status, out, _ = here("device=replay", "device.path=empty.npz")
+    assert status == 0
+    result = read_results(tmp_path / "out" / "track.npz")
+    assert result["lost"].all() and np.isnan(result["joints_m"]).all()
+    assert (result["score"] == 0).all()
+    lines = (tmp_path / "out" / "track.jsonl").read_text().splitlines()
+    assert all(json.loads(line)["lost"] for line in lines) and len(lines) == 3
+    assert "3 of them lost" in out
+
+
+def test_what_was_written_before_an_error_is_kept(here, tmp_path) -> None:
+    """A folder of images whose third one is damaged."""
+    cv2 = pytest.importorskip("cv2")
+    with np.load(ROOT / "toftrack" / "data" / "sample.npz") as sample:
+        depth, k = sample["depth_m"][:4].astype(np.float32), sample["K"]
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i, image in enumerate(depth):
+        cv2.imwrite(str(folder / f"{i}.png"), np.rint(image * 1000).astype(np.uint16))
+    camera = {"format": "toftrack-camera", "version": 1, "width": 176, "height": 144}
+    (folder / "camera.json").write_text(json.dumps(camera | {"K": k.tolist()}))
+    whole_image = (folder / "2.png").read_bytes()
+    (folder / "2.png").write_bytes(whole_image[:200])
+    status, _, err = here("device=replay", "device.path=images", "view=none", *QUICK)
+    assert status == 1
+    assert err.splitlines()[-1].startswith("error: ") and "2.png" in err.splitlines()[-1]
+    assert len(read_results(tmp_path / "out" / "track.npz")["joints_m"]) == 2
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["frames"] == 2

@@ -1,0 +1,311 @@
+"""The vendor's stream file: what is written is read back bit by bit, and broken files are told."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toftrack.camera import Camera
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.recordings.npz import read_recording
+from toftrack.recordings.sr_frame import (
+    FRAME_BYTES,
+    HEIGHT,
+    WIDTH,
+    decode_frame,
+    encode_frame,
+    unambiguous_range_m,
+)
+from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter, read_srs
+
+RANGE_M = unambiguous_range_m(20)
+FRAMES = 4
+
+
+def raw_frames(count: int = FRAMES) -> list[bytes]:
+    rng = np.random.default_rng(0)
+    return [rng.integers(0, 3000, 2 * WIDTH * HEIGHT, "<u2").tobytes() for _ in range(count)]
+
+
+def record(path: Path, count: int = FRAMES) -> list[bytes]:
+    frames = raw_frames(count)
+    facts = SrsFacts(RANGE_M, Camera(np.diag((210.0, 211, 1)), WIDTH, HEIGHT), 50.0, {"who": "me"})
+    with SrsWriter(path, SrsInit(0x74, 2, 77), bytes(range(64)), facts) as writer:
+        for index, frame in enumerate(frames):
+            writer.append(frame, 100 + 0.04 * index)
+    return frames
+
+
+def vendors(*objects: tuple[int, bytes], version: int = 1) -> bytes:
+    """A stream as the vendor's recorder writes it."""
+    content = struct.pack("<II", 0x4F497273, version)
+    for kind, data in objects:
+        content += struct.pack("<II", kind, 8 + len(data)) + data
+    return content
+
+
+INIT = (1, struct.pack("<III", 0x74, 0, 5))
+CONFIGURE = (2, bytes(64))
+FRAME = (3, raw_frames(1)[0])
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "recording.srs"
+
+
+def test_what_is_written_is_read_back(path: Path) -> None:
+    frames = record(path)
+    recording = read_srs(path)
+    assert [recording.raw(i) for i in range(len(recording))] == frames
+    np.testing.assert_allclose(recording.timestamp_s, 100 + 0.04 * np.arange(FRAMES))
+    assert recording.fps == pytest.approx(25)
+    assert recording.camera.K[0, 0] == 210
+    assert recording.init == SrsInit(0x74, 2, 77)
+    assert recording.registers == bytes(range(64))
+    assert recording.metadata == {"who": "me"}
+    assert recording.damage is None
+    recording.close()
+    recording.close()
+
+
+def test_starts_as_the_vendors_files_do(path: Path) -> None:
+    record(path)
+    content = path.read_bytes()
+    assert content[:4] == b"srIO"
+    assert struct.unpack("<6I", content[4:28]) == (1, 1, 20, 0x74, 2, 77)
+
+
+def test_the_vendors_files_are_read(path: Path) -> None:
+    calibration, unknown = (4, b"<xml/>"), (99, b"something else")
+    path.write_bytes(vendors(INIT, unknown, CONFIGURE, calibration, FRAME, CONFIGURE, FRAME))
+    recording = read_srs(path)
+    assert len(recording) == 2
+    assert recording.raw(1) == FRAME[1]
+    assert recording.init.serial_number == 5
+    assert (recording.camera.K[0, 2], recording.camera.K[1, 2]) == (92, 60)
+    assert recording.fps == 25
+    assert recording.range_m == RANGE_M
+    assert read_srs(path, modulation_mhz=40).range_m == pytest.approx(3.747, abs=1e-3)
+
+
+def test_decode_undoes_encode() -> None:
+    rng = np.random.default_rng(1)
+    radial = rng.uniform(0.1, 7.4, (HEIGHT, WIDTH)).astype(np.float32)
+    radial[0, :4] = (np.nan, -1, np.inf, 7.6)
+    amplitude = rng.integers(0, 65536, (HEIGHT, WIDTH), np.uint16)
+    depth, same = decode_frame(encode_frame(radial, amplitude, RANGE_M), RANGE_M)
+    np.testing.assert_array_equal(same, amplitude)
+    assert (depth[0, :4] == 0).all()
+    np.testing.assert_allclose(depth.ravel()[4:], radial.ravel()[4:], atol=RANGE_M / 131000)
+    again = encode_frame(depth, same, RANGE_M)
+    np.testing.assert_array_equal(decode_frame(again, RANGE_M)[0], depth)
+
+
+def test_little_endian_distance_then_amplitude() -> None:
+    data = bytearray(FRAME_BYTES)
+    data[0:2], data[-2:] = b"\x00\x80", b"\x01\x02"
+    depth, amplitude = decode_frame(bytes(data), RANGE_M)
+    assert depth[0, 0] == pytest.approx(RANGE_M * 0x8000 / 0xFFFF)
+    assert amplitude[-1, -1] == 0x0201
+    with pytest.raises(ToftrackError, match="101376 bytes"):
+        decode_frame(b"1234", RANGE_M)
+
+
+def test_replay_streams_it(path: Path) -> None:
+    record(path)
+    device = Replay(path, start=1)
+    for _ in range(2):
+        frames = list(device)
+        assert [frame.index for frame in frames] == [1, 2, 3]
+    assert frames[0].radial
+    np.testing.assert_array_equal(
+        frames[0].amplitude.ravel()[:3], np.frombuffer(raw_frames()[1], "<u2")[WIDTH * HEIGHT :][:3]
+    )
+    assert device.camera.K[0, 0] == 210
+
+
+def test_a_long_recording_needs_no_more_memory_than_a_short_one(path: Path) -> None:
+    count, nonzero = 10_000, raw_frames(1)[0]
+    record(path)
+    with open(path, "r+b") as stream:  # a sparse file: the frames are all zeros but the last
+        start = len(vendors(INIT, CONFIGURE))
+        stream.write(vendors(INIT, CONFIGURE))
+        for index in range(count):
+            stream.seek(start + index * (8 + FRAME_BYTES))
+            stream.write(struct.pack("<II", 3, 8 + FRAME_BYTES))
+        stream.write(nonzero)
+    tracemalloc.start()
+    device = Replay(path)
+    for frame in device:
+        last = frame
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert last.index == count - 1
+    assert last.amplitude.any()
+    assert peak < 10e6
+
+
+def test_cut_off_anywhere_keeps_the_whole_frames_before(path: Path) -> None:
+    frames = record(path, 2)
+    whole = path.read_bytes()
+    ends = [whole.find(frame) + FRAME_BYTES for frame in frames]
+    starts = [whole.find(frame) - 24 for frame in frames]  # of the time stamp before it
+    edges = {0, 7, 8, 9, 15, 27, 28, 30, *starts, *ends}
+    edges |= {start + extra for start in starts for extra in (1, 8, 15, 16, 20, 24, 500)}
+    for length in sorted(edges):
+        path.write_bytes(whole[:length])
+        count = sum(end <= length for end in ends)
+        if count == 0:
+            with pytest.raises(ToftrackError, match=path.name):
+                read_srs(path)
+            continue
+        recording = read_srs(path)
+        assert [recording.raw(i) for i in range(len(recording))] == frames[:count]
+        assert (recording.damage is None) == (length in ends)
+        recording.close()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty"),
+        (b"srIO", "cut off"),
+        (b"PK\x03\x04 and so on", "not an .srs"),
+        (vendors(INIT, CONFIGURE, FRAME, version=2), "version 2"),
+        (vendors(FRAME, INIT, CONFIGURE), "before its Init"),
+        (vendors(INIT, FRAME, CONFIGURE), "before its Configure"),
+        (vendors(INIT, CONFIGURE), "no whole frame"),
+        (vendors(INIT, CONFIGURE, (3, bytes(100))), "no whole frame.*100 bytes"),
+        (vendors((1, b"12"), CONFIGURE, FRAME), "Init object.*damaged"),
+        (vendors(INIT, (2, b"12"), FRAME), "Configure object.*damaged"),
+        (vendors(INIT, CONFIGURE, (0x54464F54, b"{"), FRAME), "TOFT"),
+        (vendors(INIT, CONFIGURE) + struct.pack("<II", 3, 0xFFFFFFFF), "no whole frame.*cut off"),
+        (vendors(INIT, CONFIGURE) + struct.pack("<II", 3, 0), "no whole frame.*no sense"),
+    ],
+)
+def test_broken_files_are_told(path: Path, content: bytes, words: str) -> None:
+    path.write_bytes(content)
+    with pytest.raises(ToftrackError, match=words) as caught:
+        read_srs(path)
+    assert path.name in str(caught.value)
+
+
+def test_a_size_of_4_gb_ends_the_recording_there(path: Path) -> None:
+    content = vendors(INIT, CONFIGURE, FRAME) + struct.pack("<II", 3, 0xFFFFFFFF) + FRAME[1]
+    path.write_bytes(content)
+    recording = read_srs(path)
+    assert len(recording) == 1
+    assert "cut off" in recording.damage
+
+
+def test_missing_file_and_directory_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="no file"):
+        read_srs(tmp_path / "nope.srs")
+    with pytest.raises(ToftrackError, match="directory"):
+        read_srs(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["srs", "npz"])
+def test_random_corruption_is_told_or_hforearm_conflict(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"recording.{kind}"
+    if kind == "srs":
+        record(path, 2)
+    else:
+        depth = np.random.default_rng(0).uniform(0.3, 2, (3, 12, 16)).astype(np.float32)
+        np.savez_compressed(path, depth_m=depth, K=np.diag((20.0, 20, 1)), metadata="{}")
+    whole, rng = path.read_bytes(), np.random.default_rng(2)
+    header = 500 if kind == "srs" else len(whole)  # mostly where it hurts
+    tracemalloc.start()
+    for number in range(1000):
+        data = bytearray(whole)
+        for _ in range(rng.integers(1, 4)):
+            data[rng.integers(header if number % 4 else len(data))] = rng.integers(256)
+        if number % 5 == 0:
+            del data[rng.integers(len(data)) :]
+        path.write_bytes(data)
+        try:
+            if kind == "srs":
+                recording = read_srs(path)
+                for index in range(len(recording)):
+                    recording.image(index)
+                recording.close()
+            else:
+                read_recording(path)
+        except ToftrackError as error:
+            assert "\n" not in str(error)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 20e6
+
+
+def test_existing_files_are_not_overwritten_unless_asked(path: Path) -> None:
+    record(path)
+    with pytest.raises(ToftrackError, match="exists already"):
+        SrsWriter(path)
+    SrsWriter(path, overwrite=True).close()
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        SrsWriter(path.parent / "nowhere" / "a.srs")
+
+
+def test_a_full_disk_is_told_and_the_whole_frames_are_kept(path: Path) -> None:
+    # In a process of its own, whose files may not become larger than two frames and a half.
+    program = f"""
+import resource, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+import test_srs
+from toftrack.errors import ToftrackError
+resource.setrlimit(resource.RLIMIT_FSIZE, (260_000, 260_000))
+try:
+    test_srs.record(Path({str(path)!r}), 9)
+except ToftrackError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "2 whole frames are kept" in done.stdout, done.stderr
+    recording = read_srs(path)
+    assert [recording.raw(i) for i in range(len(recording))] == raw_frames(2)
+    assert recording.damage is None
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_device_without_any_space_is_told(tmp_path: Path) -> None:
+    (tmp_path / "full.srs").symlink_to("/dev/full")
+    with pytest.raises(ToftrackError, match="No space left"):
+        SrsWriter(tmp_path / "full.srs", overwrite=True)
+
+
+def test_kill_9_while_recording_keeps_every_whole_frame(path: Path) -> None:
+    command = [sys.executable, "-m", "toftrack.record", str(path), "device.transport=emulated"]
+    options = ["device.emulated.fps=200", "device.emulated.loop=true"]
+    process = subprocess.Popen(
+        command + options, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        deadline = time.monotonic() + 30
+        while not (path.exists() and path.stat().st_size > 30 * FRAME_BYTES):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    recording, sample = read_srs(path), Path(__file__).parents[2] / "toftrack/data/sample.npz"
+    truth = read_recording(sample)
+    lengths = np.sqrt(1 + (truth.camera.normalised_rays() ** 2).sum(-1)).astype(np.float32)
+    assert len(recording) == (path.stat().st_size - 600) // (FRAME_BYTES + 24)
+    for index in range(len(recording)):
+        radial = truth.depth[index % 100].astype(np.float32) * lengths
+        expected = encode_frame(radial, truth.amplitude[index % 100], RANGE_M)
+        assert recording.raw(index) == expected

@@ -1,0 +1,266 @@
+"""The F-measure of correct, false and missed pixels, against its definition pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers.tracking import sample
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.surface import hand_surface
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.reference import ReferenceScorer
+from toftrack.render.scoring import Counts, Scorer, make_scorer
+from toftrack.render.segmentation import NearestSurface, Observation
+
+HEIGHT, WIDTH = 36, 48
+K = torch.tensor([[50.0, 0.0, 23.4], [0.0, 52.0, 17.8], [0.0, 0.0, 1.0]])
+DISTANCE_M = 0.5
+SHAPE = default_hand_shape()
+
+
+def hand_states(n: int, seed: int) -> torch.Tensor:
+    """(n, 27) hands near the middle of the image, somewhat bent and turned."""
+    g = torch.Generator().manual_seed(seed)
+    states = torch.zeros(n, 27)
+    states[:, 1], states[:, 2] = 0.09, DISTANCE_M
+    states[:, :3] += 0.01 * torch.randn(n, 3, generator=g)
+    states[:, 3:6] = 0.5 * torch.randn(n, 3, generator=g)
+    states[:, 6:] = 0.3 * torch.rand(n, 21, generator=g)
+    return states
+
+
+def surfaces(state: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """One hand's depth, (H, W) with 0 where there is none, and the wrist's silhouette.
+
+    The quadratic of every ray and ellipsoid in double precision.
+    """
+    shape = SHAPE.to(torch.float64)
+    both = hand_surface(shape).pose(forward_kinematics(state[None].double(), shape))
+    inverse = np.linalg.inv(both.axes_m[0].numpy())
+    centres = both.centres_m[0].numpy()
+    depth, wrist = np.zeros((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH), bool)
+    k = K.double().numpy()
+    for v in range(HEIGHT):
+        for u in range(WIDTH):
+            ray = np.array([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], 1.0])
+            p, q = inverse @ ray, np.einsum("eij,ej->ei", inverse, centres)
+            a, b, c = (p * p).sum(1), (p * q).sum(1), (q * q).sum(1) - 1
+            hit = b * b - a * c > 0
+            z = (b - np.sqrt(np.where(hit, b * b - a * c, 0))) / a
+            z = np.where(hit & (z > 0), z, np.inf)
+            depth[v, u] = z[:-1].min() if np.isfinite(z[:-1]).any() else 0
+            wrist[v, u] = np.isfinite(z[-1])
+    return depth, wrist
+
+
+def scene_of(state: torch.Tensor, seed: int) -> Observation:
+    """An observation of a hand that is noisy, has holes, a false part and an occluder."""
+    rng = np.random.default_rng(seed)
+    depth = surfaces(state)[0] + rng.normal(0, 0.012, (HEIGHT, WIDTH))
+    depth[depth < 0.2] = 1.4
+    depth[rng.random(depth.shape) < 0.05] = 0.0
+    depth[8:14, 5:12] = 0.55
+    occluder = np.zeros(depth.shape, bool)
+    occluder[15:20, 20:40] = True
+    depth[occluder] = 0.3
+    hand = (depth > 0) & (depth < 0.7) & ~occluder
+    nearest = float(depth[hand].min())
+    as_tensor = (torch.from_numpy(a) for a in (depth.astype(np.float32), hand, occluder))
+    return Observation(*as_tensor, K, nearest)
+
+
+def counted_by_a_loop(state: torch.Tensor, seen: Observation, head: FMeasure) -> list[float]:
+    """Correct, false, missed and residual of one hand, as the paper defines them."""
+    depth, wrist = surfaces(state)
+    silhouette = depth > 0
+    away = cv2.distanceTransform((~silhouette).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    radius = head.neighbourhood_m * float(K[0, 0]) / seen.nearest_m
+    correct = false = missed = 0
+    residual = 0.0
+    image, hand, occluder = seen.depth_m.numpy(), seen.hand.numpy(), seen.occluder.numpy()
+    for v in range(HEIGHT):
+        for u in range(WIDTH):
+            z, tolerance = float(image[v, u]), head.tolerance_m
+            if silhouette[v, u]:
+                if hand[v, u] and abs(depth[v, u] - z) <= tolerance:
+                    correct += 1
+                    near, far = 1 / (z - tolerance), 1 / (z + tolerance)
+                    off = 1 / depth[v, u] - (near + far) / 2
+                    residual += (off / ((near - far) / 2)) ** 2
+                elif not occluder[v, u]:
+                    false += 1
+            elif hand[v, u] and not wrist[v, u] and away[v, u] <= radius:
+                missed += 1
+    return [correct, false, missed, residual]
+
+
+def scorer_of(name: str) -> Scorer:
+    return ReferenceScorer(SHAPE) if name == "reference" else make_scorer(name, SHAPE, K.device)
+
+
+@pytest.mark.parametrize("name", ["reference", "torch", "numba"])
+def test_counts_agree_with_a_loop_over_pixels(name: str) -> None:
+    states = hand_states(5, 1)
+    head = FMeasure(neighbourhood_m=0.03)
+    seen = scene_of(states[0], 2)
+    counts = scorer_of(name)(states, head.evidence(seen))
+    expected = torch.tensor([counted_by_a_loop(state, seen, head) for state in states])
+    assert (expected[:, :3].amax(0) > 20).all(), "all kinds of pixels occur"
+    # Two pixels a hand may lie on an outline or at the edge of the tolerance in single precision.
+    assert (torch.stack(counts, 1) - expected).abs().max() <= 2
+
+
+def test_the_neighbourhood_grows_with_the_focal_length_and_falls_with_the_distance() -> None:
+    seen = scene_of(hand_states(1, 0)[0], 0)
+    head = FMeasure(neighbourhood_m=0.025)
+    radius = head.evidence(seen).radius_px
+    assert radius == pytest.approx(0.025 * 50 / seen.nearest_m)
+    larger = replace(seen, k=torch.diag(torch.tensor([2.0, 2.0, 1.0])) @ K)
+    assert head.evidence(larger).radius_px == pytest.approx(2 * radius)
+    farther = replace(seen, nearest_m=3 * seen.nearest_m)
+    assert head.evidence(farther).radius_px == pytest.approx(radius / 3)
+    assert head.evidence(seen.cropped(3, 4, 40, 30)).radius_px == pytest.approx(radius)
+
+
+def test_without_a_neighbourhood_nothing_is_missed() -> None:
+    states = hand_states(3, 1)
+    counts = ReferenceScorer(SHAPE)(
+        states, FMeasure(neighbourhood_m=0).evidence(scene_of(*states[:1], 0))
+    )
+    assert (counts.missed == 0).all()
+    assert (counts.correct > 0).all()
+
+
+def test_an_occluder_hides_the_model_and_is_no_evidence_against_it() -> None:
+    state = hand_states(1, 0)
+    scene = scene_of(state[0], 0)
+    shown = replace(scene, occluder=torch.zeros_like(scene.occluder))
+    head, scorer = FMeasure(), ReferenceScorer(SHAPE)
+    hidden, plain = scorer(state, head.evidence(scene)), scorer(state, head.evidence(shown))
+    covered = torch.from_numpy(surfaces(state[0])[0] > 0) & scene.occluder
+    assert int(covered.sum()) > 20
+    assert float(plain.false - hidden.false) == pytest.approx(int(covered.sum()), abs=1)
+    assert hidden.correct == plain.correct and hidden.missed == plain.missed
+    assert head.score(hidden) > head.score(plain)
+
+
+def test_pixels_outside_the_image_count_as_nothing() -> None:
+    """The two halves of an image hold the model pixels of the whole, and no others."""
+    states = hand_states(4, 3)
+    seen = scene_of(states[0], 3)
+    head = FMeasure()
+    middle, scorer = WIDTH // 2, ReferenceScorer(SHAPE)
+    whole = scorer(states, head.evidence(seen))
+    halves = [
+        scorer(states, head.evidence(seen.cropped(left, 0, right, HEIGHT)))
+        for left, right in ((0, middle), (middle, WIDTH))
+    ]
+    for name in ("correct", "false"):
+        parts = [getattr(half, name) for half in halves]
+        assert all(part.sum() > 0 for part in parts)
+        assert ((sum(parts) - getattr(whole, name)).abs() <= 2).all()
+    # A pixel near the other half's silhouette only is missed in the whole image alone.
+    assert (sum(half.missed for half in halves) <= whole.missed + 2).all()
+
+
+def counts(correct: float, false: float, missed: float, residual: float = 0.0) -> Counts:
+    return Counts(*(torch.tensor([value]) for value in (correct, false, missed, residual)))
+
+
+@pytest.mark.parametrize("beta", [0.5, 1.0, 1.5, 2.0])
+@pytest.mark.parametrize("naming", ["printed", "standard"])
+def test_the_score_is_the_f_measure_of_the_two_rates(naming: str, beta: float) -> None:
+    correct, false, missed = 70.0, 20.0, 45.0
+    with_missed, with_false = correct / (correct + missed), correct / (correct + false)
+    # The paper prints precision = c / (c + missed); usually that is the recall.
+    names = (with_missed, with_false) if naming == "printed" else (with_false, with_missed)
+    precision, recall = names
+    expected = (1 + beta**2) * precision * recall / (beta**2 * precision + recall)
+    head = FMeasure(beta=beta, naming=naming)
+    assert float(head.score(counts(correct, false, missed))) == pytest.approx(expected)
+
+
+def test_the_printed_formula_punishes_false_pixels_more_and_the_standard_one_missed_pixels() -> (
+    None
+):
+    false, missed = counts(70, 30, 10), counts(70, 10, 30)
+    printed, standard = FMeasure(beta=1.5, naming="printed"), FMeasure(beta=1.5, naming="standard")
+    assert printed.score(false) < printed.score(missed)
+    assert standard.score(false) > standard.score(missed)
+    even = FMeasure(beta=1.0)
+    torch.testing.assert_close(even.score(false), even.score(missed))
+
+
+def test_the_score_lies_between_none_and_all() -> None:
+    for naming in ("printed", "standard"):
+        head = FMeasure(naming=naming, residual_weight=1.0)
+        assert float(head.score(counts(50, 0, 0))) == 1
+        assert float(head.score(counts(0, 50, 50))) == 0
+        assert float(head.score(counts(0, 0, 0))) == 0
+        assert 0 <= float(head.score(counts(50, 3, 4, residual=50))) < 1e-6
+
+
+@pytest.mark.parametrize("coverage", [0.0, 0.2, 1.0])
+def test_nothing_correct_is_impossible_and_not_undefined(coverage: float) -> None:
+    assert float(FMeasure(coverage=coverage).log_score(counts(0, 50, 50))) == -math.inf
+
+
+def test_a_correct_pixel_counts_less_the_farther_off_it_is() -> None:
+    frame = sample().cut(0)
+    seen = NearestSurface()(frame.depth_m[0], frame.k)
+    scorer = ReferenceScorer(SHAPE)
+    states = torch.zeros(4, 27)
+    states[:, :3] = torch.from_numpy(frame.joints_m[0, 0])
+    strict, paper = FMeasure(residual_weight=1.0), FMeasure(residual_weight=0.0)
+    found = scorer(states[:1], strict.evidence(seen))
+    assert float(paper.score(found)) > float(strict.score(found)) > 0
+    # Of as many correct pixels, the nearer ones are better.
+    by_residual = [float(strict.score(counts(100, 10, 10, r))) for r in (0, 25, 50, 100)]
+    assert by_residual == sorted(by_residual, reverse=True)
+    assert by_residual[0] == pytest.approx(float(paper.score(counts(100, 10, 10))))
+    # What is lost from the correct pixels does not turn up as a gain elsewhere.
+    assert by_residual[2] == pytest.approx(float(paper.score(counts(50, 60, 10))))
+
+
+def test_the_residual_is_least_at_the_depth_that_was_seen() -> None:
+    state = hand_states(1, 5)
+    depth = torch.from_numpy(surfaces(state[0])[0].astype(np.float32))
+    seen = Observation(depth, depth > 0, torch.zeros_like(depth, dtype=torch.bool), K, 0.45)
+    moved = state.repeat(5, 1)
+    moved[:, 2] += torch.tensor([-0.012, -0.006, 0.0, 0.006, 0.012])
+    head = FMeasure(residual_weight=1.0)
+    found = ReferenceScorer(SHAPE)(moved, head.evidence(seen))
+    each = (found.residual / found.correct).tolist()
+    assert each[2] < 0.002
+    assert each[0] > each[1] > each[2] < each[3] < each[4]
+    # 6 of 20 mm off is 0.09 of a pixel, 12 of 20 mm 0.36; slanted surfaces differ by a little.
+    assert each[1] == pytest.approx(0.09, rel=0.25) and each[4] == pytest.approx(0.36, rel=0.25)
+
+
+def test_coverage_prefers_the_hypothesis_that_explains_more_of_the_image() -> None:
+    few, many = counts(20, 1, 1), counts(400, 40, 40)
+    without, with_it = FMeasure(), FMeasure(coverage=0.5)
+    assert without.log_score(few) > without.log_score(many)
+    assert with_it.log_score(few) < with_it.log_score(many)
+    gain = with_it.log_score(many) - without.log_score(many)
+    assert float(gain) == pytest.approx(0.5 * math.log(400), rel=1e-5)
+    # A search may ask for another weight; the score that is reported never has it.
+    torch.testing.assert_close(without.log_score(few, 0.5), with_it.log_score(few))
+    torch.testing.assert_close(without.score(many), with_it.score(many))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"naming": "usual"}, {"tolerance_m": 0.0}, {"neighbourhood_m": -0.01}, {"beta": 0.0}],
+)
+def test_impossible_settings_are_refused(settings: dict) -> None:
+    with pytest.raises(ToftrackError, match="likelihood"):
+        FMeasure(**settings)

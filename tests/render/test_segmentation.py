@@ -1,0 +1,237 @@
+"""Segmentation: the nearest surface, what lies behind it, and what hides it."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers.tracking import sample
+
+from toftrack.output.evaluation import TIPS
+from toftrack.render.segmentation import Expected, NearestSurface, Observation, reduce_image
+
+HEIGHT, WIDTH, FOCAL = 60, 80, 100.0
+K = np.array([[FOCAL, 0, 39.0], [0, FOCAL, 31.0], [0, 0, 1]])
+HAND = (slice(10, 40), slice(20, 50))  # 30 x 30 pixels
+
+
+def picture(hand_m: float = 0.5, wall_m: float = 1.0) -> np.ndarray:
+    """A flat hand in front of a wall."""
+    depth = np.full((HEIGHT, WIDTH), wall_m, np.float32)
+    depth[HAND] = hand_m
+    return depth
+
+
+def hand_of(depth: np.ndarray, expected: Expected | None = None, **settings) -> np.ndarray:
+    return NearestSurface(**settings)(depth, K, expected).hand.numpy()
+
+
+def test_the_nearest_surface_and_what_is_up_to_20_cm_behind_it_is_the_hand() -> None:
+    depth = picture()
+    depth[40:50, 20:50] = 0.69  # its arm
+    depth[50:55, 20:50] = 0.71  # too far behind
+    hand = hand_of(depth)
+    assert hand[HAND].all() and hand[40:50, 20:50].all()
+    assert hand.sum() == 40 * 30
+    assert NearestSurface()(depth, K).nearest_m == pytest.approx(0.5)
+
+
+def test_the_depth_behind_the_nearest_point_is_a_setting() -> None:
+    depth = picture()
+    depth[40:50, 20:50] = 0.59
+    assert hand_of(depth, depth_range_m=0.10)[40:50, 20:50].all()
+    assert not hand_of(depth, depth_range_m=0.08)[40:50, 20:50].any()
+
+
+def test_the_hand_does_not_depend_on_where_in_depth_the_scene_is() -> None:
+    near, far = hand_of(picture(0.4, 0.9)), hand_of(picture(0.8, 1.3))
+    assert near.any() and (near == far).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_specks_and_flying_pixels_are_no_hand(seed: int) -> None:
+    clean = picture()
+    noisy = clean.copy()
+    rng = np.random.default_rng(seed)
+    rows, columns = np.nonzero(cv2.dilate((clean < 1).astype(np.uint8), np.ones((3, 3))) == 0)
+    chosen = rng.choice(len(rows), 40, replace=False)
+    noisy[rows[chosen], columns[chosen]] = rng.uniform(0.15, 0.45, 40)
+    seen = NearestSurface()(noisy, K)
+    assert seen.nearest_m == pytest.approx(0.5)
+    assert not seen.hand.numpy()[rows[chosen], columns[chosen]].any()
+    assert seen.hand.numpy()[HAND].all()
+    # The paper takes the single nearest pixel, whatever it is.
+    single = NearestSurface(min_area_m2=0)(noisy, K)
+    assert single.nearest_m == pytest.approx(float(noisy.min()))
+
+
+def test_how_small_a_speck_is_depends_on_its_distance_too() -> None:
+    """The same 5 x 5 pixels are 6 cm2 at half a metre and 25 cm2 at one metre."""
+    for distance, accepted in ((0.5, False), (1.0, True)):
+        depth = np.zeros((HEIGHT, WIDTH), np.float32)
+        depth[20:25, 30:35] = distance
+        assert NearestSurface(min_area_m2=0.001)(depth, K).empty is not accepted
+
+
+@pytest.mark.parametrize(
+    "depth",
+    [
+        np.zeros((HEIGHT, WIDTH), np.float32),
+        np.full((HEIGHT, WIDTH), 1.3, np.float32),
+        np.full((HEIGHT, WIDTH), np.nan, np.float32),
+        np.full((HEIGHT, WIDTH), np.inf, np.float32),
+        np.full((HEIGHT, WIDTH), -0.5, np.float32),
+    ],
+    ids=["no reading", "too far", "nan", "infinity", "negative"],
+)
+@pytest.mark.parametrize("expected", [None, Expected(0.45, 0.55)])
+def test_nothing_in_range_is_empty(depth: np.ndarray, expected: Expected | None) -> None:
+    seen = NearestSurface()(depth, K, expected)
+    assert seen.empty
+    assert math.isinf(seen.nearest_m)
+    assert not seen.hand.any() and not seen.occluder.any()
+
+
+def test_no_reading_is_never_part_of_anything() -> None:
+    depth = picture()
+    for row, value in enumerate((0.0, np.nan, np.inf, -0.3)):
+        depth[12 + row, 25:45] = value
+    hand = hand_of(depth)
+    assert not hand[12:16, 25:45].any()
+    assert hand.sum() == 900 - 80
+
+
+def with_occluder() -> np.ndarray:
+    depth = picture()
+    depth[20:30, 0:60] = 0.35  # a bar across the hand
+    return depth
+
+
+def test_what_comes_in_front_of_a_tracked_hand_hides_it() -> None:
+    seen = NearestSurface()(with_occluder(), K, Expected(0.49, 0.55))
+    hand, occluder = seen.hand.numpy(), seen.occluder.numpy()
+    assert occluder[20:30, 0:60].all()
+    assert seen.nearest_m == pytest.approx(0.5)
+    assert hand[10:19, 20:50].all() and hand[31:40, 20:50].all()
+    assert not (hand & occluder).any()
+    # Its edge mixes both depths and is neither.
+    assert occluder.sum() == 12 * 61
+
+
+def test_without_a_tracked_hand_the_bar_in_front_is_the_nearest_surface() -> None:
+    for expected, margin in ((None, 0.035), (Expected(0.49, 0.55), 0.0)):
+        seen = NearestSurface(occluder_margin_m=margin)(with_occluder(), K, expected)
+        assert not seen.occluder.any()
+        assert seen.nearest_m == pytest.approx(0.35)
+        assert seen.hand.numpy()[20:30, 0:60].all()
+
+
+def test_a_hand_that_comes_nearer_is_not_its_own_occluder() -> None:
+    depth = picture(hand_m=0.5)
+    seen = NearestSurface()(depth, K, Expected(0.53, 0.58))
+    assert not seen.occluder.any()
+    assert seen.hand.numpy()[HAND].all()
+
+
+def test_a_hand_that_jumped_out_of_its_expected_depth_is_still_found() -> None:
+    """Nothing is where the hand was expected: what is in front of that cannot hide it."""
+    depth = picture(hand_m=0.5, wall_m=1.4)
+    seen = NearestSurface()(depth, K, Expected(0.8, 0.9))
+    assert not seen.occluder.any()
+    assert seen.hand.numpy()[HAND].all()
+
+
+def test_what_is_well_behind_a_tracked_hand_is_the_body() -> None:
+    depth = picture()
+    depth[40:60] = 0.65
+    assert hand_of(depth)[40:60].all()
+    assert not hand_of(depth, Expected(0.49, 0.55))[40:60].any()
+
+
+def test_the_segmented_sample_holds_the_true_hand_and_not_the_wall() -> None:
+    scene = sample()
+    for frame in range(0, 100, 12):
+        seen = NearestSurface()(scene.depth_m[frame], scene.k)
+        hand = seen.hand.numpy()
+        joints = scene.joints_m[frame]
+        pixels = (joints @ scene.k.T)[:, :2] / joints[:, 2:]
+        u, v = pixels.round().astype(int).T
+        # Joints lie inside of the hand; only the tips lie at its very edge.
+        assert np.delete(hand[v, u], TIPS).mean() > 0.9
+        depth = scene.depth_m[frame][hand]
+        assert depth.max() < joints[:, 2].max() + 0.25
+        assert seen.nearest_m < joints[:, 2].min() + 0.02
+
+
+def plane(height: int, width: int, k: np.ndarray) -> np.ndarray:
+    """The depth image of the plane n.X = 0.6 with the normal below."""
+    v, u = np.mgrid[:height, :width]
+    rays = np.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones_like(u)), -1)
+    return (0.6 / (rays @ NORMAL)).astype(np.float32)
+
+
+NORMAL = np.array([0.35, -0.2, 0.9])
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4, 5])
+def test_a_reduced_image_shows_the_same_surface_in_the_same_place(factor: int) -> None:
+    height, width = 120, 180
+    k = np.array([[150.0, 0, 81.3], [0, 152.0, 58.6], [0, 0, 1]])
+    depth = plane(height, width, k)
+    pixels = math.ceil(height * width / factor**2)
+    small, k_small = reduce_image(depth, k, pixels)
+    assert small.shape == (height // factor, -(-width // factor))
+    v, u = np.mgrid[: small.shape[0], : small.shape[1]]
+    rays = np.stack(
+        (
+            (u - k_small[0, 2]) / k_small[0, 0],
+            (v - k_small[1, 2]) / k_small[1, 1],
+            np.ones(u.shape),
+        ),
+        -1,
+    )
+    # At the border the median filter repeats the last row, which moves the plane by under 2 mm.
+    off = (small[..., None] * rays) @ NORMAL - 0.6
+    assert np.abs(off[1:-1, 1:-1]).max() < 1e-5
+    assert np.abs(off).max() < 0.01
+    # The 3-D point of a reduced pixel projects onto the pixel that it was taken from.
+    point = small[7, 9] * rays[7, 9]
+    back = (k @ point)[:2] / point[2]
+    assert back == pytest.approx(np.round(back), abs=1e-6)
+    assert depth[int(back[1].round()), int(back[0].round())] == pytest.approx(small[7, 9])
+
+
+def test_a_large_image_is_reduced_below_the_limit_and_shows_no_new_depths() -> None:
+    scene = sample()
+    large = np.kron(scene.depth_m[0], np.ones((3, 3), np.float32))
+    seen = NearestSurface(max_pixels=40_000)(large, scene.k)
+    assert seen.depth_m.numel() <= 40_000 * 1.01
+    assert np.isin(seen.depth_m.numpy(), scene.depth_m[0]).all()
+
+
+def test_the_given_images_are_not_changed() -> None:
+    depth, k = with_occluder(), K.copy()
+    before = depth.copy()
+    NearestSurface(max_pixels=1000)(depth, k, Expected(0.49, 0.55))
+    assert (depth == before).all() and (k == K).all()
+
+
+def test_a_crop_keeps_every_point_where_it_is() -> None:
+    seen = NearestSurface()(with_occluder(), K, Expected(0.49, 0.55))
+    part = seen.cropped(7, 11, 71, 43)
+    assert part.depth_m.shape == part.hand.shape == part.occluder.shape == (32, 64)
+
+    def points(observation: Observation) -> torch.Tensor:
+        v, u = observation.hand.nonzero().T
+        z, k = observation.depth_m[v, u], observation.k
+        return torch.stack(((u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z, z), 1)
+
+    inside = seen.hand.clone()
+    inside[:11] = inside[43:] = False
+    inside[:, :7] = inside[:, 71:] = False
+    whole = Observation(seen.depth_m, inside, seen.occluder, seen.k, seen.nearest_m)
+    torch.testing.assert_close(points(part), points(whole))
+    assert seen.k[0, 2] == 39, "the whole image's intrinsics stay"

@@ -1,0 +1,279 @@
+"""toftrack in a program of one's own: the names, the configuration, images, several trackers."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+import torch
+from helpers.tracking import CONF, ROOT, sample
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+import toftrack
+from toftrack.compute.threads import small_operations, threads
+from toftrack.configuration.compose import configuration
+
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+
+
+def python(code: str, *arguments: str, folder: Path) -> str:
+    """What a program prints that runs in a process and folder of its own."""
+    told = subprocess.run(
+        [sys.executable, *arguments, "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert told.returncode == 0, told.stderr
+    return told.stdout
+
+
+def test_importing_toftrack_is_light_until_a_name_is_used(tmp_path: Path) -> None:
+    heavy = ("torch", "numba", "hydra", "cv2", "numpy", "scipy")
+    code = f"""
+import sys, toftrack
+print([name for name in {heavy} if name in sys.modules])
+print(set(toftrack.__all__) <= set(dir(toftrack)))
+print(toftrack.__version__)
+"""
+    assert python(code, folder=tmp_path).splitlines() == ["[]", "True", toftrack.__version__]
+
+
+def test_every_stable_name_is_there_and_no_other() -> None:
+    for name in toftrack.__all__:
+        assert getattr(toftrack, name) is not None, name
+    with pytest.raises(AttributeError, match="no attribute 'make_racket'"):
+        _ = toftrack.make_racket
+
+
+def test_every_field_of_an_estimate_has_a_name() -> None:
+    """Names that other programs rely on: a change of them needs a new version."""
+    assert {field.name for field in dataclasses.fields(toftrack.Estimate)} == {
+        *("index", "timestamp_s", "state_name", "lost", "joints_m", "state", "latent", "score"),
+        *("covariance", "effective_sample_size", "compute_s", "gesture", "gesture_probability"),
+        *("pointing_origin_m", "pointing_direction"),
+    }
+
+
+def test_three_lines_track(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = sample()
+    tracker = toftrack.make_tracker(*QUICK)
+    found = [tracker.step(depth_m, scene.k) for depth_m in scene.depth_m[:6]]
+    assert isinstance(found[0], toftrack.Estimate)
+    assert [estimate.index for estimate in found] == list(range(6))
+    times = [estimate.timestamp_s for estimate in found]
+    assert times == sorted(times) and times[0] < times[-1]
+    error = np.linalg.norm(found[-1].joints_m - scene.joints_m[5], axis=-1)
+    assert error.mean() < 0.02
+    assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def test_frames_count_on_from_a_given_index_and_over_missing_hands() -> None:
+    tracker = toftrack.make_tracker()
+    nothing, k = np.zeros((30, 40), np.float32), np.array([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+    indices = [tracker.step(nothing, k, index).index for index in (None, None, 7, None)]
+    assert indices == [0, 1, 7, 8]
+    assert tracker.step(nothing, k, timestamp_s=3.5).timestamp_s == 3.5
+
+
+def test_an_image_of_any_floating_type_and_layout_gives_the_same_hand() -> None:
+    scene = sample()
+    depth = scene.depth_m[0]
+    holes = np.where(depth > 0, depth, np.nan)
+    kinds = (depth, depth.astype(np.float64), np.asfortranarray(depth), torch.from_numpy(holes))
+    joints = [toftrack.make_tracker(*QUICK).step(kind, scene.k).joints_m for kind in kinds]
+    assert np.isfinite(joints[0]).all()
+    assert all(np.array_equal(joints[0], other) for other in joints[1:])
+
+
+def test_the_size_of_the_image_may_change_on_the_way() -> None:
+    scene = sample()
+    tracker = toftrack.make_tracker(*QUICK)
+    found = []
+    for i in range(6):
+        depth, k = scene.depth_m[i], scene.k.copy()
+        if i >= 3:
+            depth, k[1, 2] = depth[10:], k[1, 2] - 10
+        found.append(tracker.step(depth, k))
+    assert not found[-1].lost
+    assert np.linalg.norm(found[-1].joints_m - scene.joints_m[5], axis=-1).mean() < 0.02
+
+
+K = [[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]]
+METRES = np.full((30, 40), 0.6, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("depth", "k", "words"),
+    [
+        (METRES * 1000, K, "plainly millimetres"),
+        ((METRES * 1000).astype(np.uint16), K, "whole numbers (uint16)"),
+        (METRES > 0, K, "float32 metres, but is bool"),
+        (METRES.astype(complex), K, "complex"),
+        (METRES[None], K, "(1, 30, 40)"),
+        (METRES[:0], K, "(0, 40)"),
+        ("depth.png", K, "two dimensions"),
+        ([[0.1, 0.2], [0.3]], K, "NumPy arrays"),
+        (METRES, np.eye(4), "K must be 3x3"),
+        (METRES, [[0, 0, 20], [0, 200, 15], [0, 0, 1]], "positive focal lengths"),
+        (METRES, np.full((3, 3), np.nan), "NaN"),
+        (METRES, "camera", "K must"),
+    ],
+)
+def test_a_bad_image_or_matrix_is_one_clear_sentence(depth: object, k: object, words: str) -> None:
+    with pytest.raises(toftrack.ToftrackError) as caught:
+        _tracker().step(depth, k)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+_made: list = []
+
+
+def _tracker() -> toftrack.Tracker:
+    if not _made:
+        _made.append(toftrack.make_tracker())
+    return _made[0]
+
+
+def test_a_bad_image_does_not_disturb_the_track() -> None:
+    scene = sample()
+    tracker = toftrack.make_tracker(*QUICK)
+    before = [tracker.step(scene.depth_m[i], scene.k) for i in range(3)][-1]
+    with pytest.raises(toftrack.ToftrackError):
+        tracker.step(scene.depth_m[3] * 1000, scene.k)
+    after = tracker.step(scene.depth_m[3], scene.k)
+    assert (before.index, after.index, after.state_name) == (2, 3, "tracking")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["nope=1"], "nope"),
+        (["device=telescope"], "device/telescope"),
+        (["hand.side=both"], "hand.side=both is unknown"),
+        (["hand.shape=gone.json"], "gone.json"),
+        (["seed=[1"], "[1"),
+        (["filter.particles=0"], "filter.particles"),
+        ([3], "3 is no text"),
+    ],
+)
+def test_a_bad_override_is_one_clear_sentence(overrides: list, words: str) -> None:
+    with pytest.raises(toftrack.ToftrackError) as caught:
+        toftrack.make_tracker(*overrides)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_device_is_what_the_command_line_would_open() -> None:
+    with toftrack.make_device("device=sample", "device.stop=2") as device:
+        frames = list(device)
+    assert [frame.index for frame in frames] == [0, 1]
+    assert device.camera.rectify(frames[0].depth, frames[0].radial).shape == (144, 176)
+    for overrides, words in ((["device=replay"], "device.path"), (["device.stop=101"], "101")):
+        with pytest.raises(toftrack.ToftrackError, match=words):
+            toftrack.make_device(*overrides)
+
+
+def test_a_configuration_of_one_s_own(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("seed: 5\n")
+    assert configuration("seed=6", config_dir=tmp_path) == {"seed": 6}
+    with pytest.raises(toftrack.ToftrackError, match="no config.yaml in the folder"):
+        toftrack.make_tracker(config_dir=tmp_path / "gone")
+
+
+def test_a_hydra_application_around_us_keeps_its_own_state(tmp_path: Path) -> None:
+    (tmp_path / "app.yaml").write_text("mine: 1\n")
+    with initialize_config_dir(str(tmp_path), job_name="mine", version_base="1.2"):
+        own = GlobalHydra.instance().hydra
+        assert configuration().seed == 0
+        assert GlobalHydra.instance().hydra is own
+        assert hydra.version.getbase() == hydra.version._get_version("1.2")
+        assert compose("app", return_hydra_config=True).hydra.job.name == "mine"
+    assert not GlobalHydra.instance().is_initialized()
+
+
+def test_a_failure_leaves_hydra_as_it_was() -> None:
+    with pytest.raises(toftrack.ToftrackError):
+        configuration("nope=1")
+    assert not GlobalHydra.instance().is_initialized()
+    assert configuration().seed == 0
+
+
+def test_trackers_in_threads_do_not_disturb_each_other() -> None:
+    scene = sample()
+
+    def follow(seed: int, found: dict[int, np.ndarray]) -> None:
+        tracker = toftrack.make_tracker(f"seed={seed}", *QUICK)
+        steps = [tracker.step(depth, scene.k) for depth in scene.depth_m[:6]]
+        found[seed] = np.stack([estimate.joints_m for estimate in steps])
+
+    alone: dict[int, np.ndarray] = {}
+    together: dict[int, np.ndarray] = {}
+    for seed in (1, 2):
+        follow(seed, alone)
+    workers = [threading.Thread(target=follow, args=(seed, together)) for seed in (1, 2)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert not np.array_equal(alone[1], alone[2])
+    for seed in (1, 2):
+        assert np.array_equal(alone[seed], together[seed])
+
+
+def test_a_thread_that_begins_while_another_one_computes_gets_all_of_torch_s_threads() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    told: list[int] = []
+
+    def work() -> None:
+        with small_operations():
+            told.append(torch.get_num_threads())
+        told.append(torch.get_num_threads())
+
+    try:
+        with small_operations():
+            most = threads()
+            worker = threading.Thread(target=work)
+            worker.start()
+            worker.join()
+        assert told == [1, 2] and torch.get_num_threads() == 2
+        with small_operations():
+            assert threads() == most
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_an_installed_package_brings_its_configuration(tmp_path: Path) -> None:
+    """Built from the checkout as an installer does, and imported from there, in another folder."""
+    pytest.importorskip("setuptools", minversion="77")
+    code = f"""
+import os, sys
+os.chdir({str(ROOT)!r})
+folders = ["build", "-b", {str(tmp_path / "build")!r}, "egg_info", "-e", {str(tmp_path)!r}]
+sys.argv = ["setup.py", "-q", *folders]
+exec(compile(open("setup.py").read(), "setup.py", "exec"))
+"""
+    python(code, folder=tmp_path)
+    built = tmp_path / "build" / "lib"
+    files = {path.relative_to(CONF) for path in CONF.rglob("*.yaml")}
+    inside = built / "toftrack" / "conf"
+    assert {path.relative_to(inside) for path in inside.rglob("*.yaml")} == files
+    code = f"""
+import sys
+sys.path.insert(0, {str(built)!r})
+sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder)]
+import toftrack
+from toftrack.configuration.compose import configuration
+print(toftrack.__file__, configuration("smooth=one_euro").smooth.results)
+"""
+    path, smooth = python(code, folder=tmp_path).split()
+    assert Path(path).is_relative_to(built) and smooth == "False"

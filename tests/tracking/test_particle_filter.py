@@ -1,0 +1,183 @@
+"""The particle filter's pure functions."""
+
+import math
+
+import pytest
+import roma
+import torch
+
+from toftrack.tracking import particle_filter as sir
+
+LOWER, UPPER = torch.tensor([-1.0, -2.0, 0.0, -0.5]), torch.tensor([1.0, 2.0, 3.0, 0.5])
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def particles(n: int, seed: int = 0) -> torch.Tensor:
+    x = torch.randn(n, 10, generator=generator(seed))
+    return torch.cat((x[:, :6], LOWER + (UPPER - LOWER) * x[:, 6:].sigmoid()), 1)
+
+
+@pytest.mark.parametrize("scheme", sorted(sir.RESAMPLERS))
+@pytest.mark.parametrize("n", [1, 10, 300])
+def test_resampling_is_unbiased(scheme: str, n: int) -> None:
+    weights = torch.rand(50, generator=generator(1)).double() ** 3
+    weights /= weights.sum()
+    g, draws = generator(2), 400
+    counts = torch.zeros(50, dtype=torch.float64)
+    for _ in range(draws):
+        counts += torch.bincount(sir.RESAMPLERS[scheme](weights, n, g), minlength=50)
+    # Each draw's variance is at most the multinomial one, so 5 of its standard deviations hold
+    # every one of the 50 means with a probability above 0.9999.
+    sigma = (n * weights * (1 - weights) / draws).sqrt()
+    assert ((counts / draws - n * weights).abs() <= 5 * sigma + 1e-9).all()
+
+
+def test_systematic_resampling_gives_each_particle_its_share_rounded() -> None:
+    weights = torch.rand(40, generator=generator(3)).double()
+    weights /= weights.sum()
+    for seed in range(20):
+        indices = sir.resample_systematic(weights, 100, generator(seed))
+        counts = torch.bincount(indices, minlength=40)
+        assert ((counts - 100 * weights).abs() < 1).all()
+
+
+@pytest.mark.parametrize("scheme", sorted(sir.RESAMPLERS))
+def test_resampling_survives_degenerate_weights(scheme: str) -> None:
+    resample = sir.RESAMPLERS[scheme]
+    one = torch.zeros(8, dtype=torch.float64)
+    one[3] = 1.0
+    assert (resample(one, 20, generator()) == 3).all()
+    last = torch.zeros(8, dtype=torch.float64)
+    last[0] = 1.0  # nothing behind the first has weight: no rounding may pick it
+    assert (resample(last, 1000, generator()) == 0).all()
+    # Weights whose sum falls short of 1, as a float32 running sum does: no index past the end.
+    short = torch.full((1000,), 0.9999e-3)
+    indices = resample(short, 1000, generator())
+    assert int(indices.max()) <= 999
+    assert len(indices.unique()) > 600
+
+
+def test_weights_from_logarithms_sum_to_one_and_keep_ratios() -> None:
+    weights = sir.normalise(torch.tensor([-1000.0, -1000.0 + math.log(3.0)], dtype=torch.float64))
+    torch.testing.assert_close(weights, torch.tensor([0.25, 0.75], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("log_weights", "expected"),
+    [
+        ([-math.inf] * 4, [0.25] * 4),
+        ([math.nan] * 4, [0.25] * 4),
+        ([0.0, math.nan, -math.inf, 0.0], [0.5, 0.0, 0.0, 0.5]),
+        ([-math.inf, -5.0, -math.inf, -math.inf], [0.0, 1.0, 0.0, 0.0]),
+    ],
+)
+def test_degenerate_weights_become_valid_ones(log_weights, expected) -> None:
+    weights = sir.normalise(torch.tensor(log_weights))
+    torch.testing.assert_close(weights, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_effective_sample_size_runs_from_one_to_n() -> None:
+    assert float(sir.effective_sample_size(torch.full((7,), 1 / 7))) == pytest.approx(7)
+    assert float(sir.effective_sample_size(torch.tensor([0.0, 1.0, 0.0]))) == pytest.approx(1)
+
+
+def test_a_difference_composed_again_gives_the_particles_back() -> None:
+    x, reference = particles(100), particles(1, seed=5)
+    again = sir.compose(reference, sir.difference(x, reference))
+    torch.testing.assert_close(again[:, :3], x[:, :3], atol=2e-5, rtol=0)
+    torch.testing.assert_close(again[:, 6:], x[:, 6:], atol=1e-5, rtol=0)
+    turn = roma.rotvec_geodesic_distance(again[:, 3:6], x[:, 3:6])
+    assert float(turn.max()) < 2e-3
+
+
+def test_turning_leaves_the_middle_of_the_hand_in_place() -> None:
+    x = particles(20)
+    tangent = torch.zeros(20, 10)
+    tangent[:, 3:6] = torch.randn(20, 3, generator=generator(4))
+    turned = sir.compose(x, tangent)
+
+    def middle(p: torch.Tensor) -> torch.Tensor:
+        return p[:, :3] + roma.rotvec_to_rotmat(p[:, 3:6]) @ torch.tensor(sir.PIVOT_M)
+
+    torch.testing.assert_close(middle(turned), middle(x), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("mode", ["truncate", "reflect"])
+def test_diffusion_stays_inside_the_bounds(mode: str) -> None:
+    x = particles(500)
+    scale = torch.full((10,), 3.0)
+    moved = sir.diffuse(x, scale, LOWER, UPPER, mode, generator())
+    assert (moved[:, 6:] >= LOWER).all() and (moved[:, 6:] <= UPPER).all()
+
+
+def test_diffusion_has_the_spread_it_is_asked_for() -> None:
+    x = torch.zeros(20_000, 10)
+    x[:, 6:] = (LOWER + UPPER) / 2
+    scale = torch.tensor([0.01, 0.02, 0.03, 0.01, 0.02, 0.03, 0.01, 0.02, 0.03, 0.04])
+    moved = sir.diffuse(x, scale, LOWER, UPPER, "reflect", generator())
+    spread = sir.difference(moved, x[:1]).std(0)
+    # The standard error of a standard deviation from 20 000 draws is 0.5 %; 5 of them.
+    torch.testing.assert_close(spread, scale, rtol=0.025, atol=0)
+
+
+def test_a_triangular_factor_gives_a_correlated_diffusion() -> None:
+    x = torch.zeros(20_000, 10)
+    x[:, 6:] = (LOWER + UPPER) / 2
+    factor = 0.02 * torch.eye(10)
+    factor[6, 0] = 0.02
+    moved = sir.diffuse(x, factor, LOWER, UPPER, "reflect", generator())
+    tangents = sir.difference(moved, x[:1])
+    correlation = torch.corrcoef(tangents[:, [0, 6]].T)[0, 1]
+    assert float(correlation) == pytest.approx(math.sqrt(0.5), abs=0.03)
+
+
+def test_reflection_does_not_push_a_particle_at_the_bound_inwards_as_truncation_piles_it_up() -> (
+    None
+):
+    latent = UPPER.expand(10_000, 4) + 0.1 * torch.randn(10_000, 4, generator=generator())
+    truncated = sir.bound(latent, LOWER, UPPER, "truncate")
+    reflected = sir.bound(latent, LOWER, UPPER, "reflect")
+    assert 0.4 < (truncated == UPPER).float().mean() < 0.6
+    assert (reflected == UPPER).float().mean() < 0.01
+
+
+def test_the_mean_rotation_is_taken_on_the_rotations_not_on_their_coordinates() -> None:
+    # Just below and just above a half turn about z: their rotation vectors average to no turn.
+    rotvec = torch.tensor([[0.0, 0.0, math.pi - 0.1], [0.0, 0.0, -math.pi + 0.1]])
+    mean = sir.mean_rotation(rotvec, torch.tensor([0.5, 0.5]))
+    assert float(mean.norm()) == pytest.approx(math.pi, abs=1e-3)
+
+
+def test_the_mean_rotation_commutes_with_a_turn_of_all() -> None:
+    rotvec = 0.3 * torch.randn(50, 3, generator=generator())
+    weights = torch.rand(50, generator=generator(1))
+    weights /= weights.sum()
+    turn = torch.tensor([[0.7, -1.2, 0.4]])
+    mean = sir.mean_rotation(rotvec, weights)
+    turned = sir.mean_rotation(roma.rotvec_composition((turn.expand(50, 3), rotvec)), weights)
+    expected = roma.rotvec_composition((turn, mean[None]))[0]
+    torch.testing.assert_close(turned, expected, atol=1e-4, rtol=0)
+
+
+def test_mean_and_covariance_of_particles_are_the_weighted_ones() -> None:
+    x = particles(200)
+    x[:, 3:6] *= 0.1
+    weights = torch.rand(200, generator=generator(1)).double()
+    weights /= weights.sum()
+    mean = sir.mean_particle(x, weights)
+    torch.testing.assert_close(mean[0, 6:], (weights.float() @ x)[6:])
+    tangents = sir.difference(x, mean)
+    expected = torch.cov(tangents.double().T, aweights=weights, correction=0)
+    torch.testing.assert_close(
+        sir.covariance(tangents, weights).double(), expected, atol=1e-5, rtol=1e-4
+    )
+
+
+def test_the_same_seed_gives_the_same_draws() -> None:
+    x = particles(30)
+    scale = torch.full((10,), 0.1)
+    one, two = (sir.diffuse(x, scale, LOWER, UPPER, "reflect", generator(9)) for _ in range(2))
+    assert torch.equal(one, two)

@@ -1,0 +1,234 @@
+"""`view=browser` as a user meets it: recordings that end or repeat, Ctrl-C, and a real browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from helpers.browsing import (
+    PATIENCE_S,
+    eventually,
+    made,
+    moments,
+    ours,
+    shown_again_and_again,
+)
+from helpers.tracking import ROOT, configuration
+
+from toftrack.devices.replay import Replay
+from toftrack.devices.sample import Sample
+from toftrack.estimate import no_estimate
+from toftrack.output.results import read_results
+from toftrack.views.browser import view as browser
+from toftrack.views.browser.view import BrowserView, browser_view
+
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+DRIVER = shutil.which("chromedriver")
+
+
+def test_frames_with_an_end_wait_for_a_visitor_but_not_for_ever(capsys) -> None:
+    found = re.compile(r"live view: (http://127\.0\.0\.1:\d+/)")
+    views: list[BrowserView] = []
+    thread = threading.Thread(
+        target=lambda: views.append(browser_view("", 25.0, 100, port=0, wait_s=PATIENCE_S))
+    )
+    thread.start()
+    told = ""
+    while not found.search(told):
+        told += capsys.readouterr().err
+    urlopen(found.search(told)[1] + "moment", timeout=PATIENCE_S).close()
+    thread.join(PATIENCE_S)
+    views[0].close()
+    browser_view("", 25.0, 100, port=0, wait_s=0.01).close()
+    assert capsys.readouterr().out == ""
+
+
+def test_with_the_page_recordings_keep_their_pace_and_only_the_sample_repeats() -> None:
+    device = configuration("view=browser").device
+    assert device.realtime and device.repeat
+    device = configuration("view=browser", "device=replay", "device.path=x.npz").device
+    assert device.realtime and not device.repeat
+    device = configuration("view=browser", "view.live=false").device
+    assert not device.realtime and not device.repeat
+    assert not configuration("device=folder", "device.path=x").device.realtime
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_repeated_recording_counts_on(realtime: bool, monkeypatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
+    device = Sample(start=10, stop=13, realtime=realtime, repeat=True)
+    assert device.frames is None and device.truth is None and device.description["repeat"]
+    frames = list(islice(device, 8))
+    assert [frame.index for frame in frames] == list(range(10, 18))
+    assert np.allclose([f.timestamp_s for f in frames], np.arange(10, 18) / 25)
+    for frame, later in zip(frames, frames[3:], strict=False):
+        assert np.array_equal(frame.depth, later.depth)
+    assert not np.array_equal(frames[0].depth, frames[1].depth)
+    assert device.dropped == 0 and clock[0] == pytest.approx(7 / 25 if realtime else 0, abs=1e-3)
+
+
+def test_a_repeated_recording_drops_what_comes_too_late_over_its_end(monkeypatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
+    device = Replay(ROOT / "toftrack/data/sample.npz", 0, 5, realtime=True, repeat=True)
+    indices = []
+    for frame in islice(device, 4):
+        indices.append(frame.index)
+        clock[0] = round(clock[0] + 0.1201, 4)  # three frames' time
+    assert indices == [0, 3, 6, 9] and device.dropped == 6
+
+
+def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "track.py"), "view=browser", "view.port=0", *QUICK],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    told = process.stderr.readline()
+    url = re.fullmatch(r"live view: (http://\S+) \(Ctrl-C ends\)\n", told)[1]
+    bodies, facts = [], {"version": 0, "run": ""}
+    while len(bodies) < 2:
+        path = f"{url}moment?run={facts['run']}&after={facts['version']}"
+        with urlopen(path, timeout=PATIENCE_S) as answer:
+            facts = json.loads(answer.headers["X-Moment"])
+            bodies += [answer.read()] if answer.status == 200 else []
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and out == "", err
+    assert "interrupted" in err and "Traceback" not in err
+    assert bodies[0] != bodies[1]
+    (results,) = tmp_path.glob("outputs/*/*/track.npz")
+    assert len(read_results(results)["joints_m"]) >= 2
+
+
+def test_the_page_stays_after_the_last_frame_until_ctrl_c(monkeypatch, capsys) -> None:
+    stayed: list[float] = []
+
+    def interrupted(seconds: float) -> None:
+        stayed.append(seconds)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(browser, "_stay", interrupted)
+    for linger_s, words in ((5.0, "for 5 s (Ctrl-C ends it)"), (float("inf"), "until Ctrl-C")):
+        with made(linger_s=linger_s):
+            pass  # ends without an error: everything was done
+        assert words in capsys.readouterr().err
+    assert stayed == [5.0, float("inf")]
+    with pytest.raises(ZeroDivisionError), made():
+        1 / 0  # noqa: B018
+    assert len(stayed) == 2 and ours() == []
+
+
+@pytest.fixture
+def chromium(tmp_path: Path) -> Iterator:
+    """Headless Chromium under WebDriver."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="pip install '.[browser-test]'")
+    if not (CHROMIUM and DRIVER):
+        pytest.skip("needs chromium and chromedriver (Debian: chromium, chromium-driver)")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for argument in (
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        f"--user-data-dir={tmp_path / 'profile'}",
+        "--window-size=1200,900",
+    ):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def view() -> Iterator[BrowserView]:
+    with closing(made()) as view:
+        yield view
+
+
+def test_the_page_works_in_a_browser(chromium, view) -> None:
+    def text(name: str) -> str:
+        return chromium.execute_script(f"return document.getElementById('{name}').textContent")
+
+    def picture(name: str) -> str:
+        return chromium.execute_script(f"return document.getElementById('{name}').toDataURL()")
+
+    def press(words: str) -> None:
+        chromium.find_element("xpath", f"//button[text()='{words}']").click()
+
+    def pressed() -> list[str]:
+        found = chromium.find_elements("css selector", "button[aria-pressed=true]")
+        return [button.text for button in found]
+
+    with shown_again_and_again(view) as taken:
+        chromium.get(view.url)
+        eventually(lambda: text("phase") == "live")
+        eventually(lambda: text("fps") != "–")
+        before = {name: picture(name) for name in ("image", "model")}
+        number = int(text("index"))
+        eventually(lambda: all(picture(name) != old for name, old in before.items()))
+        eventually(lambda: int(text("index")) > number)
+        assert text("score") in {f"{moment.estimate.score:.2f}" for moment in moments()}
+        assert text("ms").endswith(" ms") and text("gesture") != ""
+
+        eventually(lambda: pressed() == ["Right hand"])
+        press("Start again")
+        eventually(lambda: taken == ["restart"])
+        eventually(lambda: "anew" in text("told"))
+        press("Left hand")
+        eventually(lambda: taken == ["restart", "left"])
+        eventually(lambda: pressed() == ["Left hand"])
+
+        for width in (1200, 500):
+            chromium.set_window_size(width, 900)
+            over = (
+                "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
+            )
+            assert chromium.execute_script(over) <= 0
+        left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
+        assert right["y"] > left["y"] + left["height"] and left["width"] > 400
+    view.show(replace(moments()[0], estimate=no_estimate(9, 0.36, "lost", 4, 0.01), insight=None))
+    eventually(lambda: text("state") == "LOST" and text("phase") == "the hand is lost")
+    assert chromium.get_log("browser") == []
+
+    view._picture.set_phase("over")
+    eventually(lambda: text("phase") == "the recording is over")
+    assert chromium.find_element("xpath", "//button[text()='Start again']").get_property("disabled")
+    view.close()
+    time.sleep(0.2)
+    assert text("phase") == "the recording is over"
+    again = browser_view("", 25.0, None, port=urlsplit(view.url).port)
+    try:
+        again.show(moments()[0])
+        eventually(lambda: text("phase") == "live")  # by itself
+        again._server.close()
+        eventually(lambda: text("phase") == "connection lost; trying again")
+    finally:
+        again.close()

@@ -1,0 +1,257 @@
+"""The overlay: what is drawn where, and files that can be opened again."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate, no_estimate
+from toftrack.frames import Frame
+from toftrack.hand.shape import default_hand_shape
+from toftrack.views.base import NoView, TrackedFrame
+from toftrack.views.overlay import VideoView, draw_panel, panel_scale
+
+W, H = 176, 144
+CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), W, H)
+DEPTH = np.full((H, W), 1.5, np.float32)
+AMPLITUDE = np.full((H, W), 1000, np.uint16)
+THUMB, LITTLE = (0, 159, 230), (167, 121, 204)  # BGR
+
+
+def hand(lost: bool = False) -> Estimate:
+    """The five fingers as fans of straight lines at 0.5 m, thumb to the right."""
+    joints = np.zeros((21, 3), np.float32)
+    for finger in range(5):
+        angle = math.radians(30 + 30 * finger)
+        reach = np.array([0.04, 0.06, 0.08, 0.10])[:, None]
+        direction = np.array([math.cos(angle), -math.sin(angle), 0])
+        joints[4 * finger + 1 : 4 * finger + 5] = reach * direction
+    joints[:, 2] = 0.5
+    return dataclasses.replace(
+        no_estimate(7, 0.28, "tracking", 4, 0.01), joints_m=joints, lost=lost, score=0.9
+    )
+
+
+def lost_hand() -> Estimate:
+    return no_estimate(7, 0.28, "lost", 4, 0.01)
+
+
+def moment() -> TrackedFrame:
+    frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
+    return TrackedFrame(frame, DEPTH, CAMERA, hand(), default_hand_shape(), None)
+
+
+def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    caption = panel[: panel.shape[0] - scale * H]
+    body = panel[caption.shape[0] :]
+    return caption, body[:, : scale * W], body[:, scale * W :]
+
+
+def colour_share(picture: np.ndarray, bgr: tuple[int, int, int]) -> float:
+    return float((np.abs(picture.astype(int) - bgr).max(axis=-1) < 12).mean())
+
+
+def is_grey(picture: np.ndarray) -> bool:
+    return bool((picture.max(axis=-1) == picture.min(axis=-1)).all())
+
+
+def test_panels_are_three_times_a_small_image_and_once_a_large() -> None:
+    assert panel_scale(176) == 3
+    assert panel_scale(640) == 1
+    assert panel_scale(2000) == 1
+
+
+@pytest.mark.parametrize(
+    ("size", "scale"), [((144, 176), 3), ((480, 640), 1), ((7, 5), 1), ((9, 11), 1.5)]
+)
+def test_panel_sides_are_even(size: tuple[int, int], scale: float) -> None:
+    camera = Camera(CAMERA.K, size[1], size[0])
+    panel = draw_panel(np.ones(size, np.float32), None, camera, lost_hand(), None, scale)
+    assert panel.dtype == np.uint8
+    assert panel.shape[0] % 2 == panel.shape[1] % 4 == 0
+    assert panel.shape[2] == 3
+
+
+@pytest.mark.parametrize("amplitude", [AMPLITUDE, None])
+def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None) -> None:
+    one = hand()
+    _, left, right = sides(draw_panel(DEPTH, amplitude, CAMERA, one, None, 3))
+    for joint, colour in ((4, THUMB), (2, THUMB), (20, LITTLE), (18, LITTLE)):
+        u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
+        np.testing.assert_allclose(left[v, u], colour, atol=2)
+    assert is_grey(right)
+
+
+def test_a_nearer_hand_has_thicker_bones() -> None:
+    far, near = hand(), hand()
+    near = dataclasses.replace(near, joints_m=near.joints_m * np.float32(0.5))
+    shares = [
+        colour_share(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[1], THUMB)
+        for one in (far, near)
+    ]
+    assert shares[1] > 1.5 * shares[0]  # the same length in the image at half the distance
+
+
+def test_no_skeleton_without_an_estimate_or_behind_the_camera() -> None:
+    behind = dataclasses.replace(hand(), joints_m=-hand().joints_m)
+    for one in (dataclasses.replace(lost_hand(), lost=False), behind):
+        _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))
+        assert is_grey(left)
+
+
+def test_a_hand_far_outside_the_image_does_not_fail() -> None:
+    away = hand().joints_m * np.float32(1) + np.array([1e6, 0, 0], np.float32)
+    one = dataclasses.replace(hand(), joints_m=away)
+    assert is_grey(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[1])
+
+
+def test_range_image_is_darker_where_nearer_on_white() -> None:
+    model = np.zeros((H, W), np.float32)
+    model[40:80, 40:80], model[40:80, 100:140] = 0.4, 0.6
+    model[0, 0], model[0, 1] = np.nan, np.inf
+    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, hand(), model, 3))
+    near, far, background = right[180, 180, 0], right[180, 360, 0], right[400, 30, 0]
+    assert near < far < background == 255
+    assert right[1, 1, 0] == right[1, 4, 0] == 255
+    # The upscaling must not mix hand and background into other greys.
+    assert set(np.unique(right)) == {near, far, 255}
+
+
+def test_lost_is_red_and_tracking_is_not() -> None:
+    red = (40, 40, 220)
+    for lost in (True, False):
+        panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, hand(lost), None, 3)
+        caption, left, right = sides(panel)
+        assert (colour_share(caption, red) > 0.5) == lost
+        assert (colour_share(left[:, :3], red) > 0.9) == lost
+        assert (colour_share(right[:, -3:], red) > 0.9) == lost
+
+
+def test_caption_stays_in_the_left_half_and_changes_with_the_frame() -> None:
+    one = dataclasses.replace(hand(), index=123456, state_name="initialising", gesture="pointing")
+    first = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[0]
+    second = sides(
+        draw_panel(DEPTH, AMPLITUDE, CAMERA, dataclasses.replace(one, index=654321), None, 3)
+    )[0]
+    assert (first != second).any()
+    assert len(np.unique(first[:, 3 * W :])) == 1
+    assert len(np.unique(first[:, : 3 * W])) > 1
+
+
+def test_images_without_any_reading_are_black() -> None:
+    for depth in (np.zeros((H, W), np.float32), np.full((H, W), np.nan, np.float32)):
+        one = dataclasses.replace(lost_hand(), lost=False)
+        _, left, right = sides(draw_panel(depth, None, CAMERA, one, np.zeros((H, W)), 3))
+        assert (left == 0).all()
+        assert (right == 255).all()
+
+
+def panel_of(value: int, size: tuple[int, int] = (36 + 60, 160)) -> np.ndarray:
+    return np.full((*size, 3), value, np.uint8)
+
+
+def read_video(path: Path) -> tuple[list[np.ndarray], float]:
+    reader = cv2.VideoCapture(str(path))
+    frames = []
+    while True:
+        there, frame = reader.read()
+        if not there:
+            return frames, reader.get(cv2.CAP_PROP_FPS)
+        frames.append(frame)
+
+
+def test_video_has_every_panel_at_the_rate(tmp_path: Path) -> None:
+    with VideoView(tmp_path, 12.5, 30) as view:
+        for i in range(30):
+            view.add(panel_of(8 * i))
+    frames, fps = read_video(tmp_path / "overlay.mp4")
+    assert fps == pytest.approx(12.5)
+    assert len(frames) == 30
+    for i, frame in enumerate(frames):
+        assert frame.shape == (96, 160, 3)
+        assert abs(float(frame.mean()) - 8 * i) < 6
+
+
+@pytest.mark.parametrize("fps", [29.97002997, 24.998750062, 1e-3, 5000.0, math.nan, math.inf])
+def test_odd_rates_give_a_readable_video(tmp_path: Path, fps: float) -> None:
+    with VideoView(tmp_path, fps, None) as view:
+        view.add(panel_of(10))
+        view.add(panel_of(20))
+    frames, found = read_video(tmp_path / "overlay.mp4")
+    assert len(frames) == 2
+    assert 1 <= found <= 120
+
+
+def test_panels_of_other_and_odd_sizes_share_one_even_size(tmp_path: Path) -> None:
+    with VideoView(tmp_path, 25, None) as view:
+        view.add(panel_of(10, (97, 161)))
+        view.add(panel_of(20, (200, 300)))
+    frames, _ = read_video(tmp_path / "overlay.mp4")
+    assert [frame.shape for frame in frames] == [(96, 160, 3)] * 2
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("count", [10, 64, 100, 250, 1000])
+def test_filmstrip_is_ten_evenly_spread_panels(tmp_path: Path, count: int, known: bool) -> None:
+    with VideoView(tmp_path, 25, count if known else None) as view:
+        for i in range(count):
+            view.add(panel_of(round(250 * i / count), (36 + 10, 32)))
+    strip = cv2.imread(str(tmp_path / "overlay.png"))
+    height, width = strip.shape[0] // 2, strip.shape[1] // 5
+    shown = [
+        strip[height * row + height // 2, width * column + width // 2, 0] / 250 * count
+        for row in range(2)
+        for column in range(5)
+    ]
+    np.testing.assert_allclose(shown, np.linspace(0, count - 1, 10), atol=0.035 * count + 0.6)
+
+
+def test_filmstrip_shows_the_left_side_above_the_right(tmp_path: Path) -> None:
+    panel = panel_of(100)
+    panel[36:, :80], panel[36:, 80:] = 50, 200
+    with VideoView(tmp_path, 25, 1) as view:
+        view.add(panel)
+    strip = cv2.imread(str(tmp_path / "overlay.png"))
+    column = strip[:, strip.shape[1] // 2, 0].tolist()
+    assert column.index(100) < column.index(50) < column.index(200)
+
+
+def test_memory_is_bounded_when_the_length_is_unknown(tmp_path: Path) -> None:
+    view = VideoView(tmp_path, 25, None)
+    for _ in range(700):
+        view.add(panel_of(9, (36 + 4, 8)))
+        assert len(view._tiles) <= 64
+    view.close()
+
+
+def test_nothing_is_written_without_a_panel(tmp_path: Path) -> None:
+    VideoView(tmp_path, 25, 10).close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="overlay.mp4.*view=none"):
+        VideoView(tmp_path / "nowhere", 25, 10).add(panel_of(1))
+
+
+def test_no_view_takes_the_same_calls_and_writes_nothing(tmp_path: Path) -> None:
+    with NoView(folder=tmp_path, fps=25, frames=3) as view:
+        view.show(moment())
+        assert not view.commands()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tracked_frame_is_appended_as_its_panel(tmp_path: Path) -> None:
+    with VideoView(tmp_path, 25, 2) as view:
+        view.show(moment())
+        assert not view.commands()
+    assert (tmp_path / "overlay.mp4").stat().st_size > 0
+    strip = cv2.imread(str(tmp_path / "overlay.png"))
+    assert strip is not None and colour_share(strip, THUMB) > 0

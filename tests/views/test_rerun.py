@@ -1,0 +1,285 @@
+"""`view=rerun`: what lies in its file, what a viewer is sent, and how it fails."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.tracking import CONF, configuration, make_tracker
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+import toftrack.views.rerun
+from toftrack.configuration.sentences import sentence
+from toftrack.devices.sample import Sample
+from toftrack.errors import ToftrackError
+from toftrack.render.likelihood import FMeasure
+from toftrack.views.base import TrackedFrame
+from toftrack.views.classified import classify
+
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+FRAMES = 6
+
+
+def test_without_rerun_a_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    for name in ("view", "entities"):  # another test may have imported them
+        monkeypatch.delitem(sys.modules, f"toftrack.views.rerun.{name}", raising=False)
+        monkeypatch.delattr(toftrack.views.rerun, name, raising=False)
+    with pytest.raises(Exception) as error:
+        instantiate(configuration("view=rerun").view, _partial_=True)
+    assert "needs the package rerun-sdk" in sentence(error.value)
+    assert "'.[rerun]'" in sentence(error.value)
+
+
+def test_other_views_do_not_import_rerun() -> None:
+    modules = "sys, toftrack.programs.track, toftrack.views.overlay"
+    code = f"import {modules}; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.fixture
+def rerun_view():
+    """The module, where rerun-sdk is installed."""
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install -e '.[rerun]')")
+    from toftrack.views.rerun import view as rerun_view
+
+    return rerun_view
+
+
+@cache
+def moments() -> tuple[TrackedFrame, ...]:
+    """Six tracked frames; then one without an estimate, and one where nothing is in range."""
+    tracker, device = make_tracker(*QUICK), Sample(stop=FRAMES)
+    tracked = []
+    for frame in device:
+        depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
+        estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+        tracked.append(TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight))
+    last = tracked[-1]
+    nan = dataclasses.replace(
+        last.estimate, index=6, timestamp_s=0.24, state=np.full(27, np.nan, np.float32), lost=True
+    )
+    gone = dataclasses.replace(last.estimate, index=7, timestamp_s=0.28, lost=True, score=0.0)
+    return (
+        *tracked,
+        dataclasses.replace(last, estimate=nan),
+        dataclasses.replace(last, estimate=gone, insight=None),
+    )
+
+
+@pytest.fixture
+def written(rerun_view, tmp_path: Path) -> Path:
+    with rerun_view.RerunView(tmp_path, 25.0, 8, likelihood=FMeasure()) as view:
+        for moment in moments():
+            view.show(moment)
+        assert view.commands() == ()
+    return tmp_path / "track.rrd"
+
+
+def rows(path: Path, entity: str, component: str) -> dict[int, np.ndarray]:
+    """What is logged of a component, by frame number, as flat arrays; {} where it was cleared."""
+    chunk = pytest.importorskip("rerun.chunk", reason="this rerun-sdk reads files in another way")
+    found: dict[int, np.ndarray] = {}
+    for part in chunk.RrdReader(path).stream().to_chunks():
+        batch = part.to_record_batch()
+        if part.entity_path != f"/{entity}" or component not in batch.schema.names:
+            continue
+        assert {"frame", "time"} <= set(batch.schema.names)
+        numbers = batch.column("frame").to_pylist()
+        times = batch.column("time").to_pylist()
+        for number, when, value in zip(numbers, times, batch.column(component), strict=True):
+            assert when.total_seconds() == pytest.approx(number / 25)
+            if value.is_valid:
+                found[number] = np.asarray(value.values.to_pylist())
+    return found
+
+
+def test_the_file_passes_reruns_own_check(written: Path) -> None:
+    check = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(written)],
+        capture_output=True,
+        text=True,
+    )
+    assert check.returncode == 0 and "without error" in check.stdout + check.stderr
+
+
+def test_every_frames_estimate_can_be_read_back(written: Path) -> None:
+    joints = rows(written, "world/hand/joints", "Points3D:positions")
+    assert sorted(joints) == [0, 1, 2, 3, 4, 5, 7]  # frame 6 has no estimate
+    scores = rows(written, "plots/score", "Scalars:scalars")
+    latent = rows(written, "plots/latent", "Scalars:scalars")
+    times = rows(written, "plots/time", "Scalars:scalars")
+    for moment in moments():
+        estimate, number = moment.estimate, moment.estimate.index
+        assert scores[number] == pytest.approx([estimate.score, float(estimate.lost)])
+        assert latent[number] == pytest.approx(estimate.latent)
+        assert times[number] == pytest.approx(1e3 * estimate.compute_s)
+        if number != 6:
+            np.testing.assert_allclose(joints[number], estimate.joints_m, atol=1e-6)
+    colours = rows(written, "world/hand/ellipsoids", "Ellipsoids3D:colors")
+    assert len(set(colours[5].tolist())) == 6  # five fingers and the palm
+    assert len(colours[7]) == 1  # one colour says that it is lost
+
+
+def test_ellipsoids_have_the_sizes_of_the_hand_on_either_side(rerun_view) -> None:
+    from toftrack.views.rerun.entities import ellipsoids
+
+    one = moments()[0]
+    right, left = (ellipsoids(one.estimate, one.shape.of_side(side)) for side in ("right", "left"))
+    sizes = [np.array(hand.half_sizes.as_arrow_array().to_pylist()) for hand in (right, left)]
+    assert sizes[0].shape == (34, 3) and (sizes[0] > 0).all()
+    np.testing.assert_allclose(sizes[0], sizes[1], rtol=1e-5)
+    for hand in (right, left):
+        turns = np.array(hand.quaternions.as_arrow_array().to_pylist())
+        np.testing.assert_allclose(np.linalg.norm(turns, axis=1), 1, atol=1e-5)
+
+
+def test_depth_comes_back_in_metres_and_with_its_pinhole(written: Path) -> None:
+    steps = rows(written, "world/camera/depth", "DepthImage:buffer")
+    metre = rows(written, "world/camera/depth", "DepthImage:meter")
+    for moment in moments():
+        number = moment.estimate.index
+        depth = steps[number].reshape(-1).astype(np.uint8).view(np.uint16) / metre[number]
+        np.testing.assert_allclose(depth.reshape(144, 176), moment.depth_m, atol=1.1e-4)
+    pinhole = rows(written, "world/camera", "Pinhole:image_from_camera")
+    assert list(pinhole) == [0]  # it does not change
+    np.testing.assert_allclose(pinhole[0].reshape(3, 3).T, moments()[0].camera.K)
+
+
+def test_classified_pixels_are_those_of_the_figures(written: Path) -> None:
+    labels = rows(written, "world/tracker/classified", "SegmentationImage:buffer")
+    segments = rows(written, "world/tracker/segmentation", "SegmentationImage:buffer")
+    for moment in moments()[:FRAMES]:
+        seen = moment.insight.observation
+        pixels = classify(moment.estimate.state, moment.shape, seen, FMeasure()).labels()
+        np.testing.assert_array_equal(labels[moment.estimate.index].reshape(144, 176), pixels)
+        hand = segments[moment.estimate.index].reshape(144, 176) == 1
+        np.testing.assert_array_equal(hand, seen.hand.numpy())
+    assert not labels[6].any()
+    assert 7 not in labels and 7 not in segments  # nothing in range: cleared
+
+
+def test_particles_lie_around_the_hand_brighter_with_weight(written: Path) -> None:
+    places = rows(written, "world/hand/particles", "Points3D:positions")
+    colours = rows(written, "world/hand/particles", "Points3D:colors")
+    for moment in moments()[1:FRAMES]:
+        number = moment.estimate.index
+        weights = moment.insight.weights.numpy()
+        middle = weights @ places[number]
+        assert np.linalg.norm(middle - moment.estimate.joints_m.mean(0)) < 0.05
+        red = (colours[number] >> 24) & 255  # grows all along the colour map
+        assert red[weights.argmax()] == red.max() and red[weights.argmin()] == red.min()
+        assert len(set(red)) > 5
+
+
+def test_the_configured_likelihood_is_the_one_that_classifies() -> None:
+    config = configuration("view=rerun", "likelihood.tolerance_m=0.011")
+    assert config.view.likelihood.tolerance_m == 0.011
+    assert (CONF / "view" / "rerun.yaml").read_text().count("#") > 3
+    assert OmegaConf.select(config, "view.connect") is None
+
+
+def test_a_folder_that_cannot_be_written_is_told(rerun_view, tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
+        rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=FMeasure())
+
+
+def test_addresses_without_a_viewer_are_told(rerun_view, tmp_path: Path) -> None:
+    def connect(address: str) -> None:
+        rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure(), connect=address)
+
+    for address in ("nonsense", "http://127.0.0.1:9876", "rerun+http://127.0.0.1:port/proxy"):
+        with pytest.raises(ToftrackError, match="no address of a viewer"):
+            connect(address)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with pytest.raises(ToftrackError, match="no viewer answers"):
+        connect(f"rerun+http://127.0.0.1:{port}/proxy")
+    with pytest.raises(ToftrackError, match="exclude each other"):
+        rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure(), connect="x", spawn=True)
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_viewer_is_sent_the_same(rerun_view, tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    received = tmp_path / "received.rrd"
+    # Rerun's own server, which keeps what it receives instead of showing it.
+    server = subprocess.Popen(
+        [sys.executable, "-m", "rerun", "--save", str(received)]
+        + ["--port", str(port), "--bind", "127.0.0.1"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        for _ in range(100):
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.1)
+        address = f"rerun+http://127.0.0.1:{port}/proxy"
+        view = rerun_view.RerunView(tmp_path, 25.0, 8, likelihood=FMeasure(), connect=address)
+        for moment in moments():
+            view.show(moment)
+        view.close()
+        view.close()  # a second time does nothing
+        size = -1
+        while size != (size := received.stat().st_size):
+            time.sleep(0.5)
+    finally:
+        os.killpg(server.pid, signal.SIGTERM)  # python's, and the program's that it started
+        server.wait(10)
+    assert not (tmp_path / "track.rrd").exists()
+    joints = rows(received, "world/hand/joints", "Points3D:positions")
+    assert sorted(joints) == [0, 1, 2, 3, 4, 5, 7]
+
+
+def test_a_viewer_that_takes_nothing_does_not_hold_up_the_tracker(
+    rerun_view, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    stuck = threading.Event()
+    unregistered: list[bool] = []
+    monkeypatch.setattr(rerun_view, "_ANSWER_S", 0.2)
+    monkeypatch.setattr(rerun_view, "_require_answer", lambda address: None)
+    monkeypatch.setattr(rerun_view.rr, "unregister_shutdown", lambda: unregistered.append(True))
+    monkeypatch.setattr(rerun_view.rr.RecordingStream, "connect_grpc", lambda *a, **k: None)
+    view = rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure(), connect="rerun+http://a")
+    monkeypatch.setattr(view._entities, "log", lambda moment: stuck.wait())
+    for _ in range(50):
+        view.show(moments()[0])
+    with pytest.raises(ToftrackError, match="takes nothing any more.*result files are whole"):
+        view.close()
+    assert unregistered and "too slow for" in caplog.text
+    stuck.set()
+    view._thread.join(10)
+
+
+def test_a_failure_in_the_thread_is_raised_where_the_frame_was_shown(
+    rerun_view, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(moment: TrackedFrame) -> None:
+        raise RuntimeError("no space")
+
+    view = rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure())
+    monkeypatch.setattr(view._entities, "log", fail)
+    with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
+        for _ in range(100):
+            view.show(moments()[0])
+            time.sleep(0.01)
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        view.close()
+    assert not view._thread.is_alive()

@@ -1,0 +1,92 @@
+"""toftrack in a program of one's own: trackers and devices from the same configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from toftrack.configuration.compose import configuration, one_sentence
+from toftrack.errors import ToftrackError
+
+if TYPE_CHECKING:
+    import torch
+
+    from toftrack.devices.base import Device
+    from toftrack.tracking.tracker import Tracker
+
+
+def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Tracker:
+    """A tracker as `python track.py` with these overrides has it: `tracker.step(depth_m, K)`.
+
+    Any number of them may work in one process, each in a thread of its own; one tracker must not be
+    used by two threads at once.
+
+    Args:
+        overrides: as on the command line, "hand.side=left" or "filter.particles=1000".
+        config_dir: a folder with your own config.yaml and its groups, instead of toftrack's.
+
+    Raises:
+        ToftrackError: an override or a file that it names cannot be used.
+    """
+    config = configuration(*overrides, config_dir=config_dir)
+    with one_sentence():
+        return build_tracker(config)
+
+
+def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device:
+    """The camera or recording of `python track.py` with these overrides, for a `with` and a `for`.
+
+    Its frames are as the camera took them; `device.camera.rectify(frame.depth, frame.radial)` is
+    what a tracker wants, together with `device.camera.K`.
+
+    Args:
+        overrides: as on the command line, "device=replay" and "device.path=FILE.npz".
+        config_dir: as for make_tracker.
+
+    Raises:
+        ToftrackError: an override cannot be used, or the device cannot deliver.
+    """
+    config = configuration(*overrides, config_dir=config_dir)
+    with one_sentence():
+        return instantiate(config.device)
+
+
+def build_tracker(config: DictConfig) -> Tracker:
+    """The tracker of a configuration (conf/config.yaml composed)."""
+    # These take seconds: an override's error comes before.
+    from toftrack.tracking.model import TrackerModel
+    from toftrack.tracking.tracker import Tracker
+
+    device = compute_device(config.compute)
+    hand, refinement = instantiate(config.hand), instantiate(config.refine)
+    model = TrackerModel(
+        shape=hand.shape.to(device),
+        space=instantiate(config.pose_space).to(device),
+        segmentation=instantiate(config.segmentation),
+        likelihood=instantiate(config.likelihood),
+        filter=instantiate(config.filter),
+        refinement=refinement if refinement.iterations else None,
+        start=instantiate(config.start),
+        lost=instantiate(config.lost),
+        fit=hand.fit,
+        gestures=instantiate(config.gestures),
+        renderer=config.renderer,
+        device=device,
+    )
+    return Tracker(model, config.seed)
+
+
+def compute_device(name: str) -> torch.device:
+    """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ToftrackError("compute=cuda, but torch finds no CUDA GPU here; give compute=cpu")
+    if name not in ("cpu", "cuda"):
+        raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
+    return torch.device(name)

@@ -1,0 +1,1 @@
+"""A camera calibrated from pictures of a chequerboard: lens and depth."""

@@ -1,0 +1,46 @@
+"""The back end: who scores, refines and moves hypotheses here, chosen once for a whole tracker.
+
+Only the types stand here, so that every room may know them; tracking/backend.py chooses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from toftrack.hand.shape import HandShape
+    from toftrack.refinement.gauss_newton import Refiner
+    from toftrack.render.scoring import Scorer
+
+
+class Motions(NamedTuple):
+    """How particles are moved, see compute/rigid.py.
+
+    compose: reference particles and tangent offsets, (N, 6 + d) or broadcast, to particles.
+    difference: particles (N, 6 + d) and one reference (1, 6 + d) to tangent offsets (N, 6 + d).
+    """
+
+    compose: Callable[[Tensor, Tensor], Tensor]
+    difference: Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to compute everything that depends on the machine.
+
+    name: "torch", "numba" or "triton", as `renderer=` says it.
+    device: where the particles are.
+    motions: of particles.
+    make_scorer, make_refiner: for a hand of some sizes, which are moved to the device.
+    """
+
+    name: str
+    device: torch.device
+    motions: Motions
+    make_scorer: Callable[[HandShape], Scorer]
+    make_refiner: Callable[[HandShape], Refiner]

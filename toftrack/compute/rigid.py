@@ -1,0 +1,69 @@
+"""Rigid motions of particles in plain torch, the reference: offsets, their sum, mean rotations.
+
+A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector
+(3, rad) and d further coordinates, which are simply added.
+
+Differences between particles are taken in the tangent space of a reference: translation of the
+pivot, rotation vector of R R_ref', difference of the rest. The pivot is a point in the middle of
+the hand, so that turning the hand does not also carry it away, as turning about the wrist would.
+"""
+
+from __future__ import annotations
+
+import roma
+import torch
+from torch import Tensor
+
+from toftrack.compute.backend import Motions
+
+PIVOT_M = (0.0, -0.085, 0.0)
+"""The middle of the hand in the hand frame: near the knuckles of an adult hand."""
+
+
+def compose(reference: Tensor, tangent: Tensor) -> Tensor:
+    """Particles at tangent offsets from reference particles; (N, 6 + d) or broadcast, each."""
+    reference, tangent = torch.broadcast_tensors(reference, tangent)
+    rotvec = roma.rotvec_composition((tangent[:, 3:6], reference[:, 3:6]))
+    translation = _pivot(reference) + tangent[:, :3] - rotated_pivot(rotvec)
+    return torch.cat((translation, rotvec, reference[:, 6:] + tangent[:, 6:]), 1)
+
+
+def difference(particles: Tensor, reference: Tensor) -> Tensor:
+    """Tangent offsets of particles from one reference, (N, 6 + d) and (1, 6 + d) to (N, 6 + d)."""
+    inverse = -reference[:, 3:6].expand(len(particles), 3)
+    turn = roma.rotvec_composition((particles[:, 3:6], inverse))
+    move = _pivot(particles) - _pivot(reference)
+    return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
+
+
+MOTIONS = Motions(compose, difference)
+
+
+def rotated_pivot(rotvec: Tensor) -> Tensor:
+    """The pivot's offset from the wrist, by Rodrigues' formula, (N, 3) to (N, 3)."""
+    p = rotvec.new_tensor(PIVOT_M).expand_as(rotvec)
+    square = rotvec.square().sum(1, keepdim=True)
+    angle = square.clamp(min=1e-12).sqrt()
+    cross = torch.linalg.cross(rotvec, p)
+    along = torch.linalg.cross(rotvec, cross)
+    return p + angle.sin() / angle * cross + (1 - angle.cos()) / angle.square() * along
+
+
+def _pivot(particles: Tensor) -> Tensor:
+    return particles[:, :3] + rotated_pivot(particles[:, 3:6])
+
+
+def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean on SO(3), (N, 3) and (N,) to (3,).
+
+    The rotation nearest to the mean matrix (chordal L2 mean; Hartley et al., "Rotation averaging",
+    IJCV 2013).
+    """
+    half = 0.5 * rotvec.double()
+    angle = half.norm(dim=1, keepdim=True)
+    q = torch.cat((half * (angle / torch.pi).sinc(), angle.cos()), 1)
+    # The nearest rotation's quaternion is the main axis of all quaternions (Markley et al., JGCD
+    # 2007), whatever their signs.
+    scatter = (q * weights[:, None]).mT @ q
+    main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
+    return roma.unitquat_to_rotvec(main).to(rotvec.dtype)

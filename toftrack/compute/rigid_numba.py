@@ -1,0 +1,189 @@
+"""Compiled scalar geometry on the CPU: rotations, tangent offsets of particles, one hand's pose.
+
+The same formulas as in rigid.py and hand/skeleton.py, without the microseconds that every eager
+operation costs on a few numbers. Quaternions are (x, y, z, w); everything is computed in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.compute.backend import Motions
+from toftrack.compute.compiling import announced, compiled, entry_point
+from toftrack.compute.rigid import PIVOT_M
+
+_cached = entry_point(__file__)
+_PIVOT = np.array(PIVOT_M)
+
+
+@compiled
+def quaternion(a, b, c):
+    """Of a rotation vector, radians."""
+    square = a * a + b * b + c * c
+    angle = math.sqrt(square)
+    # sin(angle / 2) / angle
+    factor = math.sin(0.5 * angle) / angle if angle > 1e-6 else 0.5 - square / 48
+    return factor * a, factor * b, factor * c, math.cos(0.5 * angle)
+
+
+@compiled
+def product(p, q):
+    """Of two quaternions: first q turns, then p."""
+    return (
+        p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1],
+        p[3] * q[1] - p[0] * q[2] + p[1] * q[3] + p[2] * q[0],
+        p[3] * q[2] + p[0] * q[1] - p[1] * q[0] + p[2] * q[3],
+        p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2],
+    )
+
+
+@compiled
+def rotation_vector(q):
+    """Of a unit quaternion, radians, of length 0 .. pi."""
+    sign = -1.0 if q[3] < 0 else 1.0
+    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    # At a small angle, 2 atan(sine / cosine) / sine is 2 / cosine.
+    factor = 2 * math.atan2(sine, sign * q[3]) / sine if sine > 1e-9 else 2.0
+    factor *= sign
+    return factor * q[0], factor * q[1], factor * q[2]
+
+
+@compiled
+def turned(q, x, y, z):
+    """A vector turned by a unit quaternion."""
+    a, b, c = q[1] * z - q[2] * y, q[2] * x - q[0] * z, q[0] * y - q[1] * x
+    return (
+        x + 2 * (q[3] * a + q[1] * c - q[2] * b),
+        y + 2 * (q[3] * b + q[2] * a - q[0] * c),
+        z + 2 * (q[3] * c + q[0] * b - q[1] * a),
+    )
+
+
+@_cached
+def compose_rows(reference, tangent, pivot, out):
+    """See rigid.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
+    for i in range(len(out)):
+        r, t = reference[i], tangent[i]
+        before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
+        turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
+        after = product(turn, before)
+        old = turned(before, pivot[0], pivot[1], pivot[2])
+        new = turned(after, pivot[0], pivot[1], pivot[2])
+        vector = rotation_vector(after)
+        for j in range(3):
+            out[i, j] = r[j] + old[j] + t[j] - new[j]
+            out[i, 3 + j] = vector[j]
+        for j in range(6, out.shape[1]):
+            out[i, j] = r[j] + t[j]
+
+
+@_cached
+def difference_rows(particles, reference, pivot, out):
+    """See rigid.difference; particles, out: (N, 6 + d), reference: (1, 6 + d), float32."""
+    r = reference[0]
+    before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
+    old = turned(before, pivot[0], pivot[1], pivot[2])
+    back = (-before[0], -before[1], -before[2], before[3])
+    for i in range(len(out)):
+        p = particles[i]
+        after = quaternion(np.float64(p[3]), np.float64(p[4]), np.float64(p[5]))
+        new = turned(after, pivot[0], pivot[1], pivot[2])
+        vector = rotation_vector(product(after, back))
+        for j in range(3):
+            out[i, j] = p[j] + new[j] - r[j] - old[j]
+            out[i, 3 + j] = vector[j]
+        for j in range(6, out.shape[1]):
+            out[i, j] = p[j] - r[j]
+
+
+@compiled
+def pose_hand(state, base_frames, base, lengths, mirror, frames, joints):
+    """Frames and joints of one hand, see skeleton.forward_kinematics; all float64.
+
+    state: (27,).  base_frames: (5, 3, 3), base: (5, 3), lengths: (5, 3) of the shape.
+    mirror: -1 for a left hand, else 1.  frames: (16, 3, 3) and joints: (21, 3), written.
+    """
+    q = quaternion(state[3], state[4], state[5])
+    for j in range(3):
+        column = turned(
+            q, mirror if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0
+        )
+        for i in range(3):
+            frames[0, i, j] = column[i]
+    for i in range(3):
+        joints[0, i] = state[i]
+    angle = 6
+    for finger in range(5):
+        joint = 1 + 4 * finger
+        for i in range(3):
+            joints[joint, i] = state[i]
+            for k in range(3):
+                joints[joint, i] += frames[0, i, k] * base[finger, k]
+        for bone in range(3):
+            frame = frames[1 + 3 * finger + bone]
+            for i in range(3):
+                for j in range(3):
+                    if bone > 0:
+                        frame[i, j] = frames[3 * finger + bone, i, j]
+                    else:
+                        frame[i, j] = 0.0
+                        for k in range(3):
+                            frame[i, j] += frames[0, i, k] * base_frames[finger, k, j]
+            # Only the thumb has an abduction at its second joint; no third joint has any.
+            if bone == 0 or (bone == 1 and finger == 0):
+                mix_columns(frame, 0, state[angle])
+                angle += 1
+            mix_columns(frame, 1, state[angle])
+            angle += 1
+            for i in range(3):
+                along = lengths[finger, bone] * frame[i, 1]
+                joints[joint + bone + 1, i] = joints[joint + bone, i] - along
+
+
+@compiled
+def mix_columns(frame, column, angle):
+    """Turn a frame about its z axis (column 0) or its x axis (column 1)."""
+    sine, cosine = math.sin(angle), math.cos(angle)
+    for i in range(3):
+        p, q = frame[i, column], frame[i, column + 1]
+        frame[i, column] = cosine * p + sine * q
+        frame[i, column + 1] = cosine * q - sine * p
+
+
+@_cached
+def joints_of(states, base_frames, base, lengths, mirror, joints):
+    """The joints of N hands alone, see pose_hand; states: (N, 27).  joints: (N, 21, 3)."""
+    frames = np.empty((16, 3, 3))
+    for i in range(len(states)):
+        pose_hand(states[i], base_frames, base, lengths, mirror, frames, joints[i])
+
+
+def compose(reference: Tensor, tangent: Tensor) -> Tensor:
+    """See rigid.compose; on the CPU, in float32."""
+    return _called(compose_rows, *torch.broadcast_tensors(reference, tangent))
+
+
+def difference(particles: Tensor, reference: Tensor) -> Tensor:
+    """See rigid.difference; on the CPU, in float32."""
+    return _called(difference_rows, particles, reference)
+
+
+def _called(kernel: Callable[..., None], left: Tensor, right: Tensor) -> Tensor:
+    out = torch.empty(left.shape)
+    left, right = (t.detach().to("cpu", torch.float32).contiguous() for t in (left, right))
+    kernel(left.numpy(), right.numpy(), _PIVOT, out.numpy())
+    return out
+
+
+def motions() -> Motions:
+    """The compiled motions; compiles them if need be, about a second once on a machine."""
+    if not difference_rows.signatures:
+        with announced("filter: compiling its numba kernels (once, about 1 s)"):
+            row = torch.zeros(1, 7)
+            difference(compose(row, row), row)
+    return Motions(compose, difference)

@@ -1,0 +1,82 @@
+"""The configuration of `python track.py`, composed from conf/ and overrides."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.singleton import Singleton
+from hydra.core.utils import JobRuntime
+from hydra.errors import HydraException
+from hydra.version import VersionBase
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+import toftrack
+from toftrack.configuration.sentences import sentence
+from toftrack.errors import ToftrackError
+
+_ROOT = "config.yaml"
+_composing = threading.Lock()
+
+
+def configuration(*overrides: str, config_dir: str | Path | None = None) -> DictConfig:
+    """The configuration of `python track.py` with overrides.
+
+    A Hydra application that calls this keeps its own state of Hydra.
+
+    Raises ToftrackError when it cannot be composed.
+    """
+    folder = (
+        configuration_folder() if config_dir is None else Path(config_dir).expanduser().resolve()
+    )
+    if not (folder / _ROOT).is_file():
+        raise ToftrackError(
+            f"there is no {_ROOT} in the folder '{folder}'; give config_dir=FOLDER, a folder laid "
+            "out as toftrack's conf/"
+        )
+    for override in overrides:
+        if not isinstance(override, str):
+            raise ToftrackError(
+                f"the override {override!r} is no text; give overrides as on the command line, "
+                "'hand.side=left'"
+            )
+    with one_sentence(), _own_hydra(), initialize_config_dir(str(folder), version_base="1.3"):
+        return compose(_ROOT.removesuffix(".yaml"), overrides=list(overrides))
+
+
+def configuration_folder() -> Path:
+    """toftrack's own conf/: in the package where a wheel was installed, beside it in a checkout."""
+    package = Path(toftrack.__file__).parent
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parent / "conf"
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Hydra has one state a process, which may be that of an application around us."""
+    kinds = (GlobalHydra, JobRuntime, VersionBase)
+    instances = Singleton._instances
+    with _composing:
+        kept = {kind: instances.pop(kind) for kind in kinds if kind in instances}
+        try:
+            yield
+        finally:
+            for kind in kinds:
+                instances.pop(kind, None)
+            instances.update(kept)
+
+
+@contextmanager
+def one_sentence() -> Iterator[None]:
+    """Hydra wraps errors, those of ToftrackError too; callers get one they can catch and show."""
+    try:
+        yield
+    except ToftrackError:
+        raise
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ToftrackError(sentence(error)) from error

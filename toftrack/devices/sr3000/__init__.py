@@ -1,0 +1,1 @@
+"""The SwissRanger SR-3000 over USB, and its emulator."""

@@ -1,0 +1,390 @@
+"""A virtual SR3000 beneath pyusb: the real driver runs against it, without a camera.
+
+It serves the frames of a recording as the camera would, at a chosen rate, and misbehaves as told.
+What it does is what is assumed of the camera, so it proves that the driver is consistent and
+robust, not that the assumptions hold.
+"""
+
+from __future__ import annotations
+
+import array
+import errno
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import usb.core
+from usb.backend import IBackend
+
+from toftrack.devices.sr3000 import descriptors
+from toftrack.devices.sr3000.faults import (
+    HARMLESS,
+    OPEN_FAULTS,
+    REQUEST_FAULTS,
+    Chunk,
+    parse_faults,
+    transfer,
+)
+from toftrack.devices.sr3000.transport import UsbSettings, parse_id
+from toftrack.errors import ToftrackError
+from toftrack.recordings.sr_frame import REGISTERS, encode_frame, to_radial
+from toftrack.recordings.store import FrameStore
+
+_TURN_S = 0.01  # how soon a waiting transfer notices that the camera was unplugged
+_CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
+
+
+@dataclass(frozen=True)
+class EmulatorSettings:
+    """What the virtual camera does; see conf/device/sr3000.yaml."""
+
+    source: str = "sample"
+    """The recording that it sees: `sample`, or a file."""
+    fps: float | None = None
+    """Frames a second; None = the recording's own."""
+    loop: bool = False
+    """Begin again at the end; otherwise the stream ends there."""
+    faults: tuple[str, ...] = ()
+    """See `toftrack.devices.sr3000.faults`."""
+    fault_every: int = 0
+    """Each n-th request goes wrong, in all ways in turn; 0 = none."""
+    replug_s: float = 0.3
+    """How long it stays unplugged."""
+    late_s: float = 1.1
+    """How long after its time a late frame comes."""
+    serials: tuple[str, ...] = ("emulated-1",)
+    """Of the cameras that are plugged in."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "faults", tuple(self.faults))
+        object.__setattr__(self, "serials", tuple(map(str, self.serials)))
+        parse_faults(self.faults)
+        if (self.fps is not None and not self.fps > 0) or self.fault_every < 0:
+            raise ToftrackError(
+                "device.emulated needs fps above 0 and fault_every of 0 or more, but they are "
+                f"{self.fps} and {self.fault_every}"
+            )
+
+
+@dataclass(eq=False)
+class _Handle:
+    camera: int
+    plugging: int
+    """Unplugging and plugging in again makes another device of the camera."""
+    claimed: bool = False
+    closed: bool = False
+
+
+@dataclass(frozen=True)
+class _Id:
+    camera: int
+    plugging: int
+
+
+class EmulatedBackend(IBackend):
+    """pyusb's view of a computer with virtual cameras plugged in.
+
+    Args:
+        source: what the cameras see; 176 x 144 pixels.
+        settings: how they behave.
+        range_m: their unambiguous range.
+        usb: ids, endpoints and the request that they answer.
+    """
+
+    def __init__(
+        self,
+        source: FrameStore,
+        settings: EmulatorSettings,
+        range_m: float,
+        usb: UsbSettings | None = None,
+    ) -> None:
+        self.served = 0
+        """Whole frames put at the endpoint, those of hforearm_conflict faults included."""
+        self.requests = 0
+        self.misuse: list[str] = []
+        """What a driver did that the USB forbids; empty if all is well."""
+        self.registers = bytearray(REGISTERS)
+        self.open_handles: set[_Handle] = set()
+        self._source, self._settings, self._range_m = source, settings, range_m
+        self._usb = usb or UsbSettings()
+        self._faults = parse_faults(settings.faults)
+        self._period_s = 1.0 / (settings.fps or source.fps)
+        self._lock = threading.RLock()
+        self._queue: deque[Chunk] = deque()
+        self._stalled = False
+        self._opens = self._position = self._splits = self._cycled = 0
+        self._last_due_s = -np.inf
+        self._plugging = 0
+        self._back_s: float | None = 0.0
+        self._random = np.random.default_rng(0)
+
+    @property
+    def ended(self) -> bool:
+        """The recording is over, and nothing waits at the endpoint."""
+        with self._lock:
+            over = not self._settings.loop and self._position >= len(self._source)
+            return over and not self._queue
+
+    @property
+    def claimed(self) -> int:
+        """Interfaces that are claimed now."""
+        with self._lock:
+            return sum(handle.claimed for handle in self.open_handles)
+
+    def unplug(self, seconds: float | None = None) -> None:
+        """Pull the cameras out, for some time or (None) until `plug_in`; the scene goes on."""
+        with self._lock:
+            self._plugging += 1
+            self._back_s = None if seconds is None else time.monotonic() + seconds
+            self._queue.clear()
+            self._stalled = False
+
+    def plug_in(self) -> None:
+        """Plug the cameras in again."""
+        with self._lock:
+            self._back_s = 0.0
+
+    # What pyusb asks of a backend.
+
+    def enumerate_devices(self) -> Iterator[_Id]:
+        with self._lock:
+            there = self._plugged() and self._open_fault() != "missing"
+            if not there:
+                self._opens += 1  # an attempt that ends here
+            serials = self._settings.serials if there else ()
+            return iter([_Id(number, self._plugging) for number in range(len(serials))])
+
+    def get_device_descriptor(self, dev: _Id) -> SimpleNamespace:
+        ids = self._usb.ids
+        vendor, product = parse_id(ids[min(1, len(ids) - 1)])  # by default the usual SR3000
+        place = (dev.camera, 4 + dev.camera + 10 * dev.plugging)
+        return descriptors.device(vendor, product, *place)
+
+    def get_configuration_descriptor(self, dev: _Id, config: int) -> SimpleNamespace:
+        return descriptors.configuration(config)
+
+    def get_interface_descriptor(
+        self, dev: _Id, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        return descriptors.interface(self._usb.interface, intf, alt, config)
+
+    def get_endpoint_descriptor(
+        self, dev: _Id, ep: int, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        return descriptors.endpoint((self._usb.endpoint_in, self._usb.endpoint_out)[ep])
+
+    def open_device(self, dev: _Id) -> _Handle:
+        with self._lock:
+            if not self._plugged() or dev.plugging != self._plugging:
+                raise _error(errno.ENODEV)
+            if self._open_fault() == "permission":
+                self._opens += 1
+                raise _error(errno.EACCES)
+            handle = _Handle(dev.camera, dev.plugging)
+            self.open_handles.add(handle)
+            return handle
+
+    def close_device(self, dev_handle: _Handle) -> None:
+        with self._lock:
+            if dev_handle.closed:
+                self.misuse.append("a handle was closed twice")
+            if dev_handle.claimed and dev_handle.plugging == self._plugging:
+                self.misuse.append("a handle was closed with its interface claimed")
+            dev_handle.closed, dev_handle.claimed = True, False
+            self.open_handles.discard(dev_handle)
+
+    def get_configuration(self, dev_handle: _Handle) -> int:
+        with self._lock:
+            self._check(dev_handle, claimed=False)
+            return 1
+
+    def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
+        with self._lock:
+            self._check(dev_handle, claimed=False)
+
+    def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
+        with self._lock:
+            self._check(dev_handle, claimed=False)
+            fault = self._open_fault()
+            self._opens += 1
+            if fault == "busy":
+                raise _error(errno.EBUSY)
+            dev_handle.claimed = True
+
+    def release_interface(self, dev_handle: _Handle, intf: int) -> None:
+        with self._lock:
+            dev_handle.claimed = False
+            self._check(dev_handle, claimed=False)
+
+    def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
+        return False
+
+    def clear_halt(self, dev_handle: _Handle, ep: int) -> None:
+        with self._lock:
+            self._check(dev_handle)
+            self._stalled = False
+
+    def ctrl_transfer(
+        self,
+        dev_handle: _Handle,
+        bmRequestType: int,  # noqa: N803
+        bRequest: int,  # noqa: N803
+        wValue: int,  # noqa: N803
+        wIndex: int,  # noqa: N803
+        data: array.array,
+        timeout: int,
+    ) -> int:
+        with self._lock:
+            self._check(dev_handle, claimed=False)
+            if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):
+                return descriptors.string(
+                    data, wValue & 0xFF, self._settings.serials[dev_handle.camera]
+                )
+            usb_ = self._usb
+            expected = (usb_.request_type, usb_.request, usb_.request_value, usb_.request_index)
+            if (bmRequestType, bRequest, wValue, wIndex) != expected:
+                raise _error(errno.EPIPE)
+            self._check(dev_handle)
+            if any(chunk.error == errno.ENODEV for chunk in self._queue):
+                self.unplug(self._settings.replug_s)
+                raise _error(errno.ENODEV)
+            self._request()
+            return 0
+
+    def bulk_write(
+        self, dev_handle: _Handle, ep: int, intf: int, data: array.array, timeout: int
+    ) -> int:
+        with self._lock:
+            self._check(dev_handle)
+            if ep != self._usb.endpoint_out or len(data) != 2 or data[0] >= REGISTERS:
+                raise _error(errno.EPIPE)
+            self.registers[data[0]] = data[1]
+            return 2
+
+    def bulk_read(
+        self, dev_handle: _Handle, ep: int, intf: int, buff: array.array, timeout: int
+    ) -> int:
+        deadline, target, count = time.monotonic() + timeout / 1000, memoryview(buff), 0
+        while True:
+            with self._lock:
+                self._check(dev_handle)
+                if self._stalled:
+                    raise _error(errno.EPIPE)
+                now = time.monotonic()
+                chunk = self._queue[0] if self._queue else None
+                if chunk is not None and chunk.ready_s <= now:
+                    if chunk.error is not None:
+                        self._fail(chunk.error)
+                    taken = min(len(chunk.data), len(target) - count)
+                    target[count : count + taken] = chunk.data[:taken]
+                    count += taken
+                    chunk.data = chunk.data[taken:]
+                    used_up = not chunk.data
+                    if used_up:
+                        self._queue.popleft()
+                    if count == len(target) or (used_up and chunk.ends):
+                        return count
+                    continue
+                ready_s = np.inf if chunk is None else chunk.ready_s
+            if now >= deadline:
+                if count:
+                    return count  # as libusb, which tells of the time-out only if nothing came
+                raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
+            time.sleep(max(0.0, min(ready_s - now, deadline - now, _TURN_S)))
+
+    # The camera itself.
+
+    def _plugged(self) -> bool:
+        return self._back_s is not None and time.monotonic() >= self._back_s
+
+    def _check(self, handle: _Handle, claimed: bool = True) -> None:
+        if handle.closed:
+            self.misuse.append("a closed handle was used")
+            raise _error(errno.EINVAL)
+        if handle.plugging != self._plugging or not self._plugged():
+            raise _error(errno.ENODEV)
+        if claimed and not handle.claimed:
+            self.misuse.append("an interface was used without being claimed")
+            raise _error(errno.EINVAL)
+
+    def _open_fault(self) -> str | None:
+        hit = (f.kind for f in self._faults if f.kind in OPEN_FAULTS and f.hits(self._opens))
+        return next(hit, None)
+
+    def _fail(self, number: int) -> None:
+        self._queue.popleft()
+        if number == errno.ENODEV:
+            self.unplug(self._settings.replug_s)
+        self._stalled = number == errno.EPIPE
+        raise _error(number)
+
+    def _request_fault(self) -> str | None:
+        number = self.requests
+        every = self._settings.fault_every
+        if every and (number + 1) % every == 0:
+            kind = _CYCLE[self._cycled % len(_CYCLE)]
+            self._cycled += 1
+            return kind
+        hit = (f.kind for f in self._faults if f.kind in REQUEST_FAULTS and f.hits(number))
+        return next(hit, None)
+
+    def _request(self) -> None:
+        fault = self._request_fault()
+        self.requests += 1
+        if fault == "refuse":
+            raise _error(errno.EPIPE)
+        if fault == "timeout":
+            return
+        if fault == "unplug_before":
+            self._position += 1  # the scene goes on
+            self.unplug(self._settings.replug_s)
+            raise _error(errno.ENODEV)
+        if fault == "stall":
+            self._queue.append(Chunk(0.0, error=errno.EPIPE))
+            return
+        if fault == "io_error":
+            self._queue.append(Chunk(0.0, error=errno.EIO))
+            return
+        data = self._next_frame()
+        if data is None:
+            return
+        due = max(time.monotonic(), self._last_due_s + self._period_s)
+        self._last_due_s = due
+        if fault == "late":
+            due += self._settings.late_s
+        if fault is None or fault in HARMLESS:
+            self.served += 1
+        if fault == "unplug_after":
+            self._position += 1  # the scene goes on
+        self._queue.extend(transfer(fault, data, due, self._splits, self._random))
+        self._splits += fault == "split"
+
+    def _next_frame(self) -> bytes | None:
+        source = self._source
+        if self._settings.loop:
+            self._position %= len(source)
+        elif self._position >= len(source):
+            return None
+        depth, amplitude = source.image(self._position)
+        self._position += 1
+        return encode_frame(
+            to_radial(depth, source.radial, source.camera), amplitude, self._range_m
+        )
+
+
+def _error(number: int) -> usb.core.USBError:
+    words: dict[int, Any] = {
+        errno.ENODEV: "No such device (it may have been disconnected)",
+        errno.EACCES: "Access denied (insufficient permissions)",
+        errno.EBUSY: "Resource busy",
+        errno.EPIPE: "Pipe error",
+        errno.EOVERFLOW: "Overflow",
+        errno.EIO: "Input/Output Error",
+        errno.EINVAL: "Invalid parameter",
+    }
+    return usb.core.USBError(words[number], None, number)

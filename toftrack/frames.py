@@ -1,0 +1,122 @@
+"""Frames of a depth camera, their ground truth, and the check of images that callers hand in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+
+# No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
+LARGEST_MEDIAN_M = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image as the device delivered it: neither rectified nor cleaned up."""
+
+    index: int
+    """Number of the frame within its recording, or since a live camera was opened."""
+    timestamp_s: float
+    depth: np.ndarray
+    """(H, W) float32 metres; 0, NaN, infinities and negative values are no reading."""
+    amplitude: np.ndarray | None
+    """(H, W) uint16."""
+    radial: bool
+    """True: `depth` is the distance along the pixel's ray; False: Z along the optical axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Ground truth of T frames, in the order in which the device yields them."""
+
+    joints_m: np.ndarray
+    """(T, 21, 3) metres, camera frame."""
+    visible: np.ndarray
+    """(T,) bool: the hand is in view."""
+    in_space: np.ndarray
+    """(T,) bool: the pose lies in the palm-fist-pointing space."""
+    visible_fraction: np.ndarray | None = None
+    """(T,) share of the hand that is in view and uncovered, 0..1."""
+    joint_visible: np.ndarray | None = None
+    """(T, 21) bool."""
+
+    def __len__(self) -> int:
+        return len(self.joints_m)
+
+    def __getitem__(self, rows: slice) -> Truth:
+        """The truth of a range of frames."""
+
+        def cut(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else values[rows]
+
+        return Truth(
+            joints_m=self.joints_m[rows],
+            visible=self.visible[rows],
+            in_space=self.in_space[rows],
+            visible_fraction=cut(self.visible_fraction),
+            joint_visible=cut(self.joint_visible),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """One rectified frame, as the tracker takes it.
+
+    depth_m: (H, W) float32 rectified Z, metres, 0 = no reading.  k: (3, 3) intrinsics, pixels.
+    index: number of the frame.  timestamp_s: when it was taken.
+    """
+
+    depth_m: np.ndarray
+    k: np.ndarray
+    index: int
+    timestamp_s: float
+
+
+def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A depth image as (H, W) float32 metres with 0 for no reading, and (3, 3) float64 intrinsics.
+
+    NaN, infinities and negative readings become no reading.
+
+    Args:
+        depth_m: (H, W) of any floating type, metres along the optical axis.
+        k: (3, 3) pinhole matrix in pixels.
+
+    Raises:
+        ToftrackError: one of them has the wrong shape, type or unit.
+    """
+    try:
+        depth = np.asarray(depth_m)
+        matrix = np.asarray(k)
+    except (TypeError, ValueError, RuntimeError) as error:  # a ragged list, a tensor on a GPU
+        raise ToftrackError(
+            f"the depth image and K must be NumPy arrays, or become ones ({error})"
+        ) from None
+    if depth.ndim != 2 or depth.size == 0:
+        raise ToftrackError(
+            f"the depth image must have two dimensions (rows, columns), but its shape is "
+            f"{depth.shape}; give one frame at a time"
+        )
+    if np.issubdtype(depth.dtype, np.integer):
+        raise ToftrackError(
+            f"the depth image consists of whole numbers ({depth.dtype}), which looks like "
+            "millimetres, but must be float metres; give depth.astype('float32') / 1000"
+        )
+    if not np.issubdtype(depth.dtype, np.floating):
+        raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
+    depth = np.ascontiguousarray(depth, np.float32)
+    nearest, farthest = depth.min(), depth.max()
+    if not (nearest >= 0 and farthest < np.inf):  # also true for NaN
+        depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
+        farthest = depth.max()
+    if farthest > LARGEST_MEDIAN_M:
+        median = float(np.median(depth[depth > 0]))
+        if median > LARGEST_MEDIAN_M:
+            raise ToftrackError(
+                f"the median of the depth image is {median:.0f}, which is plainly millimetres, but "
+                "it must be metres; give depth / 1000"
+            )
+    return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K

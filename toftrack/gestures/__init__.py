@@ -1,0 +1,1 @@
+"""Names for poses: recognised gestures, pinch and the pointing ray."""

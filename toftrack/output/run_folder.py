@@ -1,0 +1,296 @@
+"""What a run left in its output folder, and the recording that it tracked."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from toftrack.camera import Camera
+from toftrack.devices.synthetic import Synthetic
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.frames import Truth
+from toftrack.hand.shape import HandShape
+from toftrack.output.results import read_results
+from toftrack.pose_space.base import PoseSpace
+from toftrack.pose_space.files import make_pose_space
+from toftrack.recordings.npz import Recording
+from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
+from toftrack.recordings.store import FrameStore, open_recording, open_source
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import Expected, NearestSurface, Observation
+
+FILES = ("track.npz", "track.jsonl", "summary.json", "hand_shape.json")
+"""What a folder must hold to be a run's."""
+
+_SAME_TIME_S = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished run: T frames, a row for each.
+
+    results: of `read_results`.  frames: (T,) numbers of the input frames.  state_names: (T,), of
+    a dropped frame that of the one before.  summary: of summary.json.
+    """
+
+    folder: Path
+    results: dict[str, Any]
+    frames: np.ndarray
+    state_names: tuple[str, ...]
+    summary: dict[str, Any]
+    shape: HandShape
+    """The hand at the end of the run."""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The run's configuration."""
+        return self.results["metadata"].get("config") or {}
+
+    def estimate(self, row: int) -> Estimate:
+        """What the tracker said about one frame."""
+        results = self.results
+        names = {f.name for f in fields(Estimate)} & results.keys()
+        values = {name: results[name][row] for name in names}
+        for name in ("timestamp_s", "score", "effective_sample_size", "compute_s"):
+            values[name] = float(values[name])
+        values["gesture"], values["lost"] = str(values["gesture"]), bool(values["lost"])
+        return Estimate(index=int(self.frames[row]), state_name=self.state_names[row], **values)
+
+    def likelihood(self) -> FMeasure:
+        """The run's likelihood; ToftrackError when it is none that this program knows."""
+        return self._made(FMeasure, "likelihood")
+
+    def segmentation(self) -> NearestSurface:
+        """The run's segmentation; ToftrackError when it is none that this program knows."""
+        return self._made(NearestSurface, "segmentation")
+
+    def pose_space(self) -> PoseSpace:
+        """The run's pose space, read or learned anew; ToftrackError when its file is gone."""
+        settings = {k: v for k, v in self._settings("pose_space").items() if k != "_target_"}
+        if settings.get("file"):
+            settings["file"] = str(self.found(settings["file"]))
+        space = make_pose_space(**settings)
+        if space.dims != self.results["latent"].shape[1]:
+            raise ToftrackError(
+                f"'{settings.get('file')}' is no more the {self.results['latent'].shape[1]}-"
+                "dimensional pose space of the run; put the old file back"
+            )
+        return space
+
+    def found(self, path: str | Path) -> Path:
+        """A path of the run's configuration as it is now: relative to here, or to where it ran."""
+        path = Path(path).expanduser()
+        if path.exists() or path.is_absolute():
+            return path
+        try:
+            ran_in = OmegaConf.load(self.folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
+        except Exception:  # no such file, or whatever a YAML reader may say about it
+            return path
+        return Path(ran_in) / path
+
+    def _settings(self, group: str) -> dict[str, Any]:
+        settings = self.config.get(group)
+        if not isinstance(settings, dict):
+            raise ToftrackError(
+                f"'{self.folder / 'track.npz'}' does not say with which {group} it was made; run "
+                "track.py again with this version"
+            )
+        return settings
+
+    def _made(self, kind: type, group: str) -> Any:
+        """Only kinds that are known here: a file must not say what is to be executed."""
+        settings = dict(self._settings(group))
+        target = settings.pop("_target_", None)
+        if target != f"{kind.__module__}.{kind.__qualname__}":
+            raise ToftrackError(f"the run in '{self.folder}' has a {group} of its own: {target}")
+        try:
+            return kind(**settings)
+        except TypeError as error:
+            raise ToftrackError(
+                f"the {group} of the run in '{self.folder}' is of another version ({error}); run "
+                "track.py again with this one"
+            ) from None
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """The images of a run's frames, and their truth."""
+
+    store: FrameStore
+    camera: Camera
+    rows: np.ndarray
+    """(T,) positions in the store."""
+    truth: Truth | None
+    """Of T rows."""
+
+    def depth(self, row: int) -> np.ndarray:
+        """(H, W) float32 metres, rectified, 0 = no reading."""
+        depth, _ = self.store.image(int(self.rows[row]))
+        return self.camera.rectify(depth, self.store.radial)
+
+    def amplitude(self, row: int) -> np.ndarray | None:
+        """(H, W) uint16, undistorted; or None."""
+        return self.camera.undistort_amplitude(self.store.image(int(self.rows[row]))[1])
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read a run's output folder; ToftrackError when it is none, or something in it is missing."""
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise ToftrackError(f"no folder '{folder}'; give the output folder of a run of track.py")
+    missing = [name for name in FILES if not (folder / name).is_file()]
+    if len(missing) == len(FILES):
+        raise ToftrackError(
+            f"'{folder}' is not the output folder of a run: it has no {FILES[0]}; give a folder "
+            "that track.py wrote, such as outputs/DATE/TIME"
+        )
+    if missing:
+        raise ToftrackError(
+            f"'{folder}' lacks {' and '.join(missing)}, so the run did not finish or the file was "
+            "moved; run track.py again"
+        )
+    results = read_results(folder / "track.npz")
+    rows = len(results["lost"])
+    if not rows:
+        raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to draw")
+    frames, names = _lines(folder / "track.jsonl", rows)
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ToftrackError(
+            f"'{folder / 'summary.json'}' cannot be read ({error}); run track.py again"
+        ) from None
+    return Run(folder, results, frames, names, summary, HandShape.load(folder / "hand_shape.json"))
+
+
+def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Frame numbers and state names for the rows of track.npz, which also has dropped frames."""
+    try:
+        told = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        index = np.array([int(line["index"]) for line in told])
+        names = [str(line["state_name"]) for line in told]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ToftrackError(f"'{path}' cannot be read ({error}); run track.py again") from None
+    if len(index) and (np.diff(index) >= 1).all():
+        every = np.arange(index[0], index[-1] + 1)
+        names = [names[i] for i in np.searchsorted(index, every, side="right") - 1]
+        index = every
+    if len(index) != rows:
+        raise ToftrackError(
+            f"'{path}' has {len(index)} frames, but track.npz beside it {rows}: they are of "
+            "different runs; run track.py again"
+        )
+    return index, tuple(names)
+
+
+def open_footage(run: Run, recording: str | Path | None = None) -> Footage | None:
+    """The recording that a run tracked; None when it tracked a live camera.
+
+    recording: where it is now, when it is not where it was.
+
+    Raises ToftrackError when it is gone, or is not the one that the run tracked.
+    """
+    device = run.config.get("device") or {}
+    about = run.results["metadata"].get("device") or {}
+    name = about.get("recording")
+    if recording is None and name is None and about.get("device") != "synthetic":
+        return None
+    if recording is None and about.get("device") == "synthetic":
+        store: FrameStore = _synthetic(device)
+        name = "the synthetic frames"
+    elif recording is None and about.get("device") == "sample":
+        store = open_source("sample")
+    else:
+        path = Path(recording).expanduser() if recording is not None else run.found(name)
+        if not path.exists():
+            raise ToftrackError(
+                f"the recording '{path}' is not there{' any more' if recording is None else ''}; "
+                "say where it is with --recording FILE"
+            )
+        camera_file = about.get("camera_file")
+        store = open_recording(
+            path,
+            None if camera_file is None else run.found(camera_file),
+            device.get("modulation_mhz", DEFAULT_MODULATION_MHZ),
+        )
+        name = path
+    camera = store.camera
+    if about.get("camera_file"):
+        camera = Camera.load(run.found(about["camera_file"]))
+    rows = _rows(run, store, camera, about, device, name)
+    truth = store.truth
+    if truth is not None:
+        values = ((f.name, getattr(truth, f.name)) for f in fields(Truth))
+        truth = Truth(**{n: None if v is None else v[rows] for n, v in values})
+    return Footage(store, camera, rows, truth)
+
+
+def _rows(
+    run: Run, store: FrameStore, camera: Camera, about: dict, device: dict, name: object
+) -> np.ndarray:
+    """Which frame of the recording each row is; ToftrackError when it cannot be the same one."""
+    advice = "give the recording of this run with --recording FILE, or run track.py again"
+    start, stop = about.get("start", 0), about.get("stop", len(store))
+    all_of_it = device.get("stop") is None
+    if stop > len(store) or (all_of_it and stop != len(store)):
+        raise ToftrackError(
+            f"'{name}' is not what this run tracked, or has changed: it has {len(store)} frames "
+            f"instead of {'' if all_of_it else 'at least '}{stop}; {advice}"
+        )
+    rows = run.frames
+    if about.get("repeat"):
+        rows = start + (rows - start) % max(1, stop - start)
+    if rows.min() < 0 or rows.max() >= len(store):
+        raise ToftrackError(
+            f"the run tracked frames {rows.min()} to {rows.max()}, but '{name}' has only "
+            f"{len(store)}; {advice}"
+        )
+    size = run.results["metadata"].get("camera") or {}
+    if (camera.width, camera.height) != (size.get("width"), size.get("height")):
+        raise ToftrackError(
+            f"'{name}' has {camera.width}x{camera.height} pixels, but the run tracked "
+            f"{size.get('width')}x{size.get('height')}; {advice}"
+        )
+    times, held = run.results["timestamp_s"], run.results["metadata"].get("held_frames") or ()
+    own = ~np.isin(run.frames, held)
+    late = np.abs(np.asarray(store.timestamp_s)[rows] - times)[own].max()
+    if not about.get("repeat") and late > _SAME_TIME_S:
+        raise ToftrackError(
+            f"'{name}' is not what this run tracked: its frames have other times; {advice}"
+        )
+    return rows
+
+
+def _synthetic(device: dict[str, Any]) -> Recording:
+    """The frames that `device=synthetic` made, made again."""
+    made = Synthetic(**{key: value for key, value in device.items() if key != "_target_"})
+    frames = list(made)
+    return Recording(
+        depth=np.stack([frame.depth for frame in frames]),
+        radial=False,
+        camera=made.camera,
+        timestamp_s=np.array([frame.timestamp_s for frame in frames]),
+        fps=made.fps,
+        amplitude=np.stack([frame.amplitude for frame in frames]),
+        truth=made.truth,
+    )
+
+
+def observe(run: Run, footage: Footage, row: int) -> Observation:
+    """One frame segmented as the tracker did; where the hand was expected follows from the row
+    before instead of the tracker's prediction.
+    """
+    expected = None
+    if row > 0 and not run.results["lost"][row - 1]:
+        depths = run.results["joints_m"][row - 1][:, 2]
+        expected = Expected(float(depths.min()), float(depths.max()))
+    return run.segmentation()(footage.depth(row), np.array(footage.camera.K), expected)

@@ -1,0 +1,217 @@
+"""Estimates for other programs, one after the other as they are made.
+
+Each is a line of JSON, the same as in track.jsonl. Sending never waits for who reads: the tracker
+keeps its pace, and what a reader is too slow for is dropped, counted, and told at the end.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, Protocol, Self
+
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.output.results import LINE_FIELDS, json_line
+
+_log = logging.getLogger(__name__)
+
+_STDOUT, _STDERR = 1, 2
+_GRACE_S = 1.0
+"""How long the lines that still wait at the end have to leave."""
+
+
+class ReaderGoneError(Exception):
+    """Whoever read the stream has closed it: there is nobody left to track for."""
+
+
+class Stream(Protocol):
+    """Where estimates are sent, within a `with`."""
+
+    def send(self, estimate: Estimate) -> None:
+        """Send one, without ever waiting for who reads it; ReaderGoneError when nobody does."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *exception: Any) -> None: ...
+
+
+class NoStream:
+    """Sends nothing."""
+
+    def send(self, estimate: Estimate) -> None:
+        """Do nothing."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: Any) -> None: ...
+
+
+class StdoutStream:
+    """Lines to standard output, which is theirs alone within the `with`.
+
+    Whatever else this process prints, its libraries included, goes to standard error meanwhile.
+
+    A reader that falls behind fills the operating system's pipe first (64 KiB on Linux, about 13
+    lines). Then `waiting` lines wait for the next call of `send`, and when there are more, the
+    oldest of them is dropped, so that the reader gets the newest. If it still does not read at the
+    end, its last line may be cut short.
+
+    Args:
+        fields: what to send of each estimate, of results.LINE_FIELDS; None for all.
+        waiting: lines, at least 1.
+
+    Raises:
+        ToftrackError: an unknown field or number; by `with`, when standard output is closed.
+        ReaderGoneError: by `send`, when the reader has closed the pipe or the disk is full.
+    """
+
+    def __init__(self, fields: Sequence[str] | None = None, waiting: int = 25) -> None:
+        self._fields = _known(fields)
+        if not isinstance(waiting, int) or waiting < 1:
+            raise ToftrackError(f"stream.waiting={waiting!r} is no number of lines; give 1 or more")
+        if not hasattr(select, "PIPE_BUF"):
+            raise ToftrackError(
+                "stream=stdout needs pipes that say whether they are full, which this operating "
+                "system has not; use stream=udp"
+            )
+        self._lines: deque[bytes] = deque(maxlen=waiting)
+        self._rest = b""
+        self._sent = self._dropped = 0
+        self._descriptor = -1
+
+    def __enter__(self) -> Self:
+        self._descriptor = _claim_stdout()
+        return self
+
+    def send(self, estimate: Estimate) -> None:
+        """Write the lines that wait and this one, as far as the reader has room for them."""
+        self._dropped += len(self._lines) == self._lines.maxlen
+        self._lines.append((json_line(estimate, self._fields) + "\n").encode())
+        try:
+            self._write(until=0.0)
+        except OSError as error:
+            self._lines.clear()
+            self._rest = b""
+            raise ReaderGoneError(
+                f"standard output takes no more lines ({error.strerror})"
+            ) from None
+
+    def __exit__(self, *exception: Any) -> None:
+        with suppress(OSError):  # nobody reads the last lines
+            self._write(until=time.monotonic() + _GRACE_S)
+        sys.stdout.flush()
+        os.dup2(self._descriptor, _STDOUT)
+        os.close(self._descriptor)
+        dropped = self._dropped + len(self._lines) + bool(self._rest)
+        _tell(self._sent, "to standard output", dropped, "the reader was too slow")
+
+    def _write(self, until: float) -> None:
+        """Write what waits; give up when there is no room for more, at that time at the latest."""
+        while self._rest or self._lines:
+            if not self._rest:
+                self._rest = self._lines.popleft()
+            patience = max(0.0, until - time.monotonic())
+            _, room, _ = select.select((), (self._descriptor,), (), patience)
+            if not room:
+                return
+            # So much is sure to fit in; the pipe's own non-blocking mode would be that of all the
+            # programs that share it.
+            count = os.write(self._descriptor, self._rest[: select.PIPE_BUF])
+            self._rest = self._rest[count:]
+            self._sent += not self._rest
+
+
+class UdpStream:
+    """A datagram a line to one address, whether anybody listens there or not.
+
+    Args:
+        host: address or name of the receiving machine.
+        port: 1 to 65535.
+        fields: what to send of each estimate, of results.LINE_FIELDS; None for all.
+
+    Raises:
+        ToftrackError: an unknown field, a host that cannot be found, or an impossible port.
+    """
+
+    def __init__(self, host: str, port: int, fields: Sequence[str] | None = None) -> None:
+        self._fields = _known(fields)
+        if not isinstance(port, int) or not 1 <= port <= 65535:
+            raise ToftrackError(f"stream.port={port!r} is no port; give a number from 1 to 65535")
+        try:
+            found = socket.getaddrinfo(str(host), port, type=socket.SOCK_DGRAM)
+        except (OSError, UnicodeError) as error:
+            raise ToftrackError(
+                f"stream.host={host} cannot be found ({error}); give the name or address of the "
+                "machine that listens"
+            ) from None
+        family, kind, protocol, _, self._address = found[0]
+        self._kind = family, kind, protocol
+        self._socket: socket.socket | None = None
+        self._sent = self._dropped = 0
+        self._reason = ""
+
+    def __enter__(self) -> Self:
+        self._socket = socket.socket(*self._kind)
+        self._socket.setblocking(False)
+        return self
+
+    def send(self, estimate: Estimate) -> None:
+        """Send a datagram; one that the system does not take at once is dropped."""
+        assert self._socket is not None, "send within `with`"
+        line = (json_line(estimate, self._fields) + "\n").encode()
+        try:
+            self._socket.sendto(line, self._address)
+        except OSError as error:  # its buffer is full, or there is no network just now
+            self._dropped += 1
+            self._reason = error.strerror or str(error)
+        else:
+            self._sent += 1
+
+    def __exit__(self, *exception: Any) -> None:
+        assert self._socket is not None
+        self._socket.close()
+        self._socket = None
+        host, port = self._address[:2]
+        _tell(self._sent, f"to {host} port {port}", self._dropped, self._reason)
+
+
+def _known(fields: Sequence[str] | None) -> tuple[str, ...]:
+    if fields is None:
+        return LINE_FIELDS
+    names = (fields,) if isinstance(fields, str) else tuple(fields)
+    unknown = [name for name in names if name not in LINE_FIELDS]
+    if unknown or not names:
+        what = f"names the unknown field {unknown[0]!r}" if unknown else "is empty"
+        raise ToftrackError(
+            f"stream.fields {what}; give null for all, or some of {', '.join(LINE_FIELDS)}"
+        )
+    return names
+
+
+def _claim_stdout() -> int:
+    """A descriptor of standard output; what is printed from now on goes to standard error."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        own = os.dup(_STDOUT)
+    except OSError as error:
+        raise ToftrackError(
+            f"standard output cannot be used ({error.strerror}); with stream=stdout, give it a "
+            "pipe or a file"
+        ) from None
+    os.dup2(_STDERR, _STDOUT)
+    return own
+
+
+def _tell(sent: int, where: str, dropped: int, reason: str) -> None:
+    why = f" ({reason})" if dropped else ""
+    _log.info("stream: %d estimates sent %s, %d dropped%s", sent, where, dropped, why)

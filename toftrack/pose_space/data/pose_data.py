@@ -1,0 +1,93 @@
+"""Poses to learn from, whatever their source: the paper's 79, recorded motion, a user's file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from toftrack.errors import ToftrackError
+from toftrack.pose_space.data.training_poses import synthetic_training_poses
+
+
+@dataclass(frozen=True)
+class PoseData:
+    """Hand poses for learning a pose space.
+
+    angles_rad: (M, 21).
+    labels: M names: a gesture, a transformation or a clip.
+    clips: M numbers; poses of one clip resemble each other as neighbours in time do, so a clip is
+        held out as a whole or not at all.
+    sources: what went in, one dictionary a file or generator, as written into the model.
+    notes: sentences about the reading that the user should see.
+    """
+
+    angles_rad: Tensor
+    labels: tuple[str, ...]
+    clips: Tensor
+    sources: tuple[dict[str, Any], ...]
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def rows(self, rows: Tensor) -> PoseData:
+        """The poses of some rows, (K,) int64."""
+        return PoseData(
+            self.angles_rad[rows],
+            tuple(self.labels[i] for i in rows.tolist()),
+            self.clips[rows],
+            self.sources,
+        )
+
+
+def synthetic_data() -> PoseData:
+    """The paper's 79 poses; each transformation and each thumb configuration is a clip."""
+    poses = synthetic_training_poses()
+    names = list(dict.fromkeys(poses.labels))
+    clips = torch.tensor([names.index(label) for label in poses.labels])
+    source = {"data": "synthetic", "poses": len(poses.labels)}
+    return PoseData(poses.angles_rad, poses.labels, clips, (source,))
+
+
+def mixed_data(parts: dict[str, PoseData], poses: int | None = None) -> PoseData:
+    """Several sources together.
+
+    parts: by name, as the configuration gives them.
+    poses: at most so many of each part, so that a long recording does not drown the others; picked
+        to cover it (`spread_out`); None takes all.
+    """
+    if not parts:
+        raise ToftrackError("data.parts is empty; give at least one source of poses")
+    chosen, clips, offset = [], [], 0
+    for part in parts.values():
+        rows = spread_out(part.angles_rad, len(part) if poses is None else poses)
+        chosen.append(part.rows(rows))
+        clips.append(chosen[-1].clips + offset)
+        offset += int(part.clips.max()) + 1
+    return PoseData(
+        torch.cat([part.angles_rad for part in chosen]),
+        tuple(label for part in chosen for label in part.labels),
+        torch.cat(clips),
+        tuple(source | {"poses": len(part)} for part in chosen for source in part.sources),
+        tuple(note for part in parts.values() for note in part.notes),
+    )
+
+
+def spread_out(angles: Tensor, count: int) -> Tensor:
+    """Rows that cover a set of poses, (M, 21) to (min(count, M),) ascending.
+
+    Farthest-point sampling (Gonzalez, Theor. Comput. Sci. 38, 1985) from the pose nearest to the
+    mean: every pose left out is close to one that stays, however often a recording repeats it.
+    """
+    if len(angles) <= count:
+        return torch.arange(len(angles))
+    nearest = (angles - angles.mean(0)).square().sum(1)
+    rows = [int(nearest.argmin())]
+    distance = (angles - angles[rows[0]]).square().sum(1)
+    while len(rows) < count:
+        rows.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (angles - angles[rows[-1]]).square().sum(1))
+    return torch.tensor(sorted(rows))

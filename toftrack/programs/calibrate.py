@@ -1,0 +1,233 @@
+"""Calibrate a depth camera from a recording of a chequerboard:
+`python -m toftrack.calibrate RECORDING --board 7x5 --square 0.03`.
+
+Move a flat chequerboard about before the camera: wholly in view, near and far over the distances
+that matter, turned to all sides, slowly. The camera file serves every device: `camera.file=FILE`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from toftrack.calibration import fitting as calibration
+from toftrack.calibration.fitting import DepthFit, DepthPairs, Lens, View
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
+from toftrack.recordings.store import FrameStore, open_recording
+from toftrack.views.figures.calibration import corner_sheet, error_plot
+
+_PICTURES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibrated camera and how it was found."""
+
+    camera: Camera
+    """With its depth polynomial."""
+    lens: Lens
+    depth: DepthFit
+    pairs: DepthPairs
+    amplitudes: list[np.ndarray]
+    """Of the lens's views."""
+    looked_at: int
+    """Frames that were searched for the board."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line, calibrate, and write the files. Raises ToftrackError."""
+    parser = argparse.ArgumentParser(
+        prog="python -m toftrack.calibrate",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("recording", help=".srs, .npz with amplitude, or a folder")
+    parser.add_argument("--board", required=True, help="inner corners, columns x rows, as 7x5")
+    parser.add_argument("--square", required=True, type=float, help="side of a square, m")
+    parser.add_argument("--out", default="camera.json", help="the camera file to write")
+    parser.add_argument("--report", help="folder of report and pictures (default: beside OUT)")
+    parser.add_argument("--camera", help="camera file to start from instead of the recording's")
+    parser.add_argument(
+        "--keep-lens", action="store_true", help="correct the depth only, trust the lens"
+    )
+    parser.add_argument("--frames", type=int, default=80, help="frames to look at, at most (80)")
+    parser.add_argument(
+        "--modulation",
+        type=int,
+        default=DEFAULT_MODULATION_MHZ,
+        help="MHz, of a .srs that does not state its range",
+    )
+    options = parser.parse_args(arguments)
+    board, square_m = _board(options.board), options.square
+    if not 0 < square_m < 1 or options.frames < 1:
+        raise ToftrackError(
+            f"--square must be metres (0.03 for 30 mm), not {square_m}, and --frames above 0"
+        )
+    store = open_recording(options.recording, options.camera, options.modulation)
+    start = Camera.load(options.camera) if options.camera else store.camera
+    try:
+        result = calibrate(store, board, square_m, start, options.keep_lens, options.frames)
+    finally:
+        store.close()
+    out = Path(options.out).expanduser()
+    folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
+    result.camera.save(out)
+    text = report_text(result, start)
+    _write_report(folder, result, start, text, board)
+    print(text)
+    print(f"camera file: {out}\nreport:      {folder}")
+
+
+def calibrate(
+    store: FrameStore,
+    board: tuple[int, int],
+    square_m: float,
+    start: Camera,
+    keep_lens: bool = False,
+    frames: int = 80,
+) -> Calibration:
+    """Calibrate from the frames of a recording.
+
+    Args:
+        store: with amplitudes.
+        board: columns, rows of inner corners.
+        square_m: side of a square.
+        start: the camera as it is known so far.
+        keep_lens: trust its intrinsics and distortion, and fit the depth only.
+        frames: how many frames, evenly spread, are searched for the board.
+
+    Raises:
+        ToftrackError: there are no amplitudes, or too few frames show the board.
+    """
+    if store.image(0)[1] is None:
+        raise ToftrackError(
+            "the recording has no amplitude images, in which the chequerboard is found; record "
+            "them, too"
+        )
+    if (start.width, start.height) != (store.camera.width, store.camera.height):
+        raise ToftrackError(
+            f"the camera file is for {start.width}x{start.height} pixels, but the recording has "
+            f"{store.camera.width}x{store.camera.height}"
+        )
+    numbers = np.unique(np.linspace(0, len(store) - 1, frames).round().astype(int))
+    views = []
+    for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):
+        corners = calibration.find_corners(store.image(number)[1], board)
+        if corners is not None:
+            views.append(View(int(number), corners))
+    fit = calibration.known_lens if keep_lens else calibration.fit_lens
+    lens = fit(views, board, square_m, start)
+    images = []
+    for view in lens.views:
+        depth, amplitude = store.image(view.index)
+        # A recording of Z was made with the recording's own camera: that is taken back.
+        images.append((to_radial(depth, store.radial, store.camera), amplitude))
+    pairs = calibration.depth_pairs(lens, board, square_m, images)
+    depth = calibration.fit_depth(pairs)
+    camera = replace(
+        lens.camera, depth_polynomial=depth.polynomial, depth_polynomial_range_m=depth.range_m
+    )
+    return Calibration(camera, lens, depth, pairs, [a for _, a in images], len(numbers))
+
+
+def report_text(result: Calibration, start: Camera) -> str:
+    """What was found, before and after, in lines."""
+    facts = _facts(result, start)
+    before, after = facts["before"], facts["after"]
+    lines = [
+        f"chequerboard found in {facts['frames_used']} of {facts['frames_searched']} frames, "
+        f"{facts['nearest_m']:.2f} to {facts['farthest_m']:.2f} m away",
+        f"corners reprojected to {facts['reprojection_px']:.3f} px rms",
+        "                      before      after",
+    ]
+    for name in ("fx", "fy", "cx", "cy"):
+        lines.append(f"{name:<18}{before[name]:>10.2f} {after[name]:>10.2f} px")
+    for number, name in enumerate(("k1", "k2", "p1", "p2", "k3")):
+        lines.append(
+            f"{name:<18}{before['distortion'][number]:>10.4f} {after['distortion'][number]:>10.4f}"
+        )
+    for key, name in (("board_rms_mm", "depth, boards"), ("pixel_rms_mm", "depth, pixels")):
+        lines.append(f"{name:<18}{before[key]:>10.2f} {after[key]:>10.2f} mm rms")
+    errors = ", ".join(f"{o}: {mm:.2f}" for o, mm in facts["validation_mm"].items())
+    lines.append(f"depth polynomial of order {facts['order']} (left-out frames, mm rms: {errors})")
+    return "\n".join(lines)
+
+
+def _facts(result: Calibration, start: Camera) -> dict[str, Any]:
+    pairs, fit = result.pairs, result.depth
+
+    def one(camera: Camera, polynomial: tuple[float, ...]) -> dict[str, Any]:
+        distance, error = calibration.frame_errors(pairs, polynomial)
+        pixel = calibration.pixel_errors(pairs, polynomial)
+        return {
+            "fx": camera.K[0, 0],
+            "fy": camera.K[1, 1],
+            "cx": camera.K[0, 2],
+            "cy": camera.K[1, 2],
+            "distortion": camera.distortion.tolist(),
+            "board_rms_mm": 1000 * float(np.sqrt(np.mean(error**2))),
+            "pixel_rms_mm": 1000 * float(np.sqrt(np.average(pixel**2, weights=pairs.weight))),
+            "board_distance_m": distance.tolist(),
+            "board_error_mm": (1000 * error).tolist(),
+        }
+
+    return {
+        "frames_searched": result.looked_at,
+        "frames_used": len(result.lens.views),
+        "nearest_m": float(pairs.true_m.min()),
+        "farthest_m": float(pairs.true_m.max()),
+        "reprojection_px": float(np.sqrt(np.mean(result.lens.errors_px**2))),
+        "order": fit.order,
+        "validation_mm": {str(order): mm for order, mm in fit.validation_mm.items()},
+        "before": one(start, ()),
+        "after": one(result.camera, fit.polynomial),
+    }
+
+
+def _write_report(
+    folder: Path, result: Calibration, start: Camera, text: str, board: tuple[int, int]
+) -> None:
+    facts, views = _facts(result, start), result.lens.views
+    chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int))
+    sheet = corner_sheet([(result.amplitudes[i], views[i].corners_px) for i in chosen], board)
+    before, after = facts["before"], facts["after"]
+    plot = error_plot(
+        np.array(before["board_distance_m"]),
+        np.array(before["board_error_mm"]) / 1000,
+        np.array(after["board_error_mm"]) / 1000,
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
+        content = json.dumps(facts, indent=1) + "\n"
+        (folder / "report.json").write_text(content, encoding="utf-8")
+        for name, picture in (("corners.png", sheet), ("depth_error.png", plot)):
+            (folder / name).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+    except OSError as error:
+        raise ToftrackError(
+            f"the report folder '{folder}' cannot be written ({error.strerror}); choose another "
+            "with --report"
+        ) from error
+
+
+def _board(text: str) -> tuple[int, int]:
+    parts = text.lower().split("x")
+    if len(parts) == 2 and all(part.isdecimal() for part in parts):
+        columns, rows = map(int, parts)
+        if 3 <= columns <= 50 and 3 <= rows <= 50:
+            return columns, rows
+    raise ToftrackError(
+        f"--board {text} is not COLUMNSxROWS of inner corners, each from 3 to 50; a board of 8x6 "
+        "squares is 7x5"
+    )

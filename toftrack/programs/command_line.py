@@ -1,0 +1,157 @@
+"""What the command-line programs share: clear errors, exit statuses, and sweeps that carry on.
+
+A program is a thin script:
+
+    @hydra.main(version_base="1.3", config_path="conf", config_name="track")
+    @sweep_job
+    def main(config: DictConfig) -> float: ...
+
+    if __name__ == "__main__":
+        sys.exit(run(main))
+
+Exit status: 0 done, 1 an error (one sentence on standard error), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import math
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from toftrack.configuration.sentences import FULL_ERROR, sentence
+
+
+@dataclass
+class _Program:
+    """The program that `run` is running, for its jobs."""
+
+    running: bool = False
+    tracebacks: bool = False
+    failed_jobs: list[str] = field(default_factory=list)
+
+
+_program = _Program()
+
+
+class _JobFailedError(BaseException):
+    """Carries a job's error past Hydra, which would print a line of its own about an Exception."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+def run(main: Callable[[], object]) -> int:
+    """Run a program and return its exit status, with errors told in one sentence.
+
+    With HYDRA_FULL_ERROR=1 in the environment the traceback comes before the sentence.
+
+    Args:
+        main: usually a function under `@hydra.main` and `@sweep_job`.
+
+    Returns:
+        0 done, 1 after an error (also of one job of a sweep), 130 after Ctrl-C.
+    """
+    _program.running = True
+    _program.tracebacks = os.environ.get(FULL_ERROR) == "1"
+    _program.failed_jobs.clear()
+    try:
+        with _hydra_raises():
+            main()
+    except KeyboardInterrupt:
+        print("interrupted: what was done until then is kept", file=sys.stderr)
+        return 130
+    except SystemExit as end:  # of Hydra's options, as --help, and of its argument parser
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        return 1 if end.code else 0
+    except BrokenPipeError:
+        # Nobody reads the output any more; python would complain again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except _JobFailedError as failure:
+        _report(failure.error)
+        return 1
+    except Exception as error:
+        _report(error)
+        return 1
+    finally:
+        _program.running = False
+    if _program.failed_jobs:
+        count = len(_program.failed_jobs)
+        print(f"error: {count} of the jobs failed, see above", file=sys.stderr)
+        return 1
+    return 0
+
+
+def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
+    """Decorate the function under `@hydra.main` so that a failing job does not stop a sweep.
+
+    In a sweep (`-m`) an error is told in one sentence, also as `error` in the summary.json of the
+    job's output folder, and the job returns infinity: the worst there is for a sweeper that
+    minimises, where NaN would stop it. Otherwise the error is raised.
+    """
+
+    @functools.wraps(task)
+    def guarded(config: DictConfig) -> float:
+        try:
+            return task(config)
+        except Exception as error:
+            if not _in_sweep():
+                if _program.running:
+                    raise _JobFailedError(error) from error
+                raise
+            _report(error)
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            _program.failed_jobs.append(str(folder))
+            _note_error(folder, sentence(error))
+            return math.inf
+
+    return guarded
+
+
+@contextlib.contextmanager
+def _hydra_raises() -> Iterator[None]:
+    """Hydra prints errors and exits by itself, unless it believes that the user wants them raw."""
+    before = os.environ.get(FULL_ERROR)
+    os.environ[FULL_ERROR] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[FULL_ERROR]
+        else:
+            os.environ[FULL_ERROR] = before
+
+
+def _in_sweep() -> bool:
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def _report(error: BaseException) -> None:
+    if _program.tracebacks:
+        traceback.print_exception(error)
+    print(f"error: {sentence(error)}", file=sys.stderr, flush=True)
+
+
+def _note_error(folder: Path, text: str) -> None:
+    """Add the error to the job's summary.json; what a finished part wrote there stays."""
+    path = folder / "summary.json"
+    # The sentence is on the terminal; a folder that cannot be written must not stop the sweep.
+    with contextlib.suppress(OSError):
+        try:
+            summary = json.loads(path.read_text(encoding="utf-8"))
+        except (FileNotFoundError, ValueError):
+            summary = {}
+        path.write_text(json.dumps(summary | {"error": text}, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,168 @@
+"""Convert a recording: `python -m toftrack.convert IN OUT`.
+
+IN and OUT are each a `.srs` (the SR3000's stream), a `.npz` (toftrack's recording) or a folder of
+16-bit PNG images with a camera file; the kind follows from the name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.recordings.npz import Recording, write_recording
+from toftrack.recordings.npz_stream import write_npz_streamed
+from toftrack.recordings.png_folder import PngFolderWriter
+from toftrack.recordings.sr_frame import (
+    DEFAULT_MODULATION_MHZ,
+    REGISTERS,
+    encode_frame,
+    to_radial,
+    unambiguous_range_m,
+)
+from toftrack.recordings.srs import SrsFacts, SrsRecording, SrsWriter
+from toftrack.recordings.store import FrameStore, open_recording
+
+_MILLIMETRE = 0.001
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line and convert. Raises ToftrackError."""
+    parser = argparse.ArgumentParser(prog="python -m toftrack.convert", description=__doc__)
+    parser.add_argument("source", metavar="IN", help="the recording to read")
+    parser.add_argument("target", metavar="OUT", help=".srs, .npz, or a folder")
+    parser.add_argument("--camera", help="camera file instead of the recording's own camera")
+    parser.add_argument(
+        "--modulation",
+        type=int,
+        default=DEFAULT_MODULATION_MHZ,
+        help="MHz of the SR3000: the range of a .srs, read (if it states none) or written",
+    )
+    parser.add_argument("--unit", type=float, help="metres of one step of the PNG images")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    options = parser.parse_args(arguments)
+    count = convert(
+        options.source,
+        options.target,
+        options.camera,
+        options.modulation,
+        options.unit,
+        options.overwrite,
+    )
+    print(f"{options.target}: {count} frames")
+
+
+def convert(
+    source: str | Path,
+    target: str | Path,
+    camera_file: str | Path | None = None,
+    modulation_mhz: int = DEFAULT_MODULATION_MHZ,
+    unit_m: float | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Convert a recording, frame by frame; returns the number of frames.
+
+    Between `.srs` and a folder the distance words are kept exactly; into `.npz` they become float32
+    metres, exactly enough to come back. From Z into `.srs` they are rounded to 1 / 65535 of the
+    range, and into a folder to `unit_m`.
+
+    Raises:
+        ToftrackError: the source cannot be read, the target not be written, or it exists.
+    """
+    target = Path(target).expanduser()
+    if unit_m is not None and not 0 < unit_m < 1:
+        raise ToftrackError(f"--unit must be above 0 and below 1 m, not {unit_m}")
+    kind = target.suffix.lower()
+    if kind not in (".srs", ".npz", "") and not target.is_dir():
+        raise ToftrackError(
+            f"'{target}' is neither .srs nor .npz, nor a folder's name; give one of them"
+        )
+    if kind == ".npz" and target.exists() and not overwrite:
+        raise ToftrackError(
+            f"the file '{target}' exists already; choose another name or give --overwrite"
+        )
+    if target.exists() and Path(source).expanduser().resolve() == target.resolve():
+        raise ToftrackError(f"'{target}' cannot be converted into itself; choose another name")
+    store = open_recording(source, camera_file, modulation_mhz)
+    try:
+        if camera_file is not None:
+            store = _with_camera(store, Camera.load(camera_file), camera_file)
+        if store.truth is not None and kind != ".npz":
+            _warn("the ground truth has no place in the new format and is left out")
+        if getattr(store, "damage", None):
+            _warn(f"{source}: {store.damage}; the frames before are converted")
+        with tqdm(total=len(store), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
+            if kind == ".npz":
+                _to_npz(store, target, bar)
+            elif kind == ".srs":
+                _to_srs(store, target, unambiguous_range_m(modulation_mhz), overwrite, bar)
+            else:
+                _to_folder(store, target, unit_m, bar)
+    finally:
+        store.close()
+    return len(store)
+
+
+def _to_npz(store: FrameStore, target: Path, bar: tqdm) -> None:
+    camera = store.camera
+    if camera.depth_polynomial:
+        beside = target.with_name(target.stem + ".camera.json")
+        camera.save(beside)
+        _warn(f"the depth polynomial has no place in .npz; use camera.file={beside}")
+    if isinstance(store, Recording):
+        write_recording(target, store)
+    else:
+        write_npz_streamed(target, store, bar.update)
+
+
+def _to_srs(store: FrameStore, target: Path, range_m: float, overwrite: bool, bar: tqdm) -> None:
+    init, registers = None, bytes(REGISTERS)
+    if isinstance(store, SrsRecording):
+        init, registers, range_m = store.init, store.registers or registers, store.range_m
+    facts = SrsFacts(range_m, store.camera, store.fps, store.metadata)
+    with SrsWriter(target, init, registers, facts, overwrite) as writer:
+        for index, time_s in enumerate(store.timestamp_s):
+            if isinstance(store, SrsRecording):
+                data = store.raw(index)
+            else:
+                depth, amplitude = store.image(index)
+                radial = to_radial(depth, store.radial, store.camera)
+                data = encode_frame(radial, amplitude, range_m)
+            writer.append(data, float(time_s))
+            bar.update()
+
+
+def _to_folder(store: FrameStore, target: Path, unit_m: float | None, bar: tqdm) -> None:
+    if unit_m is None:
+        # The camera's own words, as they are.
+        exact = isinstance(store, SrsRecording)
+        unit_m = store.range_m / np.iinfo(np.uint16).max if exact else _MILLIMETRE
+    with PngFolderWriter(
+        target, store.camera, unit_m, store.radial, store.fps, store.metadata
+    ) as writer:
+        for index, time_s in enumerate(store.timestamp_s):
+            writer.append(*store.image(index), float(time_s))
+            bar.update()
+
+
+def _with_camera(store: FrameStore, camera: Camera, path: str | Path) -> FrameStore:
+    if (camera.width, camera.height) != (store.camera.width, store.camera.height):
+        raise ToftrackError(
+            f"the camera file '{path}' is for {camera.width}x{camera.height} pixels, but the "
+            f"recording has {store.camera.width}x{store.camera.height}"
+        )
+    if isinstance(store, Recording):
+        return replace(store, camera=camera)
+    store.camera = camera
+    return store
+
+
+def _warn(text: str) -> None:
+    print(f"note: {text}", file=sys.stderr)

@@ -1,0 +1,273 @@
+"""What a sweep found: `python -m toftrack.report multirun/DIR`.
+
+Gathers the overrides (.hydra/overrides.yaml) and the figures (summary.json) of every job below a
+folder into sweep.csv, a table, and sweep.png: the error against the cost of a frame, with the
+spread over seeds. Jobs that failed are named and left out of the means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import statistics
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from toftrack.errors import ToftrackError
+
+FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
+"""What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
+
+SEED = "seed"
+RECORDINGS = ("device.path",)
+"""Overrides that choose the recording: averaged over, and shown apart where there are several."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One job of a sweep.
+
+    name: its folder below the sweep's.  overrides: as given.  figures: numbers of summary.json,
+    nested names joined by dots.  error: why it failed, None when it did not.
+    """
+
+    name: str
+    overrides: dict[str, str]
+    figures: dict[str, float]
+    error: str | None = None
+
+
+@dataclass
+class Group:
+    """The runs that differ only in the seed and the recording.
+
+    settings: the overrides that tell groups apart.  error, cost_ms: means over the runs, None
+    without any.  spread: deviation over seeds of the mean over recordings, None below two seeds.
+    recordings: the mean error of each.
+    """
+
+    settings: str
+    runs: list[Run] = field(default_factory=list)
+    error: float | None = None
+    spread: float | None = None
+    cost_ms: float | None = None
+    seeds: int = 0
+    recordings: dict[str, float] = field(default_factory=dict)
+
+
+def read_runs(folder: str | Path) -> list[Run]:
+    """Every job below a folder, in the order of their names; ToftrackError when there is none."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ToftrackError(f"no folder {folder}; give the folder of a sweep, multirun/DATE/TIME")
+    found = [path.parents[1] for path in folder.rglob(".hydra/overrides.yaml")]
+    if not found:
+        raise ToftrackError(
+            f"no job below {folder} (no .hydra/overrides.yaml); give the folder of a sweep,"
+            " multirun/DATE/TIME"
+        )
+    return [_read_run(path, folder) for path in sorted(found, key=_natural)]
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key that puts job 2 before job 10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in path.parts]
+
+
+def _read_run(path: Path, folder: Path) -> Run:
+    name = path.relative_to(folder).as_posix()
+    try:
+        lines = OmegaConf.to_container(OmegaConf.load(path / ".hydra" / "overrides.yaml"))
+        overrides = dict(_split(str(line)) for line in lines)
+    except Exception as error:  # whatever a YAML reader may say about a damaged file
+        return Run(name, {}, {}, f"its overrides cannot be read ({type(error).__name__})")
+    try:
+        summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return Run(name, overrides, {}, "it left no summary.json: it did not finish")
+    except (OSError, ValueError) as error:
+        return Run(name, overrides, {}, f"its summary.json cannot be read ({error})")
+    if not isinstance(summary, dict):
+        return Run(name, overrides, {}, "its summary.json is not one of track.py")
+    error = summary.get("error")
+    return Run(name, overrides, _flat(summary), None if error is None else str(error))
+
+
+def _split(override: str) -> tuple[str, str]:
+    key, _, value = override.partition("=")
+    return key.lstrip("+~"), value
+
+
+def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:
+    figures: dict[str, float] = {}
+    for name, value in summary.items():
+        if isinstance(value, dict):
+            figures |= _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            figures[prefix + name] = value
+    return figures
+
+
+def error_figure(runs: Sequence[Run]) -> str:
+    """The first of FIGURES that every good run has, else the first."""
+    good = [run for run in runs if run.error is None]
+    everywhere = [name for name in FIGURES if all(name in run.figures for run in good)]
+    return everywhere[0] if good and everywhere else FIGURES[0]
+
+
+def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
+    """Groups in the order of their first run, with the mean and the spread of a figure."""
+    told = _telling(runs)
+    groups: dict[str, Group] = {}
+    for run in runs:
+        settings = " ".join(f"{key}={run.overrides.get(key, '-')}" for key in told) or "all alike"
+        groups.setdefault(settings, Group(settings)).runs.append(run)
+    for group in groups.values():
+        _summarise(group, figure)
+    return list(groups.values())
+
+
+def _telling(runs: Sequence[Run]) -> list[str]:
+    """Overrides, other than seed and recording, in which runs differ."""
+    apart = [key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1]
+    return [key for key in apart if key != SEED and key not in RECORDINGS]
+
+
+def _keys(runs: Sequence[Run]) -> list[str]:
+    return list(dict.fromkeys(key for run in runs for key in run.overrides))
+
+
+def recording(run: Run) -> str:
+    """The name of the run's recording; empty when the sweep does not choose one."""
+    return next((Path(run.overrides[key]).stem for key in RECORDINGS if key in run.overrides), "")
+
+
+def _summarise(group: Group, figure: str) -> None:
+    good = [run for run in group.runs if run.error is None and figure in run.figures]
+    if not good:
+        return
+
+    def mean(runs: Sequence[Run], name: str) -> float:
+        return statistics.fmean(run.figures[name] for run in runs)
+
+    group.error = mean(good, figure)
+    seeds = sorted({run.overrides.get(SEED, "") for run in good})
+    # A seed that failed on a recording would compare other recordings: only complete seeds count.
+    names = sorted({recording(run) for run in good})
+    by_seed = [[run for run in good if run.overrides.get(SEED, "") == seed] for seed in seeds]
+    complete = [runs for runs in by_seed if {recording(run) for run in runs} == set(names)]
+    group.seeds = len(seeds)
+    if len(complete) > 1:
+        group.spread = statistics.stdev(mean(runs, figure) for runs in complete)
+    timed = [run for run in good if "mean_ms" in run.figures]
+    group.cost_ms = mean(timed, "mean_ms") if timed else None
+    for name in names:
+        group.recordings[name] = mean([run for run in good if recording(run) == name], figure)
+
+
+def write_csv(runs: Sequence[Run], path: Path) -> None:
+    """One row a job: its folder, its overrides, its figures, its error."""
+    overrides = _keys(runs)
+    figures = list(dict.fromkeys(key for run in runs for key in run.figures))
+    with open(path, "w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["run", *overrides, *figures, "error"])
+        for run in runs:
+            row = [run.overrides.get(key, "") for key in overrides]
+            row += [run.figures.get(key, "") for key in figures]
+            writer.writerow([run.name, *row, run.error or ""])
+
+
+def table(groups: Sequence[Group], figure: str) -> str:
+    """The groups as text for the terminal; a second block by recording where there are several."""
+    unit, digits = ("mm", 2) if figure.endswith("_mm") else (figure.removeprefix("metrics."), 3)
+    lines = [f" #  runs failed  {unit:>10}   spread    ms/frame  settings"]
+    for number, group in enumerate(groups, 1):
+        failed = sum(run.error is not None for run in group.runs)
+        lines.append(
+            f"{number:2d} {len(group.runs):5d} {failed:6d}  {_text(group.error, digits):>10}"
+            f" {_text(group.spread, digits):>8}  {_text(group.cost_ms, 1):>10}  {group.settings}"
+        )
+    names = list(dict.fromkeys(name for group in groups for name in group.recordings))
+    if len(names) > 1:
+        width = max(8, *(len(name) for name in names))
+        lines += ["", " #  " + " ".join(f"{name:>{width}}" for name in names)]
+        for number, group in enumerate(groups, 1):
+            cells = [_text(group.recordings.get(name), digits) for name in names]
+            lines.append(f"{number:2d}  " + " ".join(f"{cell:>{width}}" for cell in cells))
+    return "\n".join(lines)
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], list[Group]]:
+    """Read a sweep, write sweep.csv and sweep.png into its folder, print the table.
+
+    figure: a figure of summary.json such as metrics.fingertip_mm; None takes `error_figure`.
+
+    Raises ToftrackError when there is no job, no job has the figure, or nothing can be written.
+    """
+    import cv2  # slow to import
+
+    from toftrack.views.figures.sweep import sweep_figure
+
+    folder = Path(folder)
+    runs = read_runs(folder)
+    figure = figure or error_figure(runs)
+    known = sorted({name for run in runs for name in run.figures})
+    if known and figure not in known:
+        raise ToftrackError(f"no job has the figure {figure}; known: {', '.join(known)}")
+    groups = group_runs(runs, figure)
+    try:
+        write_csv(runs, folder / "sweep.csv")
+    except OSError as error:
+        raise ToftrackError(f"{folder} cannot be written ({error.strerror})") from error
+    print(table(groups, figure))
+    failed = [run for run in runs if run.error is not None]
+    if failed:
+        print(f"\n{len(failed)} of {len(runs)} jobs failed:")
+        told = {key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1}
+        for run in failed:
+            changed = " ".join(f"{k}={value}" for k, value in run.overrides.items() if k in told)
+            print(f"  {run.name} ({changed}): {run.error}")
+    written = [folder / "sweep.csv"]
+    points = [
+        (group.settings, group.cost_ms, group.error, group.spread)
+        for group in groups
+        if group.error is not None and group.cost_ms is not None
+    ]
+    if points:
+        label = f"{figure.removeprefix('metrics.')}, mean over recordings"
+        picture = folder / "sweep.png"
+        if not cv2.imwrite(str(picture), sweep_figure(points, label)):
+            raise ToftrackError(f"{picture} cannot be written")
+        written.append(picture)
+    print("\n" + "\n".join(f"  {path}" for path in written))
+    return runs, groups
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; 0 also when jobs of the sweep failed, 1 when there is nothing to report."""
+    parser = argparse.ArgumentParser(
+        prog="python -m toftrack.report", description="Gather the jobs of a sweep into one table."
+    )
+    parser.add_argument("folder", help="the sweep's folder, multirun/DATE/TIME")
+    parser.add_argument(
+        "--figure", help="of summary.json, as metrics.fingertip_mm; default the mean joint error"
+    )
+    given = parser.parse_args(arguments)
+    try:
+        report(given.folder, given.figure)
+    except ToftrackError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0

@@ -1,0 +1,112 @@
+"""The CPU's scoring back end: one fused pass a particle, compiled once by numba and cached."""
+
+from __future__ import annotations
+
+import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.compute.compiling import announced
+from toftrack.compute.threads import threads
+from toftrack.hand.shape import HandShape
+from toftrack.hand.skeleton import CHAIN_SLOTS
+from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.render.disc import disc_steps
+from toftrack.render.numba.hand import LANES
+from toftrack.render.numba.kernel import pack_evidence, score_hands
+from toftrack.render.scoring import Counts, Evidence
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Helper threads of this process; a forked one gets its own."""
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="toftrack-scorer")
+
+
+class NumbaScorer:
+    """Kinematics, drawing and counting in compiled code, one particle after the other.
+
+    Plain threads share the particles, not numba's own: these are one choice for a whole process
+    and some of them do not allow calls from two threads at once. Safe to call from several
+    threads. States on another device are moved to the CPU and the counts back.
+    """
+
+    name = "numba"
+
+    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
+        """Compiles the kernel if need be, some seconds once on a machine.
+
+        surface: instead of the shape's own.
+        """
+        shape = shape.to("cpu", torch.float32)
+        surface = (surface or hand_surface(shape)).to("cpu", torch.float32)
+        slots = np.full(25, -1, np.int64)
+        slots[list(CHAIN_SLOTS)] = np.arange(6, 27)
+        covariances = surface.axes_m @ surface.axes_m.mT
+        rows, columns = torch.triu_indices(3, 3)
+        self._hand = (
+            slots,
+            torch.cat((shape.base_frames, shape.base_m[..., None]), -1).contiguous().numpy(),
+            shape.bone_lengths_m.contiguous().numpy(),
+            np.float32(-1.0 if shape.side == "left" else 1.0),
+            surface.frame_index.contiguous().numpy(),
+            torch.cat((surface.centres_m, covariances[:, rows, columns]), 1).numpy(),
+        )
+        self._frame: tuple = (None, None)
+        self._compile()
+
+    def _compile(self) -> None:
+        """The first call of a process, with a message if it takes long."""
+        if score_hands.signatures:
+            return
+        with announced("renderer: compiling the numba kernel (once, about 6 s)"):
+            image = torch.zeros(2, 2)
+            self(torch.zeros(1, 27), Evidence(image, image, image, image > 0, torch.eye(3), 0.0))
+
+    def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
+        """See Scorer; particles whose state is not finite count 0."""
+        images, hand = self._packed(evidence)
+        height, width = evidence.hand.shape
+        k = _array(evidence.k, torch.float32)
+        x = _array(states, torch.float32)
+        counts = torch.empty(4, len(x))
+        task = functools.partial(
+            score_hands,
+            x,
+            np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+            images,
+            hand,
+            width,
+            disc_steps(evidence.radius_px, height, width),
+            *self._hand,
+            np.zeros(1, np.int64),
+            counts.numpy(),
+        )
+        helpers = min(threads(), -(-len(x) // LANES)) - 1
+        others = [_pool(os.getpid()).submit(task) for _ in range(helpers)]
+        task()
+        for other in others:
+            # A helper that has not begun has nothing left to do.
+            if not other.cancel():
+                other.result()
+        return Counts(*counts.to(states.device))
+
+    def _packed(self, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+        """The evidence as the kernel wants it, once for all calls of a frame."""
+        before, packed = self._frame
+        if before is not evidence:
+            tensors = (evidence.low, evidence.high, evidence.occluder)
+            packed = pack_evidence(
+                *(_array(tensor, torch.float32) for tensor in tensors),
+                _array(evidence.hand, torch.bool),
+            )
+            self._frame = evidence, packed
+        return packed
+
+
+def _array(tensor: Tensor, dtype: torch.dtype) -> np.ndarray:
+    return tensor.detach().to("cpu", dtype).contiguous().numpy()

@@ -1,0 +1,94 @@
+"""A hand hangs on an arm, and the arm goes on until the image ends.
+
+The silhouette of a hand with its forearm looks much like that of a hand the other way round. But
+there the arm would have to be where the fingers end, and the image shows the background; or the
+fingers would be where the arm leaves the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import roma
+import torch
+from torch import Tensor
+
+from toftrack.render.segmentation import Observation
+
+_ALONG_M = (0.05, 0.07, 0.09)
+"""Points of the forearm's axis, from the wrist."""
+_BENT = 0.7
+"""The wrist bends: the arm may be this far beside the axis, in parts of the way from the wrist."""
+_BEHIND_M = 0.06
+"""What lies less than this behind the axis may be the arm."""
+_EXITS = 64
+"""Points at most where the blob leaves the image."""
+
+
+@dataclass(frozen=True)
+class ArmSight:
+    """What an image says of arms.
+
+    depth_m: (H, W) Z, 0 where there is no reading, which may be a dark sleeve.
+    gap_px: (H, W) distance to the nearest pixel that is not background.
+    exits_m: (E, 3) points where the blob leaves the image.
+    k: (3, 3).
+    """
+
+    depth_m: Tensor
+    gap_px: Tensor
+    exits_m: Tensor
+    k: Tensor
+
+
+def border_pixels(observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the blob's pixels at the border of the image."""
+    hand = observation.hand.cpu().numpy()
+    border = np.zeros_like(hand)
+    border[[0, -1], :] = border[:, [0, -1]] = True
+    return np.nonzero(hand & border)
+
+
+def arm_sight(observation: Observation) -> ArmSight:
+    """Prepare an image for `forearm_conflict`."""
+    depth, k = observation.depth_m, observation.k
+    background = ~(observation.hand | observation.occluder) & (depth > 0)
+    gap = cv2.distanceTransform(
+        background.cpu().numpy().view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5
+    )
+    v, u = border_pixels(observation)
+    some = slice(None, None, max(1, -(-len(v) // _EXITS)))
+    v, u = (torch.from_numpy(index[some].copy()).to(depth.device) for index in (v, u))
+    z = depth[v, u]
+    exits = torch.stack(((u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z, z), 1)
+    return ArmSight(depth, torch.from_numpy(gap).to(depth.device), exits, k)
+
+
+def forearm_conflict(particles: Tensor, sight: ArmSight) -> Tensor:
+    """How much of a hypothesis' forearm cannot be, (N,), 0 to 1.
+
+    It is the share of the forearm where the image shows the background instead; and 1 where a blob
+    that leaves the image does so only on the side of the fingers, though the wrist is in view.
+
+    particles: (N, 6 + d), wrist translation and rotation vector first.
+    """
+    wrist = particles[:, :3]
+    axis = roma.rotvec_to_rotmat(particles[:, 3:6])[:, :, 1]  # from the fingers to the arm
+    along = particles.new_tensor((0.0, *_ALONG_M))
+    x = wrist[:, None] + along[:, None] * axis[:, None]  # (N, 4 points, 3)
+    k, z = sight.k, x[..., 2].clamp(min=0.05)
+    u = (k[0, 0] * x[..., 0] / z + k[0, 2]).round()
+    v = (k[1, 1] * x[..., 1] / z + k[1, 2]).round()
+    height, width = sight.depth_m.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    row, column = v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)
+    behind = sight.depth_m[row, column] > z + _BEHIND_M
+    clear = sight.gap_px[row, column] > _BENT * along * k[0, 0] / z
+    through = (inside & behind & clear)[:, 1:].float().mean(1)
+    if len(sight.exits_m) == 0:
+        return through
+    farthest = (axis @ sight.exits_m.mT).amax(1) - (axis * wrist).sum(1)
+    turned = inside[:, 0] & (farthest < 0)
+    return torch.maximum(through, turned.float())

@@ -1,0 +1,1 @@
+"""Charts and contact sheets of finished runs, pose spaces and calibrations."""

@@ -1,0 +1,258 @@
+"""What `view=rerun` logs of each frame, and how the viewer opens.
+
+Entities, on the timelines `frame` (its number) and `time` (seconds of the recording):
+
+| entity | what |
+| --- | --- |
+| `world/camera` | the camera, with `depth` (a cloud of points in 3-D) and `amplitude` |
+| `world/tracker` | the image that the tracker works on, with `segmentation` and `classified` |
+| `world/hand` | the estimate: `ellipsoids`, `skeleton`, `joints`; and `particles`, by weight |
+| `plots` | `score` (and lost), `latent` coordinates, `time` (milliseconds a frame) |
+| `log` | changes of state and gesture |
+
+The world is the camera's frame: x right, y down, z forward, metres.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import roma
+import torch
+
+from toftrack.compute.rigid import rotated_pivot
+from toftrack.compute.threads import small_operations
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.hand.shape import HandShape
+from toftrack.hand.skeleton import FINGERS
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import Observation
+from toftrack.tracking.state import StepInfo
+from toftrack.views.base import TrackedFrame
+from toftrack.views.classified import CLASS_RGB, CLASSES, classify
+from toftrack.views.model_image import cpu_surface, parted, posed_hand
+from toftrack.views.overlay import FINGER_RGB
+
+try:
+    import rerun as rr
+    import rerun.blueprint as rrb
+except ImportError as error:
+    raise ToftrackError(
+        f"view=rerun needs the package rerun-sdk ({error}); install it with "
+        "pip install -e '.[rerun]', or choose another view"
+    ) from error
+
+_STEPS_A_METRE = 5000.0
+"""Depth goes out in whole steps of 0.2 mm, up to 13 m: half the size of floating point."""
+_SHOWN_M = (0.2, 1.2)
+"""Range of the depth colours."""
+_PALM_RGB, _LOST_RGB = (170, 170, 170), (213, 94, 0)
+_SEGMENTS = (
+    (0, "background", (40, 40, 40)),
+    (1, "hand", (86, 180, 233)),
+    (2, "occluder", (230, 159, 0)),
+)
+_BONE_M, _JOINT_M, _PARTICLE_M = 0.003, 0.003, 0.0012
+
+
+class Entities:
+    """Logs frame after frame to a stream; one thread at a time.
+
+    Args:
+        stream: where to.
+        likelihood: tells correct, false and missed pixels.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, likelihood: FMeasure) -> None:
+        self._stream = stream
+        self._likelihood = likelihood
+        self._pinholes: dict[str, tuple[bytes, int, int]] = {}
+        self._told: tuple[str, ...] = ()
+        self._latent_named = False
+        self._log_constants()
+
+    @small_operations()
+    def log(self, tracked: TrackedFrame) -> None:
+        """Log one frame."""
+        estimate = tracked.estimate
+        self._stream.set_time("frame", sequence=estimate.index)
+        self._stream.set_time("time", duration=estimate.timestamp_s)
+        self._log_images(tracked)
+        if tracked.insight is None:
+            for gone in ("world/tracker/segmentation", "world/tracker/classified"):
+                self._stream.log(gone, rr.Clear(recursive=False))
+            self._stream.log("world/hand/particles", rr.Clear(recursive=False))
+        else:
+            self._log_observation(tracked, tracked.insight.observation)
+            self._log_particles(tracked.insight)
+        self._log_hand(tracked)
+        self._log_plots(estimate)
+        self._log_changes(estimate)
+
+    def _log_constants(self) -> None:
+        stream = self._stream
+        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
+        stream.log("world/tracker/segmentation", rr.AnnotationContext(_SEGMENTS), static=True)
+        classes = tuple(enumerate(CLASSES))
+        context = rr.AnnotationContext([(n, name, CLASS_RGB[n]) for n, name in classes])
+        stream.log("world/tracker/classified", context, static=True)
+        lines = rr.SeriesLines(names=["score", "lost"], colors=[(86, 180, 233), _LOST_RGB])
+        stream.log("plots/score", lines, static=True)
+        stream.log("plots/time", rr.SeriesLines(names=["ms"], colors=[(0, 158, 115)]), static=True)
+
+    def _log_pinhole(self, entity: str, k: np.ndarray, height: int, width: int) -> None:
+        """The camera of an image, when it is not the one before."""
+        key = (np.asarray(k, np.float32).tobytes(), height, width)
+        if self._pinholes.get(entity) == key:
+            return
+        self._pinholes[entity] = key
+        pinhole = rr.Pinhole(
+            image_from_camera=k,
+            resolution=(width, height),
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.1,
+        )
+        self._stream.log(entity, pinhole)
+
+    def _log_images(self, tracked: TrackedFrame) -> None:
+        depth, camera = tracked.depth_m, tracked.camera
+        self._log_pinhole("world/camera", camera.K, *depth.shape)
+        steps = _STEPS_A_METRE * depth
+        near, far = (_STEPS_A_METRE * limit for limit in _SHOWN_M)
+        image = rr.DepthImage(
+            np.where(steps < 2**16, steps, 0).round().astype(np.uint16),
+            meter=_STEPS_A_METRE,
+            depth_range=(near, far),
+            colormap="viridis",
+            point_fill_ratio=0.4,
+        )
+        self._stream.log("world/camera/depth", image)
+        amplitude = camera.undistort_amplitude(tracked.frame.amplitude)
+        if amplitude is not None:
+            self._stream.log("world/camera/amplitude", rr.Image(amplitude))
+
+    def _log_observation(self, tracked: TrackedFrame, observation: Observation) -> None:
+        """How each pixel of the tracker's own image counts."""
+        observation = observation.to(torch.device("cpu"))
+        hand, occluder = observation.hand.numpy(), observation.occluder.numpy()
+        self._log_pinhole("world/tracker", observation.k.numpy(), *hand.shape)
+        segments = hand.astype(np.uint8)
+        segments[occluder] = 2
+        self._stream.log("world/tracker/segmentation", rr.SegmentationImage(segments))
+        pixels = classify(tracked.estimate.state, tracked.shape, observation, self._likelihood)
+        labels = rr.SegmentationImage(pixels.labels())
+        self._stream.log("world/tracker/classified", labels)
+
+    def _log_particles(self, insight: StepInfo) -> None:
+        """The middles of the hands that the particles stand for, brighter with their weight."""
+        particles = insight.particles.detach().cpu()
+        middles = particles[:, :3] + rotated_pivot(particles[:, 3:6])
+        weights = insight.weights.detach().cpu().numpy()
+        shades = np.uint8(np.round(255 * weights / max(float(weights.max()), 1e-12)))
+        colours = cv2.applyColorMap(shades[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
+        points = rr.Points3D(middles.numpy(), colors=colours, radii=_PARTICLE_M)
+        self._stream.log("world/hand/particles", points)
+
+    def _log_hand(self, tracked: TrackedFrame) -> None:
+        estimate, log = tracked.estimate, self._stream.log
+        if not np.isfinite(estimate.state).all():
+            for part in ("ellipsoids", "skeleton", "joints"):
+                log(f"world/hand/{part}", rr.Clear(recursive=False))
+            return
+        log("world/hand/ellipsoids", ellipsoids(estimate, tracked.shape))
+        joints = estimate.joints_m
+        strips = [joints[[0, *range(4 * f + 1, 4 * f + 5)]] for f in range(len(FINGERS))]
+        lines = rr.LineStrips3D(strips, colors=FINGER_RGB, radii=_BONE_M / 2)
+        log("world/hand/skeleton", lines)
+        colours = [_PALM_RGB, *(rgb for rgb in FINGER_RGB for _ in range(4))]
+        log("world/hand/joints", rr.Points3D(joints, colors=colours, radii=_JOINT_M))
+
+    def _log_plots(self, estimate: Estimate) -> None:
+        log = self._stream.log
+        log("plots/score", rr.Scalars([estimate.score, float(estimate.lost)]))
+        if not self._latent_named:
+            self._latent_named = True
+            names = [f"coordinate {n}" for n in range(1, len(estimate.latent) + 1)]
+            colours = [FINGER_RGB[n % len(FINGER_RGB)] for n in range(len(names))]
+            lines = rr.SeriesLines(names=names, colors=colours)
+            log("plots/latent", lines, static=True)
+        log("plots/latent", rr.Scalars(estimate.latent))
+        log("plots/time", rr.Scalars([1e3 * estimate.compute_s]))
+
+    def _log_changes(self, estimate: Estimate) -> None:
+        now = (estimate.state_name, estimate.gesture, str(estimate.lost))
+        if now == self._told:
+            return
+        self._told = now
+        lost = "lost" if estimate.lost else "not lost"
+        text = ", ".join(filter(None, (estimate.state_name, lost, estimate.gesture)))
+        level = rr.TextLogLevel.WARN if estimate.lost else rr.TextLogLevel.INFO
+        self._stream.log("log", rr.TextLog(text, level=level))
+
+
+def ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
+    """The posed hand without its wrist, in the fingers' colours; all in one when it is lost."""
+    hand, _ = parted(posed_hand(estimate.state, shape))
+    axes = hand.axes_m[0]
+    sizes = axes.norm(dim=-2)
+    turns = axes / sizes[:, None]
+    # A left hand's frames are mirrored. An ellipsoid does not mind turning an axis around.
+    turns[..., 0] *= torch.linalg.det(turns).sign()[:, None]
+    bones = cpu_surface(shape).frame_index[:-1]
+    palette = torch.tensor((_PALM_RGB, *FINGER_RGB))
+    colours = palette[torch.where(bones > 0, 1 + (bones - 1) // 3, 0)].numpy()
+    return rr.Ellipsoids3D(
+        centers=hand.centres_m[0].numpy(),
+        half_sizes=sizes.numpy(),
+        quaternions=roma.rotmat_to_unitquat(turns).numpy(),
+        colors=[_LOST_RGB] if estimate.lost else colours,
+        fill_mode="majorwireframe",
+    )
+
+
+def blueprint() -> rrb.Blueprint:
+    """How the viewer opens: the scene in 3-D, the images beside it, and the plots below."""
+    scene = rrb.Spatial3DView(
+        origin="world",
+        contents=["+ world/**", "- world/camera/amplitude", "- world/tracker/**"],
+        name="hand, points and particles",
+        eye_controls=rrb.EyeControls3D(
+            position=(0.2, -0.1, 0.15), look_target=(0, 0, 0.5), eye_up=(0, -1, 0)
+        ),
+    )
+    images = rrb.Tabs(
+        rrb.Spatial2DView(
+            origin="world/camera",
+            contents=["world/camera/amplitude", "world/hand/skeleton"],
+            name="amplitude and skeleton",
+        ),
+        rrb.Spatial2DView(
+            origin="world/camera",
+            contents=["world/camera/depth", "world/hand/skeleton"],
+            name="depth",
+        ),
+    )
+    labels = rrb.Tabs(
+        rrb.Spatial2DView(
+            origin="world/tracker", contents=["world/tracker/classified"], name="classified pixels"
+        ),
+        rrb.Spatial2DView(
+            origin="world/tracker", contents=["world/tracker/segmentation"], name="segmentation"
+        ),
+        rrb.TextLogView(origin="log", name="changes"),
+    )
+    plots = rrb.Horizontal(
+        rrb.TimeSeriesView(
+            origin="plots/score", name="score and lost", axis_y=rrb.ScalarAxis(range=(0.0, 1.05))
+        ),
+        rrb.TimeSeriesView(origin="plots/latent", name="latent coordinates"),
+        rrb.TimeSeriesView(origin="plots/time", name="ms a frame"),
+    )
+    above = rrb.Horizontal(scene, rrb.Vertical(images, labels), column_shares=[3, 2])
+    return rrb.Blueprint(
+        rrb.Vertical(above, plots, row_shares=[3, 1]),
+        rrb.TimePanel(timeline="frame", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
