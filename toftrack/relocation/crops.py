@@ -43,7 +43,9 @@ def crop(depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray) -> tuple[np.n
     # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.
     focal = samples * distance / CROP_M
     middle = (samples - 1) / 2
-    inverse = np.array([[1 / focal, 0, -middle / focal], [0, 1 / focal, -middle / focal], [0, 0, 1]])
+    inverse = np.array(
+        [[1 / focal, 0, -middle / focal], [0, 1 / focal, -middle / focal], [0, 0, 1]]
+    )
     mapping = np.asarray(k, np.float64) @ rotation @ inverse
     read = cv2.warpPerspective(
         depth_m,
@@ -103,7 +105,7 @@ def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
 
 
 def wide_channels(read_m: Tensor) -> Tensor:
-    """(N, h, w) readings to (N, 2, h, w): depth in parts of the range, 1 where none; and validity."""
+    """(N, h, w) readings to (N, 2, h, w): depth in parts of the range, 1 where none; validity."""
     valid = read_m > 0
     far = torch.where(valid, (read_m / WIDE_RANGE_M).clamp(max=1), torch.ones_like(read_m))
     return torch.stack((far, valid.to(read_m.dtype)), 1)

@@ -91,15 +91,13 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     gone = ~present & dice.chance(0.5, n)
     pieces = labels.shape[1] - 5
     labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
-    scenes = _scenes(hands, labels, bank, dice, others=0.25, objects=0.12)
+    scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12)
 
     pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
     side = pixels.round().clamp(36, _SAMPLES)
     middle = (side - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, side, side)
-    depth, which = take_pictures(
-        scenes, lens, random_sensors(n, dice), (_SAMPLES, _SAMPLES), dice
-    )
+    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_SAMPLES, _SAMPLES), dice)
     read, parts = _resampled(depth, which, side.int().numpy())
     _cut(read, parts, dice)
     # One by one, so that each stays in the cache.
@@ -149,7 +147,9 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     labels[:, pieces:] = torch.where(no_arm[:, None], -1, labels[:, pieces:])
     other, other_left = _other_hands(hands, bank, dice)
     there = dice.chance(0.35, n) & raised
-    scenes = _scenes(hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there))
+    scenes = random_scenes(
+        hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there)
+    )
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
 
     cells, seen = [], []
@@ -182,7 +182,7 @@ def _other_hands(hands: Hands, bank: ShapeBank, dice: Dice) -> tuple[Hands, Tens
     return posed_hands(bank, pivot, left, dice, OTHER_HAND), left
 
 
-def _scenes(
+def random_scenes(
     hands: Hands,
     labels: Tensor,
     bank: ShapeBank,
@@ -213,7 +213,7 @@ def _scenes(
 def _resampled(
     depth: np.ndarray, which: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures of `side` pixels at the crop's samples, and their parts, as crops.crop reads them."""
+    """Pictures of `side` pixels at a crop's samples, and their parts, as crops.crop reads them."""
     n = len(depth)
     read = np.empty((n, _SAMPLES, _SAMPLES), np.float32)
     parts = np.empty((n, PARTS, PARTS), np.int8)

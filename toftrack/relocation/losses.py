@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toftrack.filter import PIVOT_M
+from toftrack.compute.rigid import PIVOT_M
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.relocation.images import Crops, WideImages
@@ -82,9 +82,7 @@ def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> PoseLosses:
     with torch.no_grad():
         first = p.log_probability[use].argmax(1)
         at = (use, first)
-        likeliest = hypothesis_joints(
-            p.rotation[at], p.angles[at], p.log_size[at], p.pivot_m[at]
-        )
+        likeliest = hypothesis_joints(p.rotation[at], p.angles[at], p.log_size[at], p.pivot_m[at])
         off = (likeliest - truth).norm(dim=-1).mean(1)
         right = (p.right[there] > 0) == crops.right[there]
         found = (p.present > 0) == crops.present
@@ -116,25 +114,26 @@ def finder_loss(found: Found, images: WideImages) -> Tensor:
         bump = torch.where((seen > _SEEN)[:, None, None], bump, torch.zeros(()))
         index = torch.arange(n)
         target[index, side] = torch.maximum(target[index, side], bump)
-        near = (du.square() + dv.square() < 9) & (
-            (seen > _BARELY_SEEN) & (seen <= _SEEN)
-        )[:, None, None]
+        near = (du.square() + dv.square() < 9) & ((seen > _BARELY_SEEN) & (seen <= _SEEN))[
+            :, None, None
+        ]
         ignored[index, side] |= near
         at = ((du.abs() < 1.5) & (dv.abs() < 1.5) & (seen > _SEEN)[:, None, None]).nonzero()
         if len(at):
             b, r, c = at.unbind(1)
             here = (b, side[b], r, c)
-            places = places + (
-                (found.column[here] - (column[b] - c)).abs()
-                + (found.row[here] - (row[b] - r)).abs()
-                + 10 * (found.log_depth[here] - images.depth_m[b, hand].log()).abs()
-            ).sum()
+            places = (
+                places
+                + (
+                    (found.column[here] - (column[b] - c)).abs()
+                    + (found.row[here] - (row[b] - r)).abs()
+                    + 10 * (found.log_depth[here] - images.depth_m[b, hand].log()).abs()
+                ).sum()
+            )
     positive = target == 1
     p = found.heat.sigmoid()
     log_p, log_q = F.logsigmoid(found.heat), F.logsigmoid(-found.heat)
-    gain = torch.where(
-        positive, (1 - p).square() * log_p, (1 - target) ** 4 * p.square() * log_q
-    )
+    gain = torch.where(positive, (1 - p).square() * log_p, (1 - target) ** 4 * p.square() * log_q)
     gain = torch.where(ignored & ~positive, torch.zeros(()), gain)
     count = positive.sum().clamp(min=1)
     return (-gain.sum() + 0.1 * places) / count

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compiling import announced, compiled, entry_point
+from toftrack.compute.compiling import announced, compiled, entry_point
 from toftrack.relocation.scenes import Dice, Scenes
 
 _entry = entry_point(__file__)
@@ -223,7 +223,5 @@ def _take(centres, axes, whiten, which, planes, lenses, sensors, seeds, depth, l
                 labels[n, v, u] = 0
         for e in range(centres.shape[1]):
             if which[n, e] >= 0:
-                _draw(
-                    centres[n, e], axes[n, e], whiten[n, e], which[n, e], lens, clean, labels[n]
-                )
+                _draw(centres[n, e], axes[n, e], whiten[n, e], which[n, e], lens, clean, labels[n])
         _sense(sensors[n], lens, state, depth[n], labels[n], clean)

@@ -13,7 +13,7 @@ import roma
 import torch
 from torch import Tensor
 
-from toftrack.filter import PIVOT_M
+from toftrack.compute.rigid import PIVOT_M
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.relocation.poses import sample_poses
 from toftrack.relocation.shapes import ShapeBank
@@ -204,9 +204,7 @@ def surroundings(hands: Hands, distance_m: Tensor, dice: Dice) -> tuple[Tensor, 
     nearest = (torso + shift)[:, 2] - 0.13
     shift[:, 2] += (hands.pivot_m[:, 2] + 0.03 - nearest).clamp(min=0)
     torso, head, shoulder = torso + shift, head + shift, shoulder + shift
-    neck = torso + torch.stack(
-        (torch.zeros(n), torch.full((n,), -0.33), torch.zeros(n)), 1
-    )
+    neck = torso + torch.stack((torch.zeros(n), torch.full((n,), -0.33), torch.zeros(n)), 1)
     other = torso + torch.stack((0.22 * side, torch.full((n,), 0.1), torch.zeros(n)), 1)
     upper = (hands.elbow_m + shoulder) / 2
     centres = torch.stack((torso, head, neck, upper, other, shoulder), 1)
@@ -237,9 +235,7 @@ def _along(direction: Tensor, radius: Tensor, half_length: Tensor) -> Tensor:
     return torch.stack((x, y, z), 2) * scales[:, None, :]
 
 
-def things(
-    around_m: Tensor, n_things: int, p: float, dice: Dice
-) -> tuple[Tensor, Tensor, Tensor]:
+def things(around_m: Tensor, n_things: int, p: float, dice: Dice) -> tuple[Tensor, Tensor, Tensor]:
     """Bars, plates, bottles and balls about (N, 3), most of them in front of it."""
     n = len(around_m)
     spread = torch.tensor([0.09, 0.09, 0.0])

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
 import multiprocessing
+import queue as queues
 import sys
 import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +27,8 @@ from toftrack.relocation.shapes import shape_bank
 _READY = 6
 """Batches that wait to be trained on."""
 _SHARED = "file_system"
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+Network = TypeVar("Network", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -47,12 +52,12 @@ class Schedule:
             raise ToftrackError("rate of a network must be between 0 and 1")
 
 
-Keep = Callable[[nn.Module, int], None]
-"""Called now and then with the averaged network and the number of images so far."""
+Course = list[dict[str, Any]]
+"""How training went: a row every few thousand images, with running means of the errors."""
 
 
-def train_poses(schedule: Schedule, shapes: int, seed: int, keep: Keep) -> list[dict[str, Any]]:
-    """Train the pose network; returns the course of training, a row every few thousand images."""
+def train_poses(schedule: Schedule, shapes: int, seed: int) -> tuple[PoseNet, Course]:
+    """Train the pose network; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
     network = PoseNet(schedule.width).train().to(memory_format=torch.channels_last)
 
@@ -70,11 +75,11 @@ def train_poses(schedule: Schedule, shapes: int, seed: int, keep: Keep) -> list[
         }
         return losses.total, told
 
-    return _train(network, "poses", crop_images, step, schedule, shapes, seed, keep)
+    return _train(network, "poses", crop_images, step, schedule, shapes, seed)
 
 
-def train_finder(schedule: Schedule, shapes: int, seed: int, keep: Keep) -> list[dict[str, Any]]:
-    """Train the finder; returns the course of training."""
+def train_finder(schedule: Schedule, shapes: int, seed: int) -> tuple[Finder, Course]:
+    """Train the finder; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
     network = Finder(schedule.width).train().to(memory_format=torch.channels_last)
 
@@ -85,23 +90,24 @@ def train_finder(schedule: Schedule, shapes: int, seed: int, keep: Keep) -> list
         loss = finder_loss(found, images)
         return loss, {"loss": float(loss.detach())}
 
-    return _train(network, "finder", wide_images, step, schedule, shapes, seed + 1, keep)
+    return _train(network, "finder", wide_images, step, schedule, shapes, seed + 1)
 
 
 def _train(
-    network: nn.Module,
+    network: Network,
     name: str,
     make: Callable[..., Any],
     step: Callable[[Any], tuple[Tensor, dict[str, float]]],
     schedule: Schedule,
     shapes: int,
     seed: int,
-    keep: Keep,
-) -> list[dict[str, Any]]:
+) -> tuple[Network, Course]:
+    _keep_memory()
     steps = math.ceil(schedule.images / schedule.batch)
     optimiser = torch.optim.AdamW(network.parameters(), schedule.rate, weight_decay=0.02)
     averaged = deepcopy(network)
-    course, recent = [], {}
+    course: Course = []
+    recent: dict[str, float] = {}
     began = time.perf_counter()
     bar = tqdm(total=steps * schedule.batch, unit=" images", desc=name, file=sys.stderr)
     with bar:
@@ -125,17 +131,23 @@ def _train(
                 seconds = time.perf_counter() - began
                 images = (number + 1) * schedule.batch
                 course.append({"images": images, "seconds": round(seconds, 1)} | recent)
-            if (number + 1) % 500 == 0 or number + 1 == steps:
-                keep(averaged, (number + 1) * schedule.batch)
-    return course
+    return averaged, course
+
+
+def _keep_memory() -> None:
+    """Ask glibc to reuse what was freed: the batches' large arrays come and go all the time, and
+    fresh pages cost more than half of the time on some machines. Elsewhere nothing happens.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        for option in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD):
+            libc.mallopt(option, 1 << 30)
 
 
 @torch.no_grad()
 def _average(averaged: nn.Module, network: nn.Module, kept: float) -> None:
     """Exponential moving average of all weights and statistics."""
-    for old, new in zip(
-        averaged.state_dict().values(), network.state_dict().values(), strict=True
-    ):
+    for old, new in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
         if old.is_floating_point():
             old.lerp_(new, 1 - kept)
         else:
@@ -158,7 +170,7 @@ def _batches(
                 try:
                     yield queue.get(timeout=10)
                     break
-                except multiprocessing.queues.Empty:
+                except queues.Empty:
                     if not worker.is_alive():
                         raise ToftrackError(
                             "the process that makes the training images has ended; is there enough"
@@ -174,6 +186,7 @@ def _make_batches(
 ) -> None:
     torch.multiprocessing.set_sharing_strategy(_SHARED)
     torch.set_num_threads(1)
+    _keep_memory()
     generator = torch.Generator().manual_seed(seed)
     bank = shape_bank(shapes, generator)
     for _ in range(steps):

@@ -1,0 +1,187 @@
+"""The relocaliser as the tracker uses it: where hands are, and what they look like there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import roma
+import torch
+from torch import Tensor
+
+from toftrack.checks import check_number
+from toftrack.compute.rigid import PIVOT_M
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.refinement.gauss_newton import Landmarks
+from toftrack.relocation.network import Finder, PoseNet
+from toftrack.relocation.proposals import Look, find_hands, look
+from toftrack.relocation.weights import load_weights
+
+
+@dataclass(frozen=True)
+class RelocationSettings:
+    """How the networks' word is used; see conf/relocation/network.yaml for what each does."""
+
+    places: int
+    least: float
+    hypotheses: int
+    rivals: int
+    prior: float
+    rival_m: float
+    rival_gain: float
+    rival_s: float
+    landmark_m: float
+    landmark_sigmas: float
+
+    def __post_init__(self) -> None:
+        for name in ("places", "hypotheses"):
+            check_number(f"relocation.{name}", getattr(self, name), 1, whole=True)
+        check_number("relocation.rivals", self.rivals, 0, whole=True)
+        check_number("relocation.least", self.least, 0, 1)
+        for name in ("prior", "rival_gain", "rival_s"):
+            check_number(f"relocation.{name}", getattr(self, name), 0)
+        for name in ("rival_m", "landmark_m", "landmark_sigmas"):
+            check_number(f"relocation.{name}", getattr(self, name), 0, above=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Glance:
+    """What the pose network says of the hand at one place, likeliest hypothesis first.
+
+    pivot_m, rotvec, angles: (H, 3), (H, 3), (H, 21).  joints_m: (H, 21, 3) of a hand of that size.
+    log_size: (H,) of the hand's length in units of the mean adult's.
+    log_probability, error_m: (H,).
+    landmarks: the joints by the cells' votes.
+    present, right_side: probabilities that there is a hand, and that it is of the side looked for.
+    """
+
+    pivot_m: Tensor
+    rotvec: Tensor
+    angles: Tensor
+    joints_m: Tensor
+    log_size: Tensor
+    log_probability: Tensor
+    error_m: Tensor
+    landmarks: Landmarks
+    present: float
+    right_side: float
+
+    def states(self, ratio: float) -> Tensor:
+        """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
+        pivot = self.pivot_m.new_tensor(PIVOT_M) * ratio
+        wrist = self.pivot_m - roma.rotvec_to_rotmat(self.rotvec) @ pivot
+        return torch.cat((wrist, self.rotvec, self.angles), 1)
+
+    @property
+    def centre_m(self) -> Tensor:
+        """(3,) middle of the palm of the likeliest hypothesis."""
+        return self.pivot_m[0]
+
+    def first(self, count: int) -> Glance:
+        """With only so many hypotheses."""
+        kept = slice(None, count)
+        return Glance(
+            self.pivot_m[kept],
+            self.rotvec[kept],
+            self.angles[kept],
+            self.joints_m[kept],
+            self.log_size[kept],
+            self.log_probability[kept],
+            self.error_m[kept],
+            self.landmarks,
+            self.present,
+            self.right_side,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Relocaliser:
+    """Both networks and how they are used; on the CPU."""
+
+    pose: PoseNet
+    finder: Finder
+    settings: RelocationSettings
+
+    def glance(
+        self, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
+    ) -> list[Glance]:
+        """What a hand of a side is like at each of C places (C, 3), in their order.
+
+        depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).
+        """
+        if len(centres_m) == 0:
+            return []
+        seen = look(self.pose, depth_m, k, centres_m, side)
+        return [_glance(seen, row, side) for row in range(len(seen.present))]
+
+    def search(self, depth_m: np.ndarray, k: np.ndarray, side: str) -> list[Glance]:
+        """Glances at all places where a hand may be, the best first; none where there is none.
+
+        Each place is looked at twice, the second time about the palm that the first one found:
+        poses are the more exact the nearer the crop's centre is to the middle of the palm.
+        """
+        cfg = self.settings
+        found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)
+        # The finder knows sides only roughly: places of the other side may be this one's as well.
+        other = "left" if side == "right" else "right"
+        centres = np.concatenate((found[side].centre_m, found[other].centre_m))
+        heat = np.concatenate((found[side].probability, 0.3 * found[other].probability))
+        centres = _apart(centres[np.argsort(-heat, kind="stable")])[: cfg.places]
+        first = self.glance(depth_m, k, centres, side)
+        again = np.array([glance.centre_m.numpy() for glance in first]).reshape(-1, 3)
+        second = self.glance(depth_m, k, again, side)
+        return sorted(second, key=merit, reverse=True)
+
+
+def merit(glance: Glance) -> float:
+    """How much speaks for a hand of the right side at a place: log odds, and how clear it is."""
+    there = np.log(max(glance.present, 1e-6)) + np.log(max(glance.right_side, 1e-3))
+    return float(there) - float(glance.error_m[0]) / 0.02
+
+
+def _apart(centres_m: np.ndarray, least_m: float = 0.06) -> np.ndarray:
+    """The first of all places that lie closer together than `least_m`, in their order."""
+    kept: list[np.ndarray] = []
+    for centre in centres_m:
+        if all(np.linalg.norm(centre - other) > least_m for other in kept):
+            kept.append(centre)
+    return np.array(kept).reshape(-1, 3)
+
+
+def _glance(seen: Look, row: int, side: str) -> Glance:
+    angles, size = seen.angles[row], seen.log_size[row]
+    return Glance(
+        pivot_m=seen.pivot_m[row],
+        rotvec=seen.rotvec[row],
+        angles=angles,
+        joints_m=_joints(seen.pivot_m[row], seen.rotvec[row], angles, size, side),
+        log_size=size,
+        log_probability=seen.log_probability[row],
+        error_m=seen.error_m[row],
+        landmarks=Landmarks(seen.joints_m[row], seen.sigma_m[row]),
+        present=float(seen.present[row].sigmoid()),
+        right_side=float(seen.right[row].sigmoid()),
+    )
+
+
+def _joints(pivot_m: Tensor, rotvec: Tensor, angles: Tensor, log_size: Tensor, side: str) -> Tensor:
+    """(H, 21, 3) of mean hands scaled about the middle of the palm."""
+    state = torch.cat((angles.new_zeros(len(angles), 3), rotvec, angles), 1)
+    joints = forward_kinematics(state, default_hand_shape(side=side)).joints_m
+    middle = roma.rotvec_to_rotmat(rotvec) @ rotvec.new_tensor(PIVOT_M)
+    return pivot_m[:, None] + (joints - middle[:, None]) * log_size.exp()[:, None, None]
+
+
+def make_relocaliser(weights: str | None = None, **settings: float) -> Relocaliser:
+    """The relocaliser of a configuration.
+
+    weights: a file of train_relocaliser; None = the package's.
+    Raises ToftrackError when they cannot be used.
+    """
+    pose, finder, _ = load_weights(weights)
+    return Relocaliser(pose, finder, RelocationSettings(**settings))
+
+
+def no_relocaliser() -> None:
+    """relocation=none: starts are searched for, and nothing challenges a track."""

@@ -1,0 +1,66 @@
+"""Pictures of the relocaliser's training: what it sees, and how its error falls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from toftrack.relocation.images import crop_images, wide_images
+from toftrack.relocation.shapes import shape_bank
+from toftrack.views.figures.chart import BLUE, VERMILLION, Axes, canvas, legend, titled
+
+_CROPS, _COLUMNS, _SIDE = 24, 8, 128
+_PART_COLOURS = np.array([[0, 0, 0], [0, 70, 0], [80, 0, 0], [0, 0, 90]], np.uint8)
+
+
+def images_figure(seed: int) -> np.ndarray:
+    """Crops with their parts in colour, and whole images with palms marked, BGR."""
+    generator = torch.Generator().manual_seed(seed)
+    bank = shape_bank(24, generator)
+    crops, wides = crop_images(_CROPS, bank, generator), wide_images(8, bank, generator)
+    tiles = []
+    for image, parts in zip(crops.image.numpy(), crops.parts.numpy(), strict=True):
+        tile = _grey(1 - (image[0] + 1) / 2, (_SIDE, _SIDE))
+        colours = _PART_COLOURS[np.maximum(parts, 0)]
+        tiles.append(cv2.add(tile, cv2.resize(colours, (_SIDE, _SIDE), interpolation=0)))
+    crop_rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, _CROPS, _COLUMNS)]
+    scale = 2 * _SIDE / wides.image.shape[-1]
+    tiles = []
+    for i, image in enumerate(wides.image.numpy()):
+        tile = _grey(1 - image[0], (2 * _SIDE, round(scale * image.shape[1])))
+        for cell, left, seen in zip(wides.cell[i], wides.left[i], wides.seen[i], strict=True):
+            if float(seen) > 0.15:
+                u, v = ((cell + 0.5) * 4 * scale).tolist()
+                colour = VERMILLION if bool(left) else BLUE
+                cv2.circle(tile, (round(u), round(v)), 7, colour, 2, cv2.LINE_AA)
+        tiles.append(tile)
+    wide_rows = [np.hstack(tiles[i : i + 4]) for i in (0, 4)]
+    note = (
+        "Above, crops: hand green, forearm blue, another hand red. Below, whole images: a blue ring"
+        " on a right hand's palm, a red one on a left one's."
+    )
+    return titled(np.vstack(crop_rows + wide_rows), "Training images", note)
+
+
+def _grey(nearness: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    image = (255 * nearness.clip(0, 1)).astype(np.uint8)
+    return cv2.cvtColor(cv2.resize(image, size, interpolation=0), cv2.COLOR_GRAY2BGR)
+
+
+def course_figure(course: list[dict[str, Any]]) -> np.ndarray:
+    """Mean joint errors on fresh training images over their number, BGR."""
+    picture = canvas(420, 760)
+    images = np.array([row["images"] for row in course]) / 1e3
+    votes = np.array([row["votes_mm"] for row in course])
+    joints = np.array([row["joints_mm"] for row in course])
+    top = float(max(joints.max(), votes.max(), 1.0))
+    low = float(min(joints.min(), votes.min(), top / 2))
+    axes = Axes(70, 730, 60, 360, (0.0, float(images[-1])), (low * 0.9, top * 1.1), log_y=True)
+    axes.draw(picture, "thousand images", "mean joint error, mm")
+    axes.line(picture, images, joints, VERMILLION)
+    axes.line(picture, images, votes, BLUE)
+    legend(picture, (("likeliest hypothesis", VERMILLION), ("votes", BLUE)), (330, 40))
+    return titled(picture, "Training of the pose network", "On images never seen before.")
