@@ -22,9 +22,9 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import make_scorer
 from toftrack.render.segmentation import Expected, NearestSurface
 from toftrack.run_folder import open_footage, read_run
+from toftrack.tracking.backend import make_scorer
 from toftrack.views import chart
 from toftrack.views.classified import CLASSES, classify
 from toftrack.views.model_image import model_range_image, parted, posed_hand

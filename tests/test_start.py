@@ -18,7 +18,6 @@ from toftrack.hand.skeleton import JOINT_NAMES, forward_kinematics
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import make_scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.start import (
     Lately,
@@ -29,6 +28,7 @@ from toftrack.start import (
     arm_exits,
     palm_centres,
 )
+from toftrack.tracking.backend import make_scorer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

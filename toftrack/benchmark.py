@@ -38,7 +38,7 @@ from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.pose_space.timing import decode_times
 from toftrack.render.closed_form import project
 from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import BACK_ENDS, Evidence, Scorer, make_scorer
+from toftrack.render.scoring import Evidence, Scorer
 from toftrack.timing import (
     Row,
     check_against_reference,
@@ -49,6 +49,7 @@ from toftrack.timing import (
     to_device,
     wait_for,
 )
+from toftrack.tracking.backend import BACK_ENDS, make_scorer
 
 PARTICLES = (100, 300, 1000, 3000, 10_000)
 BASELINES = ("stepping", "naive")

@@ -18,18 +18,19 @@ from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.filter import FilterSettings
 from toftrack.gestures import Gestures, GestureState, tell_gesture
 from toftrack.hand.shape import HandShape
-from toftrack.hand.surface import hand_surface
 from toftrack.hand_fit import HandFit, first_belief, retried, update
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import latent_density
-from toftrack.refinement.gauss_newton import Refinement, make_refiner, surroundings
+from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.proposals import swap_fingers
+from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import Evidence, Scorer, make_scorer
+from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
 from toftrack.start import Lately, Start
 from toftrack.track_state import Insight, LostSettings, TrackState, expected_depths
+from toftrack.tracking.backend import choose_backend
 
 _MODEL_ERROR = sir.Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
@@ -49,7 +50,7 @@ class Tracker:
         segmentation: NearestSurface,
         likelihood: FMeasure,
         settings: FilterSettings,
-        refinement: Refinement,
+        refinement: Refinement | None,
         start: Start,
         lost: LostSettings,
         fit: HandFit | None = None,
@@ -70,7 +71,7 @@ class Tracker:
         self.gestures = gestures
         self._gesture: GestureState | None = None
         self._density = latent_density(self.space) if settings.density else None
-        self._renderer = renderer
+        self._backend = choose_backend(renderer, self.device)
         self._first_shape = shape.to(self.device)
         self._size = first_belief(fit) if fit else None
         self._refused = 0  # starts not believed
@@ -86,9 +87,8 @@ class Tracker:
 
     def _set_shape(self, shape: HandShape) -> None:
         self.shape = shape
-        self.surface = hand_surface(shape)
-        self.scorer: Scorer = make_scorer(self._renderer, shape, self.device)
-        self._refiner = make_refiner(shape, self.surface, self.scorer.name)
+        self.scorer: Scorer = self._backend.make_scorer(shape)
+        self._refiner = self._backend.make_refiner(shape)
 
     def restart(self, side: str | None = None) -> None:
         """Forget the hand, also its size, and look for one anew; of another side if one is given.
@@ -139,8 +139,14 @@ class Tracker:
         mean = sir.mean_particle(particles, weights)
         filtered = self.decode(mean, track.offset)
         state = self._refine(filtered, track.state, observation, evidence)
-        if track.state is not None and self.refinement.iterations:
-            state, trend = steadied(state, track.state, track.trend, self.refinement.steadying)
+        if track.state is not None and self.refinement is not None:
+            state, trend = steadied(
+                state,
+                track.state,
+                track.trend,
+                self.refinement.steadying,
+                self._backend.motions,
+            )
             track = replace(track, trend=trend)
         score = float(self.likelihood.score(self.scorer(state, evidence)))
 
@@ -238,19 +244,15 @@ class Tracker:
         if self.track is None:
             return None
         state = self.decode(sir.compose(self.track.mean, self.track.velocity[None]))
-        return expected_depths(self.track, self._refiner.joints(state))
+        return expected_depths(self.track, self._refiner.joints(state)[0])
 
     def _improved(self, particles: Tensor, *, observation: Observation) -> Tensor:
         """Hypotheses brought onto the seen points, each by itself, and back into the pose space."""
-        cfg = self.refinement
-        if cfg.iterations == 0:
+        if self.refinement is None:
             return particles
         states = self.decode(particles)
-        for row in range(len(states)):
-            state = states[row : row + 1]
-            seen = surroundings(observation, self._refiner.joints(state).mean(0), cfg.points)
-            if len(seen.points_m):
-                states[row] = self._refiner(state, state[:, 6:], seen, cfg)[0]
+        seen = seen_points(observation)
+        states = self._refiner(states, states[:, 6:], seen, self.refinement)
         latent = self.space.encode(states[:, 6:])
         latent = sir.bound(latent, self.space.lower, self.space.upper, "truncate")
         return torch.cat((states[:, :6], latent), 1)
@@ -264,11 +266,11 @@ class Tracker:
     ) -> Tensor:
         """The filter's hand brought onto the seen points; `before` is the last one; (1, 27)."""
         cfg = self.refinement
-        if cfg.iterations == 0:
+        if cfg is None:
             return state
-        middle = self._refiner.joints(state).mean(0)
-        seen = surroundings(observation, middle, cfg.points)
-        if len(seen.points_m) == 0:
+        seen = seen_points(observation)
+        middle = self._refiner.joints(state).mean(1)
+        if not bool(seen.around(middle, cfg.points)[1].any()):
             return state
 
         def log_scores(states: Tensor) -> Tensor:
@@ -310,7 +312,7 @@ class Tracker:
         if cfg.patience and bad >= cfg.patience:
             return None, "lost", True
         offset, outside = track.offset, 0
-        if self.refinement.iterations:
+        if self.refinement is not None:
             # The particles follow the refined estimate, and what the space cannot say of its pose
             # is remembered beside them.
             latent = sir.bound(self.space.encode(state[:, 6:]), lower, upper, "truncate")
@@ -380,7 +382,7 @@ class Tracker:
             timestamp_s=timestamp_s,
             state_name="",
             lost=False,
-            joints_m=host(self._refiner.joints(state)),
+            joints_m=host(self._refiner.joints(state)[0]),
             state=host(state[0]),
             latent=host(latent[0]),
             score=score,
