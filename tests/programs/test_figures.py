@@ -23,8 +23,8 @@ from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import make_scorer
 from toftrack.render.segmentation import Expected, NearestSurface
+from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify
 from toftrack.views.figures import chart
 from toftrack.views.model_image import model_range_image, parted, posed_hand

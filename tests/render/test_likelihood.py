@@ -17,8 +17,9 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import Counts, Scorer, make_scorer
+from toftrack.render.scoring import Counts, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
+from toftrack.tracking.backend import make_scorer
 
 HEIGHT, WIDTH = 36, 48
 K = torch.tensor([[50.0, 0.0, 23.4], [0.0, 52.0, 17.8], [0.0, 0.0, 1.0]])

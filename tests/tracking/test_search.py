@@ -13,21 +13,23 @@ import torch
 from helpers.tracking import Scene, configuration, sample
 from hydra.utils import instantiate
 
+from toftrack.compute.rigid import MOTIONS, rotated_pivot
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES, forward_kinematics
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import make_scorer
 from toftrack.render.segmentation import NearestSurface, Observation
-from toftrack.tracking import particle_filter as sir
+from toftrack.tracking.backend import make_scorer
 from toftrack.tracking.palm_places import arm_exits, palm_centres
+from toftrack.tracking.particle_filter import mean_particle
 from toftrack.tracking.search import (
     LastSeen,
     LogScores,
     RoughStart,
     SearchStart,
+    Sought,
     Start,
 )
 
@@ -79,13 +81,17 @@ def unimproved(x: torch.Tensor) -> torch.Tensor:
     return x
 
 
+def sought(seen: Observation, scores: LogScores = unscored) -> Sought:
+    return Sought(seen, pose_space(), MOTIONS, scores, unimproved, None)
+
+
 def first_error_mm(start: Start, scene: Scene, seed: int, side: str = "right") -> float:
     """Mean joint error of the particles' mean on the first frame."""
     shape = default_hand_shape(side=side)
     seen = observed(scene)
     scores = log_scores_of(seen, shape)
-    particles = start(seen, pose_space(), scores, unimproved, None, 50, generator(seed))
-    mean = sir.mean_particle(particles, torch.full((50,), 0.02))
+    particles = start(sought(seen, scores), 50, generator(seed))
+    mean = mean_particle(particles, torch.full((50,), 0.02))
     joints = forward_kinematics(states_of(mean), shape).joints_m[0].numpy()
     return 1e3 * float(np.linalg.norm(joints - scene.joints_m[0], axis=-1).mean())
 
@@ -114,7 +120,7 @@ def test_the_search_beats_the_best_of_as_many_unrefined_hypotheses() -> None:
     seen = observed(sample().cut(0))
     scores = log_scores_of(seen, default_hand_shape())
     search = search_start(hypotheses=1000, samples=256)
-    found = search(seen, pose_space(), scores, unimproved, None, 50, generator())
+    found = search(sought(seen, scores), 50, generator())
     drawn = search._draw(seen, pose_space(), None, generator())
     assert scores(found, 1.0).max() > scores(drawn, 1.0).max() + 0.1
 
@@ -124,7 +130,7 @@ def test_as_many_particles_as_asked_for_inside_the_pose_space(start: Start) -> N
     seen = observed(sample().cut(0))
     space = pose_space()
     scores = log_scores_of(seen, default_hand_shape())
-    one, two = (start(seen, space, scores, unimproved, None, 37, generator(5)) for _ in range(2))
+    one, two = (start(sought(seen, scores), 37, generator(5)) for _ in range(2))
     assert one.shape == (37, 6 + space.dims)
     assert one.isfinite().all()
     assert (one[:, 6:] >= space.lower - 1e-5).all() and (one[:, 6:] <= space.upper + 1e-5).all()
@@ -136,9 +142,9 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
     start = rough_start(pose=pose, position_m=0.01, rotation_rad=0.1)
     n = 4000
     seen = observed(sample().cut(0))
-    x = start(seen, pose_space(), unscored, unimproved, None, n, generator())
+    x = start(sought(seen), n, generator())
     reference = torch.cat((torch.tensor(pose), x[0, 6:]))[None]
-    off = sir.difference(x, reference)[:, :6]
+    off = MOTIONS.difference(x, reference)[:, :6]
     sigma = torch.tensor([0.01] * 3 + [0.1] * 3)
     # Five standard errors of a mean and of a standard deviation from n draws each, six times: all
     # hold with a probability above 0.9999.
@@ -151,11 +157,11 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
 def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     scene = sample().cut(0)
     seen = observed(scene)
-    x = rough_start()(seen, pose_space(), unscored, unimproved, None, 300, generator())
-    middle = (x[:, :3] + sir.rotated_pivot(x[:, 3:6])).mean(0).numpy()
+    x = rough_start()(sought(seen), 300, generator())
+    middle = (x[:, :3] + rotated_pivot(x[:, 3:6])).mean(0).numpy()
     true_palm = scene.joints_m[0, PALM].mean(0)
     assert np.linalg.norm(middle - true_palm) < 0.06
-    mean = sir.mean_particle(x, torch.full((300,), 1 / 300))
+    mean = mean_particle(x, torch.full((300,), 1 / 300))
     joints = forward_kinematics(states_of(mean), default_hand_shape()).joints_m[0]
     tips = joints[[8, 12, 16, 20]]
     assert (tips[:, 1] < joints[0, 1] - 0.1).all(), "the fingers point up"
@@ -173,7 +179,7 @@ def test_a_pose_can_be_given_on_the_command_line() -> None:
 
     config = configuration("start=rough", "start.pose=[0,0.1,0.5,0,0,0]")
     start = hydra.utils.instantiate(config.start)
-    x = start(observed(sample().cut(0)), pose_space(), unscored, unimproved, None, 100, generator())
+    x = start(sought(observed(sample().cut(0))), 100, generator())
     assert float((x[:, :3].mean(0) - torch.tensor([0, 0.1, 0.5])).norm()) < 0.02
 
 

@@ -8,7 +8,6 @@ particles' device.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -18,10 +17,8 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
-from toftrack.compute.rigid import MOTIONS, PIVOT_M, mean_rotation, rotated_pivot
+from toftrack.compute.rigid import mean_rotation
 from toftrack.errors import ToftrackError
-
-__all__ = ["PIVOT_M", "mean_rotation", "rotated_pivot"]
 
 
 @dataclass(frozen=True)
@@ -144,31 +141,6 @@ RESAMPLERS: dict[str, Callable[[Tensor, int, torch.Generator], Tensor]] = {
 }
 
 
-def compose(reference: Tensor, tangent: Tensor) -> Tensor:
-    """See rigid.compose."""
-    return _motions(reference).compose(reference, tangent)
-
-
-def difference(particles: Tensor, reference: Tensor) -> Tensor:
-    """See rigid.difference."""
-    return _motions(particles).difference(particles, reference)
-
-
-def _motions(particles: Tensor) -> Motions:
-    if particles.device.type != "cpu" or particles.dtype != torch.float32:
-        return MOTIONS
-    return _compiled()
-
-
-@functools.cache
-def _compiled() -> Motions:
-    try:
-        from toftrack.compute import rigid_numba
-    except ImportError:
-        return MOTIONS
-    return rigid_numba.motions()
-
-
 BOUNDS = ("truncate", "reflect")
 
 
@@ -188,21 +160,21 @@ def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
 
 def diffuse(
     particles: Tensor,
-    scale: Tensor,
+    sigmas: Tensor,
     lower: Tensor,
     upper: Tensor,
     mode: str,
+    motions: Motions,
     generator: torch.Generator,
 ) -> Tensor:
     """Move every particle by Gaussian noise inside the bounds of the pose space.
 
-    scale: (6 + d,) standard deviations, or (6 + d, 6 + d) a lower triangular factor of the
-        covariance, in tangent coordinates.
+    sigmas: (6 + d,) standard deviations in tangent coordinates.  mode: see bound.
     """
     noise = torch.randn(
         particles.shape, generator=generator, device=particles.device, dtype=particles.dtype
     )
-    moved = compose(particles, noise * scale if scale.dim() == 1 else noise @ scale.mT)
+    moved = motions.compose(particles, noise * sigmas)
     moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
     return moved
 
@@ -216,6 +188,7 @@ def annealed(
     lower: Tensor,
     upper: Tensor,
     settings: FilterSettings,
+    motions: Motions,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Resample - diffuse - observe, in passes of shrinking diffusion and sharper weights.
@@ -228,8 +201,15 @@ def annealed(
     """
     for number in range(settings.passes):
         chosen = RESAMPLERS[settings.resampling](weights, settings.particles, generator)
-        scale = sigmas * settings.shrink**number
-        particles = diffuse(particles[chosen], scale, lower, upper, settings.bounds, generator)
+        particles = diffuse(
+            particles[chosen],
+            sigmas * settings.shrink**number,
+            lower,
+            upper,
+            settings.bounds,
+            motions,
+            generator,
+        )
         log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
         prior = log_prior(particles)
         weights = normalise(log_weights if prior is None else log_weights + prior)
