@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from toftrack.frames import Frame
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.output.results import read_results
-    from toftrack.tracker import Tracker
+    from toftrack.tracking.tracker import Tracker
 
     __version__: str
 
@@ -38,7 +38,7 @@ _PLACES = {
     "Frame": "toftrack.frames",
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "ToftrackError": "toftrack.errors",
-    "Tracker": "toftrack.tracker",
+    "Tracker": "toftrack.tracking.tracker",
     "make_device": "toftrack.api",
     "make_tracker": "toftrack.api",
     "read_results": "toftrack.output.results",

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from toftrack.devices.base import Device
-    from toftrack.tracker import Tracker
+    from toftrack.tracking.tracker import Tracker
 
 
 def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Tracker:
@@ -56,24 +56,27 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
 
 def build_tracker(config: DictConfig) -> Tracker:
     """The tracker of a configuration (conf/config.yaml composed)."""
-    from toftrack.tracker import Tracker  # takes seconds: an override's error comes before
+    # They take seconds: an override's error comes before.
+    from toftrack.tracking.model import TrackerModel
+    from toftrack.tracking.tracker import Tracker
 
-    hand = instantiate(config.hand)
-    return Tracker(
-        shape=hand.shape,
-        space=instantiate(config.pose_space),
+    hand, refinement = instantiate(config.hand), instantiate(config.refine)
+    device = compute_device(config.compute)
+    model = TrackerModel(
+        shape=hand.shape.to(device),
+        space=instantiate(config.pose_space).to(device),
         segmentation=instantiate(config.segmentation),
         likelihood=instantiate(config.likelihood),
-        settings=instantiate(config.filter),
-        refinement=instantiate(config.refine),
+        filter=instantiate(config.filter),
+        refinement=refinement if refinement.iterations else None,
         start=instantiate(config.start),
         lost=instantiate(config.lost),
         fit=hand.fit,
         gestures=instantiate(config.gestures),
         renderer=config.renderer,
-        device=compute_device(config.compute),
-        seed=config.seed,
+        device=device,
     )
+    return Tracker(model, config.seed)
 
 
 def compute_device(name: str) -> torch.device:

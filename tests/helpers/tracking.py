@@ -19,7 +19,7 @@ from toftrack.devices.base import Device
 from toftrack.devices.sample import Sample
 from toftrack.estimate import Estimate
 from toftrack.programs.track import track
-from toftrack.tracker import Tracker
+from toftrack.tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf"

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from toftrack import filter as sir
 from toftrack.compute.threads import small_operations, threads
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -22,6 +21,7 @@ from toftrack.refinement.gauss_newton import (
 from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.segmentation import Observation
+from toftrack.tracking import particle_filter as sir
 
 K = torch.tensor([[220.0, 0.0, 88.0], [0.0, 220.0, 72.0], [0.0, 0.0, 1.0]])
 

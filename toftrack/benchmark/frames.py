@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import cycle
-from unittest.mock import patch
 
 import hydra
 import torch
@@ -18,9 +14,6 @@ from omegaconf import DictConfig
 from toftrack.api import build_tracker
 from toftrack.configuration.compose import configuration_folder
 from toftrack.errors import ToftrackError
-from toftrack.render.likelihood import FMeasure
-from toftrack.render.segmentation import NearestSurface
-from toftrack.tracker import Tracker
 
 CONFIGURATIONS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -46,54 +39,6 @@ class FrameRow:
     median_ms: float
     repeats: int
     parts: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass
-class _Stopwatch:
-    """Attributes time to the innermost part that is running; `spent` is in seconds."""
-
-    spent: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    running: list[str] = field(default_factory=lambda: ["rest"])
-    since: float = 0.0
-
-    def switch(self) -> None:
-        """Book the time until now on what is running."""
-        now = time.perf_counter()
-        self.spent[self.running[-1]] += now - self.since
-        self.since = now
-
-    def around(self, part: str, within: str, function: Callable) -> Callable:
-        """A function whose time counts as `part`, unless it runs outside of `within`."""
-
-        def timed(*args: object, **kwargs: object) -> object:
-            if within and self.running[-1] != within:
-                return function(*args, **kwargs)
-            self.switch()
-            self.running.append(part)
-            try:
-                return function(*args, **kwargs)
-            finally:
-                self.switch()
-                self.running.pop()
-
-        return timed
-
-    @contextmanager
-    def watching(self, tracker: Tracker) -> Iterator[None]:
-        """The parts of a frame are timed within."""
-        observation, scoring, rest, refinement, _ = PARTS
-        places = (
-            (NearestSurface, "__call__", observation, ""),
-            (FMeasure, "evidence", observation, ""),
-            (Tracker, "_filter", rest, ""),
-            (type(tracker.scorer), "__call__", scoring, rest),
-            (Tracker, "_refine", refinement, ""),
-        )
-        with ExitStack() as stack:
-            for owner, name, part, within in places:
-                timed = self.around(part, within, getattr(owner, name))
-                stack.enter_context(patch.object(owner, name, timed))
-            yield
 
 
 def frame_times(
@@ -137,10 +82,10 @@ def _times(name: str, config: DictConfig, seconds: float) -> list[FrameRow]:
 
     starts = []
     for index in range(_STARTS):
-        tracker.track = None
+        tracker.state = replace(tracker.state, track=None)
         starts.append(step(index))
     # Young tracks are still compared with a new start in every frame.
-    young = range(_STARTS, _STARTS + tracker.lost.probation + 1)
+    young = range(_STARTS, _STARTS + tracker.model.lost.probation + 1)
     for index in young:
         step(index)
     whole: list[float] = []
@@ -148,17 +93,13 @@ def _times(name: str, config: DictConfig, seconds: float) -> list[FrameRow]:
     began = time.perf_counter()
     for index in cycle(range(young.stop, len(frames))):
         whole.append(step(index))
-        watch = _Stopwatch(since=time.perf_counter())
-        # Every other frame is taken apart, so that the stopwatch does not slow down the figures.
-        with watch.watching(tracker):
-            step(index)
-            watch.switch()
+        assert tracker.info is not None
         for part, found in parts.items():
-            found.append(watch.spent[part])
+            found.append(tracker.info.seconds.get(part, 0.0))
         if len(whole) >= _FEWEST and time.perf_counter() - began > seconds:
             break
     shares = {part: 1e3 * statistics.median(found) for part, found in parts.items()}
-    n = tracker.settings.particles
+    n = tracker.model.filter.particles
     # The first start of a process still waits for what is only done once.
     return [_row(name, n, whole, shares), _row(f"{name}, start", n, starts[1:], {})]
 

@@ -23,7 +23,7 @@ from toftrack.output.evaluation import metrics_table
 from toftrack.output.results import ResultWriter
 from toftrack.output.smoothing import OneEuro, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
-from toftrack.tracker import Tracker
+from toftrack.tracking.tracker import Tracker
 from toftrack.views.base import TrackedFrame, View
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from toftrack import filter as sir
 from toftrack.refinement.proposals import FINGER_OF_ANGLE
+from toftrack.tracking import particle_filter as sir
 
 
 @dataclass(frozen=True)

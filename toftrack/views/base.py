@@ -12,7 +12,7 @@ from toftrack.camera import Camera
 from toftrack.estimate import Estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import HandShape
-from toftrack.track_state import Insight
+from toftrack.tracking.state import StepInfo
 
 COMMANDS = ("restart", "right", "left")
 """What a view may ask: a new start, or another hand (which starts anew)."""
@@ -30,7 +30,7 @@ class TrackedFrame:
     estimate: Estimate
     shape: HandShape
     """The hand of the estimate."""
-    insight: Insight | None
+    insight: StepInfo | None
     """What the tracker saw and believed; None where there was nothing to track."""
 
 

@@ -20,15 +20,15 @@ import numpy as np
 import roma
 import torch
 
+from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.filter import rotated_pivot
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Observation
-from toftrack.track_state import Insight
+from toftrack.tracking.state import StepInfo
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.model_image import cpu_surface, parted, posed_hand
@@ -144,7 +144,7 @@ class Entities:
         labels = rr.SegmentationImage(pixels.labels())
         self._stream.log("world/tracker/classified", labels)
 
-    def _log_particles(self, insight: Insight) -> None:
+    def _log_particles(self, insight: StepInfo) -> None:
         """The middles of the hands that the particles stand for, brighter with their weight."""
         particles = insight.particles.detach().cpu()
         middles = particles[:, :3] + rotated_pivot(particles[:, 3:6])

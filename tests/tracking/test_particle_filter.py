@@ -6,8 +6,8 @@ import pytest
 import roma
 import torch
 
-from toftrack import filter as sir
 from toftrack.errors import ToftrackError
+from toftrack.tracking import particle_filter as sir
 
 LOWER, UPPER = torch.tensor([-1.0, -2.0, 0.0, -0.5]), torch.tensor([1.0, 2.0, 3.0, 0.5])
 

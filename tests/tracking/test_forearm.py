@@ -10,8 +10,8 @@ import roma
 import torch
 from helpers.tracking import sample
 
-from toftrack.forearm import arm_sight, armless
 from toftrack.render.segmentation import NearestSurface, Observation
+from toftrack.tracking.forearm import arm_sight, forearm_conflict
 
 K = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
 
@@ -34,30 +34,30 @@ def scene(behind_m: float = 1.0) -> np.ndarray:
 
 
 def test_an_arm_where_one_is_seen_is_possible() -> None:
-    assert float(armless(pointing(0), arm_sight(seen(scene())))) == 0
+    assert float(forearm_conflict(pointing(0), arm_sight(seen(scene())))) == 0
 
 
 @pytest.mark.parametrize(("degrees", "least"), [(90, 0.3), (135, 0.6), (180, 1), (270, 0.3)])
 def test_an_arm_where_the_background_is_seen_is_not(degrees: float, least: float) -> None:
-    assert float(armless(pointing(degrees), arm_sight(seen(scene())))) >= least
+    assert float(forearm_conflict(pointing(degrees), arm_sight(seen(scene())))) >= least
 
 
 @pytest.mark.parametrize("degrees", [-30, 30])
 def test_a_wrist_may_be_bent(degrees: float) -> None:
-    assert float(armless(pointing(degrees), arm_sight(seen(scene())))) == 0
+    assert float(forearm_conflict(pointing(degrees), arm_sight(seen(scene())))) == 0
 
 
 def test_a_place_without_reading_may_hide_a_dark_sleeve() -> None:
     inside = scene(behind_m=0.0)
     inside[130:] = 0.0  # the blob does not leave the image
-    assert float(armless(pointing(90), arm_sight(seen(inside)))) == 0
+    assert float(forearm_conflict(pointing(90), arm_sight(seen(inside)))) == 0
 
 
 def test_beyond_the_image_there_may_be_an_arm() -> None:
     image = np.full((144, 176), 1.0)
     image[:30, 78:98] = 0.5  # fingers that come from above
     above = pointing(180, y=-0.19)
-    assert float(armless(above, arm_sight(seen(image)))) == 0
+    assert float(forearm_conflict(above, arm_sight(seen(image)))) == 0
 
 
 def test_fingers_do_not_lie_where_the_arm_leaves_the_image() -> None:
@@ -65,8 +65,8 @@ def test_fingers_do_not_lie_where_the_arm_leaves_the_image() -> None:
     image = scene()
     image[10:60, 78:98] = 0.5
     sight = arm_sight(seen(image))
-    assert float(armless(pointing(180), sight)) == 1
-    assert float(armless(pointing(0), sight)) == 0
+    assert float(forearm_conflict(pointing(180), sight)) == 1
+    assert float(forearm_conflict(pointing(0), sight)) == 0
 
 
 def test_the_true_hand_of_the_recording_always_has_its_arm_and_a_turned_one_never() -> None:
@@ -81,4 +81,4 @@ def test_the_true_hand_of_the_recording_always_has_its_arm_and_a_turned_one_neve
             columns = (side, sign * arm, torch.linalg.cross(side, sign * arm))
             turn = roma.rotmat_to_rotvec(torch.stack(columns, 1))
             x = torch.cat((torch.from_numpy(wrist).float(), turn, torch.zeros(4)))[None]
-            assert (float(armless(x, sight)) == 0) == (sign == 1)
+            assert (float(forearm_conflict(x, sight)) == 0) == (sign == 1)

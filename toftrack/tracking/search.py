@@ -7,24 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-import cv2
-import numpy as np
 import roma
 import torch
 from torch import Tensor
 
-from toftrack import filter as sir
 from toftrack.errors import ToftrackError
-from toftrack.forearm import arm_sight, armless, border_pixels
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.segmentation import Observation
+from toftrack.tracking import particle_filter as sir
+from toftrack.tracking.forearm import arm_sight, forearm_conflict
+from toftrack.tracking.palm_places import arm_exits, palm_centres
 
-_WIDEST_PALM_M = 0.06
-"""Half the breadth of the broadest hand's palm with the ball of the thumb."""
-_DEPTH_M = 0.12
-"""How far behind the nearest surface a palm typically lies at most."""
-_DEPTH_EDGE_M = 0.04
-"""Between neighbouring pixels of one surface there is less than this."""
 _TURN_RAD = 0.3
 """Standard deviation of how far a hand has turned since it was lost."""
 
@@ -40,8 +33,8 @@ Prior = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class Lately:
-    """The hand before it was lost.
+class LastSeen:
+    """The hand as it was last believed.
 
     particle: (1, 6 + d).  age_s: how long ago.
     """
@@ -59,13 +52,13 @@ class Start(Protocol):
         space: PoseSpace,
         log_scores: LogScores,
         improve: Improve,
-        lately: Lately | None,
+        last: LastSeen | None,
         n: int,
         generator: torch.Generator,
     ) -> Tensor:
         """(n, 6 + d) particles on the pose space's device."""
 
-    def prior(self, observation: Observation, lately: Lately | None) -> Prior:
+    def prior(self, observation: Observation, last: LastSeen | None) -> Prior:
         """What speaks for and against a start besides the score of the image."""
 
 
@@ -95,7 +88,7 @@ class RoughStart:
         space: PoseSpace,
         log_scores: LogScores,
         improve: Improve,
-        lately: Lately | None,
+        last: LastSeen | None,
         n: int,
         generator: torch.Generator,
     ) -> Tensor:
@@ -113,7 +106,7 @@ class RoughStart:
         noise = torch.randn(n, 6 + space.dims, generator=generator, device=device)
         return sir.compose(reference, noise * spread.sigmas(space.lower, space.upper))
 
-    def prior(self, observation: Observation, lately: Lately | None) -> Prior:
+    def prior(self, observation: Observation, last: LastSeen | None) -> Prior:
         """See Start; nothing is known."""
         return lambda particles: particles.new_zeros(len(particles))
 
@@ -135,7 +128,7 @@ class SearchStart:
         image plane.
     arm_rad: spread of the forearm's direction about the way to where the blob leaves the image; a
         fifth of the hypotheses, and all where the blob does not touch the border, point anywhere.
-    forearm: taken from the log score of a hand whose forearm cannot be, see toftrack.forearm.
+    forearm: taken from the log score of a hand whose forearm cannot be, see forearm.py.
     memory: added to the log score of a hand that is turned as it was before it was lost ...
     memory_rad: ... with less the farther it has turned since (standard deviation) ...
     memory_s: ... and the longer ago it was (to 1/e). While that is less than two such times ago, a
@@ -161,13 +154,13 @@ class SearchStart:
         space: PoseSpace,
         log_scores: LogScores,
         improve: Improve,
-        lately: Lately | None,
+        last: LastSeen | None,
         n: int,
         generator: torch.Generator,
     ) -> Tensor:
         """See Start."""
         lower, upper = space.lower, space.upper
-        first = self._draw(observation, space, lately, generator)
+        first = self._draw(observation, space, last, generator)
         scores = log_scores(first, self.coverage)
         best = first[scores.topk(min(self.islands, len(first))).indices]
         best_scores = scores.topk(len(best)).values
@@ -196,17 +189,17 @@ class SearchStart:
             sigmas = sigmas * 0.75
         return sir.diffuse(best.expand(n, -1), 0.5 * sigmas, lower, upper, "reflect", generator)
 
-    def prior(self, observation: Observation, lately: Lately | None) -> Prior:
+    def prior(self, observation: Observation, last: LastSeen | None) -> Prior:
         """See Start: a hand hangs on an arm, and it does not turn round all at once."""
         sight = arm_sight(observation)
 
         def log_prior(particles: Tensor) -> Tensor:
-            known = -self.forearm * armless(particles, sight)
-            if lately is not None:
-                before = lately.particle[:, 3:6].expand(len(particles), -1)
+            known = -self.forearm * forearm_conflict(particles, sight)
+            if last is not None:
+                before = last.particle[:, 3:6].expand(len(particles), -1)
                 turned = roma.rotvec_geodesic_distance(particles[:, 3:6], before)
                 likeness = torch.exp(-0.5 * (turned / self.memory_rad).square())
-                known = known + self.memory * math.exp(-lately.age_s / self.memory_s) * likeness
+                known = known + self.memory * math.exp(-last.age_s / self.memory_s) * likeness
             return known
 
         return log_prior
@@ -215,7 +208,7 @@ class SearchStart:
         self,
         observation: Observation,
         space: PoseSpace,
-        lately: Lately | None,
+        last: LastSeen | None,
         generator: torch.Generator,
     ) -> Tensor:
         m, device = self.hypotheses, space.lower.device
@@ -240,9 +233,9 @@ class SearchStart:
         )
         rows = torch.randint(len(space.training_latents), (m,), generator=generator, device=device)
         latent = space.training_latents[rows]
-        if lately is not None and lately.age_s < 2 * self.memory_s:
+        if last is not None and last.age_s < 2 * self.memory_s:
             again = m // 4
-            before = lately.particle.expand(again, -1)
+            before = last.particle.expand(again, -1)
             turn = _TURN_RAD * normal(again, 3)
             rotation[:again] = roma.rotvec_composition((turn, before[:, 3:6]))
             latent[:again] = before[:, 6:]
@@ -255,83 +248,3 @@ def _about(angle: Tensor, axis: int) -> Tensor:
     vector = torch.zeros(len(angle), 3, device=angle.device)
     vector[:, axis] = angle
     return vector
-
-
-def _points(observation: Observation, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Points of the blob at pixels, a palm's half-thickness behind the surface, (n, 3) metres.
-
-    Outside of the image the surface is as deep as at the nearest pixel inside.
-    """
-    hand, depth = observation.hand.cpu().numpy(), observation.depth_m.cpu().numpy()
-    k = observation.k.cpu().numpy()
-    # Noise and flying pixels: the median of a neighbourhood, wherever it is mostly hand.
-    smooth = cv2.medianBlur(np.where(hand, depth, 0).astype(np.float32), 5)
-    row, column = v.clip(0, hand.shape[0] - 1), u.clip(0, hand.shape[1] - 1)
-    z = np.where(smooth[row, column] > 0, smooth[row, column], depth[row, column]) + 0.012
-    x, y = (u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z
-    return np.stack((x, y, z), 1).astype(np.float32)
-
-
-def palm_centres(observation: Observation, n: int, generator: torch.Generator) -> np.ndarray:
-    """Where the middle of the palm may be, (n, 3) float32 metres.
-
-    They are centres of widest discs: inscribed in the silhouette cut along its depth edges, so that
-    a hand in front of the body stands by itself, and no wider than a palm, so that they do not lie
-    on the body. The wider and the nearer to the camera a disc is, the oftener it is drawn.
-
-    Up to a third lie where they would if the silhouette went on beyond the image: a hand that
-    enters sideways shows fingers and forearm before its palm.
-    """
-    hand = observation.hand.cpu().numpy()
-    depth = observation.depth_m.cpu().numpy()
-    kernel = np.ones((3, 3), np.uint8)
-    far = np.where(hand, depth, depth.max()).astype(np.float32)
-    smooth = hand & (cv2.dilate(far, kernel) - cv2.erode(far, kernel) < _DEPTH_EDGE_M)
-    inside = smooth if smooth.any() else hand
-    focal = float(observation.k[0, 0])
-    # A palm's radius in pixels, and one for the border of zeros that ends the silhouette.
-    margin = 1 + math.ceil(_WIDEST_PALM_M * focal / max(observation.nearest_m, 0.1))
-    depths = np.pad(depth, margin, mode="edge")
-    nearness = np.exp(-(depths - observation.nearest_m) / _DEPTH_M)
-
-    def disc_weights(silhouette: np.ndarray) -> np.ndarray:
-        distance = cv2.distanceTransform(silhouette, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        peaks = distance >= cv2.dilate(distance, np.ones((5, 5), np.uint8)) - 0.5
-        radius_m = distance * depths / focal
-        usable = (silhouette > 0) & peaks & (radius_m < _WIDEST_PALM_M)
-        return np.where(usable, radius_m**3 * nearness, 0.0)
-
-    # The border of the image counts as the silhouette's edge, or an arm that leaves the picture
-    # would be widest there.
-    weights = disc_weights(np.pad(inside.astype(np.uint8), margin))
-    if not weights.any():
-        weights = np.pad(inside.astype(np.float64), margin)
-    if n > 1:
-        beyond = disc_weights(_ended(np.pad(inside.astype(np.uint8), margin, mode="edge")))
-        beyond = np.where(weights > 0, 0.0, beyond)
-        weights = weights + beyond * min(1.0, 0.5 * weights.sum() / max(beyond.sum(), 1e-12))
-    spots = torch.multinomial(
-        torch.from_numpy(weights.ravel() / weights.max()).double().to(generator.device),
-        n,
-        replacement=True,
-        generator=generator,
-    )
-    if n == 1:
-        spots[0] = int(weights.argmax())
-    v, u = np.divmod(spots.cpu().numpy(), weights.shape[1])
-    return _points(observation, v - margin, u - margin)
-
-
-def _ended(silhouette: np.ndarray) -> np.ndarray:
-    """The same with an outermost row and column of zeros, in place."""
-    silhouette[[0, -1], :] = silhouette[:, [0, -1]] = 0
-    return silhouette
-
-
-def arm_exits(observation: Observation, n: int, generator: torch.Generator) -> np.ndarray | None:
-    """Points where the blob leaves the image, (n, 3) float32 metres; None where it does not."""
-    v, u = border_pixels(observation)
-    if len(v) < 3:
-        return None
-    rows = torch.randint(len(v), (n,), generator=generator, device=generator.device).cpu().numpy()
-    return _points(observation, v[rows], u[rows])

@@ -7,9 +7,9 @@ import torch
 from helpers.tracking import make_tracker, sample
 from hydra.errors import InstantiationException
 
-from toftrack import filter as sir
 from toftrack.pose_space.density import latent_density
-from toftrack.tracker import Tracker
+from toftrack.tracking import particle_filter as sir
+from toftrack.tracking.tracker import Tracker
 
 
 def nearness(tracker: Tracker) -> float:

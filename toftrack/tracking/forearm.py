@@ -52,7 +52,7 @@ def border_pixels(observation: Observation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def arm_sight(observation: Observation) -> ArmSight:
-    """Prepare an image for `armless`."""
+    """Prepare an image for `forearm_conflict`."""
     depth, k = observation.depth_m, observation.k
     background = ~(observation.hand | observation.occluder) & (depth > 0)
     gap = cv2.distanceTransform(
@@ -66,7 +66,7 @@ def arm_sight(observation: Observation) -> ArmSight:
     return ArmSight(depth, torch.from_numpy(gap).to(depth.device), exits, k)
 
 
-def armless(particles: Tensor, sight: ArmSight) -> Tensor:
+def forearm_conflict(particles: Tensor, sight: ArmSight) -> Tensor:
     """How much of a hypothesis' forearm cannot be, (N,), 0 to 1.
 
     It is the share of the forearm where the image shows the background instead; and 1 where a blob

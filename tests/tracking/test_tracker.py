@@ -13,7 +13,7 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.tracker import Tracker
+from toftrack.tracking.tracker import Tracker
 from toftrack.views.model_image import model_range_image
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -116,7 +116,7 @@ def test_the_papers_estimate_is_the_filters_mean_and_nothing_else() -> None:
     tracker = make_tracker("experiment=paper", "filter.particles=50")
     for i, depth in enumerate(scene.depth_m):
         estimate = tracker.step(depth, scene.k, i, i / 25)
-        mean = tracker.decode(tracker.track.mean)[0].numpy()
+        mean = tracker.model.decode(tracker.track.mean)[0].numpy()
         assert np.array_equal(estimate.state, mean)
 
 

@@ -11,7 +11,6 @@ import roma
 import torch
 from helpers.tracking import Scene, configuration, sample
 
-from toftrack import filter as sir
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES, forward_kinematics
@@ -20,14 +19,14 @@ from toftrack.pose_space.files import make_pose_space
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import make_scorer
 from toftrack.render.segmentation import NearestSurface, Observation
-from toftrack.start import (
-    Lately,
+from toftrack.tracking import particle_filter as sir
+from toftrack.tracking.palm_places import arm_exits, palm_centres
+from toftrack.tracking.search import (
+    LastSeen,
     LogScores,
     RoughStart,
     SearchStart,
     Start,
-    arm_exits,
-    palm_centres,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -262,7 +261,7 @@ def test_a_palm_is_also_looked_for_beyond_the_border_that_cuts_the_hand() -> Non
     assert (np.linalg.norm(centres - palm, axis=1) < 0.04).any()
 
 
-def test_a_hand_as_it_was_lately_is_preferred_and_forgotten_with_time() -> None:
+def test_a_hand_as_last_seen_is_preferred_and_forgotten_with_time() -> None:
     seen = observed(sample().cut(0))
     before = torch.zeros(1, 10)
     before[:, 2] = 0.5
@@ -272,20 +271,20 @@ def test_a_hand_as_it_was_lately_is_preferred_and_forgotten_with_time() -> None:
     both = torch.cat((before, turned))
 
     def gain(age_s: float) -> float:
-        same, other = start.prior(seen, Lately(before, age_s))(both)
+        same, other = start.prior(seen, LastSeen(before, age_s))(both)
         return float(same - other)
 
     assert gain(0.0) == pytest.approx(start.memory, abs=0.01)
     assert gain(start.memory_s) == pytest.approx(start.memory / math.e, abs=0.01)
     assert not start.prior(seen, None)(both).any()
-    assert not RoughStart().prior(seen, Lately(before, 0.0))(both).any()
+    assert not RoughStart().prior(seen, LastSeen(before, 0.0))(both).any()
 
 
-def test_a_quarter_of_the_hypotheses_is_turned_and_bent_as_the_hand_was_lately() -> None:
+def test_a_quarter_of_the_hypotheses_is_turned_and_bent_as_the_hand_last_seen() -> None:
     seen = observed(sample().cut(0))
-    lately = Lately(torch.tensor([[0, 0, 0.5, 0, 0, 2.5, 0.1, 0.1, 0.1, 0.1]]), 1.0)
+    last = LastSeen(torch.tensor([[0, 0, 0.5, 0, 0, 2.5, 0.1, 0.1, 0.1, 0.1]]), 1.0)
     search = SearchStart(hypotheses=400)
-    alike = (search._draw(seen, pose_space(), lately, generator())[:, 6:] == 0.1).all(1)
+    alike = (search._draw(seen, pose_space(), last, generator())[:, 6:] == 0.1).all(1)
     assert int(alike.sum()) == 100
-    old = Lately(lately.particle, 10.0)
+    old = LastSeen(last.particle, 10.0)
     assert not (search._draw(seen, pose_space(), old, generator())[:, 6:] == 0.1).all(1).any()

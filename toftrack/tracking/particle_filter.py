@@ -197,6 +197,35 @@ def diffuse(
     return moved
 
 
+def annealed(
+    particles: Tensor,
+    weights: Tensor,
+    sigmas: Tensor,
+    log_scores: Callable[[Tensor], Tensor],
+    log_prior: Callable[[Tensor], Tensor | None],
+    lower: Tensor,
+    upper: Tensor,
+    settings: FilterSettings,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Resample - diffuse - observe, in passes of shrinking diffusion and sharper weights.
+
+    particles, weights: (M, 6 + d) predicted and (M,) normalised.
+    sigmas: (6 + d,) of the first pass's diffusion.
+    log_scores: of the image, (N, 6 + d) to (N,); their exponent grows.
+    log_prior: what else speaks for particles, (N,), in every pass alike; may say None.
+    Returns (N, 6 + d) and (N,).
+    """
+    for number in range(settings.passes):
+        chosen = RESAMPLERS[settings.resampling](weights, settings.particles, generator)
+        scale = sigmas * settings.shrink**number
+        particles = diffuse(particles[chosen], scale, lower, upper, settings.bounds, generator)
+        log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
+        prior = log_prior(particles)
+        weights = normalise(log_weights if prior is None else log_weights + prior)
+    return particles, weights
+
+
 def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d), the rotation averaged on SO(3)."""
     mean = (weights.to(particles.dtype) @ particles)[None]

@@ -23,11 +23,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from toftrack import filter as sir
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer
+from toftrack.tracking import particle_filter as sir
 
 _REACH = 3  # sizes tried on either side of the present one
 _TRIED = (1.0, 1.12, 0.9, 1.24, 0.8)  # sizes of starts, in turn

@@ -1,0 +1,67 @@
+"""The beginning of a track: where the hand may be, and whether that beats a young track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from toftrack.tracking import particle_filter
+from toftrack.tracking.life_cycle import LostSettings
+from toftrack.tracking.model import ObservedFrame
+from toftrack.tracking.refining import improved
+from toftrack.tracking.search import LastSeen, LogScores
+from toftrack.tracking.state import Track
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Where a frame's hand may be.
+
+    particles: (N, 6 + d).
+    log_scores: what they may be compared with others by; knows more than the image.
+    """
+
+    particles: Tensor
+    log_scores: LogScores
+
+
+def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Generator) -> Proposals:
+    """Particles to start with in a frame.
+
+    seen: the last hand that was believed.
+    """
+    model = frame.model
+    prior = model.start.prior(frame.observation, seen)
+
+    def log_scores(particles: Tensor, coverage: float) -> Tensor:
+        return frame.log_scores(model.decode(particles), coverage) + prior(particles)
+
+    particles = model.start(
+        frame.observation,
+        model.space,
+        log_scores,
+        partial(improved, frame=frame),
+        seen,
+        model.filter.particles,
+        generator,
+    )
+    return Proposals(particles, log_scores)
+
+
+def started(track: Track | None, proposals: Proposals, settings: LostSettings) -> Track:
+    """A new track from a start; or the given young one, if the start is no better than it."""
+    particles = proposals.particles
+    if track is not None:
+        now = particle_filter.compose(track.particles, track.velocity[None])
+        log_scores = proposals.log_scores
+        # The search has seen this frame and the track has not, so a little better is no better.
+        if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < settings.rival_gain:
+            return track
+    n, size = particles.shape
+    weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)
+    return Track(
+        particles, weights, particles[:1], particles.new_zeros(size), particles.new_zeros(21)
+    )

@@ -1,0 +1,108 @@
+"""What the tracker carries from frame to frame, what it is given, and what others may see of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.estimate import Estimate
+from toftrack.gestures.recognition import GestureState
+from toftrack.render.segmentation import Expected, Observation
+from toftrack.tracking.search import LastSeen
+from toftrack.tracking.size_fit import SizeBelief
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """One frame as the tracker takes it.
+
+    depth_m: (H, W) float32 rectified Z, metres, 0 = no reading.  k: (3, 3) intrinsics, pixels.
+    index: number of the frame.  timestamp_s: when it was taken.
+    """
+
+    depth_m: np.ndarray
+    k: np.ndarray
+    index: int
+    timestamp_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A hand that is followed.
+
+    particles: (N, 6 + d), after the last observation.  weights: (N,) normalised.
+    mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a frame.
+    offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
+        displaced by it.
+    pose: (1, 27) the last refined hand, None at the start.
+    trend: (27,) its mean change a frame, see steadying.
+    age: frames since the start.  bad: frames in a row with a low score.
+    outside: frames in a row out of the pose space.
+    expected: depths where the hand was looked for in the last frame, if something hid part of it.
+    """
+
+    particles: Tensor
+    weights: Tensor
+    mean: Tensor
+    velocity: Tensor
+    offset: Tensor
+    pose: Tensor | None = None
+    trend: Tensor | None = None
+    age: int = 0
+    bad: int = 0
+    outside: int = 0
+    expected: Expected | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """All that is carried between frames: from the same state and images, the same estimates.
+
+    generator: the state of the random generator, as torch.Generator.get_state() gives it.
+    side: "right" or "left", whose hand is followed.
+    track: None while there is no hand to follow.
+    seen: the last hand that was believed.
+    size: what is believed of the hand's size; None where it is not fitted.
+    refused: how many starts in a row were not believed.
+    gesture: smoothed probabilities of the gestures.
+    last: the last estimate that there was.
+    next_index: number of the next frame that comes without one.
+    timestamp_s: of the last frame.
+    """
+
+    generator: Tensor
+    side: str
+    track: Track | None = None
+    seen: LastSeen | None = None
+    size: SizeBelief | None = None
+    refused: int = 0
+    gesture: GestureState | None = None
+    last: Estimate | None = None
+    next_index: int = 0
+    timestamp_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StepInfo:
+    """What a step saw and believed, on its own device; for those who watch it.
+
+    particles: (N, 6 + d) before the estimate was refined; none where nothing can be a hand.
+    weights: (N,) normalised.
+    seconds: wall seconds of each stage.
+    """
+
+    observation: Observation
+    particles: Tensor
+    weights: Tensor
+    seconds: Mapping[str, float]
+
+
+def resumed(generator: Tensor, device: torch.device) -> torch.Generator:
+    """The random generator of a state."""
+    made = torch.Generator(device)
+    made.set_state(generator)
+    return made

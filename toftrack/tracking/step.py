@@ -1,0 +1,172 @@
+"""The tracker's step: a state and an image in, the next state and an estimate out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.compute.threads import small_operations
+from toftrack.estimate import Estimate, lost_estimate, no_estimate
+from toftrack.gestures.recognition import tell_gesture
+from toftrack.render.segmentation import Observation
+from toftrack.tracking import particle_filter, size_fit
+from toftrack.tracking.following import (
+    Found,
+    advanced,
+    aged,
+    expected_depths,
+    filtered,
+    remembered,
+)
+from toftrack.tracking.life_cycle import Belief, believe
+from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
+from toftrack.tracking.refining import refined
+from toftrack.tracking.size_fit import SizeBelief
+from toftrack.tracking.spans import Spans
+from toftrack.tracking.starting import propose, started
+from toftrack.tracking.state import DepthImage, StepInfo, TrackerState, resumed
+
+
+def first_state(model: TrackerModel, seed: int) -> TrackerState:
+    """Before any frame."""
+    generator = torch.Generator(model.device).manual_seed(seed)
+    size = None if model.fit is None else size_fit.first_belief(model.fit)
+    return TrackerState(generator.get_state(), model.shape.side, size=size)
+
+
+@small_operations()
+def step(
+    state: TrackerState, image: DepthImage, model: TrackerModel
+) -> tuple[TrackerState, StepInfo, Estimate]:
+    """One frame: segment, start if there is no hand yet, filter, refine, judge, fit the size.
+
+    A pure function: the state given stays as it is, and gives the same again.
+    """
+    spans, generator = Spans(), resumed(state.generator, model.device)
+    hand, track = model.hand(state.side, state.size), state.track
+    with spans("segmentation and evidence"):
+        expected = expected_depths(track, hand, model)
+        observation = model.segmentation(image.depth_m, image.k, expected)
+        state = _at(state, image)
+        if observation.empty:
+            return _without_hand(state, image, observation, model, spans)
+        frame = observed(observation, hand, model)
+    if track is None or track.age < model.lost.probation:
+        with spans("start"):
+            track = started(track, propose(state.seen, frame, generator), model.lost)
+    with spans("filter: rest"):
+        particles, weights = filtered(track, frame, generator, spans)
+        mean = particle_filter.mean_particle(particles, weights)
+    with spans("refinement"):
+        pose, trend = refined(track, mean, frame, generator)
+    score = frame.score(pose)
+    found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
+    belief = believe(track, score, found.off_rad, model.lost)
+    hidden = bool(frame.observation.occluder.any())
+    track = advanced(track, found, belief, expected if hidden else None, model)
+    estimate = _estimate(image, found, score, belief, frame)
+    gesture, estimate = tell_gesture(model.gestures, state.gesture, estimate, model.space)
+    size, refused = _sized(state, found, belief, frame, generator)
+    estimate = replace(estimate, compute_s=spans.total())
+    after = replace(
+        state,
+        generator=generator.get_state(),
+        track=track if belief.kept else None,
+        seen=remembered(state.seen, track, belief, model.lost),
+        size=size,
+        refused=refused,
+        gesture=gesture,
+        last=estimate,
+    )
+    return after, StepInfo(frame.observation, particles, weights, spans.seconds()), estimate
+
+
+def _at(state: TrackerState, image: DepthImage) -> TrackerState:
+    """The state as time goes on to an image."""
+    before = state.timestamp_s
+    passed = 0.0 if before is None else max(0.0, image.timestamp_s - before)
+    return replace(
+        state,
+        seen=aged(state.seen, passed),
+        next_index=image.index + 1,
+        timestamp_s=image.timestamp_s,
+    )
+
+
+def _without_hand(
+    state: TrackerState,
+    image: DepthImage,
+    observation: Observation,
+    model: TrackerModel,
+    spans: Spans,
+) -> tuple[TrackerState, StepInfo, Estimate]:
+    """Nothing in the frame can be a hand: the last estimate stands, and is lost."""
+    index, timestamp_s, last = image.index, image.timestamp_s, state.last
+    if last is None:
+        estimate = no_estimate(index, timestamp_s, "lost", model.space.dims, math.nan)
+    else:
+        estimate = lost_estimate(last, index, timestamp_s, math.nan)
+    gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
+    none = torch.zeros(0, 6 + model.space.dims, device=model.device)
+    info = StepInfo(observation, none, none[:, 0], spans.seconds())
+    return (
+        replace(state, track=None, gesture=gesture),
+        info,
+        replace(estimate, compute_s=spans.total()),
+    )
+
+
+def _sized(
+    state: TrackerState,
+    found: Found,
+    belief: Belief,
+    frame: ObservedFrame,
+    generator: torch.Generator,
+) -> tuple[SizeBelief | None, int]:
+    """What a frame says of the hand's size; and how many starts were refused.
+
+    A believed estimate says how large the hand is; while there is none, another size is tried.
+    """
+    model, size, refused = frame.model, state.size, state.refused
+    if model.fit is None or size is None or size.frames >= model.fit.frames:
+        return size, refused
+    if not belief.lost:
+        scorer, likelihood = frame.hand.scorer, model.likelihood
+        size = size_fit.update(
+            size, model.fit, found.pose, frame.evidence, scorer, likelihood, generator
+        )
+    elif not belief.kept and size.frames == 0:
+        refused += 1
+        size = size_fit.retried(model.fit, refused)
+    return size, refused
+
+
+def _estimate(
+    image: DepthImage, found: Found, score: float, belief: Belief, frame: ObservedFrame
+) -> Estimate:
+    """What is told of a frame, but for its gesture and the time that it took."""
+    model, mean, particles = frame.model, found.mean, found.particles
+    tangents = particle_filter.difference(particles, mean)
+    tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
+    covariance = particle_filter.covariance(tangents, found.weights)
+    return Estimate(
+        index=image.index,
+        timestamp_s=image.timestamp_s,
+        state_name=belief.state_name,
+        lost=belief.lost,
+        joints_m=_host(frame.hand.refiner.joints(found.pose)),
+        state=_host(found.pose[0]),
+        latent=_host(model.space.encode(found.pose[:, 6:])[0]),
+        score=score,
+        covariance=_host(covariance + torch.diag(model.model_variance)),
+        effective_sample_size=float(particle_filter.effective_sample_size(found.weights)),
+        compute_s=math.nan,
+    )
+
+
+def _host(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().astype(np.float32)

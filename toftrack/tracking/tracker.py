@@ -1,0 +1,97 @@
+"""The tracker: a frame in, an estimate out, a state held in between (paper, fig. 1)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from toftrack.estimate import Estimate
+from toftrack.frames import checked_image
+from toftrack.hand.shape import HandShape
+from toftrack.pose_space.base import PoseSpace
+from toftrack.render.scoring import Scorer
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.state import DepthImage, StepInfo, Track, TrackerState
+from toftrack.tracking.step import first_state, step
+
+
+class Tracker:
+    """Follows one hand through rectified depth images: holds the state of `step`.
+
+    state: all that is carried between frames; one that was kept may be put back.
+    info: what the last step saw and believed; None before the first one.
+    """
+
+    def __init__(self, model: TrackerModel, seed: int = 0) -> None:
+        self.model = model
+        self.state: TrackerState = first_state(model, seed)
+        model.hand(self.state.side, self.state.size)  # a back end that cannot run here says so now
+        self.info: StepInfo | None = None
+
+    def step(
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        index: int | None = None,
+        timestamp_s: float | None = None,
+    ) -> Estimate:
+        """One frame.
+
+        depth_m: (H, W) rectified Z in metres, 0 = no reading; H and W may change.
+        k: (3, 3) intrinsics in pixels.
+        index: number of the frame; None counts on from the last.
+        timestamp_s: None is now, seconds on a clock that never goes back.
+
+        Raises ToftrackError when the image or k has the wrong shape, type or unit.
+        """
+        began = time.perf_counter()
+        depth_m, k = checked_image(depth_m, k)
+        index = self.state.next_index if index is None else index
+        timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
+        image = DepthImage(depth_m, k, index, timestamp_s)
+        self.state, self.info, estimate = step(self.state, image, self.model)
+        return replace(estimate, compute_s=time.perf_counter() - began)
+
+    def restart(self, side: str | None = None) -> None:
+        """Forget the hand, also its size, and look for one anew; of another side if one is given.
+
+        Only random numbers and frame numbers go on. Raises ToftrackError for an unknown side.
+        """
+        state = self.state
+        side = state.side if side is None else self.model.shape.of_side(side).side
+        first = replace(first_state(self.model, 0), side=side)
+        self.state = replace(first, generator=state.generator, next_index=state.next_index)
+        self.info = None
+
+    @property
+    def shape(self) -> HandShape:
+        """The hand that the next frame is compared with."""
+        return self.model.hand(self.state.side, self.state.size).shape
+
+    @property
+    def scorer(self) -> Scorer:
+        """The back end's, for that hand."""
+        return self.model.hand(self.state.side, self.state.size).scorer
+
+    @property
+    def space(self) -> PoseSpace:
+        """The pose space."""
+        return self.model.space
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is computed."""
+        return self.model.device
+
+    @property
+    def track(self) -> Track | None:
+        """The hand that is followed; None while there is none."""
+        return self.state.track
+
+    @property
+    def insight(self) -> StepInfo | None:
+        """What the last step saw and believed; None where nothing could be a hand."""
+        return None if self.info is None or self.info.observation.empty else self.info
