@@ -56,12 +56,12 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
 
 def build_tracker(config: DictConfig) -> Tracker:
     """The tracker of a configuration (conf/config.yaml composed)."""
-    # They take seconds: an override's error comes before.
+    # These take seconds: an override's error comes before.
     from toftrack.tracking.model import TrackerModel
     from toftrack.tracking.tracker import Tracker
 
-    hand, refinement = instantiate(config.hand), instantiate(config.refine)
     device = compute_device(config.compute)
+    hand, refinement = instantiate(config.hand), instantiate(config.refine)
     model = TrackerModel(
         shape=hand.shape.to(device),
         space=instantiate(config.pose_space).to(device),

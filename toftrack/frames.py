@@ -62,6 +62,20 @@ class Truth:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """One rectified frame, as the tracker takes it.
+
+    depth_m: (H, W) float32 rectified Z, metres, 0 = no reading.  k: (3, 3) intrinsics, pixels.
+    index: number of the frame.  timestamp_s: when it was taken.
+    """
+
+    depth_m: np.ndarray
+    k: np.ndarray
+    index: int
+    timestamp_s: float
+
+
 def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     """A depth image as (H, W) float32 metres with 0 for no reading, and (3, 3) float64 intrinsics.
 

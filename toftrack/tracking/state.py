@@ -1,11 +1,10 @@
-"""What the tracker carries from frame to frame, what it is given, and what others may see of it."""
+"""What the tracker carries from frame to frame, and what others may see of it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,20 +13,6 @@ from toftrack.gestures.recognition import GestureState
 from toftrack.render.segmentation import Expected, Observation
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.size_fit import SizeBelief
-
-
-@dataclass(frozen=True, eq=False)
-class DepthImage:
-    """One frame as the tracker takes it.
-
-    depth_m: (H, W) float32 rectified Z, metres, 0 = no reading.  k: (3, 3) intrinsics, pixels.
-    index: number of the frame.  timestamp_s: when it was taken.
-    """
-
-    depth_m: np.ndarray
-    k: np.ndarray
-    index: int
-    timestamp_s: float
 
 
 @dataclass(frozen=True, eq=False)

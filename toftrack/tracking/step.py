@@ -11,6 +11,7 @@ from torch import Tensor
 
 from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
+from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
 from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter, size_fit
@@ -28,7 +29,7 @@ from toftrack.tracking.refining import refined
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.spans import Spans
 from toftrack.tracking.starting import propose, started
-from toftrack.tracking.state import DepthImage, StepInfo, TrackerState, resumed
+from toftrack.tracking.state import StepInfo, TrackerState, resumed
 
 
 def first_state(model: TrackerModel, seed: int) -> TrackerState:

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from toftrack.estimate import Estimate
-from toftrack.frames import checked_image
+from toftrack.frames import DepthImage, checked_image
 from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.scoring import Scorer
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.state import DepthImage, StepInfo, Track, TrackerState
+from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.step import first_state, step
 
 
