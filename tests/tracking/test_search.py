@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import roma
 import torch
+from helpers.configured import f_measure, nearest_surface, rough_start, search_start
 from helpers.tracking import Scene, configuration, sample
-from hydra.utils import instantiate
 
 from toftrack.compute.rigid import MOTIONS, rotated_pivot
 from toftrack.errors import ToftrackError
@@ -19,16 +18,13 @@ from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES, forward_kinematics
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
-from toftrack.render.likelihood import FMeasure
-from toftrack.render.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import Observation
 from toftrack.tracking.backend import make_scorer
 from toftrack.tracking.palm_places import arm_exits, palm_centres
 from toftrack.tracking.particle_filter import mean_particle
 from toftrack.tracking.search import (
     LastSeen,
     LogScores,
-    RoughStart,
-    SearchStart,
     Sought,
     Start,
 )
@@ -37,16 +33,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 PALM = [JOINT_NAMES.index(name) for name in ("wrist", "index_mcp", "middle_mcp", "little_mcp")]
-
-
-def search_start(**changes: float) -> SearchStart:
-    """As configured, but for some settings."""
-    return replace(instantiate(configuration("start=search").start), **changes)
-
-
-def rough_start(**changes: object) -> RoughStart:
-    """As configured, but for some settings."""
-    return replace(instantiate(configuration("start=rough").start), **changes)
 
 
 @cache
@@ -59,7 +45,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def observed(scene: Scene, frame: int = 0) -> Observation:
-    return NearestSurface()(scene.depth_m[frame], scene.k)
+    return nearest_surface()(scene.depth_m[frame], scene.k)
 
 
 def states_of(particles: torch.Tensor) -> torch.Tensor:
@@ -67,7 +53,7 @@ def states_of(particles: torch.Tensor) -> torch.Tensor:
 
 
 def log_scores_of(seen: Observation, shape: HandShape) -> LogScores:
-    head = FMeasure(residual_weight=1.0)
+    head = f_measure(coverage=0.0)
     evidence, scorer = head.evidence(seen), make_scorer("auto", shape, torch.device("cpu"))
     return lambda x, coverage: head.log_score(scorer(states_of(x), evidence), coverage)
 
@@ -208,7 +194,7 @@ def test_palm_centres_are_never_on_a_wall_behind_the_hand(behind_m: float) -> No
     depth = np.pad(depth, beside, constant_values=wall_m)
     k = scene.k.copy()
     k[:2, 2] += beside
-    seen = NearestSurface(max_pixels=depth.size)(depth, k)
+    seen = nearest_surface(max_pixels=depth.size)(depth, k)
     assert seen.hand.float().mean() > 0.99, "the wall is taken for a part of the hand"
     centres = palm_centres(seen, 2000, generator())
     # What is seen of the wall between two fingers may be taken for something narrow.
@@ -221,7 +207,7 @@ def test_palm_centres_are_never_on_a_wall_behind_the_hand(behind_m: float) -> No
 def test_a_surface_that_is_all_wall_still_gives_points_on_it() -> None:
     depth = np.full((60, 80), 0.5, np.float32)
     k = np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]])
-    seen = NearestSurface()(depth, k)
+    seen = nearest_surface()(depth, k)
     centres = palm_centres(seen, 100, generator())
     assert centres.shape == (100, 3) and np.isfinite(centres).all()
     assert centres[:, 2] == pytest.approx(0.5, abs=0.03)
@@ -245,7 +231,7 @@ def test_a_blob_inside_the_image_has_no_arm_that_leaves_it() -> None:
     depth = np.zeros((60, 80), np.float32)
     depth[20:40, 30:50] = 0.5
     k = np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]])
-    assert arm_exits(NearestSurface()(depth, k), 5, generator()) is None
+    assert arm_exits(nearest_surface()(depth, k), 5, generator()) is None
 
 
 def test_hypotheses_of_the_search_point_along_the_arm_mostly_but_anywhere_too() -> None:
@@ -272,7 +258,7 @@ def test_a_palm_is_also_looked_for_beyond_the_border_that_cuts_the_hand() -> Non
     palm = scene.joints_m[0, PALM].mean(0)
     u = int(scene.k[0, 0] * palm[0] / palm[2] + scene.k[0, 2])
     left = scene.depth_m[0][:, : u - 8]  # the middle of the palm lies outside
-    centres = palm_centres(NearestSurface()(left, scene.k), 1000, generator())
+    centres = palm_centres(nearest_surface()(left, scene.k), 1000, generator())
     pixels = scene.k[0, 0] * centres[:, 0] / centres[:, 2] + scene.k[0, 2]
     beyond = pixels > left.shape[1]
     assert 0.02 < beyond.mean() < 0.4
