@@ -75,6 +75,7 @@ def build_tracker(config: DictConfig) -> Tracker:
         fit=hand.fit,
         gestures=instantiate(config.gestures),
         backend=choose_backend(config.renderer, device),
+        relocaliser=instantiate(config.relocation),
     )
     return Tracker(model, config.seed)
 

@@ -27,3 +27,14 @@ def swap_fingers(state: Tensor, poses: Tensor, n: int, generator: torch.Generato
     tried = state.repeat(n + 1, 1)
     tried[1:, 6:] = torch.where(of_angle == fingers[:, None], poses[rows], tried[1:, 6:])
     return tried
+
+
+def exchange_fingers(state: Tensor, poses: Tensor) -> Tensor:
+    """Copies of the state, one finger of each taken from one of the poses, every finger of each.
+
+    state: (1, 27).  poses: (M, 21) joint angles.  Returns (5 M, 27).
+    """
+    of_angle = torch.tensor(FINGER_OF_ANGLE, device=state.device)
+    chosen = of_angle == torch.arange(len(FINGERS), device=state.device)[:, None]  # (5, 21)
+    angles = torch.where(chosen, poses[:, None], state[:, None, 6:]).flatten(0, 1)
+    return torch.cat((state[:, :6].expand(len(angles), 6), angles), 1)

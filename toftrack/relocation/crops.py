@@ -66,8 +66,8 @@ def channels(read_m: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
     """(N, 2 CROP, 2 CROP) readings in crop frames to (N, 3, CROP, CROP) float32.
 
     distance_m: (N,) of the crops' centres.
-    The channels: mean depth about the centre in half cubes, -1 .. 1 (1 where nothing is read); share
-    of readings in the cube; share without a reading.
+    The channels: mean depth about the centre in half cubes, -1 .. 1 (1 where nothing is read);
+    share of readings in the cube; share without a reading.
     """
     n = len(read_m)
     blocks = np.ascontiguousarray(read_m).reshape(n, CROP, 2, CROP, 2)

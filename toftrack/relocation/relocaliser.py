@@ -11,7 +11,7 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.rigid import PIVOT_M
-from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.network import Finder, PoseNet
@@ -30,7 +30,7 @@ class RelocationSettings:
     prior: float
     rival_m: float
     rival_gain: float
-    rival_s: float
+    rival_frames: int
     landmark_m: float
     landmark_sigmas: float
 
@@ -38,8 +38,9 @@ class RelocationSettings:
         for name in ("places", "hypotheses"):
             check_number(f"relocation.{name}", getattr(self, name), 1, whole=True)
         check_number("relocation.rivals", self.rivals, 0, whole=True)
+        check_number("relocation.rival_frames", self.rival_frames, 1, whole=True)
         check_number("relocation.least", self.least, 0, 1)
-        for name in ("prior", "rival_gain", "rival_s"):
+        for name in ("prior", "rival_gain"):
             check_number(f"relocation.{name}", getattr(self, name), 0)
         for name in ("rival_m", "landmark_m", "landmark_sigmas"):
             check_number(f"relocation.{name}", getattr(self, name), 0, above=True)
@@ -72,6 +73,12 @@ class Glance:
         pivot = self.pivot_m.new_tensor(PIVOT_M) * ratio
         wrist = self.pivot_m - roma.rotvec_to_rotmat(self.rotvec) @ pivot
         return torch.cat((wrist, self.rotvec, self.angles), 1)
+
+    @property
+    def length_m(self) -> float:
+        """The hand's length, the mean of the hypotheses'."""
+        weights = self.log_probability.softmax(0)
+        return DEFAULT_HAND_LENGTH_M * float((weights * self.log_size).sum().exp())
 
     @property
     def centre_m(self) -> Tensor:

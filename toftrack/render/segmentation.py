@@ -48,10 +48,15 @@ class Observation:
 
 @dataclass(frozen=True)
 class Expected:
-    """Depths between which the surface of the tracked hand is expected, metres."""
+    """Where the surface of a hand is expected, metres.
+
+    nearest_m, farthest_m: the depths of its joints.
+    centre_m: the middle of the hand in the camera frame; None where only depths are known.
+    """
 
     nearest_m: float
     farthest_m: float
+    centre_m: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,8 @@ class NearestSurface:
     max_distance_m: nothing beyond this is a hand.
     occluder_margin_m: what is more than this in front of the nearest point of a tracked hand hides
         it; 0 knows no occluders, as the paper.
+    reach_m: what lies farther than this beside the middle of an expected hand is none of it, and
+        hides nothing of it.
     max_pixels: images with more pixels are reduced by a whole factor to at most this many.
     """
 
@@ -72,12 +79,14 @@ class NearestSurface:
     min_area_m2: float
     max_distance_m: float
     occluder_margin_m: float
+    reach_m: float
     max_pixels: int
 
     def __post_init__(self) -> None:
         for name in ("depth_range_m", "min_area_m2", "occluder_margin_m"):
             check_number(f"segmentation.{name}", getattr(self, name), 0)
-        check_number("segmentation.max_distance_m", self.max_distance_m, 0, above=True)
+        for name in ("max_distance_m", "reach_m"):
+            check_number(f"segmentation.{name}", getattr(self, name), 0, above=True)
         check_number("segmentation.max_pixels", self.max_pixels, 1, whole=True)
 
     def __call__(
@@ -91,6 +100,8 @@ class NearestSurface:
         """
         depth_m, k = reduce_image(depth_m, k, self.max_pixels)
         valid = (depth_m > 0) & (depth_m <= self.max_distance_m)
+        if expected is not None and expected.centre_m is not None:
+            valid &= _disc(valid.shape, k, expected.centre_m, self.reach_m)
         occluder = np.zeros_like(valid)
         if expected is not None and self.occluder_margin_m > 0:
             in_front = valid & (depth_m < expected.nearest_m - self.occluder_margin_m)
@@ -133,6 +144,19 @@ class NearestSurface:
             if pixels * nearest**2 / focal_area >= self.min_area_m2:
                 return nearest
         return float("inf")
+
+
+def _disc(
+    shape: tuple[int, ...], k: np.ndarray, centre_m: tuple[float, float, float], radius_m: float
+) -> np.ndarray:
+    """(H, W) bool: the pixels within `radius_m` of a point, seen at its distance."""
+    x, y, z = centre_m
+    u, v = k[0, 0] * x / z + k[0, 2], k[1, 1] * y / z + k[1, 2]
+    disc = np.zeros(shape, np.uint8)
+    limit = 4 * max(shape)
+    at = (round(min(max(u, -limit), limit)), round(min(max(v, -limit), limit)))
+    cv2.circle(disc, at, min(round(radius_m * k[0, 0] / z), limit), 1, -1)
+    return disc > 0
 
 
 def _nearest_first(depth_m: np.ndarray, valid: np.ndarray) -> Iterator[tuple[int, int]]:

@@ -106,6 +106,7 @@ def advanced(
         track.age + 1,
         belief.bad,
         belief.outside,
+        track.challenged,
         expected,
     )
 
@@ -135,4 +136,7 @@ def expected_depths(track: Track | None, hand: SizedHand, model: TrackerModel) -
         # the hand: while something hides the hand, it comes nearer only as its middle does.
         approach = _APPROACH_M + max(0.0, -float(track.velocity[2]))
         nearest = max(nearest, track.expected.nearest_m - approach)
-    return Expected(nearest, farthest)
+    if model.relocaliser is None:
+        return Expected(nearest, farthest)
+    middle = hand.refiner.joints(ahead)[0].mean(0)
+    return Expected(nearest, farthest, tuple(middle.tolist()))

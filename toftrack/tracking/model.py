@@ -15,12 +15,13 @@ from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import LatentDensity, latent_density
 from toftrack.refinement.gauss_newton import Refinement, Refiner
+from toftrack.relocation.relocaliser import Glance, Relocaliser
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
-from toftrack.tracking.search import Start
+from toftrack.tracking.search import LastSeen, Start
 from toftrack.tracking.size_fit import HandFit, SizeBelief
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
@@ -47,6 +48,7 @@ class TrackerModel:
     refinement: None leaves the filter's estimate as it is.
     fit: None leaves the size as it is.
     gestures: None tells none.
+    relocaliser: None searches for starts, and challenges no track.
     """
 
     shape: HandShape
@@ -60,11 +62,17 @@ class TrackerModel:
     fit: HandFit | None
     gestures: Gestures | None
     backend: Backend
+    relocaliser: Relocaliser | None = None
 
     @property
     def device(self) -> torch.device:
         """Where everything is computed."""
         return self.backend.device
+
+    @property
+    def rivals(self) -> int:
+        """How many of the networks' poses compete with a track."""
+        return 0 if self.relocaliser is None else self.relocaliser.settings.rivals
 
     @cached_property
     def sigmas(self) -> Tensor:
@@ -124,12 +132,17 @@ def _sized_hand(shape: HandShape, backend: Backend, side: str, ratio: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class ObservedFrame:
-    """A frame that may show a hand, and the hand looked for: the judge of hypotheses."""
+    """A frame that may show a hand, and the hand looked for: the judge of hypotheses.
+
+    glance: what the networks say of the hand.  seen: the hand as it was last believed.
+    """
 
     observation: Observation
     evidence: Evidence
     hand: SizedHand
     model: TrackerModel
+    glance: Glance | None = None
+    seen: LastSeen | None = None
 
     def log_scores(self, states: Tensor, coverage: float | None = None) -> Tensor:
         """(N, 27) hands to (N,) what they are weighed by, see FMeasure.log_score."""
@@ -140,8 +153,14 @@ class ObservedFrame:
         return float(self.model.likelihood.score(self.hand.scorer(state, self.evidence)))
 
 
-def observed(observation: Observation, hand: SizedHand, model: TrackerModel) -> ObservedFrame:
+def observed(
+    observation: Observation,
+    hand: SizedHand,
+    model: TrackerModel,
+    glance: Glance | None = None,
+    seen: LastSeen | None = None,
+) -> ObservedFrame:
     """A segmented frame on the model's device, which is not empty."""
     observation = observation.to(model.device)
     evidence = model.likelihood.evidence(observation)
-    return ObservedFrame(observation, evidence, hand, model)
+    return ObservedFrame(observation, evidence, hand, model, glance, seen)

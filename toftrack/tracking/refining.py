@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from toftrack.refinement.gauss_newton import Refinement
-from toftrack.refinement.proposals import swap_fingers
+from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.model import ObservedFrame
+from toftrack.tracking.relocating import hypotheses, known_scores, landmarks_of
 from toftrack.tracking.state import Track
 
 
@@ -23,19 +26,33 @@ def improved(particles: Tensor, frame: ObservedFrame) -> Tensor:
     return model.encode(refiner(states, states[:, 6:], seen, cfg))
 
 
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A frame's estimate.
+
+    pose: (1, 27).  trend: (27,) see steadying.
+    rival: (1, 27) a pose of the networks that is another one, and better; None where there is none.
+    """
+
+    pose: Tensor
+    trend: Tensor | None
+    rival: Tensor | None = None
+
+
 def refined(
     track: Track, mean: Tensor, frame: ObservedFrame, generator: torch.Generator
-) -> tuple[Tensor, Tensor | None]:
-    """The frame's estimate from the filter's mean (1, 6 + d): pose (1, 27) and trend (27,)."""
+) -> Refined:
+    """The frame's estimate from the filter's mean (1, 6 + d)."""
     model = frame.model
     pose = model.decode(mean, track.offset)
     if model.refinement is None:
-        return pose, track.trend
-    pose = _onto_points(pose, track.pose, frame, model.refinement, generator)
+        return Refined(pose, track.trend)
+    pose, rival = _onto_points(pose, track.pose, frame, model.refinement, generator)
     if track.pose is None:
-        return pose, track.trend
+        return Refined(pose, track.trend, rival)
     steadying, motions = model.refinement.steadying, model.backend.motions
-    return steadied(pose, track.pose, track.trend, steadying, motions)
+    steady, trend = steadied(pose, track.pose, track.trend, steadying, motions)
+    return Refined(steady, trend, rival)
 
 
 def _onto_points(
@@ -44,27 +61,60 @@ def _onto_points(
     frame: ObservedFrame,
     cfg: Refinement,
     generator: torch.Generator,
-) -> Tensor:
-    """The filter's hand brought onto the seen points; `before` is the last one; (1, 27)."""
-    refiner, seen = frame.hand.refiner, seen_points(frame.observation)
+) -> tuple[Tensor, Tensor | None]:
+    """The filter's hand brought onto the seen points, (1, 27), and a rival; `before`: the last."""
+    refiner, seen, glance = frame.hand.refiner, seen_points(frame.observation), frame.glance
+    landmarks = None if glance is None else landmarks_of(glance, frame.model)
 
     def onto_points(starts: Tensor) -> Tensor:
-        return refiner(starts, starts[:, 6:], seen, cfg)
+        return refiner(starts, starts[:, 6:], seen, cfg, landmarks)
 
-    if before is None:
-        found = onto_points(state)
-    else:
+    starts = [state]
+    if before is not None:
         # The pose of the last frame stands until another one is clearly better: what the image
         # does not decide, such as a hidden finger, must not flicker.
-        as_before = torch.cat((state[:, :6], before[:, 6:]), 1)
-        both = onto_points(torch.cat((as_before, state)))
-        scores = frame.log_scores(both)
-        found = both[:1] if scores[0] + cfg.keep_gain >= scores[1] else both[1:]
-    tried = swap_fingers(found, frame.model.poses, cfg.swaps, generator)
+        starts.insert(0, torch.cat((state[:, :6], before[:, 6:]), 1))
+    own = len(starts)
+    if glance is not None:
+        starts.append(hypotheses(glance, frame.hand, frame.model.rivals)[0])
+    tried = onto_points(torch.cat(starts))
+    scores = frame.log_scores(tried)
+    first = 0 if scores[0] + cfg.keep_gain >= scores[own - 1] else own - 1
+    found, rival = tried[first][None], None
+    if glance is not None and len(tried) > own:
+        found, rival = _contested(found, tried[own:], scores[own:] - scores[first], frame)
+    exchanged = [swap_fingers(found, frame.model.poses, cfg.swaps, generator)]
+    if glance is not None:
+        exchanged.append(exchange_fingers(found, glance.angles[:2].to(found.device)))
+    tried = torch.cat(exchanged)
     scores = frame.log_scores(tried)
     best = int(scores.argmax())
     if scores[best] <= scores[0] + cfg.swap_gain:
-        return found
+        return found, rival
     swapped = tried[best][None]
     both = torch.cat((swapped, onto_points(swapped)))
-    return both[frame.log_scores(both).argmax()][None]
+    return both[frame.log_scores(both).argmax()][None], rival
+
+
+def _contested(
+    found: Tensor, others: Tensor, gain: Tensor, frame: ObservedFrame
+) -> tuple[Tensor, Tensor | None]:
+    """The found pose or a better one beside it; and the best of those that are other poses.
+
+    others: (R, 27) poses of the networks.  gain: (R,) their log scores less that of the found one.
+    """
+    relocaliser = frame.model.relocaliser
+    assert relocaliser is not None and frame.glance is not None
+    joints = frame.hand.refiner.joints(torch.cat((found, others)))
+    away = (joints[1:] - joints[:1]).norm(dim=-1).mean(1)
+    near = away < relocaliser.settings.rival_m
+    rival = None
+    if bool((~near).any()):
+        scores = known_scores(torch.cat((found, others)), joints, frame)
+        scores[1:][near] = -torch.inf
+        best = int(scores[1:].argmax())
+        if scores[1 + best] > scores[0] + relocaliser.settings.rival_gain:
+            rival = others[best][None]
+    gain = gain.masked_fill(~near, -torch.inf)
+    best = int(gain.argmax())
+    return (others[best][None] if gain[best] > 0 else found), rival

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,14 +11,15 @@ from toftrack.frames import DepthImage
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.refinement.seen_points import seen_points
-from toftrack.relocation.relocaliser import Glance, Relocaliser
+from toftrack.relocation.relocaliser import Glance
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
-from toftrack.tracking.search import LastSeen
 from toftrack.tracking.state import Track
 
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no rivals."""
+_LEAST_WORD = float(np.log(0.001))
+"""The least that the networks' word counts."""
 _NEAREST_M = 0.15
 """A camera sees nothing nearer."""
 
@@ -50,11 +49,12 @@ def expected_of(glance: Glance) -> Expected:
     return Expected(nearest, farthest, tuple(glance.centre_m.tolist()))
 
 
-def landmarks_of(glance: Glance, relocaliser: Relocaliser) -> Landmarks:
+def landmarks_of(glance: Glance, model: TrackerModel) -> Landmarks:
     """The network's joints as the refinement takes them."""
-    cfg, found = relocaliser.settings, glance.landmarks
+    assert model.relocaliser is not None
+    cfg, found = model.relocaliser.settings, glance.landmarks
     sigma = (cfg.landmark_sigmas * found.sigma_m).clamp(min=cfg.landmark_m)
-    return Landmarks(found.points_m, sigma)
+    return Landmarks(found.points_m.to(model.device), sigma.to(model.device))
 
 
 def hypotheses(glance: Glance, hand: SizedHand, count: int) -> tuple[Tensor, Tensor]:
@@ -66,40 +66,32 @@ def hypotheses(glance: Glance, hand: SizedHand, count: int) -> tuple[Tensor, Ten
     return kept.states(ratio).to(device), kept.log_probability.to(device)
 
 
-@dataclass(frozen=True, eq=False)
-class Contender:
-    """A pose of the networks and what speaks for it.
+def known_scores(states: Tensor, joints_m: Tensor, frame: ObservedFrame) -> Tensor:
+    """Log scores (N,) of hands (N, 27) with all that is known besides the image.
 
-    pose: (1, 27) refined.  log_score: with all that is known besides the image.
+    joints_m: (N, 21, 3) of the hands. The networks' word for a hand is that for the hypothesis
+    which is most like it.
     """
-
-    pose: Tensor
-    log_score: float
-
-
-def contenders(
-    glance: Glance, frame: ObservedFrame, seen: LastSeen | None, count: int
-) -> tuple[Tensor, Tensor]:
-    """The networks' poses (H, 27), refined, and their log scores (H,) with all that is known."""
-    model, relocaliser = frame.model, frame.model.relocaliser
-    assert relocaliser is not None
-    states, log_probability = hypotheses(glance, frame.hand, count)
-    if model.refinement is not None:
-        points = seen_points(frame.observation)
-        landmarks = landmarks_of(glance, relocaliser)
-        better = frame.hand.refiner(states, states[:, 6:], points, model.refinement, landmarks)
-        states, log_probability = torch.cat((states, better)), log_probability.repeat(2)
-    prior = model.start.prior(frame.observation, seen)
-    scores = frame.log_scores(states, 1.0) + prior(states)
-    return states, scores + relocaliser.settings.prior * log_probability
+    relocaliser, glance = frame.model.relocaliser, frame.glance
+    assert relocaliser is not None and glance is not None
+    prior = frame.model.start.prior(frame.observation, frame.seen)
+    away = joints_m[:, None] - glance.joints_m.to(joints_m.device)
+    likest = away.norm(dim=-1).mean(-1).argmin(1)
+    word = glance.log_probability.to(joints_m.device)[likest].clamp(min=_LEAST_WORD)
+    return frame.log_scores(states, 1.0) + prior(states) + relocaliser.settings.prior * word
 
 
-def begun(glance: Glance, frame: ObservedFrame, seen: LastSeen | None) -> Track:
+def begun(frame: ObservedFrame) -> Track:
     """A track that begins with the best of the networks' poses."""
-    relocaliser = frame.model.relocaliser
-    assert relocaliser is not None
-    states, scores = contenders(glance, frame, seen, relocaliser.settings.hypotheses)
-    return track_of(states[scores.argmax()][None], frame.model)
+    model, glance = frame.model, frame.glance
+    assert model.relocaliser is not None and glance is not None
+    states, _ = hypotheses(glance, frame.hand, model.relocaliser.settings.hypotheses)
+    if model.refinement is not None:
+        seen, landmarks = seen_points(frame.observation), landmarks_of(glance, model)
+        better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, landmarks)
+        states = torch.cat((states, better))
+    scores = known_scores(states, frame.hand.refiner.joints(states), frame)
+    return track_of(states[scores.argmax()][None], model)
 
 
 def track_of(pose: Tensor, model: TrackerModel) -> Track:

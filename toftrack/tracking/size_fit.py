@@ -32,6 +32,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.render.scoring import Evidence
 
 _REACH = 3  # sizes tried on either side of the present one
+_TOLD = 0.06  # standard deviation of the logarithm of a size that somebody else tells
 _TRIED = (1.0, 1.12, 0.9, 1.24, 0.8)  # sizes of starts, in turn
 
 
@@ -99,6 +100,19 @@ def first_belief(fit: HandFit) -> SizeBelief:
     half = int(math.log(fit.largest) / math.log1p(fit.step))
     log_size = torch.arange(-half, half + 1) * math.log1p(fit.step)
     return SizeBelief(-0.5 * (log_size / fit.prior).square(), half)
+
+
+def told(fit: HandFit, length_m: float, first: HandShape) -> SizeBelief:
+    """Before any estimate, when somebody else says how long the hand is.
+
+    first: the hand that sizes are ratios of.
+    """
+    belief = first_belief(fit)
+    log_size = math.log(length_m / first.hand_length_m)
+    steps = torch.arange(len(belief.log_likelihood)) - len(belief.log_likelihood) // 2
+    off = steps * math.log1p(fit.step) - log_size
+    log_likelihood = -0.5 * (off / _TOLD).square()
+    return SizeBelief(log_likelihood, int(log_likelihood.argmax()))
 
 
 def retried(fit: HandFit, attempt: int) -> SizeBelief:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -10,8 +10,9 @@ from torch import Tensor
 
 from toftrack.compute.backend import Motions
 from toftrack.tracking.life_cycle import LostSettings
-from toftrack.tracking.model import ObservedFrame
-from toftrack.tracking.refining import improved
+from toftrack.tracking.model import ObservedFrame, TrackerModel
+from toftrack.tracking.refining import Refined, improved
+from toftrack.tracking.relocating import begun, track_of
 from toftrack.tracking.search import LastSeen, LogScores, Sought
 from toftrack.tracking.state import Track
 
@@ -42,6 +43,33 @@ def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Genera
     improve, motions = partial(improved, frame=frame), model.backend.motions
     sought = Sought(frame.observation, model.space, motions, log_scores, improve, seen)
     return Proposals(model.start(sought, model.filter.particles, generator), log_scores)
+
+
+def begin(track: Track | None, frame: ObservedFrame, generator: torch.Generator) -> Track:
+    """The track to follow in a frame: the given one, or one that begins here."""
+    model = frame.model
+    if frame.glance is not None:
+        return begun(frame) if track is None else track
+    if track is not None and track.age >= model.lost.probation:
+        return track
+    proposals = propose(frame.seen, frame, generator)
+    return started(track, proposals, model.lost, model.backend.motions)
+
+
+def challenged(
+    track: Track, outcome: Refined, hidden: bool, model: TrackerModel
+) -> tuple[Track, Tensor, Tensor | None]:
+    """The track, the pose (1, 27) and the trend to go on with, after a rival was heard.
+
+    A rival takes over when it was better for a while; never while something hides the hand.
+    """
+    relocaliser, rival = model.relocaliser, outcome.rival
+    if relocaliser is None or rival is None or hidden:
+        return replace(track, challenged=0), outcome.pose, outcome.trend
+    count = track.challenged + 1
+    if count < relocaliser.settings.rival_frames and track.age > 0:
+        return replace(track, challenged=count), outcome.pose, outcome.trend
+    return track_of(rival, model), rival, None
 
 
 def started(

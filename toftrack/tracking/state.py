@@ -27,6 +27,7 @@ class Track:
     trend: (27,) its mean change a frame, see steadying.
     age: frames since the start.  bad: frames in a row with a low score.
     outside: frames in a row out of the pose space.
+    challenged: frames in a row in which a pose of the networks was better.
     expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
 
@@ -40,6 +41,7 @@ class Track:
     age: int = 0
     bad: int = 0
     outside: int = 0
+    challenged: int = 0
     expected: Expected | None = None
 
 

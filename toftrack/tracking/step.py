@@ -13,6 +13,7 @@ from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
+from toftrack.relocation.relocaliser import Glance
 from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter, size_fit
@@ -27,9 +28,10 @@ from toftrack.tracking.following import (
 from toftrack.tracking.life_cycle import Belief, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.refining import refined
+from toftrack.tracking.relocating import expected_of, glanced
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.spans import Spans
-from toftrack.tracking.starting import propose, started
+from toftrack.tracking.starting import begin, challenged
 from toftrack.tracking.state import StepInfo, TrackerState, resumed
 
 
@@ -49,26 +51,32 @@ def step(
     A pure function: the state given stays as it is, and gives the same again.
     """
     spans, generator = Spans(), resumed(state.generator, model.device)
-    hand, motions, track = model.hand(state.side, state.size), model.backend.motions, state.track
+    state = _at(state, image)
+    with spans("relocaliser"):
+        glance = glanced(state.track, state.side, image, model)
+        state = replace(state, size=_size_told(state, glance, model))
+    hand, track = model.hand(state.side, state.size), state.track
     with spans("segmentation and evidence"):
         expected = expected_depths(track, hand, model)
+        if expected is None and glance is not None:
+            expected = expected_of(glance)
         observation = model.segmentation(image.depth_m, image.k, expected)
-        state = _at(state, image)
-        if observation.empty:
+        nowhere = model.relocaliser is not None and glance is None
+        if observation.empty or nowhere:
             return _without_hand(state, image, observation, model, spans)
-        frame = observed(observation, hand, model)
-    if track is None or track.age < model.lost.probation:
-        with spans("start"):
-            track = started(track, propose(state.seen, frame, generator), model.lost, motions)
+        frame = observed(observation, hand, model, glance, state.seen)
+    with spans("start"):
+        track = begin(track, frame, generator)
     with spans("filter: rest"):
         particles, weights = filtered(track, frame, generator, spans)
         mean = particle_filter.mean_particle(particles, weights)
     with spans("refinement"):
-        pose, trend = refined(track, mean, frame, generator)
+        outcome = refined(track, mean, frame, generator)
+        hidden = bool(frame.observation.occluder.any())
+        track, pose, trend = challenged(track, outcome, hidden, model)
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
     belief = believe(track, score, found.off_rad, model.lost)
-    hidden = bool(frame.observation.occluder.any())
     track = advanced(track, found, belief, expected if hidden else None, model)
     estimate = _estimate(image, found, score, belief, frame)
     gesture, estimate = tell_gesture(model.gestures, state.gesture, estimate, model.space)
@@ -85,6 +93,16 @@ def step(
         last=estimate,
     )
     return after, StepInfo(frame.observation, particles, weights, spans.seconds()), estimate
+
+
+def _size_told(
+    state: TrackerState, glance: Glance | None, model: TrackerModel
+) -> SizeBelief | None:
+    """The size to begin a track with is what the networks say, until estimates say better."""
+    size = state.size
+    if model.fit is None or size is None or glance is None or state.track is not None:
+        return size
+    return size if size.frames else size_fit.told(model.fit, glance.length_m, model.shape)
 
 
 def _at(state: TrackerState, image: DepthImage) -> TrackerState:
