@@ -33,6 +33,10 @@ class Estimate:
     """Of the weights, before resampling."""
     compute_s: float
     """Wall seconds spent on the frame, capture and drawing excluded."""
+    confidence: float = math.nan
+    """Probability that every joint is within 40 mm; NaN where nothing says."""
+    outside_rad: float = math.nan
+    """How far the pose lies off the pose space, rms."""
     gesture: str = ""
     """The gesture, 'other' where it is none of the known; empty where gesture output is off or the
     hand is lost."""
@@ -72,5 +76,6 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         state_name="lost",
         lost=True,
         score=0.0,
+        confidence=0.0,
         compute_s=compute_s,
     )

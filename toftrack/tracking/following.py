@@ -9,6 +9,7 @@ from torch import Tensor
 
 from toftrack.render.segmentation import Expected
 from toftrack.tracking import particle_filter
+from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.life_cycle import Belief, LostSettings
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.search import LastSeen
@@ -107,12 +108,16 @@ def advanced(
         belief.bad,
         belief.outside,
         track.challenged,
+        belief.log_odds,
         expected,
     )
 
 
 def remembered(
-    seen: LastSeen | None, track: Track | None, belief: Belief, settings: LostSettings
+    seen: LastSeen | None,
+    track: Track | None,
+    belief: Belief,
+    settings: LostSettings | CalibratedBelief,
 ) -> LastSeen | None:
     """The last hand that was believed, as of this frame."""
     if track is None or belief.lost or track.age <= settings.probation:

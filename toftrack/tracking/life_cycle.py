@@ -36,6 +36,8 @@ class Belief:
 
     kept: the track goes on.  state_name, lost: as Estimate has them.
     bad: frames in a row with a low score.  outside: frames in a row out of the pose space.
+    confidence: probability that every joint is within 40 mm; NaN where nobody says.
+    log_odds: the same, to be smoothed over time; None likewise.
     """
 
     kept: bool
@@ -43,6 +45,8 @@ class Belief:
     lost: bool
     bad: int
     outside: int
+    confidence: float = math.nan
+    log_odds: float | None = None
 
 
 def believe(track: Track, score: float, off_rad: float, settings: LostSettings) -> Belief:

@@ -19,6 +19,7 @@ from toftrack.relocation.relocaliser import Glance, Relocaliser
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
+from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
 from toftrack.tracking.search import LastSeen, Start
@@ -58,7 +59,7 @@ class TrackerModel:
     filter: FilterSettings
     refinement: Refinement | None
     start: Start
-    lost: LostSettings
+    lost: LostSettings | CalibratedBelief
     fit: HandFit | None
     gestures: Gestures | None
     backend: Backend

@@ -12,6 +12,7 @@ from toftrack.estimate import Estimate
 from toftrack.gestures.recognition import GestureState
 from toftrack.render.segmentation import Expected, Observation
 from toftrack.tracking.search import LastSeen
+from toftrack.tracking.signs import Signs
 from toftrack.tracking.size_fit import SizeBelief
 
 
@@ -28,6 +29,7 @@ class Track:
     age: frames since the start.  bad: frames in a row with a low score.
     outside: frames in a row out of the pose space.
     challenged: frames in a row in which a pose of the networks was better.
+    log_odds: that the estimate is right, smoothed over time; None where nobody says.
     expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
 
@@ -42,6 +44,7 @@ class Track:
     bad: int = 0
     outside: int = 0
     challenged: int = 0
+    log_odds: float | None = None
     expected: Expected | None = None
 
 
@@ -80,12 +83,14 @@ class StepInfo:
     particles: (N, 6 + d) before the estimate was refined; none where nothing can be a hand.
     weights: (N,) normalised.
     seconds: wall seconds of each stage.
+    signs: what the belief was formed from; None where there are no networks.
     """
 
     observation: Observation
     particles: Tensor
     weights: Tensor
     seconds: Mapping[str, float]
+    signs: Signs | None = None
 
 
 def resumed(generator: Tensor, device: torch.device) -> torch.Generator:

@@ -17,6 +17,7 @@ from toftrack.relocation.relocaliser import Glance
 from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter, size_fit
+from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.following import (
     Found,
     advanced,
@@ -29,10 +30,11 @@ from toftrack.tracking.life_cycle import Belief, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.refining import refined
 from toftrack.tracking.relocating import expected_of, glanced
+from toftrack.tracking.signs import Signs, read_signs
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.spans import Spans
 from toftrack.tracking.starting import begin, challenged
-from toftrack.tracking.state import StepInfo, TrackerState, resumed
+from toftrack.tracking.state import StepInfo, Track, TrackerState, resumed
 
 
 def first_state(model: TrackerModel, seed: int) -> TrackerState:
@@ -76,7 +78,7 @@ def step(
         track, pose, trend = challenged(track, outcome, hidden, model)
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
-    belief = believe(track, score, found.off_rad, model.lost)
+    belief, signs = _believed(track, found, score, frame)
     track = advanced(track, found, belief, expected if hidden else None, model)
     estimate = _estimate(image, found, score, belief, frame)
     gesture, estimate = tell_gesture(model.gestures, state.gesture, estimate, model.space)
@@ -92,7 +94,23 @@ def step(
         gesture=gesture,
         last=estimate,
     )
-    return after, StepInfo(frame.observation, particles, weights, spans.seconds()), estimate
+    info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs)
+    return after, info, estimate
+
+
+def _believed(
+    track: Track, found: Found, score: float, frame: ObservedFrame
+) -> tuple[Belief, Signs | None]:
+    """What is thought of a frame's estimate, and by which signs."""
+    settings, signs = frame.model.lost, None
+    if frame.glance is not None:
+        joints = frame.hand.refiner.joints(found.pose)[0]
+        seen = frame.observation
+        signs = read_signs(joints, score, track.age, frame.glance, seen.depth_m, seen.k)
+    if isinstance(settings, CalibratedBelief):
+        assert signs is not None  # see TrackerModel
+        return settings.judge(track, signs), signs
+    return believe(track, score, found.off_rad, settings), signs
 
 
 def _size_told(
@@ -183,6 +201,8 @@ def _estimate(
         timestamp_s=image.timestamp_s,
         state_name=belief.state_name,
         lost=belief.lost,
+        confidence=belief.confidence,
+        outside_rad=found.off_rad,
         joints_m=_host(frame.hand.refiner.joints(found.pose)[0]),
         state=_host(found.pose[0]),
         latent=_host(model.space.encode(found.pose[:, 6:])[0]),

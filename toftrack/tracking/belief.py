@@ -1,0 +1,75 @@
+"""How likely an estimate is right: a calibrated probability from everything that bears on it.
+
+A logistic model of a few signs, fitted by toftrack.programs.fit_belief on rendered sequences of
+other hands, persons and sensors than any recording that the tracker is judged on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from toftrack.checks import check_number
+from toftrack.errors import ToftrackError
+from toftrack.tracking.life_cycle import Belief
+from toftrack.tracking.signs import SIGNS, Signs
+from toftrack.tracking.state import Track
+
+
+@dataclass(frozen=True)
+class CalibratedBelief:
+    """When an estimate is not to be used, and when its track is given up; see conf/lost.
+
+    confidence: estimates that are right with a lower probability are flagged lost.
+    give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
+    memory: part of the log odds that comes from the frames before.
+    probation: frames after a start during which the hand is not remembered as seen.
+    intercept, weights: of the signs, by name.
+    """
+
+    confidence: float
+    give_up: float
+    patience: int
+    memory: float
+    probation: int
+    intercept: float
+    weights: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        for name in ("confidence", "give_up"):
+            check_number(f"lost.{name}", getattr(self, name), 0, 1)
+        check_number("lost.memory", self.memory, 0, 0.99)
+        for name in ("patience", "probation"):
+            check_number(f"lost.{name}", getattr(self, name), 0, whole=True)
+        check_number("lost.intercept", self.intercept)
+        for name, value in self.weights.items():
+            if name not in SIGNS:
+                raise ToftrackError(
+                    f"lost.weights.{name} is unknown; the signs are {', '.join(SIGNS)}"
+                )
+            check_number(f"lost.weights.{name}", value)
+
+    def log_odds(self, signs: Signs) -> float:
+        """That every joint is within 40 mm, from one frame."""
+        return self.intercept + sum(w * getattr(signs, name) for name, w in self.weights.items())
+
+    def judge(self, track: Track, signs: Signs) -> Belief:
+        """What is thought of an estimate, and whether its track goes on."""
+        now = self.log_odds(signs)
+        before = track.log_odds
+        smooth = now if before is None else self.memory * before + (1 - self.memory) * now
+        confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
+        bad = track.bad + 1 if confidence < self.give_up else 0
+        kept = bad < self.patience or not self.patience
+        lost = confidence < self.confidence
+        return Belief(kept, _state_name(signs, lost), lost, bad, 0, confidence, smooth)
+
+
+def _state_name(signs: Signs, lost: bool) -> str:
+    """Why an estimate is not to be used."""
+    if not lost:
+        return "tracking"
+    if signs.unseen > 0.4:
+        return "out of view"
+    return "hidden" if signs.hidden > 0.3 else "searching"

@@ -1,0 +1,100 @@
+"""Signs that an estimate is right or wrong, read off a frame; belief.py weighs them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from torch import Tensor
+
+from toftrack.relocation.relocaliser import Glance
+
+_LEAST = 1e-3
+_LIKELY = 0.03
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What speaks for and against an estimate in one frame; each is a number of order 1.
+
+    log_score: of the image, per factor e.
+    votes_off, farthest_vote_off: how far the joints are from the networks' votes, on average and
+        the farthest, log of centimetres.
+    pose_off: likewise from the hypothesis that is most like it, on average.
+    likeliest_off: likewise from the likeliest hypothesis.
+    expected_error, unsure: what the networks think of their own hypothesis and votes, likewise.
+    absent, other_side: log odds that there is no hand, or that it is the other one.
+    unseen: share of the joints that lie outside of the image.
+    hidden: share of the joints that lie behind something.
+    young: 1 in the first frame of a track, falling.
+    """
+
+    log_score: float
+    votes_off: float
+    farthest_vote_off: float
+    pose_off: float
+    likeliest_off: float
+    expected_error: float
+    unsure: float
+    absent: float
+    other_side: float
+    unseen: float
+    hidden: float
+    young: float
+
+    def values(self) -> list[float]:
+        """In the order of SIGNS."""
+        return [getattr(self, name) for name in SIGNS]
+
+
+SIGNS = tuple(field.name for field in fields(Signs))
+
+
+def read_signs(
+    joints_m: Tensor, score: float, age: int, glance: Glance, depth_m: Tensor, k: Tensor
+) -> Signs:
+    """The signs of an estimate with joints (21, 3) in an image (H, W) with intrinsics k.
+
+    age: frames since its track began.
+    """
+    joints = joints_m.cpu()
+    votes = (joints - glance.landmarks.points_m).norm(dim=1)
+    off = (joints - glance.joints_m).norm(dim=-1).mean(1)
+    likely = off[glance.log_probability > math.log(_LIKELY)]
+    unseen, hidden = _out_of_sight(joints, depth_m, k)
+    return Signs(
+        log_score=math.log(max(score, _LEAST)),
+        votes_off=_log_cm(float(votes.mean())),
+        farthest_vote_off=_log_cm(float(votes.max())),
+        pose_off=_log_cm(float(likely.min()) if len(likely) else float(off.min())),
+        likeliest_off=_log_cm(float(off[0])),
+        expected_error=_log_cm(float(glance.error_m[0])),
+        unsure=_log_cm(float(glance.landmarks.sigma_m.mean())),
+        absent=_log_odds(1 - glance.present),
+        other_side=_log_odds(1 - glance.right_side),
+        unseen=unseen,
+        hidden=hidden,
+        young=1 / (1 + age),
+    )
+
+
+def _log_cm(metres: float) -> float:
+    return math.log(max(100 * metres, 0.05))
+
+
+def _log_odds(probability: float) -> float:
+    p = min(max(probability, _LEAST), 1 - _LEAST)
+    return math.log(p / (1 - p))
+
+
+def _out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
+    """Shares of the joints that are outside of the image, and that are behind something."""
+    depth, k = depth_m.cpu(), k.cpu()
+    z = joints[:, 2].clamp(min=0.05)
+    u = (k[0, 0] * joints[:, 0] / z + k[0, 2]).round()
+    v = (k[1, 1] * joints[:, 1] / z + k[1, 2]).round()
+    height, width = depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    seen = depth[v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
+    behind = inside & (seen > 0) & (seen < z - 0.04)
+    return float((~inside).float().mean()), float(behind.float().mean())
