@@ -57,24 +57,24 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
 def build_tracker(config: DictConfig) -> Tracker:
     """The tracker of a configuration (conf/config.yaml composed)."""
     # These take seconds: an override's error comes before.
+    from toftrack.tracking.backend import choose_backend
     from toftrack.tracking.model import TrackerModel
     from toftrack.tracking.tracker import Tracker
 
     device = compute_device(config.compute)
-    hand, refinement = instantiate(config.hand), instantiate(config.refine)
+    hand = instantiate(config.hand)
     model = TrackerModel(
         shape=hand.shape.to(device),
         space=instantiate(config.pose_space).to(device),
         segmentation=instantiate(config.segmentation),
         likelihood=instantiate(config.likelihood),
         filter=instantiate(config.filter),
-        refinement=refinement if refinement.iterations else None,
+        refinement=instantiate(config.refine),
         start=instantiate(config.start),
         lost=instantiate(config.lost),
         fit=hand.fit,
         gestures=instantiate(config.gestures),
-        renderer=config.renderer,
-        device=device,
+        backend=choose_backend(config.renderer, device),
     )
     return Tracker(model, config.seed)
 

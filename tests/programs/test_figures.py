@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.configured import f_measure, nearest_surface
 from helpers.tracking import ROOT, make_tracker, sample
 
 from toftrack.errors import ToftrackError
@@ -21,10 +22,9 @@ from toftrack.output.run_folder import open_footage, read_run
 from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
-from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import make_scorer
-from toftrack.render.segmentation import Expected, NearestSurface
+from toftrack.render.segmentation import Expected
+from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify
 from toftrack.views.figures import chart
 from toftrack.views.model_image import model_range_image, parted, posed_hand
@@ -90,9 +90,9 @@ def states() -> list[np.ndarray]:
 
 
 def test_classified_pixels_are_those_that_the_scorers_count() -> None:
-    scene, shape, likelihood = sample(), default_hand_shape(), FMeasure(residual_weight=1.0)
-    plain = NearestSurface()(scene.depth_m[30], scene.k)
-    hidden = NearestSurface()(
+    scene, shape, likelihood = sample(), default_hand_shape(), f_measure(residual_weight=1.0)
+    plain = nearest_surface()(scene.depth_m[30], scene.k)
+    hidden = nearest_surface()(
         np.where(np.arange(176) < 60, np.float32(0.3), scene.depth_m[30]),
         scene.k,
         Expected(plain.nearest_m, plain.nearest_m + 0.1),
@@ -117,8 +117,8 @@ def test_classified_pixels_are_those_that_the_scorers_count() -> None:
 
 def test_without_an_estimate_no_pixel_is_of_a_class() -> None:
     scene = sample()
-    observation = NearestSurface()(scene.depth_m[0], scene.k)
-    pixels = classify(np.full(27, np.nan), default_hand_shape(), observation, FMeasure())
+    observation = nearest_surface()(scene.depth_m[0], scene.k)
+    pixels = classify(np.full(27, np.nan), default_hand_shape(), observation, f_measure())
     assert not pixels.labels().any() and not pixels.range_m.any()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 import roma
 import torch
+from helpers.configured import nearest_surface, refinement
 from helpers.tracking import sample
 from torch import Tensor
 
+from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, FINGERS, forward_kinematics
 from toftrack.hand.surface import hand_surface
@@ -19,21 +22,22 @@ from toftrack.output.evaluation import TIPS
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
 from toftrack.refinement.gauss_newton import (
+    JOINT_FRAME,
+    Landmarks,
     Refinement,
-    Surroundings,
-    make_refiner,
+    TorchRefiner,
+    no_refinement,
     point_jacobian,
     refine,
-    surroundings,
 )
 from toftrack.refinement.proposals import swap_fingers
-from toftrack.render.segmentation import NearestSurface
+from toftrack.refinement.seen_points import SeenPoints, seen_points
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 LIMITS = torch.tensor(ANGLE_LIMITS)
-SETTINGS = Refinement()
+SETTINGS = refinement()
 FRAMES = range(0, 100, 9)
 
 
@@ -51,7 +55,7 @@ def random_state(seed: int) -> Tensor:
 
 def moved(state: Tensor, change: Tensor) -> Tensor:
     """The state after a small change: translation, rotation in the camera frame, angles."""
-    turned = roma.rotvec_composition((change[None, 3:6], state[:, 3:6]))
+    turned = roma.rotvec_composition((change[None, 3:6].expand(len(state), 3), state[:, 3:6]))
     return torch.cat((state[:, :3] + change[:3], turned, state[:, 6:] + change[6:]), 1)
 
 
@@ -59,14 +63,14 @@ def moved(state: Tensor, change: Tensor) -> Tensor:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_jacobian_agrees_with_finite_differences(side: str, seed: int) -> None:
     shape = default_hand_shape(side=side).to(torch.float64)
-    state, g = random_state(seed), generator(seed + 10)
+    state, g = torch.cat((random_state(seed), random_state(seed + 2))), generator(seed + 10)
     frame = torch.arange(16).repeat(4)
     local = 0.05 * torch.randn(len(frame), 3, generator=g, dtype=torch.float64)
-    n = torch.randn(len(frame), 3, generator=g, dtype=torch.float64)
+    n = torch.randn(2, len(frame), 3, generator=g, dtype=torch.float64)
 
     def points(state: Tensor) -> Tensor:
         pose = forward_kinematics(state, shape)
-        return (pose.frames[0, frame] @ local[..., None])[..., 0] + pose.origins_m[0, frame]
+        return (pose.frames[:, frame] @ local[..., None])[..., 0] + pose.origins_m[:, frame]
 
     found = point_jacobian(forward_kinematics(state, shape), shape, points(state), n, frame)
     step = 1e-6
@@ -75,9 +79,27 @@ def test_the_jacobian_agrees_with_finite_differences(side: str, seed: int) -> No
         change = torch.zeros(27, dtype=torch.float64)
         change[axis] = step
         difference = points(moved(state, change)) - points(moved(state, -change))
-        columns.append((n * difference).sum(1) / (2 * step))
-    torch.testing.assert_close(found, torch.stack(columns, 1), atol=1e-6, rtol=0)
-    assert (found != 0).any(0).all(), "every degree of freedom moves some point"
+        columns.append((n * difference).sum(-1) / (2 * step))
+    torch.testing.assert_close(found, torch.stack(columns, -1), atol=1e-6, rtol=0)
+    assert (found != 0).any(1).all(), "every degree of freedom moves some point"
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_every_joint_moves_with_its_frame(side: str) -> None:
+    """The Jacobian of the joints themselves, which landmarks pull at."""
+    shape = default_hand_shape(side=side).to(torch.float64)
+    state = random_state(4)
+    pose = forward_kinematics(state, shape)
+    n = torch.randn(1, 21, 3, generator=generator(), dtype=torch.float64)
+    found = point_jacobian(pose, shape, pose.joints_m, n, torch.tensor(JOINT_FRAME))
+    step = 1e-6 * torch.eye(27, dtype=torch.float64)
+    joints = [
+        [forward_kinematics(moved(state, sign * row), shape).joints_m for row in step]
+        for sign in (1, -1)
+    ]
+    difference = torch.cat(joints[0]) - torch.cat(joints[1])
+    expected = ((n * difference).sum(-1) / 2e-6).T[None]
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
 @cache
@@ -96,17 +118,15 @@ def true_states() -> Tensor:
     return states.float()
 
 
-def seen_in(row: int, around: Tensor) -> Surroundings:
+@cache
+def seen_in(row: int) -> SeenPoints:
     scene = sample().cut(FRAMES[row])
-    observation = NearestSurface()(scene.depth_m[0], scene.k)
-    return surroundings(observation, around, SETTINGS.points)
+    return seen_points(nearest_surface()(scene.depth_m[0], scene.k))
 
 
 def refined(state: Tensor, row: int, settings: Refinement = SETTINGS) -> Tensor:
     shape = default_hand_shape()
-    middle = forward_kinematics(state, shape).joints_m[0].mean(0)
-    seen = seen_in(row, middle)
-    return refine(state, state[:, 6:], seen, shape, hand_surface(shape), settings)
+    return refine(state, state[:, 6:], seen_in(row), shape, hand_surface(shape), settings)
 
 
 def errors_mm(state: Tensor, row: int) -> np.ndarray:
@@ -154,67 +174,110 @@ def test_refinement_leaves_the_truth_about_where_it_is() -> None:
     assert after < before + 2.5
 
 
-def test_more_steps_come_nearer_and_none_leave_the_pose_alone() -> None:
+def test_more_steps_come_nearer() -> None:
     start = disturbed(0, 1)
-    one, five = (Refinement(iterations=n) for n in (1, 5))
-    assert torch.equal(refined(start, 0, Refinement(iterations=0)), start)
+    one, five = (refinement(iterations=n) for n in (1, 5))
     assert (
         errors_mm(refined(start, 0, five), 0).mean() < errors_mm(refined(start, 0, one), 0).mean()
     )
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_the_compiled_refinement_agrees_with_the_reference(side: str) -> None:
-    shape = default_hand_shape(side=side)
-    one, two = (make_refiner(shape, hand_surface(shape), name) for name in ("torch", "numba"))
-    assert type(one) is not type(two)
-    for row in range(0, len(FRAMES), 2):
-        scene, start = sample().cut(FRAMES[row]), disturbed(row, 0)
-        if side == "left":
-            scene = scene.mirrored()
-            start[:, [0, 4, 5]] *= -1
-        observation = NearestSurface()(scene.depth_m[0], scene.k)
-        middle = forward_kinematics(start, shape).joints_m[0].mean(0)
-        seen = surroundings(observation, middle, SETTINGS.points)
-        found = [refiner(start, start[:, 6:], seen, SETTINGS) for refiner in (one, two)]
-        joints = [forward_kinematics(state, shape).joints_m[0] for state in found]
-        # A point that is as near to two bones goes to either, and the steps part by a little.
-        assert float((joints[0] - joints[1]).norm(dim=1).max()) < 0.002
-        error = np.linalg.norm(joints[1].numpy() - scene.joints_m[0], axis=1).mean()
-        assert error < 0.025
-
-
-def nothing_seen() -> Surroundings:
+def nothing_seen() -> SeenPoints:
     """No point of a hand, and no background that a finger could stick out over."""
-    scene = sample().cut(0)
-    observation = NearestSurface()(scene.depth_m[0], scene.k)
-    all_hand = replace(observation, hand=torch.ones_like(observation.hand))
-    seen = surroundings(all_hand, torch.tensor([9.0, 9.0, 9.0]), SETTINGS.points)
-    assert len(seen.points_m) == 0
-    return seen
+    seen = seen_in(0)
+    return replace(seen, points_m=torch.zeros(0, 3), nearest_px=torch.zeros(0, 0, 2))
 
 
-def test_nothing_seen_changes_nothing() -> None:
-    state, shape = true_states()[:1], default_hand_shape()
-    found = refine(state, state[:, 6:], nothing_seen(), shape, hand_surface(shape), SETTINGS)
-    torch.testing.assert_close(found, state, atol=1e-6, rtol=0)
+def beside(state: Tensor, x: float) -> SeenPoints:
+    """Points at the joints, moved aside."""
+    joints = forward_kinematics(state, default_hand_shape()).joints_m[0]
+    return replace(nothing_seen(), points_m=joints + torch.tensor([x, 0.0, 0.0]))
 
 
-def test_without_points_the_angles_go_to_the_prior_and_the_hand_stays() -> None:
+def test_nothing_seen_leaves_the_state_as_it_is_whatever_the_prior_says() -> None:
     state, shape = disturbed(0, 0), default_hand_shape()
     prior = true_states()[:1, 6:]
-    found = refine(state, prior, nothing_seen(), shape, hand_surface(shape), SETTINGS)
-    torch.testing.assert_close(found[:, :6], state[:, :6], atol=1e-6, rtol=0)
-    torch.testing.assert_close(found[:, 6:], clamp_to_joint_limits(prior), atol=1e-4, rtol=0)
+    for seen in (nothing_seen(), beside(state, 0.5)):
+        found = refine(state, prior, seen, shape, hand_surface(shape), SETTINGS)
+        assert torch.equal(found, state)
 
 
 def test_points_of_nothing_near_are_left_alone() -> None:
     """Points farther than the reach from the surface are no part of the hand."""
     state, shape = true_states()[:1], default_hand_shape()
-    joints = forward_kinematics(state, shape).joints_m[0]
-    far = replace(nothing_seen(), points_m=joints + torch.tensor([0.3, 0.0, 0.0]))
-    found = refine(state, state[:, 6:], far, shape, hand_surface(shape), SETTINGS)
+    seen = beside(state, 0.14)
+    middle = forward_kinematics(state, shape).joints_m.mean(1)
+    assert seen.around(middle, 500)[1].any()
+    settings = refinement(reach_m=1e-3)
+    found = refine(state, state[:, 6:], seen, shape, hand_surface(shape), settings)
     torch.testing.assert_close(found, state, atol=1e-6, rtol=0)
+    # What decides nothing leaves the angles to the prior, and the hand where it is.
+    start, prior = disturbed(0, 0), true_states()[:1, 6:]
+    found = refine(start, prior, beside(start, 0.14), shape, hand_surface(shape), settings)
+    torch.testing.assert_close(found[:, :6], start[:, :6], atol=1e-6, rtol=0)
+    torch.testing.assert_close(found[:, 6:], clamp_to_joint_limits(prior), atol=1e-4, rtol=0)
+
+
+def test_hypotheses_do_not_know_of_each_other() -> None:
+    """One that is no number and one that sees nothing among those that do."""
+    shape = default_hand_shape()
+    refiner = TorchRefiner(shape)
+    states = torch.cat([disturbed(0, seed) for seed in range(5)])
+    states[1] = torch.nan
+    states[3, 0] += 1.0
+    found = refiner(states, states[:, 6:], seen_in(0), SETTINGS)
+    assert torch.equal(found[3], states[3]) and found[1].isnan().all()
+    for row in (0, 2, 4):
+        alone = refiner(states[row][None], states[row, None, 6:], seen_in(0), SETTINGS)
+        torch.testing.assert_close(found[row], alone[0], atol=1e-4, rtol=0)
+        assert not torch.equal(found[row], states[row])
+    assert refiner(states[:0], states[:0, 6:], seen_in(0), SETTINGS).shape == (0, 27)
+
+
+def joints_of(states: Tensor) -> Tensor:
+    return forward_kinematics(states, default_hand_shape()).joints_m
+
+
+def off_mm(states: Tensor, points: Tensor) -> Tensor:
+    return 1e3 * (joints_of(states) - points).norm(dim=-1).mean(-1)
+
+
+def test_landmarks_alone_bring_the_hand_to_them() -> None:
+    refiner = TorchRefiner(default_hand_shape())
+    truth = joints_of(true_states()[0][None])[0]
+    starts = torch.cat([disturbed(0, seed) for seed in range(4)])
+    marks = Landmarks(truth, torch.full((21,), 0.002))
+    settings = refinement(iterations=15, angle_rad=2.0)
+    found = refiner(starts, starts[:, 6:], nothing_seen(), settings, marks)
+    assert (off_mm(starts, truth) > 8).all()
+    assert (off_mm(found, truth) < 1.5).all()
+
+
+def test_each_hypothesis_may_have_landmarks_of_its_own() -> None:
+    refiner = TorchRefiner(default_hand_shape())
+    starts, goals = disturbed(0, 0).repeat(2, 1), joints_of(true_states()[:2])
+    marks = Landmarks(goals, torch.full((2, 21), 0.003))
+    found = refiner(starts, starts[:, 6:], nothing_seen(), refinement(iterations=25), marks)
+    assert off_mm(found, goals)[0] < off_mm(starts, goals)[0] / 3
+    assert off_mm(found, goals)[1] < off_mm(starts, goals)[1] / 2
+
+
+def test_unknown_landmarks_count_as_none_and_a_wrong_one_little() -> None:
+    refiner = TorchRefiner(default_hand_shape())
+    start, seen = disturbed(0, 0), seen_in(0)
+    plain = refiner(start, start[:, 6:], seen, SETTINGS)
+    points, sigma = joints_of(start)[0] + 0.05, torch.full((21,), torch.inf)
+    assert torch.equal(
+        refiner(start, start[:, 6:], seen, SETTINGS, Landmarks(points, sigma)), plain
+    )
+    sigma[3] = 0.005
+    points[3] = torch.nan
+    assert torch.equal(
+        refiner(start, start[:, 6:], seen, SETTINGS, Landmarks(points, sigma)), plain
+    )
+    points[3] = 0.3
+    wrong = refiner(start, start[:, 6:], seen, SETTINGS, Landmarks(points, sigma))
+    assert (off_mm(wrong, joints_of(plain)[0]) < 1).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -224,28 +287,12 @@ def test_joint_limits_are_kept_whatever_is_seen(seed: int) -> None:
     g = generator(seed)
     noise = 0.02 * torch.randn(20, 21, 3, generator=g)
     seen = replace(nothing_seen(), points_m=(joints + noise).flatten(0, 1))
-    loose = Refinement(iterations=20, angle_rad=10.0, point_m=1e-4)
+    loose = refinement(iterations=20, angle_rad=10.0, point_m=1e-4)
     found = refine(state, state[:, 6:], seen, shape, hand_surface(shape), loose)
     assert found.isfinite().all()
     assert (found[0, 6:] >= LIMITS[:, 0] - 1e-6).all()
     assert (found[0, 6:] <= LIMITS[:, 1] + 1e-6).all()
     assert not torch.equal(found, state)
-
-
-@pytest.mark.parametrize("row", range(0, len(FRAMES), 4))
-def test_the_points_are_those_of_the_hand_without_its_edges(row: int) -> None:
-    around = true_states()[row, :3]
-    seen = seen_in(row, around)
-    assert 100 < len(seen.points_m) <= SETTINGS.points
-    assert ((seen.points_m - around).norm(dim=1) < 0.161).all()
-    scene = sample().cut(FRAMES[row])
-    pixel = (seen.points_m.double() @ torch.from_numpy(scene.k).T)[:, :2]
-    u, v = (pixel / seen.points_m[:, 2:]).round().long().T
-    read = torch.from_numpy(scene.depth_m[0])[v, u]
-    torch.testing.assert_close(read, seen.points_m[:, 2])
-    # On the silhouette the nearest pixel that is not background is the pixel itself.
-    top, left = seen.corner
-    assert torch.equal(seen.nearest_px[v - top, u - left], torch.stack((u, v), 1).float())
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
@@ -271,3 +318,28 @@ def test_swapped_hands_differ_from_the_first_in_exactly_one_finger(side: str) ->
     for joints, name in zip(rest, names, strict=False):
         still = [i for i in range(21) if i == 0 or (i - 1) // 4 != FINGERS.index(*name)]
         torch.testing.assert_close(joints[still], first[still])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("iterations", 0),
+        ("points", 0),
+        ("points", 2.5),
+        ("swaps", -1),
+        ("reach_m", 0),
+        ("point_m", -0.01),
+        ("angle_rad", "wide"),
+        ("damping", math.nan),
+        ("carry", 2),
+    ],
+)
+def test_impossible_settings_are_refused(key: str, value: object) -> None:
+    with pytest.raises(ToftrackError, match=f"^refine.{key}={value} "):
+        refinement(**{key: value})
+
+
+def test_no_refinement_is_none() -> None:
+    assert no_refinement() is None
+    with pytest.raises(ToftrackError, match="refine=none"):
+        refinement(iterations=0)

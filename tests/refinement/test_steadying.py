@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.configured import steadying
 
+from toftrack.compute import rigid
+from toftrack.errors import ToftrackError
 from toftrack.refinement.steadying import Steadying, steadied
 
-SETTINGS = Steadying()
+SETTINGS = steadying()
 
 
 def hand(x: float = 0.0) -> torch.Tensor:
@@ -23,7 +26,7 @@ def followed(states: list[torch.Tensor], settings: Steadying = SETTINGS) -> torc
     """(T, 27) the steadied states."""
     believed, trend, path = states[0], None, [states[0]]
     for state in states[1:]:
-        believed, trend = steadied(state, believed, trend, settings)
+        believed, trend = steadied(state, believed, trend, settings, rigid.MOTIONS)
         path.append(believed)
     return torch.cat(path)
 
@@ -66,3 +69,11 @@ def test_a_slow_movement_after_rest_is_followed_soon() -> None:
 def test_a_jump_is_taken_at_once() -> None:
     path = followed([*trembling(20), hand(0.2)])
     assert float(path[-1, 0]) > 0.19
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("translation_m", -1), ("finger_rad", "much"), ("calm", -1), ("memory", 2)]
+)
+def test_impossible_settings_are_refused(key: str, value: object) -> None:
+    with pytest.raises(ToftrackError, match=f"^refine.steadying.{key}={value} "):
+        steadying(**{key: value})

@@ -7,11 +7,12 @@ import math
 import cv2
 import numpy as np
 import pytest
-import torch
+from helpers.configured import nearest_surface
 from helpers.tracking import sample
 
+from toftrack.errors import ToftrackError
 from toftrack.output.evaluation import TIPS
-from toftrack.render.segmentation import Expected, NearestSurface, Observation, reduce_image
+from toftrack.render.segmentation import Expected, NearestSurface, reduce_image
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 100.0
 K = np.array([[FOCAL, 0, 39.0], [0, FOCAL, 31.0], [0, 0, 1]])
@@ -26,7 +27,7 @@ def picture(hand_m: float = 0.5, wall_m: float = 1.0) -> np.ndarray:
 
 
 def hand_of(depth: np.ndarray, expected: Expected | None = None, **settings) -> np.ndarray:
-    return NearestSurface(**settings)(depth, K, expected).hand.numpy()
+    return nearest_surface(**settings)(depth, K, expected).hand.numpy()
 
 
 def test_the_nearest_surface_and_what_is_up_to_20_cm_behind_it_is_the_hand() -> None:
@@ -36,7 +37,7 @@ def test_the_nearest_surface_and_what_is_up_to_20_cm_behind_it_is_the_hand() -> 
     hand = hand_of(depth)
     assert hand[HAND].all() and hand[40:50, 20:50].all()
     assert hand.sum() == 40 * 30
-    assert NearestSurface()(depth, K).nearest_m == pytest.approx(0.5)
+    assert nearest_surface()(depth, K).nearest_m == pytest.approx(0.5)
 
 
 def test_the_depth_behind_the_nearest_point_is_a_setting() -> None:
@@ -59,12 +60,12 @@ def test_specks_and_flying_pixels_are_no_hand(seed: int) -> None:
     rows, columns = np.nonzero(cv2.dilate((clean < 1).astype(np.uint8), np.ones((3, 3))) == 0)
     chosen = rng.choice(len(rows), 40, replace=False)
     noisy[rows[chosen], columns[chosen]] = rng.uniform(0.15, 0.45, 40)
-    seen = NearestSurface()(noisy, K)
+    seen = nearest_surface()(noisy, K)
     assert seen.nearest_m == pytest.approx(0.5)
     assert not seen.hand.numpy()[rows[chosen], columns[chosen]].any()
     assert seen.hand.numpy()[HAND].all()
     # The paper takes the single nearest pixel, whatever it is.
-    single = NearestSurface(min_area_m2=0)(noisy, K)
+    single = nearest_surface(min_area_m2=0)(noisy, K)
     assert single.nearest_m == pytest.approx(float(noisy.min()))
 
 
@@ -73,7 +74,7 @@ def test_how_small_a_speck_is_depends_on_its_distance_too() -> None:
     for distance, accepted in ((0.5, False), (1.0, True)):
         depth = np.zeros((HEIGHT, WIDTH), np.float32)
         depth[20:25, 30:35] = distance
-        assert NearestSurface(min_area_m2=0.001)(depth, K).empty is not accepted
+        assert nearest_surface(min_area_m2=0.001)(depth, K).empty is not accepted
 
 
 @pytest.mark.parametrize(
@@ -89,7 +90,7 @@ def test_how_small_a_speck_is_depends_on_its_distance_too() -> None:
 )
 @pytest.mark.parametrize("expected", [None, Expected(0.45, 0.55)])
 def test_nothing_in_range_is_empty(depth: np.ndarray, expected: Expected | None) -> None:
-    seen = NearestSurface()(depth, K, expected)
+    seen = nearest_surface()(depth, K, expected)
     assert seen.empty
     assert math.isinf(seen.nearest_m)
     assert not seen.hand.any() and not seen.occluder.any()
@@ -111,7 +112,7 @@ def with_occluder() -> np.ndarray:
 
 
 def test_what_comes_in_front_of_a_tracked_hand_hides_it() -> None:
-    seen = NearestSurface()(with_occluder(), K, Expected(0.49, 0.55))
+    seen = nearest_surface()(with_occluder(), K, Expected(0.49, 0.55))
     hand, occluder = seen.hand.numpy(), seen.occluder.numpy()
     assert occluder[20:30, 0:60].all()
     assert seen.nearest_m == pytest.approx(0.5)
@@ -123,7 +124,7 @@ def test_what_comes_in_front_of_a_tracked_hand_hides_it() -> None:
 
 def test_without_a_tracked_hand_the_bar_in_front_is_the_nearest_surface() -> None:
     for expected, margin in ((None, 0.035), (Expected(0.49, 0.55), 0.0)):
-        seen = NearestSurface(occluder_margin_m=margin)(with_occluder(), K, expected)
+        seen = nearest_surface(occluder_margin_m=margin)(with_occluder(), K, expected)
         assert not seen.occluder.any()
         assert seen.nearest_m == pytest.approx(0.35)
         assert seen.hand.numpy()[20:30, 0:60].all()
@@ -131,7 +132,7 @@ def test_without_a_tracked_hand_the_bar_in_front_is_the_nearest_surface() -> Non
 
 def test_a_hand_that_comes_nearer_is_not_its_own_occluder() -> None:
     depth = picture(hand_m=0.5)
-    seen = NearestSurface()(depth, K, Expected(0.53, 0.58))
+    seen = nearest_surface()(depth, K, Expected(0.53, 0.58))
     assert not seen.occluder.any()
     assert seen.hand.numpy()[HAND].all()
 
@@ -139,7 +140,7 @@ def test_a_hand_that_comes_nearer_is_not_its_own_occluder() -> None:
 def test_a_hand_that_jumped_out_of_its_expected_depth_is_still_found() -> None:
     """Nothing is where the hand was expected: what is in front of that cannot hide it."""
     depth = picture(hand_m=0.5, wall_m=1.4)
-    seen = NearestSurface()(depth, K, Expected(0.8, 0.9))
+    seen = nearest_surface()(depth, K, Expected(0.8, 0.9))
     assert not seen.occluder.any()
     assert seen.hand.numpy()[HAND].all()
 
@@ -154,7 +155,7 @@ def test_what_is_well_behind_a_tracked_hand_is_the_body() -> None:
 def test_the_segmented_sample_holds_the_true_hand_and_not_the_wall() -> None:
     scene = sample()
     for frame in range(0, 100, 12):
-        seen = NearestSurface()(scene.depth_m[frame], scene.k)
+        seen = nearest_surface()(scene.depth_m[frame], scene.k)
         hand = seen.hand.numpy()
         joints = scene.joints_m[frame]
         pixels = (joints @ scene.k.T)[:, :2] / joints[:, 2:]
@@ -207,7 +208,7 @@ def test_a_reduced_image_shows_the_same_surface_in_the_same_place(factor: int) -
 def test_a_large_image_is_reduced_below_the_limit_and_shows_no_new_depths() -> None:
     scene = sample()
     large = np.kron(scene.depth_m[0], np.ones((3, 3), np.float32))
-    seen = NearestSurface(max_pixels=40_000)(large, scene.k)
+    seen = nearest_surface(max_pixels=40_000)(large, scene.k)
     assert seen.depth_m.numel() <= 40_000 * 1.01
     assert np.isin(seen.depth_m.numpy(), scene.depth_m[0]).all()
 
@@ -215,23 +216,60 @@ def test_a_large_image_is_reduced_below_the_limit_and_shows_no_new_depths() -> N
 def test_the_given_images_are_not_changed() -> None:
     depth, k = with_occluder(), K.copy()
     before = depth.copy()
-    NearestSurface(max_pixels=1000)(depth, k, Expected(0.49, 0.55))
+    nearest_surface(max_pixels=1000)(depth, k, Expected(0.49, 0.55))
     assert (depth == before).all() and (k == K).all()
 
 
-def test_a_crop_keeps_every_point_where_it_is() -> None:
-    seen = NearestSurface()(with_occluder(), K, Expected(0.49, 0.55))
-    part = seen.cropped(7, 11, 71, 43)
-    assert part.depth_m.shape == part.hand.shape == part.occluder.shape == (32, 64)
+def nearest_by_a_loop(head: NearestSurface, depth: np.ndarray, valid: np.ndarray) -> float:
+    """One speck after the other: the definition."""
+    candidates = valid.copy()
+    while candidates.any():
+        row, column = divmod(int(np.where(candidates, depth, np.inf).argmin()), depth.shape[1])
+        nearest = float(depth[row, column])
+        near = candidates & (depth <= nearest + head.depth_range_m)
+        _, labels = cv2.connectedComponents(near.view(np.uint8), connectivity=4)
+        here = labels == labels[row, column]
+        if np.count_nonzero(here) * nearest**2 / FOCAL**2 >= head.min_area_m2:
+            return nearest
+        candidates &= ~here
+    return math.inf
 
-    def points(observation: Observation) -> torch.Tensor:
-        v, u = observation.hand.nonzero().T
-        z, k = observation.depth_m[v, u], observation.k
-        return torch.stack(((u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z, z), 1)
 
-    inside = seen.hand.clone()
-    inside[:11] = inside[43:] = False
-    inside[:, :7] = inside[:, 71:] = False
-    whole = Observation(seen.depth_m, inside, seen.occluder, seen.k, seen.nearest_m)
-    torch.testing.assert_close(points(part), points(whole))
-    assert seen.k[0, 2] == 39, "the whole image's intrinsics stay"
+@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize("hand_m", [0.5, 0.9, math.nan])
+def test_a_thousand_specks_are_dropped_as_by_a_loop(size: int, hand_m: float) -> None:
+    rng = np.random.default_rng(size)
+    depth = picture(hand_m)
+    depth[rng.random(depth.shape) < 0.2] = 0  # so that specks on the wall hang together less
+    for _ in range(1000 // size**2):
+        row, column = rng.integers(HEIGHT - size), rng.integers(WIDTH - size)
+        depth[row : row + size, column : column + size] = rng.uniform(0.15, 0.8)
+    for area, reach in ((0.0008, 0.2), (0.01, 0.02), (9.0, 0.2)):
+        head = nearest_surface(min_area_m2=area, depth_range_m=reach)
+        valid = (depth > 0) & (depth <= head.max_distance_m)
+        seen = head(depth, K)
+        assert seen.nearest_m == pytest.approx(nearest_by_a_loop(head, depth, valid))
+    assert seen.empty, "nothing is as large as 9 square metres"
+
+
+def test_an_image_that_must_not_be_written_to_is_segmented() -> None:
+    depth = picture()
+    depth.flags.writeable = False
+    assert nearest_surface()(depth, K).nearest_m == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("max_pixels", 0),
+        ("max_pixels", 0.5),
+        ("max_pixels", "many"),
+        ("max_distance_m", 0),
+        ("depth_range_m", -0.1),
+        ("min_area_m2", -1),
+        ("occluder_margin_m", math.inf),
+    ],
+)
+def test_impossible_settings_are_refused(key: str, value: object) -> None:
+    with pytest.raises(ToftrackError, match=f"^segmentation.{key}="):
+        nearest_surface(**{key: value})

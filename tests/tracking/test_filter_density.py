@@ -54,5 +54,5 @@ def test_density_is_added_to_the_log_weights(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("bad", ["-1", "inf", "nan"])
 def test_a_density_out_of_range_is_told(bad: str) -> None:
-    with pytest.raises(InstantiationException, match="filter.density must be 0 or more"):
+    with pytest.raises(InstantiationException, match=f"filter.density={bad} is not possible"):
         make_tracker(f"filter.density={bad}")

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import roma
 import torch
+from helpers.configured import nearest_surface
 from helpers.tracking import sample
 
-from toftrack.render.segmentation import NearestSurface, Observation
+from toftrack.render.segmentation import Observation
 from toftrack.tracking.forearm import arm_sight, forearm_conflict
 
 K = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
 
 
 def seen(image: np.ndarray) -> Observation:
-    return NearestSurface()(image.astype(np.float32), K)
+    return nearest_surface()(image.astype(np.float32), K)
 
 
 def pointing(degrees: float, x: float = 0.0, y: float = 0.0, z: float = 0.5) -> torch.Tensor:
@@ -73,7 +74,7 @@ def test_the_true_hand_of_the_recording_always_has_its_arm_and_a_turned_one_neve
     frames = sample()
     for i in range(0, 100, 10):
         wrist, middle = frames.joints_m[i, 0], frames.joints_m[i, 9]
-        sight = arm_sight(NearestSurface()(frames.depth_m[i], frames.k))
+        sight = arm_sight(nearest_surface()(frames.depth_m[i], frames.k))
         arm = torch.from_numpy((wrist - middle) / np.linalg.norm(wrist - middle)).float()
         side = torch.linalg.cross(arm, torch.tensor([0.0, 0.0, 1.0]))
         side = side / side.norm()

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.configured import f_measure
 from helpers.tracking import CONF, configuration, make_tracker
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -23,7 +24,6 @@ import toftrack.views.rerun
 from toftrack.configuration.sentences import sentence
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
-from toftrack.render.likelihood import FMeasure
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import classify
 
@@ -80,7 +80,7 @@ def moments() -> tuple[TrackedFrame, ...]:
 
 @pytest.fixture
 def written(rerun_view, tmp_path: Path) -> Path:
-    with rerun_view.RerunView(tmp_path, 25.0, 8, likelihood=FMeasure()) as view:
+    with rerun_view.RerunView(tmp_path, 25.0, 8, likelihood=f_measure()) as view:
         for moment in moments():
             view.show(moment)
         assert view.commands() == ()
@@ -162,7 +162,7 @@ def test_classified_pixels_are_those_of_the_figures(written: Path) -> None:
     segments = rows(written, "world/tracker/segmentation", "SegmentationImage:buffer")
     for moment in moments()[:FRAMES]:
         seen = moment.insight.observation
-        pixels = classify(moment.estimate.state, moment.shape, seen, FMeasure()).labels()
+        pixels = classify(moment.estimate.state, moment.shape, seen, f_measure()).labels()
         np.testing.assert_array_equal(labels[moment.estimate.index].reshape(144, 176), pixels)
         hand = segments[moment.estimate.index].reshape(144, 176) == 1
         np.testing.assert_array_equal(hand, seen.hand.numpy())
@@ -192,12 +192,12 @@ def test_the_configured_likelihood_is_the_one_that_classifies() -> None:
 
 def test_a_folder_that_cannot_be_written_is_told(rerun_view, tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
-        rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=FMeasure())
+        rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=f_measure())
 
 
 def test_addresses_without_a_viewer_are_told(rerun_view, tmp_path: Path) -> None:
     def connect(address: str) -> None:
-        rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure(), connect=address)
+        rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure(), connect=address)
 
     for address in ("nonsense", "http://127.0.0.1:9876", "rerun+http://127.0.0.1:port/proxy"):
         with pytest.raises(ToftrackError, match="no address of a viewer"):
@@ -208,7 +208,7 @@ def test_addresses_without_a_viewer_are_told(rerun_view, tmp_path: Path) -> None
     with pytest.raises(ToftrackError, match="no viewer answers"):
         connect(f"rerun+http://127.0.0.1:{port}/proxy")
     with pytest.raises(ToftrackError, match="exclude each other"):
-        rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure(), connect="x", spawn=True)
+        rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure(), connect="x", spawn=True)
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -232,7 +232,7 @@ def test_a_viewer_is_sent_the_same(rerun_view, tmp_path: Path) -> None:
                     break
             time.sleep(0.1)
         address = f"rerun+http://127.0.0.1:{port}/proxy"
-        view = rerun_view.RerunView(tmp_path, 25.0, 8, likelihood=FMeasure(), connect=address)
+        view = rerun_view.RerunView(tmp_path, 25.0, 8, likelihood=f_measure(), connect=address)
         for moment in moments():
             view.show(moment)
         view.close()
@@ -257,7 +257,7 @@ def test_a_viewer_that_takes_nothing_does_not_hold_up_the_tracker(
     monkeypatch.setattr(rerun_view, "_require_answer", lambda address: None)
     monkeypatch.setattr(rerun_view.rr, "unregister_shutdown", lambda: unregistered.append(True))
     monkeypatch.setattr(rerun_view.rr.RecordingStream, "connect_grpc", lambda *a, **k: None)
-    view = rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure(), connect="rerun+http://a")
+    view = rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure(), connect="rerun+http://a")
     monkeypatch.setattr(view._entities, "log", lambda moment: stuck.wait())
     for _ in range(50):
         view.show(moments()[0])
@@ -274,7 +274,7 @@ def test_a_failure_in_the_thread_is_raised_where_the_frame_was_shown(
     def fail(moment: TrackedFrame) -> None:
         raise RuntimeError("no space")
 
-    view = rerun_view.RerunView(tmp_path, 25.0, likelihood=FMeasure())
+    view = rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure())
     monkeypatch.setattr(view._entities, "log", fail)
     with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
         for _ in range(100):

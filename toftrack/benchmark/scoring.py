@@ -48,7 +48,8 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.render.closed_form import project
 from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import BACK_ENDS, Evidence, Scorer, make_scorer
+from toftrack.render.scoring import Evidence, Scorer
+from toftrack.tracking.backend import BACK_ENDS, make_scorer
 
 PARTICLES = (100, 300, 1000, 3000, 10_000)
 BASELINES = ("stepping", "naive")

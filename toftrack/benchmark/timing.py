@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,6 +20,21 @@ from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface
 
 _MARGIN_PX = 12
+_SEGMENTATION = NearestSurface(
+    depth_range_m=0.2,
+    min_area_m2=0.0008,
+    max_distance_m=1.2,
+    occluder_margin_m=0.035,
+    max_pixels=40_000,
+)
+_LIKELIHOOD = FMeasure(
+    tolerance_m=0.02,
+    neighbourhood_m=0.025,
+    beta=1.5,
+    naming="standard",
+    residual_weight=0.0,
+    coverage=0.0,
+)
 
 
 @dataclass(frozen=True)
@@ -51,8 +66,8 @@ def sample_evidence(upsample: float = 1.0) -> tuple[Evidence, Tensor]:
         columns = (np.arange(width) / upsample).astype(int)
         depth = np.ascontiguousarray(depth[rows][:, columns])
         k[:2] *= upsample
-    observation = NearestSurface(max_pixels=depth.size)(depth, k)
-    evidence = FMeasure().evidence(observation)
+    observation = replace(_SEGMENTATION, max_pixels=depth.size)(depth, k)
+    evidence = _LIKELIHOOD.evidence(observation)
     rows, columns = observation.hand.nonzero().unbind(1)
     margin = round(_MARGIN_PX * upsample)
     height, width = depth.shape

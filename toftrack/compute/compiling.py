@@ -10,6 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numba
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +42,17 @@ def entry_point(*sources: str | Path) -> Callable:
             return numba.njit(**OPTIONS)(function)
 
     return decorator
+
+
+@intrinsic
+def take(typingctx, counter):
+    """counter[0] += 1, atomically; the value before. How threads share tasks."""
+
+    def codegen(context, builder, signature, args):
+        at = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", at, ir.IntType(64)(1), "monotonic")
+
+    return types.int64(counter), codegen
 
 
 @contextmanager

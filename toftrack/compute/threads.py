@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -60,3 +62,23 @@ def small_operations() -> Iterator[None]:
         with _lock:
             torch.set_num_threads(before)
             _inside.count -= 1
+
+
+def run_shared(task: Callable[[], object], parts: int) -> None:
+    """Run a task that shares out its parts itself, in as many threads as may be used.
+
+    Plain threads, not numba's own: these are one choice for a whole process and some of them do not
+    allow calls from two threads at once. One part is done without any.
+    """
+    others = [_pool(os.getpid()).submit(task) for _ in range(min(threads(), parts) - 1)]
+    task()
+    for other in others:
+        # A helper that has not begun has nothing left to do.
+        if not other.cancel():
+            other.result()
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Helper threads of this process; a forked one gets its own."""
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="toftrack")

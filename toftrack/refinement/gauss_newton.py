@@ -1,4 +1,4 @@
-"""Refinement: damped Gauss-Newton on one hand in all 27 dimensions after the filter.
+"""Refinement: damped Gauss-Newton on hands in all 27 dimensions after the filter.
 
 The filter finds the hand in few dimensions; this brings the surface onto the points that were seen,
 an articulated iterative closest point (Tagliasacchi et al., "Robust articulated-ICP for real-time
@@ -6,29 +6,30 @@ hand tracking", SGP 2015) with toftrack's ellipsoids:
 
   * seen points are drawn to the nearest ellipsoid (point to plane along its normal);
   * the bones' axes are drawn into the silhouette where they stick out over the background;
+  * the joints are drawn to landmarks, where there are any: joints that somebody else found;
   * the joint angles are drawn to the filter's estimate, the pose space acting as a prior, and are
     kept within the joint limits.
 
 Derivatives are analytic: a joint angle moves a point X by a x (X - o), a the joint's axis and o its
-origin, both columns of the kinematic chain's frames.
+origin, both columns of the kinematic chain's frames. Many hypotheses are refined side by side; this
+is the reference in plain torch, and gauss_newton_numba.py does the same in compiled code.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-import cv2
-import numpy as np
 import roma
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
-from toftrack.hand.surface import HandSurface
+from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.refinement.seen_points import SeenPoints
 from toftrack.refinement.steadying import Steadying
-from toftrack.render.segmentation import Observation
 
 # The joints of the 21 angles: (finger, bone that moves first, is it an abduction).
 _JOINTS = [
@@ -52,19 +53,30 @@ _MOVES = [
     ]
     for frame in range(16)
 ]
+JOINT_FRAME = [
+    0,
+    *(0 if bone == 0 else 3 * finger + bone for finger in range(5) for bone in range(4)),
+]
+"""The frame that each of the 21 joints moves with: that of the bone which ends there."""
 
-_REACH_M = 0.16
-"""Points farther than this from the middle of the hand are none of it."""
-_MARGIN_PX = 24
-"""Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
-_SQUARE = np.ones((3, 3), np.uint8)
+FACING_M = 0.005
+"""Seen points that lie farther than this beyond the wrist belong to the arm."""
+ALONG_BONE = (0.25, 0.6, 0.9)
+"""Where on a bone's axis, in parts of its length, it is compared with the silhouette."""
+NEAREST_M = 0.05
+"""Depth below which points are projected as if they were this far."""
+SILHOUETTE_PX = 8.0
+LANDMARK_SIGMAS = 3.0
+"""Robust scales: from there on a residual counts less the larger it is (Geman and McClure)."""
+POINT_REACH = 0.4
+"""Likewise for seen points, in parts of `Refinement.reach_m`."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """How an estimate is refined.
+    """How an estimate is refined; see conf/refine/gauss_newton.yaml for what each does.
 
-    iterations: Gauss-Newton steps; 0 = none.
+    iterations: Gauss-Newton steps.
     points: seen points that are used at most.
     reach_m: points farther than this from the surface are no part of the hand.
     point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
@@ -77,243 +89,269 @@ class Refinement:
     carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
     """
 
-    iterations: int = 5
-    points: int = 500
-    reach_m: float = 0.025
-    point_m: float = 0.004
-    silhouette_px: float = 1.0
-    angle_rad: float = 0.25
-    damping: float = 1e-3
-    swaps: int = 128
-    swap_gain: float = 0.02
-    keep_gain: float = 0.01
-    steadying: Steadying = Steadying()
-    carry: float = 0.5
+    iterations: int
+    points: int
+    reach_m: float
+    point_m: float
+    silhouette_px: float
+    angle_rad: float
+    damping: float
+    swaps: int
+    swap_gain: float
+    keep_gain: float
+    steadying: Steadying
+    carry: float
+
+    def __post_init__(self) -> None:
+        least = {"iterations": 1, "points": 1, "swaps": 0}
+        for name, value in least.items():
+            remedy = ", or refine=none for no refinement" if name == "iterations" else ""
+            check_number(f"refine.{name}", getattr(self, name), value, whole=True, remedy=remedy)
+        for name in ("reach_m", "point_m", "silhouette_px", "angle_rad"):
+            check_number(f"refine.{name}", getattr(self, name), 0, above=True)
+        for name in ("damping", "swap_gain", "keep_gain"):
+            check_number(f"refine.{name}", getattr(self, name), 0)
+        check_number("refine.carry", self.carry, 0, 1)
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What the refinement sees of a frame, once a frame.
+def no_refinement() -> None:
+    """The filter's estimate as it is: refine=none."""
 
-    points_m: (P, 3) seen points of the hand and the arm.
-    nearest_px: (h, w, 2) for each pixel of a crop the nearest pixel (u, v) of the image that is
-        not background. The crop holds all of these and a margin.
-    k: (3, 3) of the image.
-    size: (H, W) of the image.
-    corner: row and column of the crop's first pixel.
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Where the joints are, as somebody else found them.
+
+    points_m: (21, 3) in the camera frame, the same for all hypotheses, or (N, 21, 3).
+    sigma_m: (21,) or (N, 21) their standard deviations; inf where a joint was not found.
     """
 
     points_m: Tensor
-    nearest_px: Tensor
-    k: Tensor
-    size: tuple[int, int]
-    corner: tuple[int, int] = (0, 0)
+    sigma_m: Tensor
 
-
-def surroundings(observation: Observation, around_m: Tensor, count: int) -> Surroundings:
-    """Points of the silhouette within a hand's reach of `around_m` (3,), at most `count` of them.
-
-    Pixels on depth edges are left out: they mix foreground and background.
-    """
-    # Whatever is not behind the hand may hide it or be it.
-    hand = observation.hand.cpu().numpy()
-    solid = hand | observation.occluder.cpu().numpy()
-    left, top, wide, high = cv2.boundingRect(solid.view(np.uint8))
-    left, right = max(0, left - _MARGIN_PX), min(solid.shape[1], left + wide + _MARGIN_PX)
-    top, bottom = max(0, top - _MARGIN_PX), min(solid.shape[0], top + high + _MARGIN_PX)
-    part = slice(top, bottom), slice(left, right)
-    solid, depth = solid[part], observation.depth_m.cpu().numpy()[part]
-    far = np.where(depth > 0, depth, np.float32(10.0))
-    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < 0.03
-    u, v = _pixels(hand[part] & smooth)
-    z = depth[v, u]
-    k = observation.k.cpu().numpy()
-    points = np.stack(((u + left - k[0, 2]) / k[0, 0] * z, (v + top - k[1, 2]) / k[1, 1] * z, z), 1)
-    points = points[np.square(points - around_m.cpu().numpy()).sum(1) < _REACH_M**2]
-    points = points[:: max(1, -(-len(points) // count))]
-    _, labels = cv2.distanceTransformWithLabels(
-        (~solid).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    u, v = _pixels(solid)
-    lookup = np.zeros((len(u) + 1, 2), np.float32)
-    lookup[labels[v, u]] = np.stack((u + left, v + top), 1)
-    device = observation.depth_m.device
-    return Surroundings(
-        torch.from_numpy(points.astype(np.float32)).to(device),
-        torch.from_numpy(lookup.take(labels, 0)).to(device),
-        observation.k,
-        tuple(observation.hand.shape),
-        (top, left),
-    )
-
-
-def _pixels(mask: np.ndarray) -> np.ndarray:
-    """Columns and rows of the pixels of a mask, (2, n) int32, row by row."""
-    found = cv2.findNonZero(mask.view(np.uint8))
-    return np.zeros((2, 0), np.int32) if found is None else found.reshape(-1, 2).T
+    def of_each(self, n: int) -> Landmarks:
+        """(n, 21, 3) and (n, 21); what is no number becomes a joint that was not found."""
+        points = self.points_m.expand(n, 21, 3)
+        known = points.isfinite().all(-1) & (self.sigma_m > 0)
+        sigma = torch.where(known, self.sigma_m, torch.inf)
+        return Landmarks(torch.where(known[..., None], points, 0.0), sigma)
 
 
 class Refiner(Protocol):
     """Brings hands of one shape onto the seen points."""
 
     def __call__(
-        self, state: Tensor, prior_angles: Tensor, seen: Surroundings, settings: Refinement
+        self,
+        states: Tensor,
+        prior_angles: Tensor,
+        seen: SeenPoints,
+        settings: Refinement,
+        landmarks: Landmarks | None = None,
     ) -> Tensor:
         """See refine."""
 
-    def joints(self, state: Tensor) -> Tensor:
-        """(1, 27) to the joints (21, 3), camera frame, metres."""
+    def joints(self, states: Tensor) -> Tensor:
+        """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
 
 
-@dataclass(frozen=True)
 class TorchRefiner:
     """The reference, which runs everywhere."""
 
-    shape: HandShape
-    surface: HandSurface
+    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
+        """shape: on the device of the states to come.  surface: instead of the shape's own."""
+        self.shape = shape
+        self.surface = surface or hand_surface(shape)
 
     def __call__(
-        self, state: Tensor, prior_angles: Tensor, seen: Surroundings, settings: Refinement
+        self,
+        states: Tensor,
+        prior_angles: Tensor,
+        seen: SeenPoints,
+        settings: Refinement,
+        landmarks: Landmarks | None = None,
     ) -> Tensor:
         """See refine."""
-        return refine(state, prior_angles, seen, self.shape, self.surface, settings)
+        return refine(states, prior_angles, seen, self.shape, self.surface, settings, landmarks)
 
-    def joints(self, state: Tensor) -> Tensor:
+    def joints(self, states: Tensor) -> Tensor:
         """See Refiner."""
-        return forward_kinematics(state, self.shape).joints_m[0]
+        return forward_kinematics(states, self.shape).joints_m
 
 
-def make_refiner(shape: HandShape, surface: HandSurface, scorer: str) -> Refiner:
-    """The refiner that goes with a scoring back end: compiled where that is "numba"."""
-    if scorer == "numba" and shape.base_m.device.type == "cpu":
-        from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+class Residuals(NamedTuple):
+    """R residuals of N hypotheses, in standard deviations.
 
-        return CompiledRefiner(shape, surface)
-    return TorchRefiner(shape, surface)
+    rows: (N, R, 27) their derivatives by translation, rotation and angles.  values: (N, R).
+    """
+
+    rows: Tensor
+    values: Tensor
 
 
 def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame: Tensor) -> Tensor:
     """How n.X changes with the 27 degrees of freedom for points X that move with frames.
 
-    pose: of one hand.  x, n: (P, 3) points and directions in the camera frame.
-    frame: (P,) which of the 16 frames each point is attached to.
-    Returns (P, 27): translation, small rotation about the wrist in the camera frame, angles.
+    pose: of N hands.  x, n: (N, P, 3) points and directions in the camera frame.
+    frame: (P,) or (N, P) which of the 16 frames each point is attached to.
+    Returns (N, P, 27): translation, small rotation about the wrist in the camera frame, angles.
     """
-    frames, origins = pose.frames[0], pose.origins_m[0]
-    base = (frames[0] @ shape.base_frames[:, :, 2].mT).mT
-    axes = torch.cat((frames[1:, :, 0], base, frames[1:2, :, 2]))[_AXIS_ROW]
+    frames, origins = pose.frames, pose.origins_m
+    base = (frames[:, 0] @ shape.base_frames[:, :, 2].mT).mT
+    axes = torch.cat((frames[:, 1:, :, 0], base, frames[:, 1:2, :, 2]), 1)[:, _AXIS_ROW]
     if shape.side == "left":  # a mirror turns the sense of rotation round
         axes = -axes
     # n.(a x (X - o)) = (n x a).(o - X) = a.((X - o) x n)
     arm_moment = torch.linalg.cross(x, n)
-    turning = arm_moment @ axes.mT - n @ torch.linalg.cross(axes, origins[_ORIGIN_ROW]).mT
+    turning = arm_moment @ axes.mT - n @ torch.linalg.cross(axes, origins[:, _ORIGIN_ROW]).mT
     by_angle = turning * torch.tensor(_MOVES, device=x.device)[frame]
-    by_rotation = torch.linalg.cross(x - origins[0], n)
-    return torch.cat((n, by_rotation, by_angle), 1)
+    by_rotation = torch.linalg.cross(x - origins[:, :1], n)
+    return torch.cat((n, by_rotation, by_angle), -1)
 
 
 def refine(
-    state: Tensor,
+    states: Tensor,
     prior_angles: Tensor,
-    seen: Surroundings,
+    seen: SeenPoints,
     shape: HandShape,
     surface: HandSurface,
     settings: Refinement,
+    landmarks: Landmarks | None = None,
 ) -> Tensor:
-    """Bring one hand onto the seen points.
+    """Bring N hands onto the seen points, each by itself.
 
-    state: (1, 27).  prior_angles: (1, 21) the pose that the filter believes in.
-    Returns (1, 27).
+    states: (N, 27).  prior_angles: (N, 21) the poses that the filter believes in.
+    landmarks: joints that are known besides.
+    Returns (N, 27); a hand within whose reach nothing is seen, and of which no landmark is known,
+    stays as it is.
     """
-    limits = state.new_tensor(ANGLE_LIMITS)
+    middle = forward_kinematics(states, shape).joints_m.mean(1)
+    points, there = seen.around(middle, settings.points)
+    informed = there.any(1)
+    if landmarks is not None:
+        landmarks = landmarks.of_each(len(states))
+        informed = informed | landmarks.sigma_m.isfinite().any(1)
+    refined = states
     for _ in range(settings.iterations):
-        pose = forward_kinematics(state, shape)
-        rows, residuals, _ = linearised(pose, seen, shape, surface, settings)
-        normal = rows.mT @ rows
-        gradient = rows.mT @ residuals
-        angles = torch.arange(6, 27, device=state.device)
-        weight = settings.angle_rad**-2
-        normal[angles, angles] += weight
-        gradient[6:] += weight * (state - torch.nn.functional.pad(prior_angles, (6, 0)))[0, 6:]
-        diagonal = normal.diagonal()
-        damped = normal + torch.diag(settings.damping * diagonal.mean() + 1e-3 * diagonal)
-        step = -torch.linalg.solve(damped, gradient)
-        turned = roma.rotvec_composition((step[None, 3:6], state[:, 3:6]))
-        bent = (state[0, 6:] + step[6:]).clamp(limits[:, 0], limits[:, 1])
-        state = torch.cat((state[:, :3] + step[None, :3], turned, bent[None]), 1)
-    return state
+        pose = forward_kinematics(refined, shape)
+        parts = [
+            point_residuals(pose, points, there, shape, surface, settings),
+            silhouette_residuals(pose, seen, shape, settings),
+        ]
+        if landmarks is not None:
+            parts.append(landmark_residuals(pose, landmarks, shape))
+        rows, values = (torch.cat(part, 1) for part in zip(*parts, strict=True))
+        step = _step(rows, values, refined[:, 6:] - prior_angles, settings)
+        refined = _moved(refined, step)
+    return torch.where(informed[:, None], refined, states)
 
 
-def linearised(
-    pose: HandPose,
-    seen: Surroundings,
-    shape: HandShape,
-    surface: HandSurface,
-    settings: Refinement,
+def _step(rows: Tensor, values: Tensor, off_prior: Tensor, settings: Refinement) -> Tensor:
+    """(N, 27) the damped step that lowers the squared residuals and the distance to the prior."""
+    normal = rows.mT @ rows
+    gradient = (rows.mT @ values[..., None])[..., 0]
+    angles = torch.arange(6, 27, device=rows.device)
+    weight = settings.angle_rad**-2
+    normal[:, angles, angles] += weight
+    gradient[:, 6:] += weight * off_prior
+    diagonal = normal.diagonal(dim1=1, dim2=2)
+    damping = settings.damping * diagonal.mean(1, keepdim=True) + 1e-3 * diagonal
+    # Hands that are no numbers stay so, and stop nobody else.
+    return -torch.linalg.solve_ex(normal + damping.diag_embed(), gradient).result
+
+
+def _moved(states: Tensor, step: Tensor) -> Tensor:
+    """States after a step of translation, rotation in the camera frame and angles, in limits."""
+    limits = states.new_tensor(ANGLE_LIMITS)
+    turned = roma.rotvec_composition((step[:, 3:6], states[:, 3:6]))
+    bent = (states[:, 6:] + step[:, 6:]).clamp(limits[:, 0], limits[:, 1])
+    return torch.cat((states[:, :3] + step[:, :3], turned, bent), 1)
+
+
+def nearest_ellipsoids(
+    pose: HandPose, points: Tensor, surface: HandSurface
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What the seen points and the silhouette say of a pose, in standard deviations.
+    """The hand's ellipsoid that is nearest to each of the points (N, P, 3).
 
-    Returns the Jacobian (R, 27), the residuals (R,) and the points that they are about (R, 3).
+    Returns the first-order distance to it (N, P), metres, below 0 inside; which it is (N, P); and
+    its normal there (N, P, 3).
     """
-    parts = (
-        _point_rows(pose, seen.points_m, shape, surface, settings),
-        _silhouette_rows(pose, seen, shape, settings),
-    )
-    rows, residuals, points = (torch.cat(part) for part in zip(*parts, strict=True))
-    return rows, residuals, points
-
-
-def _point_rows(
-    pose: HandPose,
-    points: Tensor,
-    shape: HandShape,
-    surface: HandSurface,
-    settings: Refinement,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Weighted rows of the seen points: (P, 27), (P,) in standard deviations, (P, 3)."""
     ellipsoids = surface.pose(pose)
-    centres, axes = ellipsoids.centres_m[0, :-1], ellipsoids.axes_m[0, :-1]
-    whiten = axes.mT / axes.square().sum(-2)[..., None]  # (E, 3, 3)
+    centres, axes = ellipsoids.centres_m[:, :-1], ellipsoids.axes_m[:, :-1]
+    whiten = axes.mT / axes.square().sum(-2)[..., None]  # (N, E, 3, 3)
     # First-order distance to each ellipsoid: (|q| - 1) |q| / |W'q| with q = W (p - c).
-    q = points @ whiten.mT - (whiten @ centres[..., None]).mT  # (E, P, 3)
+    q = points[:, None] @ whiten.mT - (whiten @ centres[..., None]).mT  # (N, E, P, 3)
     gradient = q @ whiten
     length, steepness = q.norm(dim=-1), gradient.norm(dim=-1).clamp(min=1e-6)
-    distance, nearest = ((length - 1) * length / steepness).min(0)
-    index = torch.arange(len(points), device=points.device)
-    normals = gradient[nearest, index] / steepness[nearest, index, None]
+    distance, nearest = ((length - 1) * length / steepness).min(1)
+    chosen = nearest[:, None, :, None].expand(-1, 1, -1, 3)
+    normals = (gradient / steepness[..., None]).gather(1, chosen)[:, 0]
+    return distance, nearest, normals
+
+
+def point_residuals(
+    pose: HandPose,
+    points: Tensor,
+    there: Tensor,
+    shape: HandShape,
+    surface: HandSurface,
+    settings: Refinement,
+) -> Residuals:
+    """Of the seen points (N, P, 3) that are there (N, P): their distances from the surface."""
+    distance, nearest, normals = nearest_ellipsoids(pose, points, surface)
     # Seen surfaces face the camera; what lies beyond the wrist is the arm.
     facing = (normals * points).sum(-1) < 0
-    beyond = (points - pose.origins_m[0, 0]) @ pose.frames[0, 0, :, 1] > 0.005
-    use = facing & ~beyond & (distance.abs() < settings.reach_m)
+    off_wrist = points - pose.origins_m[:, :1]
+    beyond = (off_wrist @ pose.frames[:, 0, :, 1, None])[..., 0] > FACING_M
+    use = there & facing & ~beyond & (distance.abs() < settings.reach_m)
     # Geman and McClure's robust weight, which forgets outliers.
-    weight = use / (1 + (distance / (0.4 * settings.reach_m)).square()) / settings.point_m
-    x = points - distance[:, None] * normals
+    weight = use / (1 + (distance / (POINT_REACH * settings.reach_m)).square()) / settings.point_m
+    x = points - distance[..., None] * normals
     rows = point_jacobian(pose, shape, x, normals, surface.frame_index[nearest])
     # The model's surface moves towards the point: the distance falls as n.X grows.
-    return -rows * weight[:, None], distance * weight, x
+    return Residuals(-rows * weight[..., None], distance * weight)
 
 
-def _silhouette_rows(
-    pose: HandPose, seen: Surroundings, shape: HandShape, settings: Refinement
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Weighted rows that draw the bones' axes into the silhouette, two for each point."""
-    frames, origins = pose.frames[0, 1:], pose.origins_m[0, 1:]
-    parts = origins.new_tensor([0.25, 0.6, 0.9])
-    along = -frames[:, :, 1] * shape.bone_lengths_m.flatten()[:, None]
-    x = (origins[:, None] + parts[:, None] * along[:, None]).flatten(0, 1)
+def silhouette_residuals(
+    pose: HandPose, seen: SeenPoints, shape: HandShape, settings: Refinement
+) -> Residuals:
+    """Of points on the bones' axes: how far they stick out of the silhouette, in u and in v."""
+    frames, origins = pose.frames[:, 1:], pose.origins_m[:, 1:]
+    (top, left), (high, wide) = seen.corner, seen.nearest_px.shape[:2]
+    if high == 0:
+        return Residuals(frames.new_zeros(len(frames), 0, 27), frames.new_zeros(len(frames), 0))
+    parts = origins.new_tensor(ALONG_BONE)
+    along = -frames[..., 1] * shape.bone_lengths_m.flatten()[:, None]
+    x = (origins[:, :, None] + parts[:, None] * along[:, :, None]).flatten(1, 2)
     frame = torch.arange(1, 16, device=x.device).repeat_interleave(len(parts))
     height, width = seen.size
-    k, z = seen.k, x[:, 2].clamp(min=0.05)
-    u, v = k[0, 0] * x[:, 0] / z + k[0, 2], k[1, 1] * x[:, 1] / z + k[1, 2]
+    k, z = seen.k, x[..., 2].clamp(min=NEAREST_M)
+    u, v = k[0, 0] * x[..., 0] / z + k[0, 2], k[1, 1] * x[..., 1] / z + k[1, 2]
     inside = (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
-    (top, left), (high, wide) = seen.corner, seen.nearest_px.shape[:2]
-    column = (u.round().long() - left).clamp(0, wide - 1)
-    row = (v.round().long() - top).clamp(0, high - 1)
-    gap = torch.stack((u, v), 1) - seen.nearest_px[row, column]
-    outside = gap.norm(dim=1)
-    weight = (inside & (outside > 1.0)) / (1 + (outside / 8.0).square()) / settings.silhouette_px
+    column = (u.nan_to_num().round().long() - left).clamp(0, wide - 1)
+    row = (v.nan_to_num().round().long() - top).clamp(0, high - 1)
+    gap = torch.stack((u, v), -1) - seen.nearest_px[row, column]
+    outside = gap.norm(dim=-1)
+    weight = (inside & (outside > 1.0)) / (1 + (outside / SILHOUETTE_PX).square())
+    weight = weight.repeat(1, 2) / settings.silhouette_px
     zero = torch.zeros_like(z)
-    by_u = torch.stack((k[0, 0] / z, zero, -k[0, 0] * x[:, 0] / z.square()), 1)
-    by_v = torch.stack((zero, k[1, 1] / z, -k[1, 1] * x[:, 1] / z.square()), 1)
-    rows = point_jacobian(pose, shape, x.repeat(2, 1), torch.cat((by_u, by_v)), frame.repeat(2))
-    return rows * weight.repeat(2)[:, None], gap.mT.flatten() * weight.repeat(2), x.repeat(2, 1)
+    by_u = torch.stack((k[0, 0] / z, zero, -k[0, 0] * x[..., 0] / z.square()), -1)
+    by_v = torch.stack((zero, k[1, 1] / z, -k[1, 1] * x[..., 1] / z.square()), -1)
+    by = torch.cat((by_u, by_v), 1)
+    rows = point_jacobian(pose, shape, x.repeat(1, 2, 1), by, frame.repeat(2))
+    return Residuals(rows * weight[..., None], gap.mT.flatten(1) * weight)
+
+
+def landmark_residuals(pose: HandPose, landmarks: Landmarks, shape: HandShape) -> Residuals:
+    """Of the joints: how far they are from their landmarks, along each of the camera's axes.
+
+    landmarks: of each of the N hands, see Landmarks.of_each.
+    """
+    gap = pose.joints_m - landmarks.points_m
+    sigma = landmarks.sigma_m
+    away = (gap.norm(dim=-1) / (LANDMARK_SIGMAS * sigma)).square()
+    weight = (1 / ((1 + away) * sigma)).repeat_interleave(3, 1)
+    x = pose.joints_m.repeat_interleave(3, 1)
+    n = torch.eye(3, dtype=x.dtype, device=x.device).repeat(21, 1).expand_as(x)
+    frame = torch.tensor(JOINT_FRAME, device=x.device).repeat_interleave(3)
+    rows = point_jacobian(pose, shape, x, n, frame)
+    return Residuals(rows * weight[..., None], gap.flatten(1) * weight)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
+from toftrack.compute.backend import Motions
 from toftrack.refinement.proposals import FINGER_OF_ANGLE
-from toftrack.tracking import particle_filter as sir
 
 
 @dataclass(frozen=True)
@@ -22,15 +23,20 @@ class Steadying:
         movement more surely and later.
     """
 
-    translation_m: float = 0.003
-    rotation_rad: float = 0.03
-    finger_rad: float = 0.12
-    calm: float = 4.0
-    memory: float = 0.85
+    translation_m: float
+    rotation_rad: float
+    finger_rad: float
+    calm: float
+    memory: float
+
+    def __post_init__(self) -> None:
+        for name in ("translation_m", "rotation_rad", "finger_rad", "calm"):
+            check_number(f"refine.steadying.{name}", getattr(self, name), 0)
+        check_number("refine.steadying.memory", self.memory, 0, 1)
 
 
 def steadied(
-    state: Tensor, before: Tensor, trend: Tensor | None, settings: Steadying
+    state: Tensor, before: Tensor, trend: Tensor | None, settings: Steadying, motions: Motions
 ) -> tuple[Tensor, Tensor]:
     """Take less of a change the more it looks like noise, so that a still hand does not tremble.
 
@@ -44,7 +50,7 @@ def steadied(
     trend: (27,) mean change a frame as of the last frame; None at the start.
     Returns the (1, 27) pose to believe and the trend.
     """
-    change = sir.difference(state, before)[0]
+    change = motions.difference(state, before)[0]
     trend = change if trend is None else torch.lerp(change, trend, settings.memory)
     of_angle = torch.tensor(FINGER_OF_ANGLE, device=state.device)
     group = torch.cat((of_angle.new_tensor([5, 5, 5, 6, 6, 6]), of_angle))
@@ -61,4 +67,4 @@ def steadied(
     noise = noise * (1 + settings.calm / (1 + moving**6)) ** 2
     square = size_squared(change)
     part = square / (square + noise)
-    return sir.compose(before, (change * part[group])[None]), trend
+    return motions.compose(before, (change * part[group])[None]), trend

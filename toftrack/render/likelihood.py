@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.segmentation import Observation
@@ -24,8 +25,8 @@ NAMINGS = ("printed", "standard")
 class FMeasure:
     """The paper's F-measure of correct, false and missed pixels.
 
-    tolerance_m: a model pixel is correct when its depth is within this of the image's (paper:
-    0.02).
+    tolerance_m: a model pixel is correct when its depth is within this of the image's (the paper:
+        0.02).
     neighbourhood_m: missed pixels count up to this distance from the silhouette, at the hand's
         depth ("in proportion to the finger's length": about a third of a finger).
     beta: weight of the second of the two rates (paper: 1.5).
@@ -39,22 +40,23 @@ class FMeasure:
         content with a hand of which only a few pixels lie inside the image.
     """
 
-    tolerance_m: float = 0.02
-    neighbourhood_m: float = 0.025
-    beta: float = 1.5
-    naming: str = "standard"
-    residual_weight: float = 0.0
-    coverage: float = 0.0
+    tolerance_m: float
+    neighbourhood_m: float
+    beta: float
+    naming: str
+    residual_weight: float
+    coverage: float
 
     def __post_init__(self) -> None:
         if self.naming not in NAMINGS:
             raise ToftrackError(
                 f"likelihood.naming={self.naming} is unknown; give one of {', '.join(NAMINGS)}"
             )
-        if not (self.tolerance_m > 0 and self.neighbourhood_m >= 0 and self.beta > 0):
-            raise ToftrackError(
-                "likelihood: tolerance_m and beta must be above 0 and neighbourhood_m not below 0"
-            )
+        check_number("likelihood.tolerance_m", self.tolerance_m, 0, above=True)
+        check_number("likelihood.neighbourhood_m", self.neighbourhood_m, 0)
+        check_number("likelihood.beta", self.beta, 0, above=True)
+        check_number("likelihood.residual_weight", self.residual_weight, 0, 1)
+        check_number("likelihood.coverage", self.coverage, 0)
 
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""

@@ -1,5 +1,4 @@
-"""Counting correct, false and missed pixels of N hypotheses: the one function every back end
-offers.
+"""Counting correct, false and missed pixels of hypotheses: what every back end offers.
 
 A back end is a callable from hand states to Counts. What counts as correct is decided once a frame
 by the likelihood and handed over as Evidence: images of inverse depth to compare with, so that a
@@ -8,19 +7,10 @@ back end knows geometry and pixels but no policy.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import torch
 from torch import Tensor
-
-from toftrack.errors import ToftrackError
-from toftrack.hand.shape import HandShape
-
-log = logging.getLogger(__name__)
-
-BACK_ENDS = ("torch", "numba", "triton")
 
 
 @dataclass(frozen=True)
@@ -77,37 +67,3 @@ class Scorer(Protocol):
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """states: (N, 27) on the evidence's device. Pixels outside the image count as nothing."""
-
-
-def make_scorer(name: str, shape: HandShape, device: torch.device) -> Scorer:
-    """The back end of a name in BACK_ENDS, or `auto`: the fastest that works here.
-
-    shape: sizes of the hand that all hypotheses share.
-    Raises ToftrackError for an unknown name or a back end that cannot run here.
-    """
-    shape = shape.to(device)
-    if name == "torch":
-        from toftrack.render.torch_scorer import TorchScorer
-
-        return TorchScorer(shape)
-    if name == "auto":
-        wanted = "triton" if device.type == "cuda" else "numba"
-    elif name in BACK_ENDS:
-        wanted = name
-    else:
-        raise ToftrackError(f"renderer={name} is unknown; give one of auto, {', '.join(BACK_ENDS)}")
-    try:
-        if wanted == "numba":
-            from toftrack.render.numba.scorer import NumbaScorer
-
-            return NumbaScorer(shape)
-        from toftrack.render.triton.scorer import TritonScorer
-
-        return TritonScorer(shape)
-    except ImportError as error:
-        if name != "auto":
-            raise ToftrackError(
-                f"renderer={name} cannot run here ({error}); install it or give renderer=torch"
-            ) from None
-        log.info("renderer: %s is not available (%s), using torch", wanted, error)
-        return make_scorer("torch", shape, device)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
+
+from toftrack.checks import check_number
 
 
 @dataclass(frozen=True)
@@ -42,19 +45,6 @@ class Observation:
             k=self.k.to(device),
         )
 
-    def cropped(self, left: int, top: int, right: int, bottom: int) -> Observation:
-        """The part [top, bottom) x [left, right) with intrinsics to match."""
-        k = self.k.clone()
-        k[0, 2] -= left
-        k[1, 2] -= top
-        return replace(
-            self,
-            depth_m=self.depth_m[top:bottom, left:right].contiguous(),
-            hand=self.hand[top:bottom, left:right].contiguous(),
-            occluder=self.occluder[top:bottom, left:right].contiguous(),
-            k=k,
-        )
-
 
 @dataclass(frozen=True)
 class Expected:
@@ -68,7 +58,8 @@ class Expected:
 class NearestSurface:
     """The nearest thing in front of the camera is the hand (paper, section 2.1).
 
-    depth_range_m: everything that is more than this behind the nearest point is dropped (0.20).
+    depth_range_m: everything that is more than this behind the nearest point is dropped (the
+        paper: 0.20).
     min_area_m2: the nearest point must belong to a surface of at least this area, so that noisy and
         flying pixels are no hand. 0 takes the single nearest pixel, as the paper.
     max_distance_m: nothing beyond this is a hand.
@@ -77,11 +68,17 @@ class NearestSurface:
     max_pixels: images with more pixels are reduced by a whole factor to at most this many.
     """
 
-    depth_range_m: float = 0.20
-    min_area_m2: float = 0.0008
-    max_distance_m: float = 1.2
-    occluder_margin_m: float = 0.035
-    max_pixels: int = 40_000
+    depth_range_m: float
+    min_area_m2: float
+    max_distance_m: float
+    occluder_margin_m: float
+    max_pixels: int
+
+    def __post_init__(self) -> None:
+        for name in ("depth_range_m", "min_area_m2", "occluder_margin_m"):
+            check_number(f"segmentation.{name}", getattr(self, name), 0)
+        check_number("segmentation.max_distance_m", self.max_distance_m, 0, above=True)
+        check_number("segmentation.max_pixels", self.max_pixels, 1, whole=True)
 
     def __call__(
         self, depth_m: np.ndarray, k: np.ndarray, expected: Expected | None = None
@@ -118,32 +115,48 @@ class NearestSurface:
         )
 
     def _nearest(self, depth_m: np.ndarray, valid: np.ndarray, focal_area: float) -> float:
-        candidates = valid.copy()
-        while candidates.any():
-            lowest = cv2.minMaxLoc(depth_m, candidates.view(np.uint8))
-            nearest, (column, row) = lowest[0], lowest[2]
+        """Depth of the nearest surface that is large enough for a hand; inf where there is none."""
+        dropped = np.ones((depth_m.shape[0] + 2, depth_m.shape[1] + 2), np.uint8)
+        inside = dropped[1:-1, 1:-1]
+        inside[:] = ~valid
+        flags = 4 | cv2.FLOODFILL_FIXED_RANGE | cv2.FLOODFILL_MASK_ONLY | (1 << 8)
+        for row, column in _nearest_first(depth_m, valid):
+            if inside[row, column]:
+                continue
+            nearest = float(depth_m[row, column])
             if self.min_area_m2 <= 0:
                 return nearest
-            near = (candidates & (depth_m <= nearest + self.depth_range_m)).view(np.uint8)
-            _, labels = cv2.connectedComponents(near, connectivity=4)
-            label = labels[row, column]
-            area = np.count_nonzero(labels == label) * nearest**2 / focal_area
-            if area >= self.min_area_m2:
+            # What hangs together with it, down to the depth that a hand has, is looked at once and
+            # dropped: too small for a hand, it is a speck.
+            up_to = float(self.depth_range_m)
+            pixels = cv2.floodFill(depth_m, dropped, (column, row), 0, 0, up_to, flags)[0]
+            if pixels * nearest**2 / focal_area >= self.min_area_m2:
                 return nearest
-            # Too small for a hand: drop the speck and everything as small in front of the rest.
-            candidates &= labels != label
         return float("inf")
+
+
+def _nearest_first(depth_m: np.ndarray, valid: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Row and column of the valid pixels; they are only sorted if the first one does not do."""
+    if not valid.any():
+        return
+    column, row = cv2.minMaxLoc(depth_m, valid.view(np.uint8))[2]
+    yield row, column
+    rows, columns = np.nonzero(valid)
+    order = np.argsort(depth_m[rows, columns], kind="stable")
+    yield from zip(rows[order].tolist(), columns[order].tolist(), strict=True)
 
 
 def reduce_image(
     depth_m: np.ndarray, k: np.ndarray, max_pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce an image by a whole factor, keeping real depths: the median-filtered pixel in the
-    middle of each block, so that no new flying pixels arise. Returns the image and its intrinsics.
+    """Reduce an image by a whole factor; returns the image and its intrinsics.
+
+    Depths stay real ones: the median-filtered pixel in the middle of each block, so that no new
+    flying pixels arise.
     """
     factor = int(np.ceil(np.sqrt(depth_m.size / max_pixels)))
     if factor <= 1:
-        return np.ascontiguousarray(depth_m, dtype=np.float32), k
+        return np.require(depth_m, np.float32, ("C", "W")), k
     filtered = cv2.medianBlur(np.ascontiguousarray(depth_m, dtype=np.float32), 3 + 2 * (factor > 2))
     offset = (factor - 1) // 2
     small = filtered[offset::factor, offset::factor]

@@ -30,7 +30,7 @@ def filtered(
         with spans("filter: scoring"):
             return frame.log_scores(states)
 
-    particles = particle_filter.compose(track.particles, track.velocity[None])
+    particles = model.backend.motions.compose(track.particles, track.velocity[None])
     # A hand that was nearly lost is looked for farther away.
     width = 1.0 + track.bad
     sigmas = width * particle_filter.widened(
@@ -45,6 +45,7 @@ def filtered(
         model.space.lower,
         model.space.upper,
         model.filter,
+        model.backend.motions,
         generator,
     )
 
@@ -79,18 +80,19 @@ def advanced(
 
     expected: where the hand was looked for, if something hides part of it.
     """
-    cfg, lower, upper = model.filter, model.space.lower, model.space.upper
+    cfg, motions = model.filter, model.backend.motions
+    lower, upper = model.space.lower, model.space.upper
     particles, mean, offset = found.particles, found.mean, track.offset
     if model.refinement is not None:
         # The particles follow the refined estimate, and what the space cannot say of its pose
         # is remembered beside them.
-        change = particle_filter.difference(found.refined, mean)
-        particles = particle_filter.compose(particles, change)
+        change = motions.difference(found.refined, mean)
+        particles = motions.compose(particles, change)
         particles[:, 6:] = particle_filter.bound(particles[:, 6:], lower, upper, "truncate")
         mean, offset = found.refined, model.refinement.carry * found.offset
     velocity = torch.zeros_like(track.velocity)
     if track.age > 0:
-        moved = particle_filter.difference(mean, track.mean)[0]
+        moved = motions.difference(mean, track.mean)[0]
         keep = cfg.velocity_smoothing
         velocity = keep * track.velocity + (1 - keep) * cfg.velocity * moved
     return Track(
@@ -126,8 +128,8 @@ def expected_depths(track: Track | None, hand: SizedHand, model: TrackerModel) -
     """Where the next frame is looked for the hand, one movement ahead; None where there is none."""
     if track is None:
         return None
-    ahead = model.decode(particle_filter.compose(track.mean, track.velocity[None]))
-    nearest, farthest = map(float, hand.refiner.joints(ahead)[:, 2].aminmax())
+    ahead = model.decode(model.backend.motions.compose(track.mean, track.velocity[None]))
+    nearest, farthest = map(float, hand.refiner.joints(ahead)[0, :, 2].aminmax())
     if track.expected is not None:
         # A hidden finger is free to move in front of what hides it, which would then be taken for
         # the hand: while something hides the hand, it comes nearer only as its middle does.

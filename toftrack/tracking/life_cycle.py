@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+from toftrack.checks import check_number
 from toftrack.tracking.state import Track
 
 
@@ -17,6 +19,15 @@ class LostSettings:
     probation: int
     rival_gain: float
     outside_rad: float
+
+    def __post_init__(self) -> None:
+        for name in ("patience", "probation"):
+            check_number(f"lost.{name}", getattr(self, name), 0, whole=True)
+        for name in ("score", "start_score"):
+            check_number(f"lost.{name}", getattr(self, name), 0, 1)
+        check_number("lost.rival_gain", self.rival_gain, 0)
+        if self.outside_rad != math.inf:
+            check_number("lost.outside_rad", self.outside_rad, 0, remedy=", or .inf")
 
 
 @dataclass(frozen=True)

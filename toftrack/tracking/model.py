@@ -9,14 +9,14 @@ from functools import cached_property, lru_cache, partial
 import torch
 from torch import Tensor
 
+from toftrack.compute.backend import Backend
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand.shape import HandShape
-from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.density import LatentDensity, latent_density
-from toftrack.refinement.gauss_newton import Refinement, Refiner, make_refiner
+from toftrack.refinement.gauss_newton import Refinement, Refiner
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import Evidence, Scorer, make_scorer
+from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
@@ -59,8 +59,12 @@ class TrackerModel:
     lost: LostSettings
     fit: HandFit | None
     gestures: Gestures | None
-    renderer: str
-    device: torch.device
+    backend: Backend
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is computed."""
+        return self.backend.device
 
     @cached_property
     def sigmas(self) -> Tensor:
@@ -94,7 +98,7 @@ class TrackerModel:
 
     @cached_property
     def _hands(self) -> Callable[[str, float], SizedHand]:
-        return lru_cache(_HANDS)(partial(_sized_hand, self.shape, self.renderer, self.device))
+        return lru_cache(_HANDS)(partial(_sized_hand, self.shape, self.backend))
 
     def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
         """(N, 6 + d) particles to (N, 27) hand states, all displaced by `offset` (21,) rad."""
@@ -113,12 +117,9 @@ class TrackerModel:
         return particle, state[0, 6:] - self.space.decode(particle[:, 6:])[0]
 
 
-def _sized_hand(
-    shape: HandShape, renderer: str, device: torch.device, side: str, ratio: float
-) -> SizedHand:
+def _sized_hand(shape: HandShape, backend: Backend, side: str, ratio: float) -> SizedHand:
     sized = shape.of_side(side).scaled(ratio)
-    scorer = make_scorer(renderer, sized, device)
-    return SizedHand(sized, scorer, make_refiner(sized, hand_surface(sized), scorer.name))
+    return SizedHand(sized, backend.make_scorer(sized), backend.make_refiner(sized))
 
 
 @dataclass(frozen=True, eq=False)

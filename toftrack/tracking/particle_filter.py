@@ -1,30 +1,24 @@
 """Sequential importance resampling as pure functions on tensors (paper, section 2.3).
 
-A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector (3,
-rad)
-and d latent coordinates. Weights are kept as logarithms until they are used. Every function that
-draws takes an explicit generator on the particles' device.
-
-Differences between particles are taken in the tangent space of a reference: translation of the
-pivot, rotation vector of R R_ref', latent difference. The pivot is a point in the middle of the
-hand, so that turning the hand does not also carry it away, as turning about the wrist would.
+A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector
+(3, rad) and d latent coordinates; compute/rigid.py says how it is moved. Weights are kept as
+logarithms until they are used. Every function that draws takes an explicit generator on the
+particles' device.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
-from toftrack.compute.rigid import MOTIONS, PIVOT_M, mean_rotation, rotated_pivot
+from toftrack.compute.rigid import mean_rotation
 from toftrack.errors import ToftrackError
-
-__all__ = ["PIVOT_M", "mean_rotation", "rotated_pivot"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +33,10 @@ class Spread:
     depth_m: float
     rotation_rad: float
     latent: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            check_number(f"filter.spread.{field.name}", getattr(self, field.name), 0)
 
     def sigmas(self, lower: Tensor, upper: Tensor) -> Tensor:
         """(6 + d,) standard deviations in tangent coordinates."""
@@ -63,7 +61,7 @@ class FilterSettings:
     velocity_smoothing: float
     resampling: str
     bounds: str
-    density: float = 0.0
+    density: float
 
     def __post_init__(self) -> None:
         if self.resampling not in RESAMPLERS:
@@ -71,10 +69,17 @@ class FilterSettings:
                 f"filter.resampling={self.resampling} is unknown; give one of"
                 f" {', '.join(RESAMPLERS)}"
             )
-        if self.particles < 1 or self.passes < 1:
-            raise ToftrackError("filter.particles and filter.passes must be at least 1")
-        if not 0 <= self.density < math.inf:
-            raise ToftrackError("filter.density must be 0 or more")
+        if self.bounds not in BOUNDS:
+            raise ToftrackError(
+                f"filter.bounds={self.bounds} is unknown; give {' or '.join(BOUNDS)}"
+            )
+        for name in ("particles", "passes"):
+            check_number(f"filter.{name}", getattr(self, name), 1, whole=True)
+        for name in ("exponent", "exponent_growth", "shrink"):
+            check_number(f"filter.{name}", getattr(self, name), 0, above=True)
+        for name in ("rest", "speed_gain", "velocity", "density"):
+            check_number(f"filter.{name}", getattr(self, name), 0)
+        check_number("filter.velocity_smoothing", self.velocity_smoothing, 0, 1)
 
 
 def widened(sigmas: Tensor, velocity: Tensor, rest: float, gain: float) -> Tensor:
@@ -136,63 +141,40 @@ RESAMPLERS: dict[str, Callable[[Tensor, int, torch.Generator], Tensor]] = {
 }
 
 
-def compose(reference: Tensor, tangent: Tensor) -> Tensor:
-    """See rigid.compose."""
-    return _motions(reference).compose(reference, tangent)
-
-
-def difference(particles: Tensor, reference: Tensor) -> Tensor:
-    """See rigid.difference."""
-    return _motions(particles).difference(particles, reference)
-
-
-def _motions(particles: Tensor) -> Motions:
-    if particles.device.type != "cpu" or particles.dtype != torch.float32:
-        return MOTIONS
-    return _compiled()
-
-
-@functools.cache
-def _compiled() -> Motions:
-    try:
-        from toftrack.compute import rigid_numba
-    except ImportError:
-        return MOTIONS
-    return rigid_numba.motions()
+BOUNDS = ("truncate", "reflect")
 
 
 def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
     """Keep latent coordinates in their box, (N, d).
 
-    "truncate" moves what is outside onto the bound, as the paper, which draws estimates near a
-    bound away from where they should be and piles particles up on it; "reflect" folds it back.
+    mode: of BOUNDS. "truncate" moves what is outside onto the bound, as the paper, which draws
+        estimates near a bound away from where they should be and piles particles up on it;
+        "reflect" folds it back.
     """
     if mode == "truncate":
         return torch.minimum(torch.maximum(latent, lower), upper)
-    if mode == "reflect":
-        width = upper - lower
-        folded = torch.remainder(latent - lower, 2 * width)
-        return lower + torch.minimum(folded, 2 * width - folded)
-    raise ToftrackError(f"filter.bounds={mode} is unknown; give truncate or reflect")
+    width = upper - lower
+    folded = torch.remainder(latent - lower, 2 * width)
+    return lower + torch.minimum(folded, 2 * width - folded)
 
 
 def diffuse(
     particles: Tensor,
-    scale: Tensor,
+    sigmas: Tensor,
     lower: Tensor,
     upper: Tensor,
     mode: str,
+    motions: Motions,
     generator: torch.Generator,
 ) -> Tensor:
     """Move every particle by Gaussian noise inside the bounds of the pose space.
 
-    scale: (6 + d,) standard deviations, or (6 + d, 6 + d) a lower triangular factor of the
-        covariance, in tangent coordinates.
+    sigmas: (6 + d,) standard deviations in tangent coordinates.  mode: see bound.
     """
     noise = torch.randn(
         particles.shape, generator=generator, device=particles.device, dtype=particles.dtype
     )
-    moved = compose(particles, noise * scale if scale.dim() == 1 else noise @ scale.mT)
+    moved = motions.compose(particles, noise * sigmas)
     moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
     return moved
 
@@ -206,6 +188,7 @@ def annealed(
     lower: Tensor,
     upper: Tensor,
     settings: FilterSettings,
+    motions: Motions,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Resample - diffuse - observe, in passes of shrinking diffusion and sharper weights.
@@ -218,8 +201,15 @@ def annealed(
     """
     for number in range(settings.passes):
         chosen = RESAMPLERS[settings.resampling](weights, settings.particles, generator)
-        scale = sigmas * settings.shrink**number
-        particles = diffuse(particles[chosen], scale, lower, upper, settings.bounds, generator)
+        particles = diffuse(
+            particles[chosen],
+            sigmas * settings.shrink**number,
+            lower,
+            upper,
+            settings.bounds,
+            motions,
+            generator,
+        )
         log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
         prior = log_prior(particles)
         weights = normalise(log_weights if prior is None else log_weights + prior)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from toftrack.refinement.gauss_newton import Refinement, surroundings
+from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.proposals import swap_fingers
+from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.model import ObservedFrame
 from toftrack.tracking.state import Track
@@ -18,13 +19,8 @@ def improved(particles: Tensor, frame: ObservedFrame) -> Tensor:
     cfg = model.refinement
     if cfg is None:
         return particles
-    states = model.decode(particles)
-    for row in range(len(states)):
-        state = states[row : row + 1]
-        seen = surroundings(frame.observation, refiner.joints(state).mean(0), cfg.points)
-        if len(seen.points_m):
-            states[row] = refiner(state, state[:, 6:], seen, cfg)[0]
-    return model.encode(states)
+    states, seen = model.decode(particles), seen_points(frame.observation)
+    return model.encode(refiner(states, states[:, 6:], seen, cfg))
 
 
 def refined(
@@ -38,7 +34,8 @@ def refined(
     pose = _onto_points(pose, track.pose, frame, model.refinement, generator)
     if track.pose is None:
         return pose, track.trend
-    return steadied(pose, track.pose, track.trend, model.refinement.steadying)
+    steadying, motions = model.refinement.steadying, model.backend.motions
+    return steadied(pose, track.pose, track.trend, steadying, motions)
 
 
 def _onto_points(
@@ -49,21 +46,20 @@ def _onto_points(
     generator: torch.Generator,
 ) -> Tensor:
     """The filter's hand brought onto the seen points; `before` is the last one; (1, 27)."""
-    refiner = frame.hand.refiner
-    seen = surroundings(frame.observation, refiner.joints(state).mean(0), cfg.points)
-    if len(seen.points_m) == 0:
-        return state
+    refiner, seen = frame.hand.refiner, seen_points(frame.observation)
 
-    def onto_points(start: Tensor) -> Tensor:
-        return refiner(start, start[:, 6:], seen, cfg)
+    def onto_points(starts: Tensor) -> Tensor:
+        return refiner(starts, starts[:, 6:], seen, cfg)
 
-    found = onto_points(state)
-    if before is not None:
+    if before is None:
+        found = onto_points(state)
+    else:
         # The pose of the last frame stands until another one is clearly better: what the image
         # does not decide, such as a hidden finger, must not flicker.
-        kept = onto_points(torch.cat((state[:, :6], before[:, 6:]), 1))
-        scores = frame.log_scores(torch.cat((kept, found)))
-        found = kept if scores[0] + cfg.keep_gain >= scores[1] else found
+        as_before = torch.cat((state[:, :6], before[:, 6:]), 1)
+        both = onto_points(torch.cat((as_before, state)))
+        scores = frame.log_scores(both)
+        found = both[:1] if scores[0] + cfg.keep_gain >= scores[1] else both[1:]
     tried = swap_fingers(found, frame.model.poses, cfg.swaps, generator)
     scores = frame.log_scores(tried)
     best = int(scores.argmax())

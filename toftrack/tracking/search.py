@@ -11,12 +11,15 @@ import roma
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
+from toftrack.compute.backend import Motions
+from toftrack.compute.rigid import PIVOT_M
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.segmentation import Observation
-from toftrack.tracking import particle_filter as sir
 from toftrack.tracking.forearm import arm_sight, forearm_conflict
 from toftrack.tracking.palm_places import arm_exits, palm_centres
+from toftrack.tracking.particle_filter import Spread, diffuse
 
 _TURN_RAD = 0.3
 """Standard deviation of how far a hand has turned since it was lost."""
@@ -43,19 +46,25 @@ class LastSeen:
     age_s: float
 
 
-class Start(Protocol):
-    """Makes the first particles from a frame that is not empty."""
+@dataclass(frozen=True, eq=False)
+class Sought:
+    """What a start gets to see of a frame that is not empty, and of the hand that is sought in it.
 
-    def __call__(
-        self,
-        observation: Observation,
-        space: PoseSpace,
-        log_scores: LogScores,
-        improve: Improve,
-        last: LastSeen | None,
-        n: int,
-        generator: torch.Generator,
-    ) -> Tensor:
+    last: the hand as it was last believed, if it ever was.
+    """
+
+    observation: Observation
+    space: PoseSpace
+    motions: Motions
+    log_scores: LogScores
+    improve: Improve
+    last: LastSeen | None
+
+
+class Start(Protocol):
+    """Makes the first particles."""
+
+    def __call__(self, sought: Sought, n: int, generator: torch.Generator) -> Tensor:
         """(n, 6 + d) particles on the pose space's device."""
 
     def prior(self, observation: Observation, last: LastSeen | None) -> Prior:
@@ -71,9 +80,9 @@ class RoughStart:
     position_m, rotation_rad: standard deviations of the particles about it.
     """
 
-    pose: tuple[float, ...] | None = None
-    position_m: float = 0.01
-    rotation_rad: float = 0.1
+    pose: tuple[float, ...] | None
+    position_m: float
+    rotation_rad: float
 
     def __post_init__(self) -> None:
         if self.pose is not None and len(self.pose) != 6:
@@ -81,30 +90,25 @@ class RoughStart:
                 f"start.pose has {len(self.pose)} numbers; give six: translation in metres and"
                 " rotation vector in radians"
             )
+        for number, value in enumerate(self.pose or ()):
+            check_number(f"start.pose[{number}]", value)
+        for name in ("position_m", "rotation_rad"):
+            check_number(f"start.{name}", getattr(self, name), 0)
 
-    def __call__(
-        self,
-        observation: Observation,
-        space: PoseSpace,
-        log_scores: LogScores,
-        improve: Improve,
-        last: LastSeen | None,
-        n: int,
-        generator: torch.Generator,
-    ) -> Tensor:
+    def __call__(self, sought: Sought, n: int, generator: torch.Generator) -> Tensor:
         """See Start; nothing is scored."""
-        device = space.lower.device
+        space, device = sought.space, sought.space.lower.device
         reference = torch.zeros(1, 6 + space.dims, device=device)
         rows = [label == "palm" for label in space.training_labels]
         reference[0, 6:] = space.training_latents[rows.index(True) if True in rows else 0]
         if self.pose is not None:
             reference[0, :6] = torch.tensor(self.pose, device=device)
         else:
-            centre = torch.from_numpy(palm_centres(observation, 1, generator)[0]).to(device)
-            reference[0, :3] = centre - reference.new_tensor(sir.PIVOT_M)
-        spread = sir.Spread(self.position_m, self.position_m, self.rotation_rad, 0.0)
+            centre = torch.from_numpy(palm_centres(sought.observation, 1, generator)[0]).to(device)
+            reference[0, :3] = centre - reference.new_tensor(PIVOT_M)
+        spread = Spread(self.position_m, self.position_m, self.rotation_rad, 0.0)
         noise = torch.randn(n, 6 + space.dims, generator=generator, device=device)
-        return sir.compose(reference, noise * spread.sigmas(space.lower, space.upper))
+        return sought.motions.compose(reference, noise * spread.sigmas(space.lower, space.upper))
 
     def prior(self, observation: Observation, last: LastSeen | None) -> Prior:
         """See Start; nothing is known."""
@@ -135,41 +139,43 @@ class SearchStart:
         quarter of the hypotheses are turned and bent as then.
     """
 
-    hypotheses: int = 3000
-    islands: int = 64
-    coverage: float = 1.0
-    samples: int = 1024
-    improved: int = 16
-    position_m: float = 0.02
-    tilt_rad: float = 0.5
-    arm_rad: float = 0.5
-    forearm: float = 0.5
-    memory: float = 0.2
-    memory_rad: float = 0.7
-    memory_s: float = 2.0
+    hypotheses: int
+    islands: int
+    coverage: float
+    samples: int
+    improved: int
+    position_m: float
+    tilt_rad: float
+    arm_rad: float
+    forearm: float
+    memory: float
+    memory_rad: float
+    memory_s: float
 
-    def __call__(
-        self,
-        observation: Observation,
-        space: PoseSpace,
-        log_scores: LogScores,
-        improve: Improve,
-        last: LastSeen | None,
-        n: int,
-        generator: torch.Generator,
-    ) -> Tensor:
+    def __post_init__(self) -> None:
+        for name, least in (("hypotheses", 1), ("islands", 1), ("samples", 1), ("improved", 0)):
+            check_number(f"start.{name}", getattr(self, name), least, whole=True)
+        for name in ("coverage", "position_m", "tilt_rad", "arm_rad", "forearm", "memory"):
+            check_number(f"start.{name}", getattr(self, name), 0)
+        for name in ("memory_rad", "memory_s"):
+            check_number(f"start.{name}", getattr(self, name), 0, above=True)
+
+    def __call__(self, sought: Sought, n: int, generator: torch.Generator) -> Tensor:
         """See Start."""
+        space, log_scores = sought.space, sought.log_scores
         lower, upper = space.lower, space.upper
-        first = self._draw(observation, space, last, generator)
+
+        def spread(particles: Tensor, sigmas: Tensor) -> Tensor:
+            return diffuse(particles, sigmas, lower, upper, "reflect", sought.motions, generator)
+
+        first = self._draw(sought.observation, space, sought.last, generator)
         scores = log_scores(first, self.coverage)
         best = first[scores.topk(min(self.islands, len(first))).indices]
         best_scores = scores.topk(len(best)).values
-        sigmas = sir.Spread(self.position_m, 0.015, 0.35, 0.15).sigmas(lower, upper)
+        sigmas = Spread(self.position_m, 0.015, 0.35, 0.15).sigmas(lower, upper)
         while True:
             each = max(1, self.samples // len(best))
-            tried = sir.diffuse(
-                best.repeat_interleave(each, 0), sigmas, lower, upper, "reflect", generator
-            )
+            tried = spread(best.repeat_interleave(each, 0), sigmas)
             # Every island keeps what it had if nothing better was found.
             new_scores = log_scores(tried, self.coverage).view(-1, each)
             scores = torch.cat((best_scores[:, None], new_scores), 1)
@@ -179,7 +185,7 @@ class SearchStart:
             keep = top.topk(max(1, len(best) // 2)).indices
             best, best_scores = best[keep], top[keep]
             if len(best) <= self.improved:
-                better = improve(best)
+                better = sought.improve(best)
                 new_scores = log_scores(better, self.coverage)
                 wins = new_scores > best_scores
                 best = torch.where(wins[:, None], better, best)
@@ -187,7 +193,7 @@ class SearchStart:
             if len(best) == 1:
                 break
             sigmas = sigmas * 0.75
-        return sir.diffuse(best.expand(n, -1), 0.5 * sigmas, lower, upper, "reflect", generator)
+        return spread(best.expand(n, -1), 0.5 * sigmas)
 
     def prior(self, observation: Observation, last: LastSeen | None) -> Prior:
         """See Start: a hand hangs on an arm, and it does not turn round all at once."""
@@ -239,7 +245,7 @@ class SearchStart:
             turn = _TURN_RAD * normal(again, 3)
             rotation[:again] = roma.rotvec_composition((turn, before[:, 3:6]))
             latent[:again] = before[:, 6:]
-        pivot = roma.rotvec_to_rotmat(rotation) @ rotation.new_tensor(sir.PIVOT_M)
+        pivot = roma.rotvec_to_rotmat(rotation) @ rotation.new_tensor(PIVOT_M)
         translation = centre + normal(m, 3) * self.position_m - pivot
         return torch.cat((translation, rotation, latent), 1)
 

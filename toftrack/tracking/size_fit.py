@@ -18,16 +18,18 @@ built: the evidence is taken closer instead.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from toftrack.checks import check_number
+from toftrack.compute.backend import Motions
+from toftrack.compute.rigid import rotated_pivot
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
-from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import Evidence, Scorer
-from toftrack.tracking import particle_filter as sir
+from toftrack.render.scoring import Evidence
 
 _REACH = 3  # sizes tried on either side of the present one
 _TRIED = (1.0, 1.12, 0.9, 1.24, 0.8)  # sizes of starts, in turn
@@ -46,13 +48,20 @@ class HandFit:
         pixels count more than false ones, too large a hand fits best (by 2 to 4 % at 1.5).
     """
 
-    frames: int = 30
-    prior: float = 0.12
-    step: float = 0.02
-    largest: float = 1.4
-    samples: int = 64
-    exponent: float = 20.0
-    beta: float = 1.0
+    frames: int
+    prior: float
+    step: float
+    largest: float
+    samples: int
+    exponent: float
+    beta: float
+
+    def __post_init__(self) -> None:
+        for name, least in (("frames", 0), ("samples", 1)):
+            check_number(f"hand.fit.{name}", getattr(self, name), least, whole=True)
+        for name in ("prior", "step", "exponent", "beta"):
+            check_number(f"hand.fit.{name}", getattr(self, name), 0, above=True)
+        check_number("hand.fit.largest", self.largest, 1)
 
 
 @dataclass(frozen=True)
@@ -108,21 +117,21 @@ def update(
     fit: HandFit,
     state: Tensor,
     evidence: Evidence,
-    scorer: Scorer,
-    likelihood: FMeasure,
+    log_scores: Callable[[Tensor, Evidence], Tensor],
+    motions: Motions,
     generator: torch.Generator,
 ) -> SizeBelief:
     """What is believed after one more estimate.
 
-    state: (1, 27) refined with a hand of the present size, for which `scorer` was made.
+    state: (1, 27) refined with a hand of the present size.
+    log_scores: of (N, 27) such hands, (N,), by an F-measure of fit.beta.
     """
-    likelihood = replace(likelihood, beta=fit.beta)
     sizes = len(belief.log_likelihood)
     around = range(max(0, belief.index - _REACH), min(sizes, belief.index + _REACH + 1))
     noise = torch.randn(fit.samples, 27, generator=generator, device=state.device)
     noise = noise * noise.new_tensor([0.004] * 3 + [0.03] * 3 + [0.06] * 21)
     noise[0] = 0.0
-    moved = sir.compose(state, noise)  # every angle is a coordinate here
+    moved = motions.compose(state, noise)  # every angle is a coordinate here
     scores = []
     for index in around:
         ratio = (1 + fit.step) ** (index - belief.index)
@@ -133,9 +142,9 @@ def update(
             occluder=evidence.occluder * ratio,
         )
         # The middle of the hand stays where it is: about the wrist, it would grow out of place.
-        middle = moved[:, :3] + sir.rotated_pivot(moved[:, 3:6])
+        middle = moved[:, :3] + rotated_pivot(moved[:, 3:6])
         states = torch.cat(((middle - ratio * (middle - moved[:, :3])) / ratio, moved[:, 3:]), 1)
-        best = likelihood.log_score(scorer(states, closer)).max()
+        best = log_scores(states, closer).max()
         scores.append(fit.exponent * float(best))
     total = belief.log_likelihood.clone()
     # Sizes that were not tried are as unlikely as the nearest one that was.

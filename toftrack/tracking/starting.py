@@ -8,11 +8,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from toftrack.tracking import particle_filter
+from toftrack.compute.backend import Motions
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.model import ObservedFrame
 from toftrack.tracking.refining import improved
-from toftrack.tracking.search import LastSeen, LogScores
+from toftrack.tracking.search import LastSeen, LogScores, Sought
 from toftrack.tracking.state import Track
 
 
@@ -39,23 +39,18 @@ def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Genera
     def log_scores(particles: Tensor, coverage: float) -> Tensor:
         return frame.log_scores(model.decode(particles), coverage) + prior(particles)
 
-    particles = model.start(
-        frame.observation,
-        model.space,
-        log_scores,
-        partial(improved, frame=frame),
-        seen,
-        model.filter.particles,
-        generator,
-    )
-    return Proposals(particles, log_scores)
+    improve, motions = partial(improved, frame=frame), model.backend.motions
+    sought = Sought(frame.observation, model.space, motions, log_scores, improve, seen)
+    return Proposals(model.start(sought, model.filter.particles, generator), log_scores)
 
 
-def started(track: Track | None, proposals: Proposals, settings: LostSettings) -> Track:
+def started(
+    track: Track | None, proposals: Proposals, settings: LostSettings, motions: Motions
+) -> Track:
     """A new track from a start; or the given young one, if the start is no better than it."""
     particles = proposals.particles
     if track is not None:
-        now = particle_filter.compose(track.particles, track.velocity[None])
+        now = motions.compose(track.particles, track.velocity[None])
         log_scores = proposals.log_scores
         # The search has seen this frame and the track has not, so a little better is no better.
         if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < settings.rival_gain:

@@ -13,6 +13,7 @@ from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
+from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter, size_fit
 from toftrack.tracking.following import (
@@ -48,7 +49,7 @@ def step(
     A pure function: the state given stays as it is, and gives the same again.
     """
     spans, generator = Spans(), resumed(state.generator, model.device)
-    hand, track = model.hand(state.side, state.size), state.track
+    hand, motions, track = model.hand(state.side, state.size), model.backend.motions, state.track
     with spans("segmentation and evidence"):
         expected = expected_depths(track, hand, model)
         observation = model.segmentation(image.depth_m, image.k, expected)
@@ -58,7 +59,7 @@ def step(
         frame = observed(observation, hand, model)
     if track is None or track.age < model.lost.probation:
         with spans("start"):
-            track = started(track, propose(state.seen, frame, generator), model.lost)
+            track = started(track, propose(state.seen, frame, generator), model.lost, motions)
     with spans("filter: rest"):
         particles, weights = filtered(track, frame, generator, spans)
         mean = particle_filter.mean_particle(particles, weights)
@@ -136,9 +137,14 @@ def _sized(
     if model.fit is None or size is None or size.frames >= model.fit.frames:
         return size, refused
     if not belief.lost:
-        scorer, likelihood = frame.hand.scorer, model.likelihood
+        likelihood = replace(model.likelihood, beta=model.fit.beta)
+
+        def log_scores(states: Tensor, evidence: Evidence) -> Tensor:
+            return likelihood.log_score(frame.hand.scorer(states, evidence))
+
+        motions, evidence = model.backend.motions, frame.evidence
         size = size_fit.update(
-            size, model.fit, found.pose, frame.evidence, scorer, likelihood, generator
+            size, model.fit, found.pose, evidence, log_scores, motions, generator
         )
     elif not belief.kept and size.frames == 0:
         refused += 1
@@ -151,7 +157,7 @@ def _estimate(
 ) -> Estimate:
     """What is told of a frame, but for its gesture and the time that it took."""
     model, mean, particles = frame.model, found.mean, found.particles
-    tangents = particle_filter.difference(particles, mean)
+    tangents = model.backend.motions.difference(particles, mean)
     tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
     covariance = particle_filter.covariance(tangents, found.weights)
     return Estimate(
@@ -159,7 +165,7 @@ def _estimate(
         timestamp_s=image.timestamp_s,
         state_name=belief.state_name,
         lost=belief.lost,
-        joints_m=_host(frame.hand.refiner.joints(found.pose)),
+        joints_m=_host(frame.hand.refiner.joints(found.pose)[0]),
         state=_host(found.pose[0]),
         latent=_host(model.space.encode(found.pose[:, 6:])[0]),
         score=score,

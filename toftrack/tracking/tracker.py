@@ -28,7 +28,6 @@ class Tracker:
     def __init__(self, model: TrackerModel, seed: int = 0) -> None:
         self.model = model
         self.state: TrackerState = first_state(model, seed)
-        model.hand(self.state.side, self.state.size)  # a back end that cannot run here says so now
         self.info: StepInfo | None = None
 
     def step(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, entry_point, take
 from toftrack.render.numba.hand import (
     DU,
     DX,
@@ -37,7 +37,6 @@ from toftrack.render.numba.vector import (
     merge,
     near,
     ones,
-    take,
     widen,
 )
 

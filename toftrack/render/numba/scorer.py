@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import functools
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import announced
-from toftrack.compute.threads import threads
+from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
@@ -21,18 +19,11 @@ from toftrack.render.numba.kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence
 
 
-@functools.cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Helper threads of this process; a forked one gets its own."""
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="toftrack-scorer")
-
-
 class NumbaScorer:
     """Kinematics, drawing and counting in compiled code, one particle after the other.
 
-    Plain threads share the particles, not numba's own: these are one choice for a whole process
-    and some of them do not allow calls from two threads at once. Safe to call from several
-    threads. States on another device are moved to the CPU and the counts back.
+    Threads share the particles. Safe to call from several threads. States on another device are
+    moved to the CPU and the counts back.
     """
 
     name = "numba"
@@ -86,13 +77,7 @@ class NumbaScorer:
             np.zeros(1, np.int64),
             counts.numpy(),
         )
-        helpers = min(threads(), -(-len(x) // LANES)) - 1
-        others = [_pool(os.getpid()).submit(task) for _ in range(helpers)]
-        task()
-        for other in others:
-            # A helper that has not begun has nothing left to do.
-            if not other.cancel():
-                other.result()
+        run_shared(task, -(-len(x) // LANES))
         return Counts(*counts.to(states.device))
 
     def _packed(self, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:

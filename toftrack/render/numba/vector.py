@@ -167,14 +167,3 @@ def ones(typingctx, word):
         return builder.ctpop(args[0])
 
     return types.int64(types.uint64), codegen
-
-
-@intrinsic
-def take(typingctx, counter):
-    """counter[0] += 1, atomically; the value before."""
-
-    def codegen(context, builder, signature, args):
-        at = _pointer(context, builder, signature.args[0], args[0], ir.IntType(64)(0))
-        return builder.atomic_rmw("add", at, ir.IntType(64)(1), "monotonic")
-
-    return types.int64(counter), codegen

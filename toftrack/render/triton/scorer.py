@@ -35,6 +35,12 @@ _LARGEST_RADIUS_PX = 63
 _BLOCK, _ROWS = 64, 8
 
 
+def require_device() -> None:
+    """Raises ImportError where there is no CUDA, and triton does not interpret its kernels."""
+    if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
+        raise ImportError("there is no CUDA device")
+
+
 class TritonScorer:
     """Fused kernels for CUDA; radii above 63 pixels are left to TorchScorer."""
 
@@ -43,10 +49,9 @@ class TritonScorer:
     def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
         """shape: on the CUDA device.  surface: instead of the shape's own.
 
-        Raises ImportError where there is no CUDA (and triton does not interpret its kernels).
+        Raises ImportError where it cannot run.
         """
-        if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
-            raise ImportError("there is no CUDA device")
+        require_device()
         surface = surface or hand_surface(shape)
         self._large = TorchScorer(shape, surface)
         device = shape.base_m.device

@@ -1,0 +1,58 @@
+"""Parts as the configuration has them, with changes: settings have no defaults of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import hydra
+from helpers.tracking import configuration
+
+from toftrack.refinement.gauss_newton import Refinement
+from toftrack.refinement.steadying import Steadying
+from toftrack.render.likelihood import FMeasure
+from toftrack.render.segmentation import NearestSurface
+from toftrack.tracking.life_cycle import LostSettings
+from toftrack.tracking.search import RoughStart, SearchStart
+
+
+@cache
+def _part(group: str, option: str | None = None) -> Any:
+    overrides = [] if option is None else [f"{group}={option}"]
+    return hydra.utils.instantiate(configuration(*overrides)[group])
+
+
+def nearest_surface(**changes: Any) -> NearestSurface:
+    """conf/segmentation/nearest.yaml"""
+    return replace(_part("segmentation"), **changes)
+
+
+def f_measure(**changes: Any) -> FMeasure:
+    """conf/likelihood/f_measure.yaml"""
+    return replace(_part("likelihood"), **changes)
+
+
+def refinement(**changes: Any) -> Refinement:
+    """conf/refine/gauss_newton.yaml"""
+    return replace(_part("refine"), **changes)
+
+
+def steadying(**changes: Any) -> Steadying:
+    """The steadying of conf/refine/gauss_newton.yaml"""
+    return replace(_part("refine").steadying, **changes)
+
+
+def search_start(**changes: Any) -> SearchStart:
+    """conf/start/search.yaml"""
+    return replace(_part("start", "search"), **changes)
+
+
+def rough_start(**changes: Any) -> RoughStart:
+    """conf/start/rough.yaml"""
+    return replace(_part("start", "rough"), **changes)
+
+
+def lost_settings(**changes: Any) -> LostSettings:
+    """conf/lost/score.yaml"""
+    return replace(_part("lost"), **changes)

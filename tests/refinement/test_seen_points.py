@@ -1,0 +1,110 @@
+"""The points and the silhouette that the refinement sees of a frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.configured import nearest_surface
+from helpers.tracking import sample
+from torch import Tensor
+
+from toftrack.refinement.seen_points import REACH_M, SeenPoints, seen_points
+from toftrack.render.segmentation import Observation
+
+COUNT = 500
+
+
+def observed(frame: int) -> Observation:
+    scene = sample().cut(frame)
+    return nearest_surface()(scene.depth_m[0], scene.k)
+
+
+@pytest.mark.parametrize("frame", [0, 40, 80])
+def test_the_points_are_those_of_the_hand_without_its_edges(frame: int) -> None:
+    observation = observed(frame)
+    seen = seen_points(observation)
+    assert 100 < len(seen.points_m) < int(observation.hand.sum())
+    pixel = (seen.points_m @ seen.k.T)[:, :2]
+    u, v = (pixel / seen.points_m[:, 2:]).round().long().T
+    assert observation.hand[v, u].all()
+    torch.testing.assert_close(observation.depth_m[v, u], seen.points_m[:, 2])
+    rows = (v[:, None] + torch.tensor([-1, 0, 1])).clamp(max=len(observation.depth_m) - 1)
+    around = observation.depth_m[rows, u[:, None]]
+    assert (around.amax(1) - around.amin(1) < 0.03).all()
+    # On the silhouette the nearest pixel that is not background is the pixel itself.
+    top, left = seen.corner
+    assert torch.equal(seen.nearest_px[v - top, u - left], torch.stack((u, v), 1).float())
+
+
+def test_the_nearest_pixel_of_the_background_is_on_the_silhouette() -> None:
+    observation = observed(0)
+    seen = seen_points(observation)
+    hand = observation.hand.nonzero().flip(1).float()
+    top, left = seen.corner
+    g = np.random.default_rng(0)
+    height, width = seen.nearest_px.shape[:2]
+    for row, column in zip(g.integers(height, size=50), g.integers(width, size=50), strict=True):
+        here = torch.tensor([float(column + left), float(row + top)])
+        found = (seen.nearest_px[row, column] - here).norm()
+        nearest = (hand - here).norm(dim=1).amin()
+        # OpenCV's labels go by a distance that is within a few percent of the Euclidean one.
+        assert nearest - 1e-4 <= found <= 1.05 * nearest + 0.5
+
+
+def by_a_loop(points: Tensor, middle: Tensor, count: int) -> Tensor:
+    near = points[(points - middle).square().sum(1) < REACH_M**2]
+    return near[:: max(1, -(-len(near) // count))]
+
+
+@pytest.mark.parametrize("count", [1, 7, 500, 100_000])
+def test_each_hypothesis_has_the_points_around_itself(count: int) -> None:
+    seen = seen_points(observed(0))
+    middles = seen.points_m[::200].clone()
+    middles[1] += 0.15
+    middles[2] += 1.0
+    middles[3] = torch.nan
+    points, there = seen.around(middles, count)
+    assert points.shape[:2] == there.shape and there.shape[1] <= count
+    for i, middle in enumerate(middles):
+        assert torch.equal(points[i, there[i]], by_a_loop(seen.points_m, middle, count))
+    assert not there[2:4].any() and there[0].any()
+
+
+def no_points(seen: SeenPoints) -> SeenPoints:
+    return replace(seen, points_m=torch.zeros(0, 3))
+
+
+def test_without_points_or_hypotheses_there_are_none() -> None:
+    seen = seen_points(observed(0))
+    points, there = no_points(seen).around(torch.zeros(4, 3), COUNT)
+    assert points.shape == (4, 0, 3) and there.shape == (4, 0)
+    assert seen.around(torch.zeros(0, 3), COUNT)[0].shape[0] == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (40, 30)])
+def test_an_image_of_nothing_has_no_points_and_no_silhouette(size: tuple[int, int]) -> None:
+    nothing = torch.zeros(size, dtype=torch.bool)
+    seen = seen_points(Observation(torch.zeros(size), nothing, nothing, torch.eye(3), np.inf))
+    assert len(seen.points_m) == 0 and seen.nearest_px.numel() == 0
+
+
+def test_an_image_of_one_pixel_is_a_point() -> None:
+    hand = torch.ones(1, 1, dtype=torch.bool)
+    seen = seen_points(Observation(torch.full((1, 1), 0.5), hand, ~hand, torch.eye(3), 0.5))
+    assert torch.equal(seen.points_m, torch.tensor([[0.0, 0.0, 0.5]]))
+    assert torch.equal(seen.nearest_px, torch.zeros(1, 1, 2))
+
+
+def test_an_occluder_is_part_of_the_silhouette_and_has_no_points() -> None:
+    observation = observed(0)
+    covered = replace(
+        observation,
+        hand=torch.zeros_like(observation.hand),
+        occluder=observation.hand.clone(),
+    )
+    seen, plain = seen_points(covered), seen_points(observation)
+    assert len(seen.points_m) == 0
+    assert torch.equal(seen.nearest_px, plain.nearest_px)

@@ -1,0 +1,117 @@
+"""What the refinement sees of a frame: points of the hand and the silhouette around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.render.segmentation import Observation
+
+REACH_M = 0.16
+"""Points farther than this from the middle of a hand are none of it."""
+_MARGIN_PX = 24
+"""Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
+_SQUARE = np.ones((3, 3), np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """What the refinement sees of a frame, once a frame and the same for all hypotheses.
+
+    points_m: (P, 3) seen points of the hand and the arm, row by row.
+    nearest_px: (h, w, 2) for each pixel of a crop the nearest pixel (u, v) of the image that is
+        not background. The crop holds all of these and a margin; it is empty where there are none.
+    k: (3, 3) of the image.
+    size: (H, W) of the image.
+    corner: row and column of the crop's first pixel.
+    """
+
+    points_m: Tensor
+    nearest_px: Tensor
+    k: Tensor
+    size: tuple[int, int]
+    corner: tuple[int, int] = (0, 0)
+
+    def around(self, middle_m: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """The points of each of N hypotheses: those within its reach, thinned out evenly.
+
+        middle_m: (N, 3) mean of a hypothesis' joints.  count: points of a hypothesis at most.
+        Returns the points (N, C, 3), and which of them there are, (N, C) bool.
+        """
+        total = len(self.points_m)
+        near = (self.points_m - middle_m[:, None]).square().sum(-1) < REACH_M**2
+        stride = (near.sum(1, keepdim=True) + count - 1).div(count, rounding_mode="floor")
+        rank = near.cumsum(1) - 1
+        kept = near & (rank % stride.clamp(min=1) == 0)
+        # What is not kept goes to one place past the end.
+        slots = min(count, total)
+        to = torch.where(kept, rank // stride.clamp(min=1), slots)
+        index = to.new_zeros(len(near), slots + 1)
+        index.scatter_(1, to, torch.arange(total, device=to.device).expand_as(to))
+        there = torch.arange(slots, device=to.device) < kept.sum(1, keepdim=True)
+        return self.points_m[index[:, :slots]], there
+
+
+def seen_points(observation: Observation) -> SeenPoints:
+    """The points and the silhouette of an observation, on its device.
+
+    Pixels on depth edges are left out: they mix foreground and background.
+    """
+    # Whatever is not behind the hand may hide it or be it.
+    hand = observation.hand.cpu().numpy()
+    solid = hand | observation.occluder.cpu().numpy()
+    left, top, wide, high = cv2.boundingRect(solid.view(np.uint8))
+    left, right = max(0, left - _MARGIN_PX), min(solid.shape[1], left + wide + _MARGIN_PX)
+    top, bottom = max(0, top - _MARGIN_PX), min(solid.shape[0], top + high + _MARGIN_PX)
+    if wide == 0:
+        left = top = right = bottom = 0
+    part = slice(top, bottom), slice(left, right)
+    points = _smooth_points(observation, hand[part], part)
+    device = observation.depth_m.device
+    return SeenPoints(
+        torch.from_numpy(points).to(device),
+        torch.from_numpy(_nearest_pixels(solid[part], top, left)).to(device),
+        observation.k,
+        tuple(observation.hand.shape),
+        (top, left),
+    )
+
+
+def _smooth_points(
+    observation: Observation, hand: np.ndarray, part: tuple[slice, slice]
+) -> np.ndarray:
+    """(P, 3) float32 points of the crop's hand pixels that are on no depth edge."""
+    if not hand.any():
+        return np.zeros((0, 3), np.float32)
+    depth = observation.depth_m.cpu().numpy()[part]
+    far = np.where(depth > 0, depth, np.float32(10.0))
+    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < 0.03
+    u, v = _pixels(hand & smooth)
+    z = depth[v, u]
+    k = observation.k.cpu().numpy()
+    x = (u + part[1].start - k[0, 2]) / k[0, 0] * z
+    y = (v + part[0].start - k[1, 2]) / k[1, 1] * z
+    return np.stack((x, y, z), 1).astype(np.float32)
+
+
+def _nearest_pixels(solid: np.ndarray, top: int, left: int) -> np.ndarray:
+    """(h, w, 2) float32: the image's column and row of the nearest solid pixel of a crop."""
+    if solid.size == 0:
+        return np.zeros((0, 0, 2), np.float32)
+    _, labels = cv2.distanceTransformWithLabels(
+        (~solid).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    u, v = _pixels(solid)
+    lookup = np.zeros((len(u) + 1, 2), np.float32)
+    lookup[labels[v, u]] = np.stack((u + left, v + top), 1)
+    return lookup.take(labels, 0)
+
+
+def _pixels(mask: np.ndarray) -> np.ndarray:
+    """Columns and rows of the pixels of a mask, (2, n) int32, row by row."""
+    found = cv2.findNonZero(mask.view(np.uint8))
+    return np.zeros((2, 0), np.int32) if found is None else found.reshape(-1, 2).T
