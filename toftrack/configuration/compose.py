@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 import toftrack
+from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
@@ -46,7 +47,10 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
                 "'hand.side=left'"
             )
     with one_sentence(), _own_hydra(), initialize_config_dir(str(folder), version_base="1.3"):
-        return compose(_ROOT.removesuffix(".yaml"), overrides=list(overrides))
+        name = _ROOT.removesuffix(".yaml")
+        config = compose(name, overrides=list(overrides))
+        check_overrides(config, name, overrides)
+        return config
 
 
 def configuration_folder() -> Path:
