@@ -11,8 +11,8 @@ from torch import Tensor
 from toftrack.tracking.following import displacement
 from toftrack.tracking.model import ObservedFrame, TrackerModel
 from toftrack.tracking.refining import improved
-from toftrack.tracking.search import LastSeen, LogScores, Sought
-from toftrack.tracking.state import Track
+from toftrack.tracking.search import LogScores, Sought
+from toftrack.tracking.state import Track, TrackerState
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +27,9 @@ class Proposals:
     log_scores: LogScores
 
 
-def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Generator) -> Proposals:
-    """Particles to start with in a frame.
-
-    seen: the last hand that was believed.
-    """
-    model = frame.model
+def propose(state: TrackerState, frame: ObservedFrame, generator: torch.Generator) -> Proposals:
+    """Particles to start with in a frame, from what the state still knows of the hand."""
+    model, seen = frame.model, state.seen
     prior = model.start.prior(frame.observation, seen)
 
     def log_scores(particles: Tensor, coverage: float) -> Tensor:

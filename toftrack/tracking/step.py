@@ -62,7 +62,7 @@ def step(
         frame = observed(observation, hand, model)
     if young(track, model.lost):
         with spans("start"):
-            track = started(track, propose(state.seen, frame, generator), dt_s, model)
+            track = started(track, propose(state, frame, generator), dt_s, model)
     with spans("filter: rest"):
         particles, weights = filtered(track, dt_s, frame, generator, spans)
         mean = particle_filter.mean_particle(particles, weights)
