@@ -11,7 +11,7 @@ from torch import Tensor
 from toftrack.compute.pace import FRAME_S
 from toftrack.render.segmentation import Expected
 from toftrack.tracking import particle_filter
-from toftrack.tracking.life_cycle import Belief, LostSettings, lasted
+from toftrack.tracking.life_cycle import Belief, LostSettings, lasted, longer
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.particle_filter import FilterSettings
 from toftrack.tracking.search import LastSeen
@@ -30,9 +30,9 @@ def displacement(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:
     return track.velocity * (settings.velocity ** (dt_s / FRAME_S) * dt_s)
 
 
-def young(track: Track | None, settings: LostSettings) -> bool:
-    """Whether another start may still take a track's place; there is none even."""
-    return track is None or not lasted(track.age_s, settings.probation)
+def young(track: Track, settings: LostSettings) -> bool:
+    """Whether a better start may still take a track's place."""
+    return not lasted(track.age_s, settings.probation)
 
 
 def filtered(
@@ -118,17 +118,17 @@ def advanced(
         keep = cfg.velocity_smoothing ** (dt_s / FRAME_S)
         velocity = torch.lerp(moved / dt_s, track.velocity, keep)
     return Track(
-        particles,
-        found.weights,
-        mean,
-        velocity,
-        offset,
-        found.pose,
-        found.trend,
-        track.age_s + dt_s if track.age_s else FRAME_S,
-        belief.bad_s,
-        belief.outside_s,
-        expected,
+        particles=particles,
+        weights=found.weights,
+        mean=mean,
+        velocity=velocity,
+        offset=offset,
+        pose=found.pose,
+        trend=found.trend,
+        age_s=longer(track.age_s, dt_s),
+        bad_s=belief.bad_s,
+        outside_s=belief.outside_s,
+        expected=expected,
     )
 
 

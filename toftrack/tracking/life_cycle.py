@@ -54,7 +54,8 @@ def lasted(seconds: float, frames: float) -> bool:
     return seconds > (frames - 0.5) * FRAME_S
 
 
-def _longer(seconds: float, dt_s: float) -> float:
+def longer(seconds: float, dt_s: float) -> float:
+    """What has gone on for so long, a frame later; where it begins, that frame is FRAME_S."""
     return seconds + dt_s if seconds else FRAME_S
 
 
@@ -66,8 +67,8 @@ def believe(
     track: as of the frame before.  score: of the estimate, 0..1.
     off_rad: how far its pose lies off the pose space, rms.  dt_s: since the last frame.
     """
-    bad = _longer(track.bad_s, dt_s) if score < settings.score else 0.0
-    outside = _longer(track.outside_s, dt_s) if off_rad > settings.outside_rad else 0.0
+    bad = longer(track.bad_s, dt_s) if score < settings.score else 0.0
+    outside = longer(track.outside_s, dt_s) if off_rad > settings.outside_rad else 0.0
     if track.age_s == 0 and score < settings.start_score:
         return Belief(False, "initialising", True, bad, outside)
     if bad and settings.patience and lasted(bad, settings.patience):

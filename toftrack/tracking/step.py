@@ -60,7 +60,7 @@ def step(
         if observation.empty:
             return _without_hand(state, image, observation, model, spans)
         frame = observed(observation, hand, model)
-    if young(track, model.lost):
+    if track is None or young(track, model.lost):
         with spans("start"):
             track = started(track, propose(state, frame, generator), dt_s, model)
     with spans("filter: rest"):
@@ -70,7 +70,9 @@ def step(
         pose, trend = refined(track, mean, dt_s, frame, generator)
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
-    belief = believe(track, score, found.off_rad, dt_s, model.lost)
+    # A pose that nothing refined is one of the space.
+    off_rad = 0.0 if model.refinement is None else found.off_rad
+    belief = believe(track, score, off_rad, dt_s, model.lost)
     hidden = bool(frame.observation.occluder.any())
     track = advanced(track, found, belief, expected if hidden else None, dt_s, model)
     estimate = _estimate(image, found, score, belief, frame)
