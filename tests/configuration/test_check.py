@@ -77,8 +77,6 @@ def test_every_setting_of_the_tables_is_one() -> None:
             prefix, node = pending.pop()
             for name in node:
                 keys.add(f"{prefix}.{name}")
-                if not OmegaConf.is_missing(node, name) and OmegaConf.is_dict(
-                    node._get_node(name)
-                ):
+                if not OmegaConf.is_missing(node, name) and OmegaConf.is_dict(node._get_node(name)):
                     pending.append((f"{prefix}.{name}", node[name]))
     assert check._ABOVE_ZERO | check._OPEN_ENDED | check._MAY_BE_NONE <= keys

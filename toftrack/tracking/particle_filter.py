@@ -89,7 +89,7 @@ def widened(sigmas: Tensor, velocity: Tensor, rest: float, gain: float) -> Tenso
     rest: part of the sigmas that a hand at rest keeps, 1 = the same at any speed.
     gain: standard deviation gained per unit of speed; at most the sigmas are doubled.
     """
-    groups = torch.split(velocity, (3, 3, velocity.shape[0] - 6))
+    groups = torch.split(velocity, [3, 3, velocity.shape[0] - 6])
     speed = torch.cat([group.norm().expand(group.shape) for group in groups])
     return torch.minimum(rest * sigmas + gain * speed, 2 * sigmas)
 
