@@ -88,7 +88,7 @@ def _pairs(
 ) -> Iterator[tuple[str, object, object]]:
     """Key, value and usual value of every setting that both have and that differs."""
     ours = str(OmegaConf.select(config, "_target_", default="toftrack.")).startswith("toftrack.")
-    for name in config:
+    for name in map(str, config):
         key = f"{prefix}{name}"
         if name not in default or OmegaConf.is_missing(config, name):
             continue

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -64,7 +65,7 @@ def configuration_folder() -> Path:
 def _own_hydra() -> Iterator[None]:
     """Hydra has one state a process, which may be that of an application around us."""
     kinds = (GlobalHydra, JobRuntime, VersionBase)
-    instances = Singleton._instances
+    instances: dict[Any, Any] = Singleton._instances
     with _composing:
         kept = {kind: instances.pop(kind) for kind in kinds if kind in instances}
         try:

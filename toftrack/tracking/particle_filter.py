@@ -90,7 +90,7 @@ def widened(sigmas: Tensor, movement: Tensor, rest: float, gain: float) -> Tenso
     rest: part of the sigmas that a hand at rest keeps, 1 = the same at any speed.
     gain: standard deviation gained per unit of movement; at most the sigmas are doubled.
     """
-    groups = torch.split(movement, (3, 3, movement.shape[0] - 6))
+    groups = torch.split(movement, [3, 3, movement.shape[0] - 6])
     length = torch.cat([group.norm().expand(group.shape) for group in groups])
     return torch.minimum(rest * sigmas + gain * length, 2 * sigmas)
 
