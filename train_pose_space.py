@@ -6,13 +6,14 @@ import hydra
 from omegaconf import DictConfig
 
 from toftrack.programs import command_line
-from toftrack.programs.train import train
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train_pose_space")
 @command_line.sweep_job
 def main(config: DictConfig) -> float:
     """Train, write the model and its figures, and return what a sweep minimises."""
+    from toftrack.programs.train import train  # takes seconds: an override's error comes before
+
     return train(config)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from numbers import Integral, Real
+from typing import Any
 
 from toftrack.errors import ToftrackError
 
 
 def check_number(
     key: str,
-    value: object,
+    value: Any,
     least: float = -math.inf,
     most: float = math.inf,
     *,

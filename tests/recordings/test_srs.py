@@ -217,7 +217,7 @@ def test_missing_file_and_directory_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["srs", "npz"])
-def test_random_corruption_is_told_or_hforearm_conflict(tmp_path: Path, kind: str) -> None:
+def test_random_corruption_is_told_or_harmless(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"recording.{kind}"
     if kind == "srs":
         record(path, 2)

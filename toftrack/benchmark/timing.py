@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -59,6 +60,7 @@ def sample_evidence(upsample: float = 1.0) -> tuple[Evidence, Tensor]:
     """
     sample = open_source("sample")
     depth, k = sample.image(0)[0], sample.camera.K.copy()
+    assert sample.truth is not None
     wrist = torch.from_numpy(sample.truth.joints_m[0, 0])
     if upsample != 1:
         height, width = (round(size * upsample) for size in depth.shape)
@@ -68,11 +70,11 @@ def sample_evidence(upsample: float = 1.0) -> tuple[Evidence, Tensor]:
         k[:2] *= upsample
     observation = replace(_SEGMENTATION, max_pixels=depth.size)(depth, k)
     evidence = _LIKELIHOOD.evidence(observation)
-    rows, columns = observation.hand.nonzero().unbind(1)
+    v, u = observation.hand.nonzero().unbind(1)
     margin = round(_MARGIN_PX * upsample)
     height, width = depth.shape
-    left, right = int(columns.min()) - margin, int(columns.max()) + margin + 1
-    top, bottom = int(rows.min()) - margin, int(rows.max()) + margin + 1
+    left, right = int(u.min()) - margin, int(u.max()) + margin + 1
+    top, bottom = int(v.min()) - margin, int(v.max()) + margin + 1
     return evidence.cropped(
         max(left, 0), max(top, 0), min(right, width), min(bottom, height)
     ), wrist
@@ -89,8 +91,9 @@ def filter_states(n: int, wrist: Tensor, seed: int = 0) -> Tensor:
 
 def to_device(evidence: Evidence, device: torch.device) -> Evidence:
     """The same evidence on a device."""
-    images = (evidence.low, evidence.high, evidence.occluder, evidence.hand, evidence.k)
-    return Evidence(*(image.to(device) for image in images), evidence.radius_px)
+    images = {f.name: getattr(evidence, f.name) for f in fields(evidence)}
+    del images["radius_px"]
+    return replace(evidence, **{name: image.to(device) for name, image in images.items()})
 
 
 def check_against_reference(
@@ -114,7 +117,7 @@ def check_against_reference(
 
 
 def interleaved(
-    calls: dict[str, Callable[[], object]],
+    calls: Mapping[str, Callable[[], object]],
     repeats: dict[str, int],
     device: torch.device,
     progress: tqdm | None = None,
@@ -150,6 +153,6 @@ def fastest_chunk(shape: HandShape, states: Tensor, evidence: Evidence, stepping
     for chunk in chunks:
         scorer = ReferenceScorer(shape, chunk, stepping)
         name = str(chunk)
-        found = interleaved({name: lambda s=scorer: s(some, evidence)}, {name: 2}, states.device)
+        found = interleaved({name: partial(scorer, some, evidence)}, {name: 2}, states.device)
         times[chunk] = min(found[name])
     return min(times, key=times.__getitem__)

@@ -26,13 +26,14 @@ _SILENT_S = 1.0
 _compiling = threading.Lock()
 
 
-def entry_point(*sources: str | Path) -> Callable:
+def entry_point(*sources: str | Path | None) -> Callable:
     """Decorator of a kernel's entry points: compiled at the first call, or from the cache.
 
     sources: the files that the kernel is made of; a change in any of them compiles it anew.
     """
     # numba's cache notices changes of the function's own file only, but it does go by the name.
-    checksum = zlib.crc32(b"".join(Path(file).read_bytes() for file in (__file__, *sources)))
+    files = [file for file in (__file__, *sources) if file is not None]
+    checksum = zlib.crc32(b"".join(Path(file).read_bytes() for file in files))
 
     def decorator(function: Callable) -> Callable:
         function.__qualname__ += f"_{checksum:08x}"

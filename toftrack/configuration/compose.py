@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -17,6 +18,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 import toftrack
+from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
@@ -46,7 +48,10 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
                 "'hand.side=left'"
             )
     with one_sentence(), _own_hydra(), initialize_config_dir(str(folder), version_base="1.3"):
-        return compose(_ROOT.removesuffix(".yaml"), overrides=list(overrides))
+        name = _ROOT.removesuffix(".yaml")
+        config = compose(name, overrides=list(overrides))
+        check_overrides(config, name, overrides)
+        return config
 
 
 def configuration_folder() -> Path:
@@ -60,7 +65,7 @@ def configuration_folder() -> Path:
 def _own_hydra() -> Iterator[None]:
     """Hydra has one state a process, which may be that of an application around us."""
     kinds = (GlobalHydra, JobRuntime, VersionBase)
-    instances = Singleton._instances
+    instances: dict[Any, Any] = Singleton._instances
     with _composing:
         kept = {kind: instances.pop(kind) for kind in kinds if kind in instances}
         try:

@@ -64,6 +64,7 @@ class Synthetic(BaseDevice):
             )
         )
         super().__init__(camera, fps, frames)
+        self._count = frames
         self.description = {"device": "synthetic", "noise_m": noise_m, "seed": seed}
         self._noise_m, self._seed = noise_m, seed
         shape = default_hand_shape()
@@ -73,7 +74,7 @@ class Synthetic(BaseDevice):
         self.truth = Truth(pose.joints_m.numpy(), yes, yes)
 
     def _states(self) -> torch.Tensor:
-        phase = torch.arange(self.frames) / 50.0 * 2 * math.pi
+        phase = torch.arange(self._count) / 50.0 * 2 * math.pi
         closing = (0.5 - 0.5 * phase.cos())[:, None].double()
         angles = torch.lerp(basic_pose("palm"), basic_pose("fist"), closing).float()
         position = torch.stack(
@@ -90,7 +91,7 @@ class Synthetic(BaseDevice):
         generator = np.random.default_rng(self._seed)
         camera, (centres, axes) = self.camera, self._ellipsoids
         k = torch.tensor(camera.K, dtype=torch.float32)
-        for index in range(self.frames):
+        for index in range(self._count):
             hand = Ellipsoids(centres[index : index + 1], axes[index : index + 1])
             depth = render_range_images(hand, k, camera.height, camera.width)[0].numpy()
             depth = np.where(depth > 0, depth, _WALL_M)

@@ -78,7 +78,9 @@ class HandSurface:
         return Ellipsoids(pose.origins_m[:, self.frame_index] + centres, frames @ self.axes_m)
 
 
-def _between(start: Tensor, end: Tensor, breadth: Tensor, depth: Tensor, overlap: Tensor):
+def _between(
+    start: Tensor, end: Tensor, breadth: float, depth: float, overlap: float
+) -> tuple[Tensor, Tensor]:
     """A flat ellipsoid from `start` to `end` in the palm: centre and axes in the hand frame."""
     along = end - start
     length = along.norm()
@@ -139,11 +141,11 @@ def hand_surface(shape: HandShape) -> HandSurface:
 
     # Metacarpals, from the carpus to the knuckles; the flesh of the palm lies in front of the
     # bones.
-    for finger, (start_x, breadth, depth) in enumerate(
+    for finger, (start_x, wide, deep) in enumerate(
         ((9.0, 13.0, 15.0), (2.0, 13.0, 16.0), (-6.0, 12.5, 15.5), (-13.0, 11.5, 14.5)), start=1
     ):
         start, end = palm(start_x, -4.0, -8.0), base[finger] + palm(0.0, 0.0, -3.0)
-        attach(0, *_between(start, end, breadth * mm, depth * mm, 0.5 * breadth * mm))
+        attach(0, *_between(start, end, wide * mm, deep * mm, 0.5 * wide * mm))
     # Carpus, thenar and hypothenar pads, the web between thumb and index finger, and the pad of the
     # knuckles across the palm.
     attach(0, *_between(palm(-15, -4, -2), palm(13, -4, -2), 18 * mm, 16 * mm, 11 * mm))

@@ -114,6 +114,7 @@ class ResultWriter:
         self._closed = True
         try:
             self._lines.close()
+            arrays: dict[str, Any]
             arrays, held = self._arrays()
             metadata = self._metadata | ({"held_frames": held} if held else {})
             arrays["joint_names"] = np.array(self._joint_names, np.str_)

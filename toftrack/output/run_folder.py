@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +210,7 @@ def open_footage(run: Run, recording: str | Path | None = None) -> Footage | Non
     elif recording is None and about.get("device") == "sample":
         store = open_source("sample")
     else:
-        path = Path(recording).expanduser() if recording is not None else run.found(name)
+        path = Path(recording).expanduser() if recording is not None else run.found(str(name))
         if not path.exists():
             raise ToftrackError(
                 f"the recording '{path}' is not there{' any more' if recording is None else ''}; "
@@ -229,8 +229,9 @@ def open_footage(run: Run, recording: str | Path | None = None) -> Footage | Non
     rows = _rows(run, store, camera, about, device, name)
     truth = store.truth
     if truth is not None:
-        values = ((f.name, getattr(truth, f.name)) for f in fields(Truth))
-        truth = Truth(**{n: None if v is None else v[rows] for n, v in values})
+        values = {f.name: getattr(truth, f.name) for f in fields(Truth)}
+        some = {name: value[rows] for name, value in values.items() if value is not None}
+        truth = replace(truth, **some)
     return Footage(store, camera, rows, truth)
 
 
@@ -280,7 +281,7 @@ def _synthetic(device: dict[str, Any]) -> Recording:
         camera=made.camera,
         timestamp_s=np.array([frame.timestamp_s for frame in frames]),
         fps=made.fps,
-        amplitude=np.stack([frame.amplitude for frame in frames]),
+        amplitude=np.stack([np.asarray(frame.amplitude) for frame in frames]),
         truth=made.truth,
     )
 

@@ -153,7 +153,8 @@ class UdpStream:
                 f"stream.host={host} cannot be found ({error}); give the name or address of the "
                 "machine that listens"
             ) from None
-        family, kind, protocol, _, self._address = found[0]
+        family, kind, protocol, _, address = found[0]
+        self._address: Any = address
         self._kind = family, kind, protocol
         self._socket: socket.socket | None = None
         self._sent = self._dropped = 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Protocol, Self, runtime_checkable
 
 import torch
@@ -46,6 +46,7 @@ class PoseSpace(Protocol):
         """The same space on another device or of another dtype."""
 
 
+@dataclass(frozen=True, eq=False)
 class TensorSpace:
     """What spaces that are frozen dataclasses of tensors share.
 

@@ -85,7 +85,8 @@ def save_pose_space(
     }
     arrays = {name: tensor.cpu().numpy() for name, tensor in space.arrays().items()}
     with open(path, "wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+        content: dict[str, Any] = {"header": np.array(json.dumps(header)), **arrays}
+        np.savez_compressed(file, **content)
 
 
 def load_pose_space(path: str | Path) -> PoseSpace:

@@ -97,7 +97,8 @@ def evaluate_space(
     """Errors of one kind of space on its training poses and, fold by fold, on held-out clips."""
     settings = settings or {}
     space = fit_pose_space(kind, dims, data, **settings)
-    results, reached = [], []
+    results: list[tuple[Tensor, Tensor]] = []
+    reached: list[tuple[Tensor, Tensor]] = []
     for training, out in clip_folds(data.clips):
         try:
             fold = fit_pose_space(kind, dims, data.rows(training), **settings)

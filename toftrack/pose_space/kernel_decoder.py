@@ -9,7 +9,7 @@ training poses the map goes on in a line instead of falling back to the mean pos
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -95,7 +95,7 @@ def fit_regression(latents: np.ndarray, angles: np.ndarray, folds: int = 5) -> R
             for r, ridge in enumerate(_RIDGES):
                 predicted = across @ (projected / (values.clip(0) + ridge)[:, None])
                 errors[w, r] += np.square(predicted - expected).sum()
-    w, r = np.unravel_index(errors.argmin(), errors.shape)
+    w, r = map(int, np.unravel_index(errors.argmin(), errors.shape))
     width = _WIDTHS[w] * median
     design, line = _line(latents, angles)
     kernel = np.exp(-square / (2 * width**2)) + _RIDGES[r] * np.eye(count)
@@ -111,7 +111,7 @@ def fit_regression(latents: np.ndarray, angles: np.ndarray, folds: int = 5) -> R
 
 def regression_tensors(
     regression: Regression, latents: np.ndarray, labels: tuple[str, ...]
-) -> dict[str, Tensor | tuple[str, ...]]:
+) -> dict[str, Any]:
     """The fields of a KernelDecodedSpace, float32 on the CPU."""
     arrays = {
         "lower": latents.min(0),

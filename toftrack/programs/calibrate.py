@@ -123,7 +123,9 @@ def calibrate(
     numbers = np.unique(np.linspace(0, len(store) - 1, frames).round().astype(int))
     views = []
     for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):
-        corners = calibration.find_corners(store.image(number)[1], board)
+        amplitude = store.image(number)[1]
+        assert amplitude is not None  # as was made sure of above
+        corners = calibration.find_corners(amplitude, board)
         if corners is not None:
             views.append(View(int(number), corners))
     fit = calibration.known_lens if keep_lens else calibration.fit_lens
@@ -131,14 +133,15 @@ def calibrate(
     images = []
     for view in lens.views:
         depth, amplitude = store.image(view.index)
+        assert amplitude is not None
         # A recording of Z was made with the recording's own camera: that is taken back.
         images.append((to_radial(depth, store.radial, store.camera), amplitude))
     pairs = calibration.depth_pairs(lens, board, square_m, images)
-    depth = calibration.fit_depth(pairs)
+    found = calibration.fit_depth(pairs)
     camera = replace(
-        lens.camera, depth_polynomial=depth.polynomial, depth_polynomial_range_m=depth.range_m
+        lens.camera, depth_polynomial=found.polynomial, depth_polynomial_range_m=found.range_m
     )
-    return Calibration(camera, lens, depth, pairs, [a for _, a in images], len(numbers))
+    return Calibration(camera, lens, found, pairs, [a for _, a in images], len(numbers))
 
 
 def report_text(result: Calibration, start: Camera) -> str:

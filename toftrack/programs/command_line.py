@@ -29,6 +29,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
 
 
@@ -106,6 +107,7 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
     @functools.wraps(task)
     def guarded(config: DictConfig) -> float:
         try:
+            _check(config)
             return task(config)
         except Exception as error:
             if not _in_sweep():
@@ -133,6 +135,11 @@ def _hydra_raises() -> Iterator[None]:
             del os.environ[FULL_ERROR]
         else:
             os.environ[FULL_ERROR] = before
+
+
+def _check(config: DictConfig) -> None:
+    hydra = HydraConfig.get()
+    check_overrides(config, str(hydra.job.config_name), hydra.overrides.task)
 
 
 def _in_sweep() -> bool:

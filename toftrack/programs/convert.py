@@ -19,7 +19,7 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.npz_stream import write_npz_streamed
-from toftrack.recordings.png_folder import PngFolderWriter
+from toftrack.recordings.png_folder import PngFolder, PngFolderWriter
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     REGISTERS,
@@ -96,8 +96,8 @@ def convert(
             store = _with_camera(store, Camera.load(camera_file), camera_file)
         if store.truth is not None and kind != ".npz":
             _warn("the ground truth has no place in the new format and is left out")
-        if getattr(store, "damage", None):
-            _warn(f"{source}: {store.damage}; the frames before are converted")
+        if damage := getattr(store, "damage", None):
+            _warn(f"{source}: {damage}; the frames before are converted")
         with tqdm(total=len(store), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
             if kind == ".npz":
                 _to_npz(store, target, bar)
@@ -141,9 +141,9 @@ def _to_srs(store: FrameStore, target: Path, range_m: float, overwrite: bool, ba
 
 def _to_folder(store: FrameStore, target: Path, unit_m: float | None, bar: tqdm) -> None:
     if unit_m is None:
-        # The camera's own words, as they are.
-        exact = isinstance(store, SrsRecording)
-        unit_m = store.range_m / np.iinfo(np.uint16).max if exact else _MILLIMETRE
+        unit_m = _MILLIMETRE
+        if isinstance(store, SrsRecording):  # the camera's own words, as they are
+            unit_m = store.range_m / np.iinfo(np.uint16).max
     with PngFolderWriter(
         target, store.camera, unit_m, store.radial, store.fps, store.metadata
     ) as writer:
@@ -160,6 +160,7 @@ def _with_camera(store: FrameStore, camera: Camera, path: str | Path) -> FrameSt
         )
     if isinstance(store, Recording):
         return replace(store, camera=camera)
+    assert isinstance(store, PngFolder | SrsRecording)
     store.camera = camera
     return store
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig
@@ -120,7 +121,7 @@ class _Signals:
     def __init__(self, device: Sr3000) -> None:
         self.came = False
         self._device = device
-        self._before: dict[int, object] = {}
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> _Signals:
         if threading.current_thread() is threading.main_thread():

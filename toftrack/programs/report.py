@@ -84,7 +84,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _read_run(path: Path, folder: Path) -> Run:
     name = path.relative_to(folder).as_posix()
     try:
-        lines = OmegaConf.to_container(OmegaConf.load(path / ".hydra" / "overrides.yaml"))
+        lines: Any = OmegaConf.to_container(OmegaConf.load(path / ".hydra" / "overrides.yaml"))
         overrides = dict(_split(str(line)) for line in lines)
     except Exception as error:  # whatever a YAML reader may say about a damaged file
         return Run(name, {}, {}, f"its overrides cannot be read ({type(error).__name__})")
@@ -96,8 +96,8 @@ def _read_run(path: Path, folder: Path) -> Run:
         return Run(name, overrides, {}, f"its summary.json cannot be read ({error})")
     if not isinstance(summary, dict):
         return Run(name, overrides, {}, "its summary.json is not one of track.py")
-    error = summary.get("error")
-    return Run(name, overrides, _flat(summary), None if error is None else str(error))
+    told = summary.get("error")
+    return Run(name, overrides, _flat(summary), None if told is None else str(told))
 
 
 def _split(override: str) -> tuple[str, str]:
@@ -180,8 +180,8 @@ def write_csv(runs: Sequence[Run], path: Path) -> None:
         writer = csv.writer(stream)
         writer.writerow(["run", *overrides, *figures, "error"])
         for run in runs:
-            row = [run.overrides.get(key, "") for key in overrides]
-            row += [run.figures.get(key, "") for key in figures]
+            row = [*(run.overrides.get(key, "") for key in overrides)]
+            row += [*(str(run.figures.get(key, "")) for key in figures)]
             writer.writerow([run.name, *row, run.error or ""])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import hydra
@@ -29,7 +30,7 @@ def train(config: DictConfig) -> float:
     degrees of the nearest points in the box to held-out clips, or of decode(encode(x)) on the
     training poses of a single clip.
     """
-    settings = OmegaConf.to_container(config.pose_space, resolve=True)
+    settings: Any = OmegaConf.to_container(config.pose_space, resolve=True)
     if settings.pop("file", None) is not None:
         raise ToftrackError(
             "pose_space.file names a model to use, not to train; leave it out, the new model is"

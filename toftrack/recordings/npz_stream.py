@@ -57,7 +57,9 @@ def write_npz_streamed(
             if store.image(0)[1] is not None:
                 with _member(archive, "amplitude", shape, "<u2") as stream:
                     for index in range(len(store)):
-                        stream.write(store.image(index)[1].astype("<u2").tobytes())
+                        amplitude = store.image(index)[1]
+                        assert amplitude is not None  # all images have one, or none has
+                        stream.write(amplitude.astype("<u2").tobytes())
         os.replace(partial, path)
     except OSError as error:
         raise ToftrackError(

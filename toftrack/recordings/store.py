@@ -20,14 +20,27 @@ from toftrack.recordings.srs import read_srs
 class FrameStore(Protocol):
     """T frames in an order, each to be had by its number."""
 
-    camera: Camera
-    fps: float
-    radial: bool
-    """True: the depth is the distance along each pixel's ray; False: Z along the optical axis."""
-    timestamp_s: np.ndarray
-    """(T,) float64, not decreasing."""
-    truth: Truth | None
-    metadata: dict[str, Any]
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def fps(self) -> float: ...
+
+    @property
+    def radial(self) -> bool:
+        """True: the depth is the distance along each pixel's ray; False: Z along the axis."""
+        ...
+
+    @property
+    def timestamp_s(self) -> np.ndarray:
+        """(T,) float64, not decreasing."""
+        ...
+
+    @property
+    def truth(self) -> Truth | None: ...
+
+    @property
+    def metadata(self) -> dict[str, Any]: ...
 
     def __len__(self) -> int: ...
 

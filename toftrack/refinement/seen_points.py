@@ -76,7 +76,7 @@ def seen_points(observation: Observation) -> SeenPoints:
         torch.from_numpy(points).to(device),
         torch.from_numpy(_nearest_pixels(solid[part], top, left)).to(device),
         observation.k,
-        tuple(observation.hand.shape),
+        (observation.hand.shape[0], observation.hand.shape[1]),
         (top, left),
     )
 
@@ -108,7 +108,7 @@ def _nearest_pixels(solid: np.ndarray, top: int, left: int) -> np.ndarray:
     u, v = _pixels(solid)
     lookup = np.zeros((len(u) + 1, 2), np.float32)
     lookup[labels[v, u]] = np.stack((u + left, v + top), 1)
-    return lookup.take(labels, 0)
+    return lookup.take(np.asarray(labels), 0)
 
 
 def _pixels(mask: np.ndarray) -> np.ndarray:

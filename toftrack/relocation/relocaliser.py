@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,11 @@ from toftrack.relocation.network import Finder, PoseNet
 from toftrack.relocation.proposals import Look, find_hands, look
 from toftrack.relocation.weights import load_weights
 
+SAME_PLACE_M = 0.06
+"""Places that lie closer together are one."""
+_CLEAR_M = 0.010
+"""Expected error that counts as much as a factor e in probability."""
+
 
 @dataclass(frozen=True)
 class RelocationSettings:
@@ -25,6 +31,7 @@ class RelocationSettings:
 
     places: int
     least: float
+    merit: float
     hypotheses: int
     rivals: int
     prior: float
@@ -40,6 +47,7 @@ class RelocationSettings:
         check_number("relocation.rivals", self.rivals, 0, whole=True)
         check_number("relocation.rival_frames", self.rival_frames, 1, whole=True)
         check_number("relocation.least", self.least, 0, 1)
+        check_number("relocation.merit", self.merit)
         for name in ("prior", "rival_gain"):
             check_number(f"relocation.{name}", getattr(self, name), 0)
         for name in ("rival_m", "landmark_m", "landmark_sigmas"):
@@ -134,26 +142,34 @@ class Relocaliser:
         other = "left" if side == "right" else "right"
         centres = np.concatenate((found[side].centre_m, found[other].centre_m))
         heat = np.concatenate((found[side].probability, 0.3 * found[other].probability))
-        centres = _apart(centres[np.argsort(-heat, kind="stable")])[: cfg.places]
+        order = np.argsort(-heat, kind="stable")
+        order = order[_apart(centres[order])][: cfg.places]
+        centres, heat = centres[order], heat[order]
         first = self.glance(depth_m, k, centres, side)
         again = np.array([glance.centre_m.numpy() for glance in first]).reshape(-1, 3)
         second = self.glance(depth_m, k, again, side)
-        return sorted(second, key=merit, reverse=True)
+        hands = [(merit(glance, p), glance) for glance, p in zip(second, heat, strict=True)]
+        hands = [hand for hand in hands if hand[0] > cfg.merit]
+        return [glance for _, glance in sorted(hands, key=lambda hand: -hand[0])]
 
 
-def merit(glance: Glance) -> float:
-    """How much speaks for a hand of the right side at a place: log odds, and how clear it is."""
-    there = np.log(max(glance.present, 1e-6)) + np.log(max(glance.right_side, 1e-3))
-    return float(there) - float(glance.error_m[0]) / 0.02
+def merit(glance: Glance, heat: float) -> float:
+    """How much speaks for a hand of the side that is looked for at a place, log scale.
+
+    heat: the finder's probability.
+    """
+    odds = math.log(max(heat, 1e-6)) + math.log(max(glance.present, 1e-6))
+    odds += 0.5 * math.log(max(glance.right_side, 1e-3))
+    return odds - float(glance.error_m[0]) / _CLEAR_M
 
 
-def _apart(centres_m: np.ndarray, least_m: float = 0.06) -> np.ndarray:
-    """The first of all places that lie closer together than `least_m`, in their order."""
-    kept: list[np.ndarray] = []
-    for centre in centres_m:
-        if all(np.linalg.norm(centre - other) > least_m for other in kept):
-            kept.append(centre)
-    return np.array(kept).reshape(-1, 3)
+def _apart(centres_m: np.ndarray) -> list[int]:
+    """Rows of the first of all places that are the same, in their order."""
+    kept: list[int] = []
+    for row, centre in enumerate(centres_m):
+        if all(np.linalg.norm(centre - centres_m[other]) > SAME_PLACE_M for other in kept):
+            kept.append(row)
+    return kept
 
 
 def _glance(seen: Look, row: int, side: str) -> Glance:

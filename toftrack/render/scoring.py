@@ -38,9 +38,10 @@ class Evidence:
         k = self.k.clone()
         k[0, 2] -= left
         k[1, 2] -= top
+        rows, columns = slice(top, bottom), slice(left, right)
         images = (self.low, self.high, self.occluder, self.hand)
-        parts = (image[top:bottom, left:right].contiguous() for image in images)
-        return Evidence(*parts, k, self.radius_px)
+        low, high, occluder, hand = (image[rows, columns].contiguous() for image in images)
+        return Evidence(low, high, occluder, hand, k, self.radius_px)
 
 
 class Counts(NamedTuple):

@@ -179,8 +179,8 @@ def _score(o: Outlines, evidence: Evidence) -> Tensor:
 
     # Where a hand pixel can be missed: the box and the neighbourhood around it.
     reach = min(math.ceil(evidence.radius_px), height + width)
-    outer = (max(0, left - reach), max(0, top - reach))
-    outer += (min(width, right + reach), min(height, bottom + reach))
+    first = (max(0, left - reach), max(0, top - reach))
+    outer = (*first, min(width, right + reach), min(height, bottom + reach))
     margins = (left - outer[0], outer[2] - right, top - outer[1], outer[3] - bottom)
     words = pack_bits(F.pad(model, margins))
     hand = evidence.hand[outer[1] : outer[3], outer[0] : outer[2]]
@@ -224,7 +224,7 @@ def _boxes(o: Outlines, width: int, height: int) -> tuple[_Boxes, tuple[int, int
     wide, (left, right), rest = numbers[:count], numbers[count : count + 2], numbers[count + 2 :]
     high, (top, bottom) = rest[:count], rest[count:]
     sizes = list(zip(wide, high, strict=True))
-    return _Boxes(*firsts, sizes), (left, top, right, bottom)
+    return _Boxes(firsts[0], firsts[1], sizes), (left, top, right, bottom)
 
 
 def _inverse_depth(o: Outlines, boxes: _Boxes, box: tuple[int, int, int, int]) -> Tensor:

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from toftrack.checks import check_number
+from toftrack.compute.pace import FRAME_S
 from toftrack.errors import ToftrackError
-from toftrack.tracking.life_cycle import Belief
+from toftrack.tracking.life_cycle import Belief, lasted, longer
 from toftrack.tracking.signs import SIGNS, Signs
 from toftrack.tracking.state import Track
 
@@ -54,16 +55,17 @@ class CalibratedBelief:
         """That every joint is within 40 mm, from one frame."""
         return self.intercept + sum(w * getattr(signs, name) for name, w in self.weights.items())
 
-    def judge(self, track: Track, signs: Signs) -> Belief:
-        """What is thought of an estimate, and whether its track goes on."""
+    def judge(self, track: Track, signs: Signs, dt_s: float) -> Belief:
+        """What is thought of an estimate, dt_s after the last, and whether its track goes on."""
         now = self.log_odds(signs)
         before = track.log_odds
-        smooth = now if before is None else self.memory * before + (1 - self.memory) * now
+        kept = self.memory ** (dt_s / FRAME_S)
+        smooth = now if before is None else kept * before + (1 - kept) * now
         confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
-        bad = track.bad + 1 if confidence < self.give_up else 0
-        kept = bad < self.patience or not self.patience
+        bad = longer(track.bad_s, dt_s) if confidence < self.give_up else 0.0
+        ends = self.patience > 0 and bad > 0 and lasted(bad, self.patience)
         lost = confidence < self.confidence
-        return Belief(kept, _state_name(signs, lost), lost, bad, 0, confidence, smooth)
+        return Belief(not ends, _state_name(signs, lost), lost, bad, 0.0, confidence, smooth)
 
 
 def _state_name(signs: Signs, lost: bool) -> str:

@@ -48,7 +48,8 @@ def border_pixels(observation: Observation) -> tuple[np.ndarray, np.ndarray]:
     hand = observation.hand.cpu().numpy()
     border = np.zeros_like(hand)
     border[[0, -1], :] = border[:, [0, -1]] = True
-    return np.nonzero(hand & border)
+    v, u = np.nonzero(hand & border)
+    return v, u
 
 
 def arm_sight(observation: Observation) -> ArmSight:
@@ -60,9 +61,10 @@ def arm_sight(observation: Observation) -> ArmSight:
     )
     v, u = border_pixels(observation)
     some = slice(None, None, max(1, -(-len(v) // _EXITS)))
-    v, u = (torch.from_numpy(index[some].copy()).to(depth.device) for index in (v, u))
-    z = depth[v, u]
-    exits = torch.stack(((u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z, z), 1)
+    rows, columns = (torch.from_numpy(index[some].copy()).to(depth.device) for index in (v, u))
+    z = depth[rows, columns]
+    x, y = (columns - k[0, 2]) / k[0, 0] * z, (rows - k[1, 2]) / k[1, 1] * z
+    exits = torch.stack((x, y, z), 1)
     return ArmSight(depth, torch.from_numpy(gap).to(depth.device), exits, k)
 
 

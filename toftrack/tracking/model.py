@@ -28,6 +28,8 @@ from toftrack.tracking.size_fit import HandFit, SizeBelief
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
+_HIDDEN = 0.03
+"""Share of the hand's pixels that must be hidden for it to matter."""
 _HANDS = 32
 """Sizes of the hand that are kept made; a fit tries no more."""
 
@@ -144,6 +146,14 @@ class ObservedFrame:
     model: TrackerModel
     glance: Glance | None = None
     seen: LastSeen | None = None
+
+    @property
+    def hidden(self) -> bool:
+        """Whether something hides part of the hand."""
+        occluder = self.observation.occluder
+        if self.model.relocaliser is None:
+            return bool(occluder.any())
+        return int(occluder.sum()) > _HIDDEN * int(self.observation.hand.sum())
 
     def log_scores(self, states: Tensor, coverage: float | None = None) -> Tensor:
         """(N, 27) hands to (N,) what they are weighed by, see FMeasure.log_score."""

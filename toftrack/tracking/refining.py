@@ -40,7 +40,7 @@ class Refined:
 
 
 def refined(
-    track: Track, mean: Tensor, frame: ObservedFrame, generator: torch.Generator
+    track: Track, mean: Tensor, dt_s: float, frame: ObservedFrame, generator: torch.Generator
 ) -> Refined:
     """The frame's estimate from the filter's mean (1, 6 + d)."""
     model = frame.model
@@ -51,7 +51,7 @@ def refined(
     if track.pose is None:
         return Refined(pose, track.trend, rival)
     steadying, motions = model.refinement.steadying, model.backend.motions
-    steady, trend = steadied(pose, track.pose, track.trend, steadying, motions)
+    steady, trend = steadied(pose, track.pose, track.trend, dt_s, steadying, motions)
     return Refined(steady, trend, rival)
 
 

@@ -11,10 +11,11 @@ from toftrack.frames import DepthImage
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.refinement.seen_points import seen_points
-from toftrack.relocation.relocaliser import Glance
+from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance
 from toftrack.render.segmentation import Expected
+from toftrack.tracking.following import displacement
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
-from toftrack.tracking.state import Track
+from toftrack.tracking.state import Track, TrackerState
 
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no rivals."""
@@ -25,21 +26,28 @@ _NEAREST_M = 0.15
 
 
 def glanced(
-    track: Track | None, side: str, image: DepthImage, model: TrackerModel
-) -> Glance | None:
-    """What the networks say of a frame: at the tracked hand, or the best place of all.
+    state: TrackerState, dt_s: float, image: DepthImage, model: TrackerModel
+) -> tuple[Track | None, Glance | None]:
+    """The track to go on with, and what the networks say of the hand: where it is, or at the best
+    place of all; None where there are no networks, or no hand.
 
-    None where there are no networks, or no hand.
+    A track that is doubted gives way to a hand that is found elsewhere.
     """
-    relocaliser = model.relocaliser
+    relocaliser, track, side = model.relocaliser, state.track, state.side
     if relocaliser is None:
-        return None
-    if track is None:
-        return next(iter(relocaliser.search(image.depth_m, image.k, side)), None)
-    ahead = model.backend.motions.compose(track.mean, track.velocity[None])
+        return track, None
+    best = None
+    if track is None or track.doubted:
+        best = next(iter(relocaliser.search(image.depth_m, image.k, side)), None)
+        if track is None:
+            return None, best
+    moved = displacement(track, dt_s, model.filter)[None]
+    ahead = model.backend.motions.compose(track.mean, moved)
     centre = (ahead[:, :3] + rotated_pivot(ahead[:, 3:6])).cpu().numpy()
     centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
-    return relocaliser.glance(image.depth_m, image.k, centre, side)[0]
+    if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
+        return None, best
+    return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
 
 
 def expected_of(glance: Glance) -> Expected:

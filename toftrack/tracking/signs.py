@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 
 from torch import Tensor
 
+from toftrack.compute.pace import FRAME_S
 from toftrack.relocation.relocaliser import Glance
 
 _LEAST = 1e-3
@@ -51,11 +52,11 @@ SIGNS = tuple(field.name for field in fields(Signs))
 
 
 def read_signs(
-    joints_m: Tensor, score: float, age: int, glance: Glance, depth_m: Tensor, k: Tensor
+    joints_m: Tensor, score: float, age_s: float, glance: Glance, depth_m: Tensor, k: Tensor
 ) -> Signs:
     """The signs of an estimate with joints (21, 3) in an image (H, W) with intrinsics k.
 
-    age: frames since its track began.
+    age_s: seconds since its track began.
     """
     joints = joints_m.cpu()
     votes = (joints - glance.landmarks.points_m).norm(dim=1)
@@ -74,7 +75,7 @@ def read_signs(
         other_side=_log_odds(1 - glance.right_side),
         unseen=unseen,
         hidden=hidden,
-        young=1 / (1 + age),
+        young=1 / (1 + age_s / FRAME_S),
     )
 
 

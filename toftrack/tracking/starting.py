@@ -8,13 +8,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from toftrack.compute.backend import Motions
-from toftrack.tracking.life_cycle import LostSettings
+from toftrack.tracking.following import displacement, young
+from toftrack.tracking.life_cycle import lasted, longer
 from toftrack.tracking.model import ObservedFrame, TrackerModel
 from toftrack.tracking.refining import Refined, improved
 from toftrack.tracking.relocating import begun, track_of
-from toftrack.tracking.search import LastSeen, LogScores, Sought
-from toftrack.tracking.state import Track
+from toftrack.tracking.search import LogScores, Sought
+from toftrack.tracking.state import Track, TrackerState
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +29,9 @@ class Proposals:
     log_scores: LogScores
 
 
-def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Generator) -> Proposals:
-    """Particles to start with in a frame.
-
-    seen: the last hand that was believed.
-    """
-    model = frame.model
+def propose(state: TrackerState, frame: ObservedFrame, generator: torch.Generator) -> Proposals:
+    """Particles to start with in a frame, from what the state still knows of the hand."""
+    model, seen = frame.model, state.seen
     prior = model.start.prior(frame.observation, seen)
 
     def log_scores(particles: Tensor, coverage: float) -> Tensor:
@@ -45,43 +42,47 @@ def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Genera
     return Proposals(model.start(sought, model.filter.particles, generator), log_scores)
 
 
-def begin(track: Track | None, frame: ObservedFrame, generator: torch.Generator) -> Track:
+def begin(
+    track: Track | None,
+    state: TrackerState,
+    dt_s: float,
+    frame: ObservedFrame,
+    generator: torch.Generator,
+) -> Track:
     """The track to follow in a frame: the given one, or one that begins here."""
     model = frame.model
     if frame.glance is not None:
         return begun(frame) if track is None else track
-    if track is not None and track.age >= model.lost.probation:
+    if track is not None and not young(track, model.lost):
         return track
-    proposals = propose(frame.seen, frame, generator)
-    return started(track, proposals, model.lost, model.backend.motions)
+    return started(track, propose(state, frame, generator), dt_s, model)
 
 
 def challenged(
-    track: Track, outcome: Refined, hidden: bool, model: TrackerModel
+    track: Track, outcome: Refined, dt_s: float, frame: ObservedFrame
 ) -> tuple[Track, Tensor, Tensor | None]:
     """The track, the pose (1, 27) and the trend to go on with, after a rival was heard.
 
     A rival takes over when it was better for a while; never while something hides the hand.
     """
-    relocaliser, rival = model.relocaliser, outcome.rival
-    if relocaliser is None or rival is None or hidden:
-        return replace(track, challenged=0), outcome.pose, outcome.trend
-    count = track.challenged + 1
-    if count < relocaliser.settings.rival_frames and track.age > 0:
-        return replace(track, challenged=count), outcome.pose, outcome.trend
-    return track_of(rival, model), rival, None
+    relocaliser, rival = frame.model.relocaliser, outcome.rival
+    if relocaliser is None or rival is None or frame.hidden:
+        return replace(track, challenged_s=0.0), outcome.pose, outcome.trend
+    since = longer(track.challenged_s, dt_s)
+    if track.age_s > 0 and not lasted(since, relocaliser.settings.rival_frames):
+        return replace(track, challenged_s=since), outcome.pose, outcome.trend
+    return track_of(rival, frame.model), rival, None
 
 
-def started(
-    track: Track | None, proposals: Proposals, settings: LostSettings, motions: Motions
-) -> Track:
+def started(track: Track | None, proposals: Proposals, dt_s: float, model: TrackerModel) -> Track:
     """A new track from a start; or the given young one, if the start is no better than it."""
     particles = proposals.particles
     if track is not None:
-        now = motions.compose(track.particles, track.velocity[None])
+        ahead = displacement(track, dt_s, model.filter)
+        now = model.backend.motions.compose(track.particles, ahead[None])
         log_scores = proposals.log_scores
         # The search has seen this frame and the track has not, so a little better is no better.
-        if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < settings.rival_gain:
+        if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < model.lost.rival_gain:
             return track
     n, size = particles.shape
     weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.pace import FRAME_S, elapsed_s
 from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
@@ -53,13 +54,14 @@ def step(
     A pure function: the state given stays as it is, and gives the same again.
     """
     spans, generator = Spans(), resumed(state.generator, model.device)
+    dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
     state = _at(state, image)
     with spans("relocaliser"):
-        glance = glanced(state.track, state.side, image, model)
-        state = replace(state, size=_size_told(state, glance, model))
-    hand, track = model.hand(state.side, state.size), state.track
+        track, glance = glanced(state, dt_s, image, model)
+        state = replace(state, size=_size_told(state, track, glance, model))
+    hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
-        expected = expected_depths(track, hand, model)
+        expected = expected_depths(track, dt_s, hand, model)
         if expected is None and glance is not None:
             expected = expected_of(glance)
         observation = model.segmentation(image.depth_m, image.k, expected)
@@ -68,20 +70,21 @@ def step(
             return _without_hand(state, image, observation, model, spans)
         frame = observed(observation, hand, model, glance, state.seen)
     with spans("start"):
-        track = begin(track, frame, generator)
+        track = begin(track, state, dt_s, frame, generator)
     with spans("filter: rest"):
-        particles, weights = filtered(track, frame, generator, spans)
+        particles, weights = filtered(track, dt_s, frame, generator, spans)
         mean = particle_filter.mean_particle(particles, weights)
     with spans("refinement"):
-        outcome = refined(track, mean, frame, generator)
-        hidden = bool(frame.observation.occluder.any())
-        track, pose, trend = challenged(track, outcome, hidden, model)
+        outcome = refined(track, mean, dt_s, frame, generator)
+        track, pose, trend = challenged(track, outcome, dt_s, frame)
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
-    belief, signs = _believed(track, found, score, frame)
-    track = advanced(track, found, belief, expected if hidden else None, model)
+    belief, signs = _believed(track, found, score, dt_s, frame)
+    track = advanced(track, found, belief, expected if frame.hidden else None, dt_s, model)
     estimate = _estimate(image, found, score, belief, frame)
-    gesture, estimate = tell_gesture(model.gestures, state.gesture, estimate, model.space)
+    gesture, estimate = tell_gesture(
+        model.gestures, state.gesture, estimate, model.space, dt_s / FRAME_S
+    )
     size, refused = _sized(state, found, belief, frame, generator)
     estimate = replace(estimate, compute_s=spans.total())
     after = replace(
@@ -99,26 +102,28 @@ def step(
 
 
 def _believed(
-    track: Track, found: Found, score: float, frame: ObservedFrame
+    track: Track, found: Found, score: float, dt_s: float, frame: ObservedFrame
 ) -> tuple[Belief, Signs | None]:
     """What is thought of a frame's estimate, and by which signs."""
     settings, signs = frame.model.lost, None
     if frame.glance is not None:
         joints = frame.hand.refiner.joints(found.pose)[0]
         seen = frame.observation
-        signs = read_signs(joints, score, track.age, frame.glance, seen.depth_m, seen.k)
+        signs = read_signs(joints, score, track.age_s, frame.glance, seen.depth_m, seen.k)
     if isinstance(settings, CalibratedBelief):
         assert signs is not None  # see TrackerModel
-        return settings.judge(track, signs), signs
-    return believe(track, score, found.off_rad, settings), signs
+        return settings.judge(track, signs, dt_s), signs
+    # A pose that nothing refined is one of the space.
+    off_rad = 0.0 if frame.model.refinement is None else found.off_rad
+    return believe(track, score, off_rad, dt_s, settings), signs
 
 
 def _size_told(
-    state: TrackerState, glance: Glance | None, model: TrackerModel
+    state: TrackerState, track: Track | None, glance: Glance | None, model: TrackerModel
 ) -> SizeBelief | None:
     """The size to begin a track with is what the networks say, until estimates say better."""
     size = state.size
-    if model.fit is None or size is None or glance is None or state.track is not None:
+    if model.fit is None or size is None or glance is None or track is not None:
         return size
     return size if size.frames else size_fit.told(model.fit, glance.length_m, model.shape)
 

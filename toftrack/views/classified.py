@@ -70,6 +70,6 @@ def classify(
     if not beside.all():
         distance_px = cv2.distanceTransform(beside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         reach = distance_px <= evidence.radius_px
-    images = (torch.from_numpy(image)[None] for image in (range_m, on_wrist, reach))
-    classes = classify_range_images(*images, evidence)
+    surface, at_wrist, near = (torch.from_numpy(a)[None] for a in (range_m, on_wrist, reach))
+    classes = classify_range_images(surface, at_wrist, near, evidence)
     return Classified(range_m, *(image[0].numpy() for image in classes))

@@ -72,7 +72,7 @@ def draw_panel(
     smooth = cv2.INTER_NEAREST if amplitude is None else cv2.INTER_LINEAR
     left = cv2.cvtColor(cv2.resize(grey, size, interpolation=smooth), cv2.COLOR_GRAY2BGR)
     _draw_skeleton(left, camera, estimate.joints_m, size[0] / width, size[1] / height)
-    model = np.full((height, width), 255, np.uint8)
+    model: np.ndarray = np.full((height, width), 255, np.uint8)
     if model_depth is not None:
         model = range_grey(model_depth)
     # Nearest, because mixing the hand with the background would draw a dark rim around it.

@@ -232,6 +232,7 @@ class RealSense(BaseDevice):
     def _wait(self, begun: bool) -> Any | None:
         """The next set of frames, None at the end; ToftrackError when none comes."""
         deadline, over = time.monotonic() + self._timeout_s, False
+        assert self._take is not None
         while True:
             came, frames = self._take()
             if came:

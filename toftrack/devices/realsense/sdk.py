@@ -136,8 +136,9 @@ def choose_streams(
         chosen = [p for p in depth if size is None or _size(p) == size]
         if not chosen:
             offered = ", ".join("{}x{} at {}".format(*s) for s in sorted(set(map(_size, depth))))
+            wanted = "{}x{} pixels at {} frames/s".format(*(size or ()))
             raise ToftrackError(
-                f"{owner} has no depth images of {size[0]}x{size[1]} pixels at {size[2]} frames/s; "
+                f"{owner} has no depth images of {wanted}; "
                 f"set device.width, device.height and device.fps to one of {offered} (a USB 2 port "
                 "or cable leaves few)"
             )

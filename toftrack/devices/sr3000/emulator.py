@@ -104,7 +104,7 @@ class EmulatedBackend(IBackend):
         usb: UsbSettings | None = None,
     ) -> None:
         self.served = 0
-        """Whole frames put at the endpoint, those of hforearm_conflict faults included."""
+        """Whole frames put at the endpoint, those of harmless faults included."""
         self.requests = 0
         self.misuse: list[str] = []
         """What a driver did that the USB forbids; empty if all is well."""

@@ -58,6 +58,7 @@ class MesaTransport:
         self.close()
         self.check()
         library = self._library
+        assert library is not None
         camera = _CAMERA()
         opened = library.SR_OpenUSB(ctypes.byref(camera), self._serial)
         if opened <= 0 or not camera.value:

@@ -65,7 +65,7 @@ class UsbTransport:
         self._serial = serial
         self._backend = backend
         self._ended = ended
-        self._device: usb.core.Device | None = None
+        self._device: Any = None  # a usb.core.Device while it is open
         self._length = -(-FRAME_BYTES // settings.read_multiple) * settings.read_multiple
         self.patience_s = (3 * settings.timeout_ms + settings.drain_ms) / 1000
 

@@ -52,7 +52,7 @@ def leap_data(path: str, poses: int | None = 400, worst_fit_mm: float = 10.0) ->
     kept = [_longest(family, lengths, f) for f in dict.fromkeys(family)]
 
     shape = default_hand_shape().to(torch.float64)
-    directions = sum(straight_finger_directions(clips[i], shape) for i in kept)
+    directions = torch.stack([straight_finger_directions(clips[i], shape) for i in kept]).sum(0)
     yaw = math.atan2(float(directions[0]), float(directions[1]))
     fits = [fit_angles(clips[i], shape_of_joints(clips[i], shape, yaw)) for i in kept]
     angles = torch.cat([fit.angles_rad for fit in fits])

@@ -71,8 +71,8 @@ class TritonScorer:
             evidence.hand.contiguous().view(torch.uint8), hand, width, words
         )
         steps = _steps(evidence.radius_px, height, width, device)
-        images = (evidence.low, evidence.high, evidence.occluder)
-        images = tuple(image.float().contiguous() for image in images)
+        bands = (evidence.low, evidence.high, evidence.occluder)
+        images = tuple(band.float().contiguous() for band in bands)
         camera = evidence.k.float().contiguous()
         chunk = max(1, _SCRATCH_BYTES // (8 * height * words))
         parts = [

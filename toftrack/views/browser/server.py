@@ -92,7 +92,7 @@ class BrowserServer:
             self._server = _Server(source, host, family, address)
         except OSError as error:
             raise _refused(host, port, error) from error
-        at, port = self._server.server_address[:2]
+        at, port = map(str, self._server.server_address[:2])
         self.url = f"http://[{at}]:{port}/" if ":" in at else f"http://{at}:{port}/"
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="browser-server", daemon=True
@@ -127,7 +127,8 @@ class _Server(ThreadingHTTPServer):
     def server_bind(self) -> None:
         # HTTPServer's asks a name server for this machine's name, which can take seconds.
         socketserver.TCPServer.server_bind(self)
-        self.server_name, self.server_port = self.server_address[:2]
+        at, port = self.server_address[:2]
+        self.server_name, self.server_port = str(at), port
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         with self._lock:

@@ -25,8 +25,8 @@ def corner_sheet(
     for amplitude, corners in images:
         root = np.sqrt(amplitude.astype(np.float32))
         grey = (255 * root / max(float(root.max()), 1.0)).astype(np.uint8)
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        tile = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+        shown = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        tile = cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR)
         places = ((corners + 0.5) * scale - 0.5).astype(np.float32).reshape(-1, 1, 2)
         cv2.drawChessboardCorners(tile, board, places, True)
         tiles.append(tile)

@@ -118,7 +118,7 @@ def _write_frames(picture: np.ndarray, axes: Axes, time_s: np.ndarray, frames: n
     """Frame numbers above the axes of the score; those that would overlap are left out."""
     y, size = axes.top - 10, 0.45
     chart.write(picture, "frame", (axes.right, y), align="right")
-    end = axes.left + chart.text_width("score") + 10
+    end: float = axes.left + chart.text_width("score") + 10
     last = axes.right - chart.text_width("frame") - 10
     for time, frame in sorted(zip(time_s.tolist(), frames.tolist(), strict=True)):
         x, half = float(axes.place(time, axes.y[0])[0]), chart.text_width(f"{frame}", size) / 2
@@ -285,10 +285,9 @@ def _cross(picture: np.ndarray, centre: tuple[int, int], colour: chart.Colour) -
 def _time_colours(time_s: np.ndarray) -> list[chart.Colour]:
     """Of each frame, dark to bright; the brightest third would not be seen on white."""
     start, end = _span(time_s)
-    shades = np.uint8(np.round(180 * (time_s - start) / (end - start)))
-    return [
-        tuple(map(int, c)) for c in cv2.applyColorMap(shades[:, None], cv2.COLORMAP_INFERNO)[:, 0]
-    ]
+    shades = np.round(180 * (time_s - start) / (end - start)).astype(np.uint8)
+    colours = cv2.applyColorMap(shades[:, None], cv2.COLORMAP_INFERNO)[:, 0]
+    return [(int(b), int(g), int(r)) for b, g, r in colours]
 
 
 def _time_bar(time_s: np.ndarray, height: int) -> np.ndarray:

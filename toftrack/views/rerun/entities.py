@@ -149,7 +149,7 @@ class Entities:
         particles = insight.particles.detach().cpu()
         middles = particles[:, :3] + rotated_pivot(particles[:, 3:6])
         weights = insight.weights.detach().cpu().numpy()
-        shades = np.uint8(np.round(255 * weights / max(float(weights.max()), 1e-12)))
+        shades = np.round(255 * weights / max(float(weights.max()), 1e-12)).astype(np.uint8)
         colours = cv2.applyColorMap(shades[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
         points = rr.Points3D(middles.numpy(), colors=colours, radii=_PARTICLE_M)
         self._stream.log("world/hand/particles", points)

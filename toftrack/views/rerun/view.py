@@ -62,7 +62,7 @@ class RerunView:
         if self._path is None:
             if spawn:
                 _start_viewer(self._stream)
-            else:
+            elif connect:
                 _require_answer(connect)
             self._stream.connect_grpc(connect or _ADDRESS, default_blueprint=blueprint())
         else:

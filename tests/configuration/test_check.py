@@ -1,0 +1,82 @@
+"""Overrides that cannot be meant: one sentence, before anything slow."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import yaml
+from helpers.tracking import CONF, ROOT
+from omegaconf import OmegaConf
+
+import toftrack.configuration.check as check
+from toftrack.configuration.compose import configuration
+from toftrack.errors import ToftrackError
+
+WRONG = (
+    ("start.islands=0", "start.islands=0 .*whole number above 0"),
+    ("refine.points=0", "refine.points=0 .*above 0"),
+    ("segmentation.max_pixels=0", "max_pixels=0 .*above 0"),
+    ("hand.fit.step=0", "hand.fit.step=0 .*a number above 0"),
+    ("filter.spread.depth_m=-0.1", "filter.spread.depth_m=-0.1 .*at least 0"),
+    ("filter.particles=many", "filter.particles=many .*a whole number"),
+    ("filter.particles=2.5", "filter.particles=2.5 .*a whole number"),
+    ("filter.exponent=nan", "filter.exponent=nan .*a number"),
+    ("filter.passes=null", "filter.passes=None .*a whole number"),
+    ("refine.steadying.calm=[1]", "refine.steadying.calm=.*a number"),
+    ("device.repeat=5", "device.repeat=5 .*true or false"),
+)
+
+
+@pytest.mark.parametrize(("override", "words"), WRONG)
+def test_a_wrong_value_is_told_in_one_sentence(override: str, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words) as error:
+        configuration(override)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("filter.exponent=30", "filter.particles=100"),  # a whole number is a number
+        ("view=browser", "view.linger_s=inf"),
+        ("lost.outside_rad=inf",),
+        ("experiment=paper", "filter.particles=10"),
+        ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
+        ("start=rough", "start.pose=[0,0,0.4,0,0,0]"),
+        ("+device.anything=-1",),
+        ("~device.repeat",),
+        ("gestures.file=mine.csv", "device.stop=5"),
+    ],
+)
+def test_a_right_value_passes(overrides: tuple[str, ...]) -> None:
+    configuration(*overrides)
+
+
+def test_what_a_part_of_somebody_else_s_accepts_is_not_judged(tmp_path) -> None:
+    (tmp_path / "device").mkdir()
+    (tmp_path / "device" / "raw.yaml").write_text("_target_: mine.Raw\ngain: 1\n")
+    (tmp_path / "config.yaml").write_text("defaults:\n  - device: raw\n  - _self_\n")
+    assert configuration("device.gain=-0.5", config_dir=tmp_path).device.gain == -0.5
+
+
+def test_the_program_ends_without_torch_having_been_loaded(tmp_path) -> None:
+    command = [sys.executable, "-X", "importtime", str(ROOT / "track.py"), "start.islands=0"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("error: start.islands=0 is not possible")
+    assert "| torch\n" not in done.stderr
+
+
+def test_every_setting_of_the_tables_is_one() -> None:
+    keys: set[str] = set()
+    for path in CONF.glob("*/*.yaml"):
+        pending = [(path.parent.name, OmegaConf.create(yaml.safe_load(path.read_text())))]
+        while pending:
+            prefix, node = pending.pop()
+            for name in node:
+                keys.add(f"{prefix}.{name}")
+                if not OmegaConf.is_missing(node, name) and OmegaConf.is_dict(node._get_node(name)):
+                    pending.append((f"{prefix}.{name}", node[name]))
+    assert check._ABOVE_ZERO | check._OPEN_ENDED | check._MAY_BE_NONE <= keys

@@ -1,0 +1,110 @@
+"""A light check of what was overridden, before torch is loaded: is a number a number, and possible?
+
+Each value is compared with the one in conf/ that it takes the place of: where that is a number, so
+must be the override, whole where it is whole, and not negative, as no number in conf/ is. Which
+settings must be above 0 stands here; other bounds are for the parts that use the settings. Only
+toftrack's own parts are looked at: what a part of somebody else's accepts, nobody knows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from toftrack.checks import check_number
+from toftrack.errors import ToftrackError
+
+_ABOVE_ZERO = frozenset(
+    """
+    data.poses data.worst_fit_mm
+    device.fps device.frames device.height device.queue_frames device.timeout_s device.width
+    device.emulated.unit_m device.libmesasr.timeout_ms
+    device.persistence.backoff_s device.persistence.first_frame_s device.persistence.give_up_s
+    device.persistence.longest_backoff_s device.persistence.reopen_after
+    device.usb.drain_ms device.usb.read_multiple device.usb.timeout_ms
+    filter.exponent filter.exponent_growth filter.particles filter.passes filter.shrink
+    gestures.flexion_rad gestures.off_rad gestures.other gestures.split_rad gestures.thumb_rad
+    hand.length_m hand.fit.beta hand.fit.exponent hand.fit.frames hand.fit.largest hand.fit.prior
+    hand.fit.samples hand.fit.step
+    likelihood.beta likelihood.tolerance_m
+    pose_space.dims
+    refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
+    segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
+    smooth.min_cutoff_hz smooth.speed_cutoff_hz
+    start.hypotheses start.islands start.memory_rad start.memory_s start.samples
+    stream.port stream.waiting
+    view.most_fps view.quality
+    """.split()
+)
+_OPEN_ENDED = frozenset({"lost.outside_rad", "view.linger_s", "view.wait_s"})
+"""Infinity is a value of these."""
+_MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
+
+
+def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> None:
+    """Compare a composed configuration with what it would be if only options were chosen.
+
+    Hydra must be initialised, as it is within `compose` and a job of `@hydra.main`.
+
+    config: what was composed.  name: of the configuration file.  overrides: of the command line.
+    Raises ToftrackError with one sentence that names the setting.
+    """
+    loader = GlobalHydra.instance().config_loader()
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    chosen = [o for o in parsed if not o.is_delete() and loader.get_group_options(o.key_or_group)]
+    if len(chosen) == len(parsed):
+        return
+    try:
+        lines = [override.input_line for override in chosen if override.input_line is not None]
+        default = loader.load_configuration(name, lines, RunMode.RUN)
+    except (HydraException, OmegaConfBaseException):
+        return  # options that exclude each other unless something is deleted: nothing to compare
+    for key, value, usual in _pairs(config, default):
+        check_value(key, value, usual)
+
+
+def check_value(key: str, value: object, usual: object) -> None:
+    """Raise ToftrackError where a setting's value cannot stand in for the usual one in conf/."""
+    if isinstance(usual, bool):
+        if not isinstance(value, bool):
+            raise ToftrackError(f"{key}={value} is not possible; give true or false")
+    elif isinstance(usual, (int, float)):
+        if value is None and key in _MAY_BE_NONE or value == math.inf and key in _OPEN_ENDED:
+            return
+        check_number(key, value, 0, above=key in _ABOVE_ZERO, whole=isinstance(usual, int))
+    elif isinstance(usual, list) and not isinstance(value, list):
+        raise ToftrackError(f"{key}={value} is not possible; give a list, as [{value}]")
+
+
+def _pairs(
+    config: DictConfig, default: DictConfig, prefix: str = ""
+) -> Iterator[tuple[str, object, object]]:
+    """Key, value and usual value of every setting that both have and that differs."""
+    ours = str(OmegaConf.select(config, "_target_", default="toftrack.")).startswith("toftrack.")
+    for name in map(str, config):
+        key = f"{prefix}{name}"
+        if name not in default or OmegaConf.is_missing(config, name):
+            continue
+        if OmegaConf.is_missing(default, name):
+            continue
+        try:
+            value, usual = config[name], default[name]
+        except OmegaConfBaseException:
+            continue  # an interpolation that only resolves elsewhere
+        if isinstance(value, DictConfig) and isinstance(usual, DictConfig):
+            yield from _pairs(value, usual, f"{key}.")
+        elif ours:
+            plain, other = _plain(value), _plain(usual)
+            if plain != other or type(plain) is not type(other):
+                yield key, plain, other
+
+
+def _plain(value: object) -> object:
+    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
