@@ -12,12 +12,15 @@ from torch import Tensor
 from toftrack.relocation.crops import CROP, CROP_M, WIDE_F_PX, channels, wide_channels
 from toftrack.relocation.pictures import Lens, random_sensors, take_pictures
 from toftrack.relocation.scenes import (
+    BACKGROUND,
+    FOREARM,
     HAND,
     OTHER_FOREARM,
     OTHER_HAND,
     Dice,
     Hands,
     Scenes,
+    moved,
     posed_hands,
     room,
     surroundings,
@@ -82,16 +85,17 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     near = torch.where(dice.chance(0.3, n), 0.040, 0.016)[:, None] * dice.normal(n, 3)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.13, high=0.30)
-    present = ~dice.chance(0.12, n)
+    present = ~dice.chance(0.16, n)
     pivot = centre + torch.where(present[:, None], near.clamp(-0.09, 0.09), away)
-    left = dice.chance(0.25, n)
+    left = dice.chance(0.3, n)
     hands = posed_hands(bank, pivot, left, dice, HAND)
     labels = hands.labels.clone()
-    # Half of the crops about something else: there is no hand at all, only its arm, or nothing.
-    gone = ~present & dice.chance(0.5, n)
+    # Most of the crops about something else: there is no hand at all, only its arm, or nothing.
+    gone = ~present & dice.chance(0.7, n)
     pieces = labels.shape[1] - 5
     labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
     scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12)
+    scenes = moved(scenes, torch.where(gone[:, None], _onto_something(scenes, centre, dice), 0.0))
 
     pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
     side = pixels.round().clamp(36, _SAMPLES)
@@ -117,6 +121,18 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
         log_size=hands.log_size,
         joints_m=hands.joints_m - centre[:, None],
     )
+
+
+def _onto_something(scenes: Scenes, centre_m: Tensor, dice: Dice) -> Tensor:
+    """(N, 3) by how much to move scenes so that the crop shows some thing or part of a body."""
+    drawn = (scenes.labels == BACKGROUND) | (scenes.labels == FOREARM)
+    weights = drawn.float() + 1e-6
+    one = torch.multinomial(weights, 1, generator=dice.generator)[:, 0]
+    at = scenes.centres_m[torch.arange(len(one)), one]
+    thick = scenes.axes_m[torch.arange(len(one)), one][:, 2].norm(dim=1)
+    near = at + 0.03 * dice.normal(len(one), 3)
+    near[:, 2] -= 0.8 * thick
+    return centre_m - near
 
 
 def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImages:

@@ -78,7 +78,7 @@ def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> PoseLosses:
     presence = F.binary_cross_entropy_with_logits(p.present, crops.present.float())
     there = crops.present
     side = F.binary_cross_entropy_with_logits(p.right[there], crops.right[there].float())
-    loss = loss + 0.5 * presence + 0.3 * side
+    loss = loss + 0.5 * presence + side
     with torch.no_grad():
         first = p.log_probability[use].argmax(1)
         at = (use, first)

@@ -59,6 +59,13 @@ class Scenes:
     planes: Tensor
 
 
+def moved(scenes: Scenes, by_m: Tensor) -> Scenes:
+    """The same scenes elsewhere; by_m: (N, 3)."""
+    planes = scenes.planes.clone()
+    planes[..., 3] += (planes[..., :3] * by_m[:, None]).sum(-1)
+    return Scenes(scenes.centres_m + by_m[:, None], scenes.axes_m, scenes.labels, planes)
+
+
 class Dice:
     """Draws of one generator, short to write."""
 
@@ -85,7 +92,7 @@ class Dice:
 def random_rotations(n: int, dice: Dice) -> Tensor:
     """(n, 3, 3) hands as people hold them: palms and backs alike, edge-on, at the camera, any."""
     kind = dice.uniform(n)
-    upright, sideways, pointing = kind < 0.5, kind < 0.70, kind < 0.86
+    upright, sideways, pointing = kind < 0.42, kind < 0.65, kind < 0.85
     roll = 0.6 * dice.normal(n)
     roll = torch.where(sideways & ~upright, dice.uniform(n, low=-2.4, high=2.4), roll)
     roll = torch.where(pointing & ~sideways, 1.0 * dice.normal(n), roll)

@@ -11,9 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
@@ -26,7 +27,6 @@ from toftrack.relocation.shapes import shape_bank
 
 _READY = 6
 """Batches that wait to be trained on."""
-_SHARED = "file_system"
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -168,7 +168,7 @@ def _batches(
         for _ in range(steps):
             while True:
                 try:
-                    yield queue.get(timeout=10)
+                    yield _tensors(*queue.get(timeout=10))
                     break
                 except queues.Empty:
                     if not worker.is_alive():
@@ -184,10 +184,22 @@ def _batches(
 def _make_batches(
     queue: Any, make: Callable[..., Any], batch: int, steps: int, shapes: int, seed: int
 ) -> None:
-    torch.multiprocessing.set_sharing_strategy(_SHARED)
     torch.set_num_threads(1)
     _keep_memory()
     generator = torch.Generator().manual_seed(seed)
     bank = shape_bank(shapes, generator)
     for _ in range(steps):
-        queue.put(make(batch, bank, generator))
+        queue.put(_arrays(make(batch, bank, generator)))
+
+
+def _arrays(batch: Any) -> tuple[type, list[np.ndarray]]:
+    """A batch as arrays, which travel by themselves: torch would share memory through a helper that
+    a busy machine may starve. Images in half precision, which is more than a sensor's.
+    """
+    values = [getattr(batch, field.name).numpy() for field in fields(batch)]
+    return type(batch), [v.astype(np.float16) if v.ndim == 4 else v for v in values]
+
+
+def _tensors(kind: type, arrays: list[np.ndarray]) -> Any:
+    """The batch again."""
+    return kind(*(torch.from_numpy(a.astype(np.float32) if a.ndim == 4 else a) for a in arrays))
