@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,8 +131,16 @@ class Relocaliser:
         seen = look(self.pose, depth_m, k, centres_m, side)
         return [_glance(seen, row, side) for row in range(len(seen.present))]
 
-    def search(self, depth_m: np.ndarray, k: np.ndarray, side: str) -> list[Glance]:
+    def search(
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        side: str,
+        likely: Callable[[np.ndarray], float] = lambda centre_m: 0.0,
+    ) -> list[Glance]:
         """Glances at all places where a hand may be, the best first; none where there is none.
+
+        likely: what is known of places (3,) besides the image, log scale.
 
         Each place is looked at twice, the second time about the palm that the first one found:
         poses are the more exact the nearer the crop's centre is to the middle of the palm.
@@ -148,7 +157,10 @@ class Relocaliser:
         first = self.glance(depth_m, k, centres, side)
         again = np.array([glance.centre_m.numpy() for glance in first]).reshape(-1, 3)
         second = self.glance(depth_m, k, again, side)
-        hands = [(merit(glance, p), glance) for glance, p in zip(second, heat, strict=True)]
+        hands = [
+            (merit(glance, p) + likely(glance.centre_m.numpy()), glance)
+            for glance, p in zip(second, heat, strict=True)
+        ]
         hands = [hand for hand in hands if hand[0] > cfg.merit]
         return [glance for _, glance in sorted(hands, key=lambda hand: -hand[0])]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,12 +17,16 @@ from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
+from toftrack.tracking.search import LastSeen
 from toftrack.tracking.state import Track, TrackerState
 
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no rivals."""
 _LEAST_WORD = float(np.log(0.001))
 """The least that the networks' word counts."""
+_STEP_M, _SPEED_M_S = 0.04, 0.5
+"""How far a hand has moved since it was last believed: at once, and a second."""
+_FORGOTTEN_S = 1.0
 _NEAREST_M = 0.15
 """A camera sees nothing nearer."""
 
@@ -38,7 +44,8 @@ def glanced(
         return track, None
     best = None
     if track is None or track.doubted:
-        best = next(iter(relocaliser.search(image.depth_m, image.k, side)), None)
+        likely = partial(_reachable, state.seen)
+        best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
         if track is None:
             return None, best
     moved = displacement(track, dt_s, model.filter)[None]
@@ -48,6 +55,19 @@ def glanced(
     if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
         return None, best
     return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
+
+
+def _reachable(seen: LastSeen | None, centre_m: np.ndarray) -> float:
+    """How likely a hand has come to a place from where it was last believed, log scale.
+
+    Another hand, or the thing that hides the hand, is no place that it has jumped to.
+    """
+    if seen is None:
+        return 0.0
+    before = seen.particle[:, :3] + rotated_pivot(seen.particle[:, 3:6])
+    away = float(np.linalg.norm(before[0].cpu().numpy() - centre_m))
+    off = away / (_STEP_M + _SPEED_M_S * seen.age_s)
+    return -0.5 * off**2 if seen.age_s < _FORGOTTEN_S else 0.0
 
 
 def expected_of(glance: Glance) -> Expected:
