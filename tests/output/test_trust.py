@@ -1,0 +1,159 @@
+"""What a user gets of a track: cases done by hand."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from toftrack.errors import ToftrackError
+from toftrack.output.trust import Hand, interval, lingering, longest_run, trust, trust_of_two
+
+J = 21
+
+
+def hand(visible: list[bool], z: float = 0.5, x: float = 0.0) -> Hand:
+    """A hand that rests, all joints in one point."""
+    joints = np.tile(np.array([x, 0.0, z]), (len(visible), J, 1))
+    return Hand(joints, np.array(visible))
+
+
+def off(true: Hand, mm: list[float]) -> np.ndarray:
+    """Estimates of which every joint is so far off in x."""
+    joints = true.joints_m.copy()
+    joints[:, :, 0] += np.array(mm)[:, None] / 1e3
+    return joints
+
+
+def flags(text: str) -> np.ndarray:
+    """'.x.' is false, true, false."""
+    return np.array([letter == "x" for letter in text])
+
+
+def test_each_frame_is_of_one_kind() -> None:
+    true = hand([True] * 8)
+    joints = off(true, [0, 39.9, 0, 0, 0, 60, 60, 10])  # the last two are flagged lost
+    joints[2, 4, 1] += 0.1  # one joint 100 mm away: mean 4.8 mm
+    figures = trust(joints, flags("......xx"), true)
+    assert figures.usable_pct == 100 * 4 / 8
+    assert figures.partly_pct == 100 * 1 / 8
+    assert figures.silent_pct == 100 * 1 / 8
+    assert figures.false_alarm_pct == 100 * 1 / 8
+    assert (figures.frames, figures.visible, figures.longest_silent) == (8, 8, 1)
+    assert figures.mean_mm == pytest.approx((0 + 39.9 + 100 / J + 0 + 0 + 60) / 6)
+    assert figures.mean_all_mm == pytest.approx((0 + 39.9 + 100 / J + 0 + 0 + 60 + 60 + 10) / 8)
+
+
+def test_a_hand_that_went_may_linger_for_three_frames() -> None:
+    true = hand([True, True, *[False] * 6, True, True])
+    figures = trust(true.joints_m, flags(".........."), true)
+    assert figures.silent_pct == 100 * 3 / 10  # frames 5, 6, 7
+    assert figures.longest_silent == 3
+    assert figures.usable_pct == 100
+
+
+def test_a_hand_that_was_never_there_is_not_forgiven() -> None:
+    figures = trust(np.zeros((4, J, 3)), flags("...x"), hand([False] * 4))
+    assert figures.silent_pct == 75
+    assert (figures.usable_pct, figures.visible) == (0, 0)
+    assert figures.mean_mm is None and figures.mean_all_mm is None
+
+
+def test_an_estimate_that_is_not_finite_counts_as_lost_and_as_far_away() -> None:
+    true = hand([True] * 4)
+    joints = true.joints_m.copy()
+    joints[1, 3, 2], joints[2] = np.inf, np.nan
+    figures = trust(joints, flags("...."), true)
+    assert figures.usable_pct == 50
+    assert figures.false_alarm_pct == figures.silent_pct == 0
+    assert figures.mean_mm == 0
+    assert figures.mean_all_mm == 500  # two frames of a metre each
+
+
+def test_right_means_three_frames_in_a_row() -> None:
+    true = hand([True] * 7)
+    late = off(true, [30, 10, 10, 30, 10, 10, 10])
+    assert trust(late, flags("......."), true).first_right == 4
+    assert trust(late, flags(".....x."), true).first_right is None
+    # Two frames at the end are too few.
+    assert trust(off(true, [30] * 5 + [0] * 2), flags("......."), true).first_right is None
+    assert trust(off(true, [25] * 7), flags("......."), true).first_right is None
+    assert trust(off(true, [24.9] * 7), flags("......."), true).first_right == 0
+
+
+def test_found_after_counts_from_each_return() -> None:
+    visible = [True] * 3 + [False] * 2 + [True] * 5 + [False] + [True] * 3
+    true = hand(visible)
+    joints = off(true, [0] * 3 + [0] * 2 + [50, 50, 0, 0, 0] + [0] + [0, 0, 50])
+    figures = trust(joints, np.zeros(len(visible), bool), true)
+    assert figures.first_right == 0
+    assert figures.found_after == (2, None)
+
+
+def test_a_hand_that_is_there_from_the_start_does_not_return() -> None:
+    true = hand([True] * 5)
+    assert trust(true.joints_m, flags("....."), true).found_after == ()
+
+
+def test_frames_at_the_start_can_be_left_out() -> None:
+    true = hand([True] * 4)
+    figures = trust(off(true, [90, 90, 0, 0]), flags("...."), true, skip=2)
+    assert (figures.frames, figures.usable_pct, figures.silent_pct) == (2, 100, 0)
+
+
+def test_any_number_of_joints_can_be_compared() -> None:
+    true = Hand(np.zeros((3, 11, 3)), np.ones(3, bool))
+    assert trust(np.zeros((3, 11, 3)), flags("..."), true).usable_pct == 100
+
+
+def test_two_hands_get_the_slots_that_fit() -> None:
+    left, right = hand([True] * 4, x=-0.2), hand([True] * 4, x=0.2)
+    joints = np.stack([right.joints_m, off(left, [0, 0, 0, 70])], axis=1)
+    figures = trust_of_two(joints, np.zeros((4, 2), bool), [left, right])
+    assert figures.first.usable_pct == 75
+    assert figures.second is not None and figures.second.usable_pct == 100
+    assert figures.ghost_pct is None
+
+
+def test_a_swap_on_the_way_is_an_error() -> None:
+    left, right = hand([True] * 5, x=-0.2), hand([True] * 5, x=0.2)
+    joints = np.stack([left.joints_m, right.joints_m], axis=1)
+    joints[3:] = joints[3:, ::-1]
+    figures = trust_of_two(joints, np.zeros((5, 2), bool), [left, right])
+    assert figures.first.silent_pct == 40
+    assert figures.second is not None and figures.second.silent_pct == 40
+
+
+def test_a_second_hand_where_there_is_one_is_a_ghost() -> None:
+    true = hand([True] * 4)
+    joints = np.stack([np.full((4, J, 3), np.nan), true.joints_m], axis=1)
+    lost = np.stack([flags("xxx."), flags("....")], axis=1)
+    figures = trust_of_two(joints, lost, [true])
+    assert figures.first.usable_pct == 100
+    assert figures.second is None
+    assert figures.ghost_pct == 25
+
+
+def test_shapes_must_fit() -> None:
+    true = hand([True] * 4)
+    with pytest.raises(ToftrackError, match="same joints"):
+        trust(true.joints_m[:3], flags("..."), true)
+    with pytest.raises(ToftrackError, match="two slots"):
+        trust_of_two(true.joints_m, flags("...."), [true])
+    with pytest.raises(ToftrackError, match="true hands"):
+        trust_of_two(np.zeros((4, 2, J, 3)), np.zeros((4, 2), bool), [])
+
+
+def test_the_interval_holds_the_mean() -> None:
+    share = interval([10.0, 20.0, 90.0])
+    assert share.low < share.mean == 40 < share.high
+    assert asdict(interval([50.0] * 4)) == {"mean": 50, "low": 50, "high": 50}
+
+
+def test_runs() -> None:
+    assert longest_run(flags(".xx.xxx.x")) == 3
+    assert longest_run(flags("...")) == longest_run(flags("")) == 0
+    assert longest_run(flags("xx")) == 2
+    np.testing.assert_array_equal(lingering(flags("x....x"), 3), flags("xxxx.x"))
+    np.testing.assert_array_equal(lingering(flags("x"), 3), flags("x"))

@@ -1,0 +1,88 @@
+"""`python -m toftrack.programs.evaluate` on a tiny data set."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.data_sets import scene, write_msra
+
+from toftrack import cli
+from toftrack.programs.evaluate import main
+from toftrack.recordings.datasets import msra
+
+FEW = "filter.particles=60"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two sequences of the same six frames."""
+    seen = scene(msra._CAMERA, 6)
+    for gesture in ("1", "TIP"):
+        write_msra(tmp_path / "P0" / gesture, seen, boxed=True)
+    return tmp_path
+
+
+def test_the_table_and_the_file_say_how_good_it_is(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "report.json"
+    main(["MSRA15", str(folder), FEW, "--json", str(report)])
+    printed = capsys.readouterr()
+    assert [line.split()[0] for line in printed.out.splitlines()] == [
+        "sequence",
+        "P0/1",
+        "P0/TIP",
+        "mean",
+        "compared:",
+        "tips:",
+    ]
+    assert "12/12" in printed.err
+    facts = json.loads(report.read_text())
+    assert (facts["data_set"], facts["overrides"]) == ("MSRA15", [FEW])
+    assert facts["tip_inset_mm"] == 7
+    assert len(facts["joints"]) == 21
+    assert facts["total"]["frames"] == 12
+    # Two trackers that begin alike see the same; the palm at the start is easy.
+    assert facts["sequences"]["P0/1"] == facts["sequences"]["P0/TIP"]
+    assert facts["total"]["mean_mm"] < 15
+
+
+def test_sequences_and_frames_can_be_chosen(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["MSRA15", str(folder), "--sequences", "P0/TIP", "--frames", "2", "--tip-inset", "0", FEW])
+    printed = capsys.readouterr()
+    assert "P0/1" not in printed.out
+    assert "2/2" in printed.err
+    assert "ours are moved 0 mm" in printed.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["MSRA", "."], "known: MSRA14, MSRA15, ICVL, NYU"),
+        (["MSRA15", "nowhere"], "there is no folder"),
+        (["MSRA15", ".", "--sequences", "P9/1"], "there is no sequence 'P9/1'; there are P0/1"),
+        (["MSRA15", ".", "nonsense=1"], "nonsense"),
+        (["MSRA15", ".", "--frames", "1", "--json", "no/such/file"], "cannot be written"),
+    ],
+)
+def test_errors_are_one_sentence(
+    arguments: list[str],
+    reason: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    assert cli.run(lambda: main(arguments)) == 1
+    last = capsys.readouterr().err.rstrip().splitlines()[-1]
+    assert last.startswith("error: ") and reason in last
+
+
+def test_labels_without_image_are_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "P0" / "1" / "000005_depth.bin").unlink()
+    main(["MSRA15", str(folder), "--sequences", "P0/1", "--frames", "1", FEW])
+    assert "note: P0/1: 1 labels have no image" in capsys.readouterr().err

@@ -1,0 +1,239 @@
+"""What a user gets of a track: how many frames are usable, silently wrong, or needlessly refused.
+
+Against ground truth, over all poses. A joint is right within 40 mm, an estimate wrong when its mean
+joint error exceeds 40 mm. An estimate that is not finite counts as flagged lost, and as infinitely
+far away wherever frames flagged lost count as well.
+
+| figure | of | which frames |
+| --- | --- | --- |
+| usable | visible frames | not flagged lost, every joint within 40 mm |
+| partly | visible frames | not flagged, mean error at most 40 mm, but some joint is farther off |
+| false alarm | visible frames | flagged lost although every joint is within 40 mm |
+| silent | all frames | not flagged, and the mean error exceeds 40 mm, or no hand is visible |
+
+A frame without a visible hand is silent only from the fourth frame after the hand went: up to three
+are forgiven. The track is right from the first of three visible, unflagged frames in a row that
+have a mean error below 25 mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from toftrack.errors import ToftrackError
+
+OK_MM = 40.0
+"""The largest error of a joint that can be used, and the largest mean error that is not wrong."""
+RIGHT_MM = 25.0
+RIGHT_FRAMES = 3
+FORGIVEN_FRAMES = 3
+"""So many frames after the hand went may still say that it is there."""
+
+_NOWHERE_M = 1e3
+"""Where an estimate that is not finite is taken to be."""
+_MISS_M = 0.1
+"""The most that one frame adds to the cost of giving a slot to a hand."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """The figures of one track of one hand, see the head of this module. Shares in per cent."""
+
+    frames: int
+    """How many count."""
+    visible: int
+    """How many of them show the hand."""
+    usable_pct: float
+    partly_pct: float
+    false_alarm_pct: float
+    silent_pct: float
+    longest_silent: int
+    """Frames of the longest run of silently wrong ones."""
+    mean_mm: float | None
+    """Mean joint error over visible frames that are not flagged lost; None: there are none."""
+    mean_all_mm: float | None
+    """The same over all visible frames; one frame counts for at most a metre."""
+    first_right: int | None
+    """From which frame on the track is right for the first time; None: never."""
+    found_after: tuple[int | None, ...]
+    """For each time that the hand becomes visible again: frames until the track is right."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """The truth about one hand of a recording."""
+
+    joints_m: np.ndarray
+    """(T, J, 3) metres, camera frame."""
+    visible: np.ndarray
+    """(T,) bool."""
+
+
+@dataclass(frozen=True)
+class TwoSlots:
+    """The figures of a track of two slots."""
+
+    first: Trust
+    second: Trust | None
+    """None where the recording has one hand."""
+    ghost_pct: float | None
+    """Frames in which the slot without a hand says that it has one; None where both have theirs."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """A mean over recordings with its 90 % bootstrap interval, per cent."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def trust(joints_m: np.ndarray, lost: np.ndarray, hand: Hand, skip: int = 0) -> Trust:
+    """The figures of one track, unrounded.
+
+    Args:
+        joints_m: (T, J, 3) estimates in metres, camera frame; not finite where there is none.
+        lost: (T,) bool.
+        hand: the truth about the same T frames and J joints.
+        skip: frames at the start that do not count.
+
+    Raises:
+        ToftrackError: estimates and truth differ in shape.
+    """
+    estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
+    _check(estimate.shape, lost.shape, hand)
+    visible = np.asarray(hand.visible, bool)
+    finite = np.isfinite(estimate).all((1, 2))
+    error = _errors_mm(estimate, finite, hand)
+    average, largest = error.mean(1), error.max(1)
+    used = np.arange(len(lost)) >= skip
+    said = ~lost & finite
+    seen = visible & used
+    good = seen & said
+    silent = used & said & np.where(visible, average > OK_MM, ~lingering(visible, FORGIVEN_FRAMES))
+    right = _runs(visible & said & (average < RIGHT_MM), RIGHT_FRAMES)
+    returns = np.flatnonzero(visible[1:] & ~visible[:-1]) + 1
+    return Trust(
+        frames=int(used.sum()),
+        visible=int(seen.sum()),
+        usable_pct=_share_pct(good & (largest <= OK_MM), seen),
+        partly_pct=_share_pct(good & (average <= OK_MM) & (largest > OK_MM), seen),
+        false_alarm_pct=_share_pct(seen & lost & finite & (largest <= OK_MM), seen),
+        silent_pct=_share_pct(silent, used),
+        longest_silent=longest_run(silent),
+        mean_mm=float(average[good].mean()) if good.any() else None,
+        mean_all_mm=float(np.minimum(average[seen], 1e3).mean()) if seen.any() else None,
+        first_right=_until(right, 0),
+        found_after=tuple(_until(right, int(frame)) for frame in returns),
+    )
+
+
+def trust_of_two(
+    joints_m: np.ndarray, lost: np.ndarray, hands: Sequence[Hand], skip: int = 0
+) -> TwoSlots:
+    """The figures of a track of two slots.
+
+    Each true hand has one slot for the whole recording, the one with the smaller sum of errors; a
+    swap on the way counts as error.
+
+    Args:
+        joints_m: (T, 2, J, 3) metres, camera frame.
+        lost: (T, 2) bool.
+        hands: one or two.
+        skip: as for `trust`.
+
+    Raises:
+        ToftrackError: as `trust`, or there are not two slots, or not one or two hands.
+    """
+    estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
+    if estimate.ndim != 4 or estimate.shape[1] != 2 or lost.shape != estimate.shape[:2]:
+        raise ToftrackError(
+            "a track of two slots must have joints of the shape (T, 2, J, 3) and lost of (T, 2), "
+            f"but they are {estimate.shape} and {lost.shape}"
+        )
+    if len(hands) not in (1, 2):
+        raise ToftrackError(f"there are {len(hands)} true hands; one or two can be compared")
+    for hand in hands:
+        _check(estimate[:, 0].shape, lost[:, 0].shape, hand)
+
+    def cost(order: tuple[int, int]) -> float:
+        pairs = zip(order, hands, strict=False)  # one hand leaves a slot over
+        return sum(_cost(estimate[:, slot], lost[:, slot], hand) for slot, hand in pairs)
+
+    slots = min(((0, 1), (1, 0)), key=cost)
+    figures = [
+        trust(estimate[:, slot], lost[:, slot], hand, skip)
+        for slot, hand in zip(slots, hands, strict=False)
+    ]
+    if len(hands) == 2:
+        return TwoSlots(first=figures[0], second=figures[1], ghost_pct=None)
+    there = ~lost[skip:, slots[1]]
+    return TwoSlots(figures[0], None, 100.0 * float(there.mean()) if there.size else 0.0)
+
+
+def interval(shares: Sequence[float], draws: int = 2000, seed: int = 0) -> Share:
+    """The mean of a share over recordings, with the interval from resampling the recordings."""
+    values = np.asarray(shares, np.float64)
+    rng = np.random.default_rng(seed)
+    low, high = np.percentile(rng.choice(values, (draws, len(values))).mean(1), (5, 95))
+    return Share(mean=float(values.mean()), low=float(low), high=float(high))
+
+
+def lingering(visible: np.ndarray, frames: int) -> np.ndarray:
+    """(T,) bool: the hand is visible, or was at most so many frames ago."""
+    recent = visible.copy()
+    for back in range(1, frames + 1):
+        recent[back:] |= visible[:-back]
+    return recent
+
+
+def longest_run(flags: np.ndarray) -> int:
+    """The number of frames of the longest run of true ones in (T,) bool."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _check(estimate: tuple[int, ...], lost: tuple[int, ...], hand: Hand) -> None:
+    true, visible = np.shape(hand.joints_m), np.shape(hand.visible)
+    if len(true) != 3 or estimate != true or lost != true[:1] or visible != true[:1]:
+        raise ToftrackError(
+            f"the estimates have the shape {estimate} and 'lost' {lost}, but the truth has {true} "
+            f"and 'visible' {visible}; compare the same joints of the same frames"
+        )
+
+
+def _errors_mm(estimate: np.ndarray, finite: np.ndarray, hand: Hand) -> np.ndarray:
+    """(T, J) joint errors; estimates that are not finite are a kilometre away."""
+    somewhere = np.where(finite[:, None, None], estimate, _NOWHERE_M)
+    return 1e3 * np.linalg.norm(somewhere - hand.joints_m, axis=2)
+
+
+def _cost(estimate: np.ndarray, lost: np.ndarray, hand: Hand) -> float:
+    """Metres: what it costs to give a slot's (T, J, 3) and (T,) to a hand."""
+    finite = np.isfinite(estimate).all((1, 2))
+    error = 1e-3 * _errors_mm(estimate, finite, hand).mean(1)
+    counted = np.minimum(np.where(lost, np.inf, error), _MISS_M)
+    return float(np.where(hand.visible, counted, 0.0).sum())
+
+
+def _runs(flags: np.ndarray, length: int) -> np.ndarray:
+    """(T,) bool: the frame and those after it, `length` together, are all true."""
+    steady = np.zeros(len(flags), bool)
+    last = len(flags) - length + 1
+    if last > 0:
+        steady[:last] = np.lib.stride_tricks.sliding_window_view(flags, length).all(axis=1)
+    return steady
+
+
+def _until(steady: np.ndarray, frame: int) -> int | None:
+    """Frames from `frame` to the first true one; None: there is none."""
+    later = np.flatnonzero(steady[frame:])
+    return int(later[0]) if len(later) else None
+
+
+def _share_pct(part: np.ndarray, whole: np.ndarray) -> float:
+    return 100.0 * float(part.sum()) / max(int(whole.sum()), 1)

@@ -1,0 +1,156 @@
+"""Evaluate the tracker on a public data set: `python -m toftrack.programs.evaluate MSRA15 FOLDER`.
+
+Each sequence is tracked from its first frame by a tracker of its own, with the side of the data
+set's hands. The figures are those of toftrack's own recordings, over the joints that the labels
+share with it, its fingertips moved to where the data set has them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from toftrack import cli
+from toftrack.errors import ToftrackError
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.interface import make_tracker
+from toftrack.output.labelled_figures import LabelledFigures, labelled_figures, table, totals
+from toftrack.recordings.datasets import DATA_SETS, open_data_set
+from toftrack.recordings.datasets.base import DataSet, LabelledSequence, compared_joints
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line, track, print the table. Raises ToftrackError."""
+    options = _parser().parse_intermixed_args(arguments)
+    data_set, sequences = open_data_set(options.data_set, options.folder)
+    sequences = _chosen(sequences, options.sequences)
+    inset_m = data_set.tip_inset_m if options.tip_inset is None else options.tip_inset / 1e3
+    figures = evaluate(data_set, sequences, options.overrides, inset_m, options.frames)
+    print(table(figures))
+    print(f"compared: {', '.join(JOINT_NAMES[row] for row in data_set.joints)}")
+    print(f"tips: {data_set.tips}; ours are moved {1e3 * inset_m:g} mm inwards")
+    if options.json:
+        facts = {
+            "data_set": data_set.name,
+            "folder": str(options.folder),
+            "overrides": options.overrides,
+            "joints": [JOINT_NAMES[row] for row in data_set.joints],
+            "tips": data_set.tips,
+            "tip_inset_mm": 1e3 * inset_m,
+            "total": totals(figures),
+            "sequences": {name: values.as_dict() for name, values in figures.items()},
+        }
+        _write(Path(options.json), facts)
+
+
+def evaluate(
+    data_set: DataSet,
+    sequences: Sequence[LabelledSequence],
+    overrides: Sequence[str],
+    tip_inset_m: float,
+    frames: int | None = None,
+) -> dict[str, LabelledFigures]:
+    """Track sequences and compare them with their labels; the figures by the sequences' names.
+
+    Args:
+        overrides: of the tracker's configuration; hand.side among them goes before the data set's.
+        tip_inset_m: as for `compared_joints`.
+        frames: so many at the start of each sequence only.
+
+    Raises:
+        ToftrackError: an override or a file cannot be used.
+    """
+    counts = [
+        len(sequence) if frames is None else min(frames, len(sequence)) for sequence in sequences
+    ]
+    figures = {}
+    with tqdm(total=sum(counts), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
+        for sequence, count in zip(sequences, counts, strict=True):
+            bar.set_postfix_str(sequence.name, refresh=False)
+            if sequence.left_out:
+                bar.write(
+                    f"note: {sequence.name}: {sequence.left_out} labels have no image and are left "
+                    "out",
+                    file=sys.stderr,
+                )
+            joints, lost = _track(sequence, count, overrides, bar)
+            figures[sequence.name] = labelled_figures(
+                compared_joints(joints, data_set.joints, tip_inset_m),
+                lost,
+                sequence.joints_m[:count],
+                data_set.joints,
+            )
+    return figures
+
+
+def _track(
+    sequence: LabelledSequence, count: int, overrides: Sequence[str], bar: tqdm
+) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 21, 3) metres and lost, (T,) bool, of the first frames."""
+    tracker = make_tracker(f"hand.side={sequence.side}", *overrides)
+    joints, lost = np.full((count, 21, 3), np.nan), np.ones(count, bool)
+    for index in range(count):
+        depth_m = sequence.frame(index)
+        estimate = tracker.step(depth_m, sequence.camera.K, index, index / sequence.fps)
+        joints[index], lost[index] = estimate.joints_m, estimate.lost
+        bar.update()
+    return joints, lost
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m toftrack.programs.evaluate",
+        description="Evaluate the tracker on a public data set of labelled depth images.",
+    )
+    parser.add_argument("data_set", metavar="DATASET", help=", ".join(DATA_SETS))
+    parser.add_argument("folder", metavar="FOLDER", help="where the data set lies")
+    parser.add_argument(
+        "overrides", metavar="OVERRIDE", nargs="*", help="as for track.py, filter.particles=1000"
+    )
+    parser.add_argument("--sequences", help="only those, by name, separated by commas: P0/1,P0/2")
+    parser.add_argument("--frames", type=_count, help="only so many at the start of each sequence")
+    parser.add_argument(
+        "--tip-inset",
+        type=float,
+        metavar="MM",
+        help="how far the labels' fingertips lie inside of ours, instead of the data set's own",
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the figures here, too")
+    return parser
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 1:
+        raise ValueError
+    return count
+
+
+def _chosen(sequences: list[LabelledSequence], names: str | None) -> list[LabelledSequence]:
+    if names is None:
+        return sequences
+    known = {sequence.name: sequence for sequence in sequences}
+    for name in names.split(","):
+        if name not in known:
+            raise ToftrackError(f"there is no sequence '{name}'; there are {', '.join(known)}")
+    return [known[name] for name in names.split(",")]
+
+
+def _write(path: Path, facts: dict[str, Any]) -> None:
+    try:
+        path.write_text(json.dumps(facts, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ToftrackError(
+            f"the file '{path}' cannot be written ({error.strerror}); choose another place"
+        ) from error
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))

@@ -1,0 +1,141 @@
+"""What every public data set looks like to the rest of the program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+
+MILLIMETRE = 1e-3
+_TIPS = (4, 8, 12, 16, 20)
+_PNG_END = b"IEND\xaeB`\x82"
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledSequence:
+    """Consecutive frames of one hand with the true places of some joints."""
+
+    name: str
+    side: str
+    """Whose hand it is, 'right' or 'left'."""
+    camera: Camera
+    fps: float
+    joints_m: np.ndarray
+    """(T, J, 3) metres, camera frame; the joints are those of the data set."""
+    frame: Callable[[int], np.ndarray]
+    """The depth of a frame by its number, (H, W) float32 metres along the optical axis, 0 = no
+    reading. Raises ToftrackError when its file is missing or damaged."""
+    left_out: int = 0
+    """Labels that have no image."""
+
+    def __len__(self) -> int:
+        return len(self.joints_m)
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A public data set.
+
+    name: as given on the command line.
+    joints: rows of toftrack's 21 joints that the labels can be compared with, J of them.
+    tip_inset_m: how far the labels' finger ends lie inside of toftrack's, along the last bone.
+    tips: in words, how the labels' finger ends differ from toftrack's.
+    layout: what its folder has to contain, a part of an error's sentence.
+    open: the sequences in a folder, none where it holds something else; raises ToftrackError for
+        files that are damaged.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    tip_inset_m: float
+    tips: str
+    layout: str
+    open: Callable[[Path], list[LabelledSequence]]
+
+
+def compared_joints(
+    joints_m: np.ndarray, joints: tuple[int, ...], tip_inset_m: float
+) -> np.ndarray:
+    """Estimates as a data set defines its joints.
+
+    Args:
+        joints_m: (T, 21, 3) metres, in toftrack's order.
+        joints: the rows wanted, J of them.
+        tip_inset_m: how far finger ends move along the last bone towards the joint before.
+
+    Returns:
+        (T, J, 3) metres.
+    """
+    moved = np.array(joints_m, np.float64)
+    for tip in _TIPS:
+        inwards = moved[:, tip - 1] - moved[:, tip]
+        length = np.linalg.norm(inwards, axis=1, keepdims=True)
+        moved[:, tip] += tip_inset_m * inwards / np.maximum(length, 1e-9)
+    return moved[:, list(joints)]
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file; ToftrackError, one sentence, when it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ToftrackError(
+            f"the file '{path}' cannot be read ({error.strerror}); copy the data set again"
+        ) from error
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a text file that are not empty; ToftrackError when it cannot be read."""
+    try:
+        text = read_bytes(path).decode("ascii")
+    except UnicodeDecodeError:
+        raise ToftrackError(
+            f"the file '{path}' is damaged: it is no text; copy the data set again"
+        ) from None
+    return [line for line in text.splitlines() if line.strip()]
+
+
+def read_png(path: Path, kind: type, shape: tuple[int, ...]) -> np.ndarray:
+    """An image of exactly that type and shape (colours in the order blue, green, red).
+
+    Raises ToftrackError when it is missing, damaged or of another kind.
+    """
+    content = read_bytes(path)
+    whole = content.endswith(_PNG_END)  # the decoder fills up what was cut off
+    try:
+        image = (
+            cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
+        )
+    except cv2.error:
+        image = None
+    if image is None:
+        raise ToftrackError(f"the image '{path}' is damaged; copy the data set again")
+    if image.dtype != kind or image.shape != shape:
+        raise ToftrackError(
+            f"the image '{path}' is {_kind(image)}, but must be {np.dtype(kind)} of the shape "
+            f"{shape}; give the depth images as the authors distribute them"
+        )
+    return image
+
+
+def numbers(text: str, count: int, path: Path, line: int) -> np.ndarray:
+    """(count,) float64 of a line of text; ToftrackError names the file and the line."""
+    try:
+        values = np.array(text.split(), np.float64)
+    except ValueError:
+        values = np.empty(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ToftrackError(
+            f"line {line} of '{path}' must consist of {count} numbers; copy the data set again"
+        )
+    return values
+
+
+def _kind(image: np.ndarray) -> str:
+    return f"{image.dtype} of the shape {image.shape}"
