@@ -212,7 +212,7 @@ def test_trackers_in_threads_do_not_disturb_each_other() -> None:
 
     def follow(seed: int, found: dict[int, np.ndarray]) -> None:
         tracker = toftrack.make_tracker(f"seed={seed}", *QUICK)
-        steps = [tracker.step(depth, scene.k) for depth in scene.depth_m[:6]]
+        steps = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(6)]
         found[seed] = np.stack([estimate.joints_m for estimate in steps])
 
     alone: dict[int, np.ndarray] = {}

@@ -9,6 +9,7 @@ import torch
 from helpers.configured import steadying
 
 from toftrack.compute import rigid
+from toftrack.compute.pace import FRAME_S
 from toftrack.errors import ToftrackError
 from toftrack.refinement.steadying import Steadying, steadied
 
@@ -26,7 +27,7 @@ def followed(states: list[torch.Tensor], settings: Steadying = SETTINGS) -> torc
     """(T, 27) the steadied states."""
     believed, trend, path = states[0], None, [states[0]]
     for state in states[1:]:
-        believed, trend = steadied(state, believed, trend, settings, rigid.MOTIONS)
+        believed, trend = steadied(state, believed, trend, FRAME_S, settings, rigid.MOTIONS)
         path.append(believed)
     return torch.cat(path)
 

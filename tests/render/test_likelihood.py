@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import configured
 import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import configured
 from helpers.configured import nearest_surface
 from helpers.tracking import sample
 

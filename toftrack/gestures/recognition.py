@@ -210,6 +210,7 @@ def update(
     score: float,
     off_rad: float,
     gestures: Gestures,
+    frames: float = 1.0,
 ) -> tuple[GestureState, str, float]:
     """One frame on: the new state, the label and its probability.
 
@@ -219,11 +220,13 @@ def update(
     state: of the frame before; None at the start or after the hand was lost.
     angles: (21,) rad, the refined estimate.  score: its score, 0..1.
     off_rad: rms distance of the angles from the pose space, rad; NaN where there is none.
+    frames: how many times 1/25 s have passed since the state.
     """
     cfg = gestures.settings
     smooth = gestures.probabilities(angles, score, off_rad)
     if state is not None:
-        smooth = cfg.smoothing * state.probabilities + (1 - cfg.smoothing) * smooth
+        keep = cfg.smoothing**frames
+        smooth = keep * state.probabilities + (1 - keep) * smooth
     best = int(smooth.argmax())
     if state is not None:
         current = gestures.names.index(state.label)
@@ -243,7 +246,11 @@ def pointing_ray(joints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tell_gesture(
-    gestures: Gestures | None, state: GestureState | None, estimate: Estimate, space: PoseSpace
+    gestures: Gestures | None,
+    state: GestureState | None,
+    estimate: Estimate,
+    space: PoseSpace,
+    frames: float = 1.0,
 ) -> tuple[GestureState | None, Estimate]:
     """The estimate with its gesture, and with the pointing ray while it points.
 
@@ -263,7 +270,7 @@ def tell_gesture(
     latent = space.lower.new_tensor(estimate.latent)[None]
     off = angles - space.decode(latent)[0].cpu().numpy()
     off_rad = float(np.sqrt(np.square(off).mean()))
-    state, label, probability = update(state, angles, estimate.score, off_rad, gestures)
+    state, label, probability = update(state, angles, estimate.score, off_rad, gestures, frames)
     estimate = replace(estimate, gesture=label, gesture_probability=probability)
     if label == POINTING:
         origin, direction = pointing_ray(estimate.joints_m)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
+from toftrack.compute.pace import FRAME_S
 from toftrack.refinement.proposals import FINGER_OF_ANGLE
 
 
@@ -19,7 +20,7 @@ class Steadying:
     translation_m, rotation_rad, finger_rad: noise of the refined pose of a hand that moves, in
         translation, rotation and all angles of a finger together. Smaller changes are mostly noise.
     calm: by how much more, in parts of it, the noise counts while the whole hand rests; 0 = none.
-    memory: part of the trend that is kept from frame to frame; towards 1, rest is told from slow
+    memory: part of the trend that is kept over FRAME_S; towards 1, rest is told from slow
         movement more surely and later.
     """
 
@@ -36,7 +37,12 @@ class Steadying:
 
 
 def steadied(
-    state: Tensor, before: Tensor, trend: Tensor | None, settings: Steadying, motions: Motions
+    state: Tensor,
+    before: Tensor,
+    trend: Tensor | None,
+    dt_s: float,
+    settings: Steadying,
+    motions: Motions,
 ) -> tuple[Tensor, Tensor]:
     """Take less of a change the more it looks like noise, so that a still hand does not tremble.
 
@@ -47,11 +53,14 @@ def steadied(
     groups together the hand rests, and s grows.
 
     state, before: (1, 27) this frame's pose and the last one's.
-    trend: (27,) mean change a frame as of the last frame; None at the start.
+    trend: (27,) mean change a second as of the last frame; None at the start.
+    dt_s: from the last frame to this one.
     Returns the (1, 27) pose to believe and the trend.
     """
     change = motions.difference(state, before)[0]
-    trend = change if trend is None else torch.lerp(change, trend, settings.memory)
+    speed = change / dt_s
+    keep = settings.memory ** (dt_s / FRAME_S)
+    trend = speed if trend is None else torch.lerp(speed, trend, keep)
     of_angle = torch.tensor(FINGER_OF_ANGLE, device=state.device)
     group = torch.cat((of_angle.new_tensor([5, 5, 5, 6, 6, 6]), of_angle))
 
@@ -62,7 +71,7 @@ def steadied(
         [settings.finger_rad] * 5 + [settings.translation_m, settings.rotation_rad]
     )
     noise = noise.clamp(min=1e-9).square()
-    moving = (size_squared(trend) / noise).sum()
+    moving = (size_squared(trend * FRAME_S) / noise).sum()
     # Steep: a still hand's signal stays below 1 in nine frames of ten, a slow movement's above.
     noise = noise * (1 + settings.calm / (1 + moving**6)) ** 2
     square = size_squared(change)

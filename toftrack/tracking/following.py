@@ -2,39 +2,56 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from toftrack.compute.pace import FRAME_S
 from toftrack.render.segmentation import Expected
 from toftrack.tracking import particle_filter
-from toftrack.tracking.life_cycle import Belief, LostSettings
+from toftrack.tracking.life_cycle import Belief, LostSettings, lasted, longer
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
+from toftrack.tracking.particle_filter import FilterSettings
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.spans import Spans
 from toftrack.tracking.state import Track
 
-_APPROACH_M = 0.002
-"""How much nearer than its middle's movement a partly hidden hand may come in a frame."""
+_APPROACH_M_S = 0.05
+"""How much faster than its middle a partly hidden hand may come nearer, m/s."""
+
+
+def displacement(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:
+    """(6 + d,) how far a hand is expected to move on, in tangent coordinates.
+
+    It is trusted less the longer ago it was seen.
+    """
+    return track.velocity * (settings.velocity ** (dt_s / FRAME_S) * dt_s)
+
+
+def young(track: Track, settings: LostSettings) -> bool:
+    """Whether a better start may still take a track's place."""
+    return not lasted(track.age_s, settings.probation)
 
 
 def filtered(
-    track: Track, frame: ObservedFrame, generator: torch.Generator, spans: Spans
+    track: Track, dt_s: float, frame: ObservedFrame, generator: torch.Generator, spans: Spans
 ) -> tuple[Tensor, Tensor]:
     """The filter's particles (N, 6 + d) and weights (N,) of a frame."""
-    model = frame.model
+    model, frames = frame.model, dt_s / FRAME_S
 
     def log_scores(particles: Tensor) -> Tensor:
         states = model.decode(particles, track.offset)
         with spans("filter: scoring"):
             return frame.log_scores(states)
 
-    particles = model.backend.motions.compose(track.particles, track.velocity[None])
+    ahead = displacement(track, dt_s, model.filter)
+    particles = model.backend.motions.compose(track.particles, ahead[None])
     # A hand that was nearly lost is looked for farther away.
-    width = 1.0 + track.bad
+    width = 1.0 + track.bad_s / FRAME_S
     sigmas = width * particle_filter.widened(
-        model.sigmas, track.velocity, model.filter.rest, model.filter.speed_gain
+        model.sigmas * math.sqrt(frames), ahead, model.filter.rest, model.filter.speed_gain
     )
     return particle_filter.annealed(
         particles,
@@ -74,9 +91,14 @@ class Found:
 
 
 def advanced(
-    track: Track, found: Found, belief: Belief, expected: Expected | None, model: TrackerModel
+    track: Track,
+    found: Found,
+    belief: Belief,
+    expected: Expected | None,
+    dt_s: float,
+    model: TrackerModel,
 ) -> Track:
-    """The track as of this frame.
+    """The track as of this frame, which comes dt_s after the last one.
 
     expected: where the hand was looked for, if something hides part of it.
     """
@@ -91,22 +113,22 @@ def advanced(
         particles[:, 6:] = particle_filter.bound(particles[:, 6:], lower, upper, "truncate")
         mean, offset = found.refined, model.refinement.carry * found.offset
     velocity = torch.zeros_like(track.velocity)
-    if track.age > 0:
+    if track.age_s > 0:
         moved = motions.difference(mean, track.mean)[0]
-        keep = cfg.velocity_smoothing
-        velocity = keep * track.velocity + (1 - keep) * cfg.velocity * moved
+        keep = cfg.velocity_smoothing ** (dt_s / FRAME_S)
+        velocity = torch.lerp(moved / dt_s, track.velocity, keep)
     return Track(
-        particles,
-        found.weights,
-        mean,
-        velocity,
-        offset,
-        found.pose,
-        found.trend,
-        track.age + 1,
-        belief.bad,
-        belief.outside,
-        expected,
+        particles=particles,
+        weights=found.weights,
+        mean=mean,
+        velocity=velocity,
+        offset=offset,
+        pose=found.pose,
+        trend=found.trend,
+        age_s=longer(track.age_s, dt_s),
+        bad_s=belief.bad_s,
+        outside_s=belief.outside_s,
+        expected=expected,
     )
 
 
@@ -114,7 +136,7 @@ def remembered(
     seen: LastSeen | None, track: Track | None, belief: Belief, settings: LostSettings
 ) -> LastSeen | None:
     """The last hand that was believed, as of this frame."""
-    if track is None or belief.lost or track.age <= settings.probation:
+    if track is None or belief.lost or not lasted(track.age_s, settings.probation + 1):
         return seen
     return LastSeen(track.mean, 0.0)
 
@@ -124,15 +146,18 @@ def aged(seen: LastSeen | None, seconds: float) -> LastSeen | None:
     return None if seen is None else replace(seen, age_s=seen.age_s + seconds)
 
 
-def expected_depths(track: Track | None, hand: SizedHand, model: TrackerModel) -> Expected | None:
-    """Where the next frame is looked for the hand, one movement ahead; None where there is none."""
+def expected_depths(
+    track: Track | None, dt_s: float, hand: SizedHand, model: TrackerModel
+) -> Expected | None:
+    """Where the hand is looked for, dt_s after the last frame; None where there is none."""
     if track is None:
         return None
-    ahead = model.decode(model.backend.motions.compose(track.mean, track.velocity[None]))
-    nearest, farthest = map(float, hand.refiner.joints(ahead)[0, :, 2].aminmax())
+    ahead = displacement(track, dt_s, model.filter)
+    state = model.decode(model.backend.motions.compose(track.mean, ahead[None]))
+    nearest, farthest = map(float, hand.refiner.joints(state)[0, :, 2].aminmax())
     if track.expected is not None:
         # A hidden finger is free to move in front of what hides it, which would then be taken for
         # the hand: while something hides the hand, it comes nearer only as its middle does.
-        approach = _APPROACH_M + max(0.0, -float(track.velocity[2]))
+        approach = _APPROACH_M_S * dt_s + max(0.0, -float(ahead[2]))
         nearest = max(nearest, track.expected.nearest_m - approach)
     return Expected(nearest, farthest)

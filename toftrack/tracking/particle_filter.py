@@ -82,16 +82,17 @@ class FilterSettings:
         check_number("filter.velocity_smoothing", self.velocity_smoothing, 0, 1)
 
 
-def widened(sigmas: Tensor, velocity: Tensor, rest: float, gain: float) -> Tensor:
+def widened(sigmas: Tensor, movement: Tensor, rest: float, gain: float) -> Tensor:
     """Diffusion that follows the speed: narrow for a hand at rest, wide for a fast one.
 
-    sigmas: (6 + d,) for a moderately moving hand.  velocity: (6 + d,) tangent, a frame.
+    sigmas: (6 + d,) for a moderately moving hand.  movement: (6 + d,) tangent, how
+        far it moves until the frame.
     rest: part of the sigmas that a hand at rest keeps, 1 = the same at any speed.
-    gain: standard deviation gained per unit of speed; at most the sigmas are doubled.
+    gain: standard deviation gained per unit of movement; at most the sigmas are doubled.
     """
-    groups = torch.split(velocity, [3, 3, velocity.shape[0] - 6])
-    speed = torch.cat([group.norm().expand(group.shape) for group in groups])
-    return torch.minimum(rest * sigmas + gain * speed, 2 * sigmas)
+    groups = torch.split(movement, [3, 3, movement.shape[0] - 6])
+    length = torch.cat([group.norm().expand(group.shape) for group in groups])
+    return torch.minimum(rest * sigmas + gain * length, 2 * sigmas)
 
 
 def normalise(log_weights: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ def improved(particles: Tensor, frame: ObservedFrame) -> Tensor:
 
 
 def refined(
-    track: Track, mean: Tensor, frame: ObservedFrame, generator: torch.Generator
+    track: Track, mean: Tensor, dt_s: float, frame: ObservedFrame, generator: torch.Generator
 ) -> tuple[Tensor, Tensor | None]:
     """The frame's estimate from the filter's mean (1, 6 + d): pose (1, 27) and trend (27,)."""
     model = frame.model
@@ -35,7 +35,7 @@ def refined(
     if track.pose is None:
         return pose, track.trend
     steadying, motions = model.refinement.steadying, model.backend.motions
-    return steadied(pose, track.pose, track.trend, steadying, motions)
+    return steadied(pose, track.pose, track.trend, dt_s, steadying, motions)
 
 
 def _onto_points(

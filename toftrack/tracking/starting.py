@@ -8,12 +8,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from toftrack.compute.backend import Motions
-from toftrack.tracking.life_cycle import LostSettings
-from toftrack.tracking.model import ObservedFrame
+from toftrack.tracking.following import displacement
+from toftrack.tracking.model import ObservedFrame, TrackerModel
 from toftrack.tracking.refining import improved
-from toftrack.tracking.search import LastSeen, LogScores, Sought
-from toftrack.tracking.state import Track
+from toftrack.tracking.search import LogScores, Sought
+from toftrack.tracking.state import Track, TrackerState
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +27,9 @@ class Proposals:
     log_scores: LogScores
 
 
-def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Generator) -> Proposals:
-    """Particles to start with in a frame.
-
-    seen: the last hand that was believed.
-    """
-    model = frame.model
+def propose(state: TrackerState, frame: ObservedFrame, generator: torch.Generator) -> Proposals:
+    """Particles to start with in a frame, from what the state still knows of the hand."""
+    model, seen = frame.model, state.seen
     prior = model.start.prior(frame.observation, seen)
 
     def log_scores(particles: Tensor, coverage: float) -> Tensor:
@@ -44,16 +40,15 @@ def propose(seen: LastSeen | None, frame: ObservedFrame, generator: torch.Genera
     return Proposals(model.start(sought, model.filter.particles, generator), log_scores)
 
 
-def started(
-    track: Track | None, proposals: Proposals, settings: LostSettings, motions: Motions
-) -> Track:
+def started(track: Track | None, proposals: Proposals, dt_s: float, model: TrackerModel) -> Track:
     """A new track from a start; or the given young one, if the start is no better than it."""
     particles = proposals.particles
     if track is not None:
-        now = motions.compose(track.particles, track.velocity[None])
+        ahead = displacement(track, dt_s, model.filter)
+        now = model.backend.motions.compose(track.particles, ahead[None])
         log_scores = proposals.log_scores
         # The search has seen this frame and the track has not, so a little better is no better.
-        if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < settings.rival_gain:
+        if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < model.lost.rival_gain:
             return track
     n, size = particles.shape
     weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)

@@ -20,13 +20,14 @@ class Track:
     """A hand that is followed.
 
     particles: (N, 6 + d), after the last observation.  weights: (N,) normalised.
-    mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a frame.
+    mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a second.
     offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
         displaced by it.
     pose: (1, 27) the last refined hand, None at the start.
-    trend: (27,) its mean change a frame, see steadying.
-    age: frames since the start.  bad: frames in a row with a low score.
-    outside: frames in a row out of the pose space.
+    trend: (27,) its mean change a second, see steadying.
+    age_s: how long it has been followed, 0 before the first frame.
+    bad_s: how long its score has been low.  outside_s: how long it has been out of the pose space.
+        The first frame of each counts FRAME_S, so that one alone says the same at any rate.
     expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
 
@@ -37,9 +38,9 @@ class Track:
     offset: Tensor
     pose: Tensor | None = None
     trend: Tensor | None = None
-    age: int = 0
-    bad: int = 0
-    outside: int = 0
+    age_s: float = 0.0
+    bad_s: float = 0.0
+    outside_s: float = 0.0
     expected: Expected | None = None
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.pace import FRAME_S, elapsed_s
 from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
@@ -23,6 +24,7 @@ from toftrack.tracking.following import (
     expected_depths,
     filtered,
     remembered,
+    young,
 )
 from toftrack.tracking.life_cycle import Belief, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
@@ -49,29 +51,34 @@ def step(
     A pure function: the state given stays as it is, and gives the same again.
     """
     spans, generator = Spans(), resumed(state.generator, model.device)
-    hand, motions, track = model.hand(state.side, state.size), model.backend.motions, state.track
+    hand, track = model.hand(state.side, state.size), state.track
+    dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
     with spans("segmentation and evidence"):
-        expected = expected_depths(track, hand, model)
+        expected = expected_depths(track, dt_s, hand, model)
         observation = model.segmentation(image.depth_m, image.k, expected)
         state = _at(state, image)
         if observation.empty:
             return _without_hand(state, image, observation, model, spans)
         frame = observed(observation, hand, model)
-    if track is None or track.age < model.lost.probation:
+    if track is None or young(track, model.lost):
         with spans("start"):
-            track = started(track, propose(state.seen, frame, generator), model.lost, motions)
+            track = started(track, propose(state, frame, generator), dt_s, model)
     with spans("filter: rest"):
-        particles, weights = filtered(track, frame, generator, spans)
+        particles, weights = filtered(track, dt_s, frame, generator, spans)
         mean = particle_filter.mean_particle(particles, weights)
     with spans("refinement"):
-        pose, trend = refined(track, mean, frame, generator)
+        pose, trend = refined(track, mean, dt_s, frame, generator)
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
-    belief = believe(track, score, found.off_rad, model.lost)
+    # A pose that nothing refined is one of the space.
+    off_rad = 0.0 if model.refinement is None else found.off_rad
+    belief = believe(track, score, off_rad, dt_s, model.lost)
     hidden = bool(frame.observation.occluder.any())
-    track = advanced(track, found, belief, expected if hidden else None, model)
+    track = advanced(track, found, belief, expected if hidden else None, dt_s, model)
     estimate = _estimate(image, found, score, belief, frame)
-    gesture, estimate = tell_gesture(model.gestures, state.gesture, estimate, model.space)
+    gesture, estimate = tell_gesture(
+        model.gestures, state.gesture, estimate, model.space, dt_s / FRAME_S
+    )
     size, refused = _sized(state, found, belief, frame, generator)
     estimate = replace(estimate, compute_s=spans.total())
     after = replace(

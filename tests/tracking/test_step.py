@@ -1,0 +1,179 @@
+"""The step as a function of a state: replayed, interleaved, forgotten, and at other frame rates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.configured import lost_settings
+from helpers.tracking import Scene, errors_mm, make_tracker, sample
+
+from toftrack.compute.pace import FRAME_S, elapsed_s
+from toftrack.estimate import Estimate
+from toftrack.tracking.life_cycle import believe
+from toftrack.tracking.state import Track, TrackerState
+from toftrack.tracking.tracker import Tracker
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+QUICK = ("start.hypotheses=600", "start.samples=128", "filter.particles=80", "refine.swaps=16")
+"""Fast, and found all the same in the first frames."""
+
+
+def quick(*overrides: str) -> Tracker:
+    return make_tracker(*QUICK, *overrides)
+
+
+def tracked(
+    tracker: Tracker, scene: Scene, rows: range, fps: float = 25.0, begin_s: float = 0.0
+) -> list[Estimate]:
+    """Frames of the recording, timed as by a camera of some rate."""
+    return [tracker.step(scene.depth_m[i], scene.k, i, begin_s + i / fps) for i in rows]
+
+
+def same(one: Estimate, two: Estimate) -> bool:
+    """In everything but the time that it took."""
+    names = [field.name for field in fields(Estimate) if field.name != "compute_s"]
+    pairs = ((getattr(one, name), getattr(two, name)) for name in names)
+    return all(
+        np.array_equal(a, b, equal_nan=True)
+        if isinstance(a, np.ndarray)
+        else a == b or (a != a and b != b)
+        for a, b in pairs
+    )
+
+
+@pytest.mark.parametrize("kept", [0, 2, 7])
+def test_a_recording_replayed_from_a_saved_state_gives_the_same_estimates(kept: int) -> None:
+    """Before the start, while the start is still doubted, and in the middle of the size's fit."""
+    tracker, scene = quick(), sample()
+    tracked(tracker, scene, range(kept))
+    state = tracker.state
+    first = tracked(tracker, scene, range(kept, kept + 4))
+    assert tracker.state is not state
+    tracker.state = state
+    again = tracked(tracker, scene, range(kept, kept + 4))
+    assert all(map(same, first, again))
+    other = quick("seed=5")
+    other.state = state
+    assert all(map(same, first, tracked(other, scene, range(kept, kept + 4))))
+
+
+def test_states_that_are_stepped_in_turn_do_not_disturb_each_other() -> None:
+    right, left = sample(), sample().mirrored()
+    alone = tracked(quick(), right, range(6)), tracked(quick("hand.side=left"), left, range(6))
+    tracker = quick()
+    other = quick("hand.side=left")
+    states = [tracker.state, other.state]
+    together: tuple[list[Estimate], list[Estimate]] = [], []
+    for i in range(6):
+        for number, scene in enumerate((right, left)):
+            tracker.state = states[number]
+            together[number].extend(tracked(tracker, scene, range(i, i + 1)))
+            states[number] = tracker.state
+    for one, two in zip(alone, together, strict=True):
+        assert all(map(same, one, two))
+
+
+def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() -> None:
+    tracker, scene = quick(), sample()
+    fresh = tracker.state
+    tracked(tracker, scene, range(9))
+    before = tracker.state
+    assert before.track is not None and before.seen is not None and before.gesture is not None
+    assert before.size is not None and before.size.frames > 0 and before.last is not None
+    tracker.restart()
+    kept = {"generator": before.generator, "next_index": 9}
+    for field in fields(TrackerState):
+        value = getattr(tracker.state, field.name)
+        if field.name == "size":
+            assert torch.equal(value.log_likelihood, fresh.size.log_likelihood)
+            assert (value.index, value.frames) == (fresh.size.index, 0)
+        else:
+            assert value is kept.get(field.name, value) or value == kept[field.name]
+            if field.name not in kept:
+                assert value == getattr(fresh, field.name), field.name
+    assert tracker.insight is None
+    empty = tracker.step(np.zeros_like(scene.depth_m[0]), scene.k)
+    assert empty.index == 9 and np.isnan(empty.joints_m).all() and empty.gesture == ""
+
+
+def test_what_a_step_saw_is_told_with_the_time_of_its_stages() -> None:
+    tracker, scene = quick(), sample()
+    estimate = tracked(tracker, scene, range(1))[0]
+    seconds = tracker.insight.seconds
+    stages = {"segmentation and evidence", "start", "filter: scoring", "filter: rest"}
+    assert stages | {"refinement", "rest"} == set(seconds)
+    assert all(value > 0 for value in seconds.values())
+    assert sum(seconds.values()) <= estimate.compute_s
+    assert tracker.insight.particles.shape == (80, 10)
+
+
+@pytest.mark.parametrize(
+    ("every", "fps"), [(2, 25.0), (3, 25.0), (1, 50.0), (1, 12.5)], ids=lambda value: f"{value:g}"
+)
+def test_the_hand_is_followed_at_other_rates(every: int, fps: float) -> None:
+    """Frames dropped, and the same movement twice as fast and half as fast."""
+    scene = sample().cut(*range(0, 36, every))
+    tracker = quick()
+    found = tracked(tracker, scene, range(len(scene)), fps / every)
+    assert not any(estimate.lost for estimate in found)
+    assert errors_mm(found, scene)[4:].mean() < 12
+
+
+def test_a_movement_at_another_rate_has_the_same_speed() -> None:
+    """Of the same hand, seen by a camera that takes half of the frames."""
+    speeds = []
+    for every in (1, 2):
+        tracker = quick()
+        for i in range(0, 25, every):
+            tracked(tracker, sample(), range(i, i + 1))
+        speeds.append(tracker.track.velocity[:3])
+    assert float((speeds[0] - speeds[1]).norm()) < 0.05, speeds
+
+
+@pytest.mark.parametrize("jump_s", [-100.0, 1e6, math.nan, 1e-9])
+def test_a_clock_that_jumps_does_not_lose_the_hand(jump_s: float) -> None:
+    tracker, scene = quick(), sample()
+    tracked(tracker, scene, range(8))
+    found = tracked(tracker, scene, range(8, 12), begin_s=jump_s)
+    assert not any(estimate.lost for estimate in found)
+    assert errors_mm(found, scene.cut(*range(8, 12)))[-1] < 15
+    assert tracker.track.particles.isfinite().all()
+
+
+def test_elapsed_time_is_kept_within_reason() -> None:
+    assert elapsed_s(None, 5.0) == FRAME_S
+    assert elapsed_s(1.0, 1.05) == pytest.approx(0.05)
+    assert elapsed_s(1.0, 0.5) == elapsed_s(1.0, math.nan) == elapsed_s(math.nan, 1.0) == FRAME_S
+    assert elapsed_s(1.0, 1.0) == pytest.approx(1 / 120)
+    assert elapsed_s(1.0, 1e9) == 0.5 and elapsed_s(0.0, math.inf) == FRAME_S
+
+
+def young_track() -> Track:
+    nothing = torch.zeros(1, 10)
+    return Track(nothing, torch.ones(1), nothing, nothing[0], torch.zeros(21), age_s=1.0)
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(60.0, 8), (25.0, 4), (15.0, 3), (5.0, 2)])
+def test_patience_is_a_time_and_one_bad_frame_never_ends_it(fps: float, frames: int) -> None:
+    settings, track, states = lost_settings(score=0.6, patience=4), young_track(), []
+    for _ in range(frames):
+        belief = believe(track, 0.5, 0.0, 1 / fps, settings)
+        states.append((belief.kept, belief.lost))
+        track = replace(track, bad_s=belief.bad_s)
+    assert states[0] == (True, False)
+    assert [kept for kept, _ in states] == [True] * (frames - 1) + [False]
+    good = believe(replace(track, bad_s=0.1), 0.9, 0.0, 1 / fps, settings)
+    assert (good.kept, good.lost, good.bad_s) == (True, False, 0.0)
+
+
+def test_a_pose_out_of_the_space_is_lost_from_the_second_frame_on() -> None:
+    settings, track = lost_settings(outside_rad=0.16), young_track()
+    first = believe(track, 0.9, 0.2, FRAME_S, settings)
+    second = believe(replace(track, outside_s=first.outside_s), 0.9, 0.2, FRAME_S, settings)
+    assert (first.lost, second.lost) == (False, True)
+    assert first.kept and second.kept and second.state_name == "tracking"
