@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.data_sets import scene, write_msra
 
-from toftrack import cli
+from toftrack.programs import command_line
 from toftrack.programs.evaluate import main
 from toftrack.recordings.datasets import msra
 
@@ -77,7 +77,7 @@ def test_errors_are_one_sentence(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(folder)
-    assert cli.run(lambda: main(arguments)) == 1
+    assert command_line.run(lambda: main(arguments)) == 1
     last = capsys.readouterr().err.rstrip().splitlines()[-1]
     assert last.startswith("error: ") and reason in last
 

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from toftrack import cli
+from toftrack.api import make_tracker
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.interface import make_tracker
 from toftrack.output.labelled_figures import LabelledFigures, labelled_figures, table, totals
+from toftrack.programs import command_line
 from toftrack.recordings.datasets import DATA_SETS, open_data_set
 from toftrack.recordings.datasets.base import DataSet, LabelledSequence, compared_joints
 
@@ -153,4 +153,4 @@ def _write(path: Path, facts: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(command_line.run(main))
