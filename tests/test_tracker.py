@@ -225,7 +225,8 @@ def test_the_paper_s_configuration_runs_and_is_the_paper_s() -> None:
     assert (config.filter.bounds, config.filter.velocity) == ("truncate", 0)
     head = config.likelihood
     assert (head.beta, head.naming, head.tolerance_m) == (1.5, "printed", 0.02)
-    assert (head.residual_weight, head.coverage, config.refine.iterations) == (0, 0, 0)
+    assert (head.residual_weight, head.coverage) == (0, 0)
+    assert config.refine["_target_"].endswith("no_refinement")
     assert (config.hand.shape, config.lost.patience) == ("default", 0)
     assert config.segmentation.min_area_m2 == config.segmentation.occluder_margin_m == 0
     assert config.pose_space.kind == "pca" and config.pose_space.dims == 4
