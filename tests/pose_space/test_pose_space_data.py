@@ -197,7 +197,7 @@ def test_a_mixture_keeps_clips_and_sources_apart(tmp_path: Path) -> None:
     assert len(both.clips.unique()) == len(synthetic_data().clips.unique()) + 1
     assert [source["data"] for source in both.sources] == ["synthetic", "file"]
     with pytest.raises(ToftrackError, match="data.parts"):
-        mixed_data({})
+        mixed_data({}, poses=None)
 
 
 def test_folds_hold_out_whole_clips_and_every_pose_once() -> None:
