@@ -1,11 +1,30 @@
-"""Tests marked `slow` (minutes) run only with `pytest --slow`."""
+"""Tests marked `slow` run only with `pytest --slow`; and the list of what was skipped, and why.
+
+A test may be skipped where a machine lacks what it needs, for the reasons below. Any other skip
+fails the run, so that no test falls asleep unnoticed.
+"""
 
 from __future__ import annotations
 
+import re
 import signal
+from collections import Counter
 
 import pytest
 import torch
+
+ALLOWED_SKIPS = (
+    r"slow; run with --slow",
+    r"needs a CUDA device|there is no CUDA device|there is a CUDA device",
+    r"triton is not installed",
+    r"pyrealsense2",  # the error's own sentence names it
+    r"rerun-sdk is not installed|of the extra rerun|this rerun-sdk reads files in another way",
+    r"pip install '.\[browser-test\]'|needs chromium and chromedriver",
+    r"there is no C compiler",
+    r"needs /dev/full|needs /proc",
+    r"a camera is plugged in",
+    r"could not import 'setuptools'|module 'setuptools' has",
+)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -18,6 +37,33 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="slow; run with --slow"))
+
+
+def _skips(config: pytest.Config) -> Counter[str]:
+    """How often each reason to skip was given."""
+    reporter = config.pluginmanager.get_plugin("terminalreporter")
+    skipped = reporter.stats.get("skipped", []) if reporter else []
+    reasons = (report.longrepr[2] for report in skipped if isinstance(report.longrepr, tuple))
+    return Counter(reason.removeprefix("Skipped: ") for reason in reasons)
+
+
+def _allowed(reason: str) -> bool:
+    return any(re.search(pattern, reason) for pattern in ALLOWED_SKIPS)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if session.exitstatus == pytest.ExitCode.OK and not all(map(_allowed, _skips(session.config))):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
+    if reasons := _skips(config):
+        terminalreporter.section("skipped")
+    for reason, count in sorted(reasons.items()):
+        note = "" if _allowed(reason) else "  NOT ALLOWED by tests/conftest.py"
+        terminalreporter.write_line(f"{count:4d} x {reason}{note}")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -114,7 +114,6 @@ class ResultWriter:
         self._closed = True
         try:
             self._lines.close()
-            arrays: dict[str, Any]
             arrays, held = self._arrays()
             metadata = self._metadata | ({"held_frames": held} if held else {})
             arrays["joint_names"] = np.array(self._joint_names, np.str_)
@@ -141,7 +140,7 @@ class ResultWriter:
     ) -> None:
         self.close()
 
-    def _arrays(self) -> tuple[dict[str, np.ndarray], list[int]]:
+    def _arrays(self) -> tuple[dict[str, Any], list[int]]:
         """The arrays of track.npz, and the indices of the frames that were dropped."""
         done = self._estimates
         if not done:

@@ -92,8 +92,8 @@ class BrowserServer:
             self._server = _Server(source, host, family, address)
         except OSError as error:
             raise _refused(host, port, error) from error
-        at, port = map(str, self._server.server_address[:2])
-        self.url = f"http://[{at}]:{port}/" if ":" in at else f"http://{at}:{port}/"
+        at, free = map(str, self._server.server_address[:2])
+        self.url = f"http://[{at}]:{free}/" if ":" in at else f"http://{at}:{free}/"
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="browser-server", daemon=True
         )
