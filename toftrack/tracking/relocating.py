@@ -30,9 +30,9 @@ _FAR_SIGMAS = 3.0
 """Farther off, a joint is as wrong as it can be."""
 _LEAST_WORD = float(np.log(0.001))
 """The least that the networks' word counts."""
-_STEP_M, _SPEED_M_S = 0.04, 0.5
+_STEP_M, _SPEED_M_S = 0.04, 0.35
 """How far a hand has moved since it was last believed: at once, and a second."""
-_FORGOTTEN_S = 1.0
+_FORGOTTEN_S = 2.0
 _NEAREST_M = 0.15
 """A camera sees nothing nearer."""
 
@@ -129,10 +129,13 @@ def votes_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
     return -model.relocaliser.settings.votes * (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
 
 
-def known_scores(states: Tensor, joints_m: Tensor, frame: ObservedFrame) -> Tensor:
+def known_scores(
+    states: Tensor, joints_m: Tensor, frame: ObservedFrame, coverage: float | None = None
+) -> Tensor:
     """Log scores (N,) of hands (N, 27) with all that is known besides the image.
 
-    joints_m: (N, 21, 3) of the hands. The networks' word for a hand is that for the hypothesis
+    joints_m: (N, 21, 3) of the hands.  coverage: as FMeasure.log_score has it. The word of the
+    networks for a hand is that for the hypothesis
     which is most like it.
     """
     relocaliser, glance = frame.model.relocaliser, frame.glance
@@ -142,7 +145,7 @@ def known_scores(states: Tensor, joints_m: Tensor, frame: ObservedFrame) -> Tens
     likest = away.norm(dim=-1).mean(-1).argmin(1)
     word = glance.log_probability.to(joints_m.device)[likest].clamp(min=_LEAST_WORD)
     word = relocaliser.settings.prior * word + votes_word(joints_m, frame)
-    return frame.log_scores(states, 1.0) + prior(states) + word
+    return frame.log_scores(states, coverage) + prior(states) + word
 
 
 def begun(frame: ObservedFrame) -> Track:
@@ -154,7 +157,7 @@ def begun(frame: ObservedFrame) -> Track:
         seen, landmarks = seen_points(frame.observation), landmarks_of(glance, model)
         better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, landmarks)
         states = torch.cat((states, better))
-    scores = known_scores(states, frame.hand.refiner.joints(states), frame)
+    scores = known_scores(states, frame.hand.refiner.joints(states), frame, coverage=1.0)
     return track_of(states[scores.argmax()][None], model)
 
 
