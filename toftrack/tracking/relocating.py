@@ -30,7 +30,9 @@ _FAR_SIGMAS = 3.0
 """Farther off, a joint is as wrong as it can be."""
 _LEAST_WORD = float(np.log(0.001))
 """The least that the networks' word counts."""
-_STEP_M, _SPEED_M_S = 0.04, 0.35
+_IN_FRONT_M = 0.03
+"""What is so much nearer than a hidden hand is what hides it."""
+_STEP_M, _SPEED_M_S = 0.04, 0.25
 """How far a hand has moved since it was last believed: at once, and a second."""
 _FORGOTTEN_S = 2.0
 _NEAREST_M = 0.15
@@ -50,7 +52,7 @@ def glanced(
         return track, None
     best = None
     if track is None or track.doubted:
-        likely = partial(_reachable, state.seen)
+        likely = partial(_reachable, state.seen, track)
         best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
         if track is None:
             return None, best
@@ -63,11 +65,14 @@ def glanced(
     return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
 
 
-def _reachable(seen: LastSeen | None, centre_m: np.ndarray) -> float:
+def _reachable(seen: LastSeen | None, track: Track | None, centre_m: np.ndarray) -> float:
     """How likely a hand has come to a place from where it was last believed, log scale.
 
     Another hand, or the thing that hides the hand, is no place that it has jumped to.
     """
+    hidden = track is not None and track.expected is not None
+    if hidden and centre_m[2] < track.expected.nearest_m - _IN_FRONT_M:
+        return -np.inf
     if seen is None:
         return 0.0
     before = seen.particle[:, :3] + rotated_pivot(seen.particle[:, 3:6])
