@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,7 +13,11 @@ from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.model import ObservedFrame
 from toftrack.tracking.relocating import candidates, known_scores, landmarks_of, votes_word
+from toftrack.tracking.signs import out_of_sight
 from toftrack.tracking.state import Track
+
+_UNSEEN = 0.3
+"""Share of the joints that must be out of sight for the networks not to be heard."""
 
 
 def improved(particles: Tensor, frame: ObservedFrame) -> Tensor:
@@ -63,7 +67,10 @@ def _onto_points(
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor | None]:
     """The filter's hand brought onto the seen points, (1, 27), and a rival; `before`: the last."""
-    refiner, seen, glance = frame.hand.refiner, seen_points(frame.observation), frame.glance
+    refiner, seen = frame.hand.refiner, seen_points(frame.observation)
+    glance = None if before is not None and _mostly_unseen(state, frame) else frame.glance
+    if glance is None:
+        frame = replace(frame, glance=None)
     landmarks = None if glance is None else landmarks_of(glance, frame.model)
 
     def onto_points(starts: Tensor) -> Tensor:
@@ -94,6 +101,15 @@ def _onto_points(
     swapped = tried[best][None]
     both = torch.cat((swapped, onto_points(swapped)))
     return both[_scores(both, frame).argmax()][None], rival
+
+
+def _mostly_unseen(state: Tensor, frame: ObservedFrame) -> bool:
+    """Whether so much of a hand (1, 27) is out of sight that the networks know less than a track.
+
+    What is hidden or cut off moves on as it did; the networks see another hand in the rest of it.
+    """
+    joints, image = frame.hand.refiner.joints(state)[0].cpu(), frame.observation
+    return sum(out_of_sight(joints, image.depth_m, image.k)) > _UNSEEN
 
 
 def _scores(states: Tensor, frame: ObservedFrame) -> Tensor:

@@ -62,7 +62,7 @@ def read_signs(
     votes = (joints - glance.landmarks.points_m).norm(dim=1)
     off = (joints - glance.joints_m).norm(dim=-1).mean(1)
     likely = off[glance.log_probability > math.log(_LIKELY)]
-    unseen, hidden = _out_of_sight(joints, depth_m, k)
+    unseen, hidden = out_of_sight(joints, depth_m, k)
     return Signs(
         log_score=math.log(max(score, _LEAST)),
         votes_off=_log_cm(float(votes.mean())),
@@ -88,8 +88,8 @@ def _log_odds(probability: float) -> float:
     return math.log(p / (1 - p))
 
 
-def _out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
-    """Shares of the joints that are outside of the image, and that are behind something."""
+def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
+    """Shares of the joints (21, 3) outside of the image (H, W), and of those behind something."""
     depth, k = depth_m.cpu(), k.cpu()
     z = joints[:, 2].clamp(min=0.05)
     u = (k[0, 0] * joints[:, 0] / z + k[0, 2]).round()
