@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import roma
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.rigid import PIVOT_M
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.network import Finder, PoseNet
@@ -204,9 +205,14 @@ def _glance(seen: Look, row: int, side: str) -> Glance:
 def _joints(pivot_m: Tensor, rotvec: Tensor, angles: Tensor, log_size: Tensor, side: str) -> Tensor:
     """(H, 21, 3) of mean hands scaled about the middle of the palm."""
     state = torch.cat((angles.new_zeros(len(angles), 3), rotvec, angles), 1)
-    joints = forward_kinematics(state, default_hand_shape(side=side)).joints_m
+    joints = forward_kinematics(state, _mean_hand(side)).joints_m
     middle = roma.rotvec_to_rotmat(rotvec) @ rotvec.new_tensor(PIVOT_M)
     return pivot_m[:, None] + (joints - middle[:, None]) * log_size.exp()[:, None, None]
+
+
+@lru_cache
+def _mean_hand(side: str) -> HandShape:
+    return default_hand_shape(side=side)
 
 
 def make_relocaliser(weights: str | None = None, **settings: float) -> Relocaliser:
