@@ -174,7 +174,8 @@ def merit(glance: Glance, heat: float) -> float:
     """
     odds = math.log(max(heat, 1e-6)) + math.log(max(glance.present, 1e-6))
     odds += 0.5 * math.log(max(glance.right_side, 1e-3))
-    return odds - float(glance.error_m[0]) / _CLEAR_M
+    unsure = float(glance.error_m[0]) + 0.5 * float(glance.landmarks.sigma_m.mean())
+    return odds - unsure / _CLEAR_M
 
 
 def _apart(centres_m: np.ndarray) -> list[int]:

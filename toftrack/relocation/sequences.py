@@ -42,11 +42,14 @@ class Sequence:
 
 
 def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) -> Sequence:
-    """One random scene: `frames` images at 25 frames/s of one hand in its surroundings."""
+    """One random scene: `frames` images at 25 frames/s of one hand in its surroundings.
+
+    In an eighth of the scenes there is no hand at all.
+    """
     dice = Dice(generator)
     width, height, focal = CAMERAS[int(dice.rows(len(CAMERAS), 1))]
     keys = frames // _KEY + 2
-    left = dice.chance(0.5, 1)
+    left, empty = dice.chance(0.5, 1), bool(dice.chance(0.125, 1))
     place = _places(keys, width / focal, height / focal, dice)
     turns = _turns(keys, dice)
     angles = _held(sample_poses(keys, generator), dice)
@@ -70,7 +73,8 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         # The same draws in every frame: the scene stays, only the hand moves.
         same = Dice(torch.Generator().manual_seed(scene))
         hands = posed_hands(bank, pivot[None], left, same, HAND, turn[None], pose[None])
-        scenes = random_scenes(hands, hands.labels, bank, same, others=0.2, objects=0.06)
+        labels = torch.where(hands.labels == HAND, -1, hands.labels) if empty else hands.labels
+        scenes = random_scenes(hands, labels, bank, same, others=0.2, objects=0.06)
         depth, which = take_pictures(scenes, lens, sensor, (height, width), dice)
         images.append(depth[0])
         joints.append(hands.joints_m[0])
