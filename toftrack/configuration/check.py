@@ -46,7 +46,9 @@ _ABOVE_ZERO = frozenset(
     view.most_fps view.quality
     """.split()
 )
-_OPEN_ENDED = frozenset({"lost.outside_rad", "segmentation.reach_m", "view.linger_s", "view.wait_s"})
+_OPEN_ENDED = frozenset(
+    {"lost.outside_rad", "segmentation.reach_m", "view.linger_s", "view.wait_s"}
+)
 """Infinity is a value of these."""
 _LOG_ODDS = ("lost.intercept", "lost.weights.", "relocation.merit")
 """How the settings begin that may be below 0."""
