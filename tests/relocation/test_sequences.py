@@ -21,9 +21,8 @@ def test_the_joints_lie_below_the_rendered_surface() -> None:
     for seed in range(4):
         seen = sequence(seed)
         height, width = seen.depth_m.shape[1:]
-        for depth, joints in zip(
-            seen.depth_m[seen.visible], seen.joints_m[seen.visible], strict=True
-        ):
+        for row in np.flatnonzero(seen.visible):
+            depth, joints = seen.depth_m[row], seen.joints_m[row]
             u, v = np.rint((joints @ seen.k.T)[:, :2] / joints[:, 2:]).astype(int).T
             inside = (u >= 1) & (u < width - 1) & (v >= 1) & (v < height - 1)
             at = depth[v[inside], u[inside]]
