@@ -13,17 +13,18 @@ import cv2
 import hydra
 import numpy as np
 import pytest
+from helpers.settings import realsense, realsense_emulator
 from helpers.tracking import ROOT, configuration, make_tracker
 
 from toftrack.camera import Camera
 from toftrack.devices.base import Device
 from toftrack.devices.realsense.device import RealSense
-from toftrack.devices.realsense.emulator import EmulatedCamera, EmulatorSettings
+from toftrack.devices.realsense.emulator import EmulatedCamera
 from toftrack.devices.realsense.sdk import camera_of, load_sdk
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 
-FINE = EmulatorSettings(fps=500.0, unit_m=0.0001)
+FINE = realsense_emulator(fps=500.0, unit_m=0.0001)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def rs() -> ModuleType:
 
 def emulated(**changes: Any) -> RealSense:
     settings = {"transport": "emulated", "keep": "every", "emulated": FINE} | changes
-    return RealSense(**settings)
+    return realsense(**settings)
 
 
 def test_the_software_device_delivers_the_samples_frames(rs: ModuleType) -> None:
@@ -68,7 +69,7 @@ def test_tracks_as_well_through_the_sdk_as_the_recording_itself(rs: ModuleType) 
 
     straight = error_mm(Sample(stop=25))
     for unit_m in (0.001, 0.0001):
-        settings = EmulatorSettings(fps=500.0, unit_m=unit_m)
+        settings = realsense_emulator(fps=500.0, unit_m=unit_m)
         assert error_mm(emulated(stop=25, emulated=settings)) == pytest.approx(straight, abs=1)
 
 
@@ -85,7 +86,7 @@ def test_the_configuration_makes_the_device(rs: ModuleType) -> None:
 
 
 def test_newest_drops_what_nobody_took_and_leaves_a_gap(rs: ModuleType) -> None:
-    device = emulated(keep="newest", emulated=EmulatorSettings(fps=200.0, loop=True))
+    device = emulated(keep="newest", emulated=realsense_emulator(fps=200.0, loop=True))
     assert device.frames is None and device.truth is None
     indices = []
     for frame in device:
@@ -131,11 +132,11 @@ def record(rs: ModuleType, path: Path, camera: EmulatedCamera) -> Path:
 @pytest.fixture(scope="module")
 def recording(rs: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
-    return record(rs, folder / "hand.db3", EmulatedCamera(rs, EmulatorSettings(fps=100.0)))
+    return record(rs, folder / "hand.db3", EmulatedCamera(rs, realsense_emulator(fps=100.0)))
 
 
 def test_a_recording_gives_every_frame_in_order_however_slow_its_reader(recording: Path) -> None:
-    device = RealSense(bag=recording)
+    device = realsense(bag=recording)
     sample = Sample()
     np.testing.assert_allclose(device.camera.K, sample.camera.K, rtol=1e-6)
     count = 0
@@ -151,7 +152,7 @@ def test_a_recording_gives_every_frame_in_order_however_slow_its_reader(recordin
 
 
 def test_a_part_of_a_recording_keeps_its_indices_and_can_be_read_again(recording: Path) -> None:
-    device = RealSense(bag=recording, start=40, stop=43, infrared=False)
+    device = realsense(bag=recording, start=40, stop=43, infrared=False)
     for _ in range(2):
         frames = list(device)
         assert [frame.index for frame in frames] == [40, 41, 42]
@@ -159,7 +160,7 @@ def test_a_part_of_a_recording_keeps_its_indices_and_can_be_read_again(recording
 
 
 def test_a_recording_at_its_own_pace_drops_what_comes_too_late(recording: Path) -> None:
-    device = RealSense(bag=recording, realtime=True)
+    device = realsense(bag=recording, realtime=True)
     indices = []
     for frame in device:
         indices.append(frame.index)
@@ -171,7 +172,7 @@ def test_a_recording_at_its_own_pace_drops_what_comes_too_late(recording: Path) 
 
 def test_a_start_behind_the_end_is_told(recording: Path) -> None:
     with pytest.raises(ToftrackError, match="no frame from start=100 on, but 100 before"):
-        list(RealSense(bag=recording, start=100))
+        list(realsense(bag=recording, start=100))
 
 
 def test_a_recording_without_depth_is_told(rs: ModuleType, tmp_path: Path) -> None:
@@ -187,7 +188,7 @@ def test_a_recording_without_depth_is_told(rs: ModuleType, tmp_path: Path) -> No
 
     path = record(rs, tmp_path / "infrared.db3", InfraredOnly(rs, FINE))
     with pytest.raises(ToftrackError, match="infrared.* has no depth images"):
-        RealSense(bag=path)
+        realsense(bag=path)
 
 
 def test_a_recording_without_a_frame_is_told(rs: ModuleType, tmp_path: Path) -> None:
@@ -196,7 +197,7 @@ def test_a_recording_without_a_frame_is_told(rs: ModuleType, tmp_path: Path) -> 
 
     path = record(rs, tmp_path / "silent.db3", Silent(rs, FINE))
     with pytest.raises(ToftrackError, match="silent.*has no (depth images|frame with depth)"):
-        list(RealSense(bag=path))
+        list(realsense(bag=path))
 
 
 @pytest.mark.parametrize("name", ["text.bag", "text.db3", "empty.bag", "empty.db3", "cut"])
@@ -207,7 +208,7 @@ def test_what_is_no_recording_is_told(
     content = recording.read_bytes()[:5000] if name == "cut" else b"text" * ("text" in name)
     path.write_bytes(content)
     with pytest.raises(ToftrackError, match=rf"{path.name}' is not a recording of a RealSense"):
-        RealSense(bag=path)
+        realsense(bag=path)
 
 
 MODELS = ("brown_conrady", "modified_brown_conrady", "inverse_brown_conrady")

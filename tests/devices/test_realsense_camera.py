@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from helpers.fake_realsense import Camera as FakeCamera
 from helpers.fake_realsense import Profile, Sdk
+from helpers.settings import realsense, realsense_emulator
 from helpers.tracking import ROOT
 
 from toftrack.devices.realsense.device import RealSense
-from toftrack.devices.realsense.emulator import EmulatorSettings
 from toftrack.errors import ToftrackError
 
 
@@ -35,7 +35,7 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sdk]:
 
 
 def live(**changes: Any) -> RealSense:
-    return RealSense(**({"width": 8, "height": 6} | changes))
+    return realsense(**({"width": 8, "height": 6} | changes))
 
 
 def test_the_sdk_is_not_imported_until_it_is_used() -> None:
@@ -153,4 +153,4 @@ def test_senseless_settings_are_told_without_the_sdk(changes: dict[str, Any], to
 
 def test_senseless_settings_of_the_virtual_camera_are_told() -> None:
     with pytest.raises(ToftrackError, match="fps and unit_m above 0"):
-        EmulatorSettings(unit_m=0)
+        realsense_emulator(unit_m=0)

@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 import usb.core
+from helpers.settings import (
+    sr3000,
+)
 from helpers.sr3000_camera import STEP_M, camera, read
 
 from toftrack.devices.base import Device
@@ -173,7 +176,7 @@ def no_library(**_: Any) -> None:
 def test_no_library_is_told_with_the_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sr3000_usb.usb.core, "find", no_library)
     with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*libusb.*libmesasr.*emulated"):
-        Sr3000()
+        sr3000()
 
 
 def test_no_camera_is_told_with_the_ids() -> None:
@@ -187,7 +190,7 @@ def test_usb_that_cannot_be_listed_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(sr3000_usb.usb.core, "find", fails)
     with pytest.raises(ToftrackError, match="cannot be listed"):
-        Sr3000()
+        sr3000()
 
 
 @pytest.mark.parametrize(("kind", "words"), [("permission", "udev"), ("busy", "another program")])

@@ -8,9 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.settings import (
+    mesa_settings,
+    persistence_settings,
+    sr3000,
+)
 
 from toftrack.devices.sr3000.device import Sr3000
-from toftrack.devices.sr3000.transport import MesaSettings, Persistence
 from toftrack.errors import ToftrackError
 
 SOURCE = r"""
@@ -86,12 +90,12 @@ def libraries(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def camera(library: Path | str, **changes: object) -> Sr3000:
-    persistence = Persistence(
+    persistence = persistence_settings(
         first_frame_s=0.3, give_up_s=0.5, backoff_s=0.01, longest_backoff_s=0.05, reopen_after=2
     )
     settings = {"keep": "every", "stop": 5} | changes
-    mesa = MesaSettings(library=str(library), timeout_ms=50)
-    return Sr3000("libmesasr", libmesasr=mesa, persistence=persistence, **settings)
+    mesa = mesa_settings(library=str(library), timeout_ms=50)
+    return sr3000("libmesasr", libmesasr=mesa, persistence=persistence, **settings)
 
 
 @needs_compiler

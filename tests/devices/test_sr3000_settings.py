@@ -10,13 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 import usb.core
+from helpers.settings import (
+    persistence_settings,
+    sr3000,
+    sr3000_emulator,
+    usb_settings,
+)
 from helpers.sr3000_camera import STEP_M, camera, read
 
 from toftrack.camera import Camera
 from toftrack.devices.sample import Sample
-from toftrack.devices.sr3000.device import Sr3000
-from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
-from toftrack.devices.sr3000.transport import Exposure, Persistence, UsbSettings
+from toftrack.devices.sr3000.emulator import EmulatedBackend
+from toftrack.devices.sr3000.transport import Exposure
 from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.recordings.store import open_source
@@ -62,19 +67,19 @@ def test_amplitude_threshold_takes_the_distance_of_dim_pixels() -> None:
 
 
 def test_a_camera_with_other_endpoints_is_told() -> None:
-    source, settings = open_source("sample"), EmulatorSettings()
-    backend = EmulatedBackend(source, settings, 7.5, UsbSettings(endpoint_in=0x81))
-    transport = UsbTransport(UsbSettings(), Exposure(), None, backend)
+    source, settings = open_source("sample"), sr3000_emulator()
+    backend = EmulatedBackend(source, settings, 7.5, usb_settings(endpoint_in=0x81))
+    transport = UsbTransport(usb_settings(), Exposure(20, None, 0), None, backend)
     with pytest.raises(ToftrackError, match="no endpoint 0x86 .it has 0x02, 0x81"):
         transport.open()
     assert backend.open_handles == set()
 
 
 def test_a_register_that_the_camera_refuses_is_told() -> None:
-    source, settings = open_source("sample"), EmulatorSettings()
-    backend = EmulatedBackend(source, settings, 7.5, UsbSettings(endpoint_out=0x02))
+    source, settings = open_source("sample"), sr3000_emulator()
+    backend = EmulatedBackend(source, settings, 7.5, usb_settings(endpoint_out=0x02))
     backend.bulk_write = lambda *_: (_ for _ in ()).throw(usb.core.USBError("Pipe error", -9, 32))
-    transport = UsbTransport(UsbSettings(registers={1: 2}), Exposure(), None, backend)
+    transport = UsbTransport(usb_settings(registers={1: 2}), Exposure(20, None, 0), None, backend)
     with pytest.raises(ToftrackError, match="register 1"):
         transport.open()
     assert backend.open_handles == set()
@@ -110,22 +115,22 @@ def test_camera_file_replaces_the_optics(tmp_path: Any) -> None:
 )
 def test_bad_settings_are_told(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
-        Sr3000(**({"transport": "emulated"} | settings))
+        sr3000(**({"transport": "emulated"} | settings))
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: UsbSettings(ids=("1ad2",)), "VENDOR:PRODUCT"),
-        (lambda: UsbSettings(ids=()), "empty"),
-        (lambda: UsbSettings(timeout_ms=0), "timeout_ms"),
-        (lambda: UsbSettings(registers={64: 0}), "0 to 63"),
-        (lambda: UsbSettings(registers={1: 256}), "0 to 255"),
-        (lambda: EmulatorSettings(faults=("explode@3",)), "explode"),
-        (lambda: EmulatorSettings(faults=("timeout@x",)), "timeout@x"),
-        (lambda: EmulatorSettings(fps=0.0), "fps"),
-        (lambda: Persistence(give_up_s=0), "give_up_s"),
-        (lambda: Persistence(backoff_s="soon"), "backoff_s"),
+        (lambda: usb_settings(ids=("1ad2",)), "VENDOR:PRODUCT"),
+        (lambda: usb_settings(ids=()), "empty"),
+        (lambda: usb_settings(timeout_ms=0), "timeout_ms"),
+        (lambda: usb_settings(registers={64: 0}), "0 to 63"),
+        (lambda: usb_settings(registers={1: 256}), "0 to 255"),
+        (lambda: sr3000_emulator(faults=("explode@3",)), "explode"),
+        (lambda: sr3000_emulator(faults=("timeout@x",)), "timeout@x"),
+        (lambda: sr3000_emulator(fps=0.0), "fps"),
+        (lambda: persistence_settings(give_up_s=0), "give_up_s"),
+        (lambda: persistence_settings(backoff_s="soon"), "backoff_s"),
     ],
 )
 def test_bad_settings_of_the_parts_are_told(make: Any, words: str) -> None:

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from toftrack.devices.sr3000.device import Sr3000
-from toftrack.devices.sr3000.emulator import EmulatorSettings
-from toftrack.devices.sr3000.transport import UsbSettings
+from helpers.settings import (
+    sr3000,
+    sr3000_emulator,
+    usb_settings,
+)
 
 ROOT = Path(__file__).parents[2]
 EMULATED = ("device=sr3000", "device.transport=emulated", "view=none")
@@ -80,12 +81,12 @@ def memory_mb() -> float:
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
 def test_soak(keep: str) -> None:
     """10 000 frames at 50 frames/s with a fault every 50: nothing is lost, nothing grows."""
-    device = Sr3000(
+    device = sr3000(
         transport="emulated",
         keep=keep,
         stop=10_000,
-        usb=UsbSettings(timeout_ms=200),
-        emulated=EmulatorSettings(fps=50.0, loop=True, fault_every=50, replug_s=0.1),
+        usb=usb_settings(timeout_ms=200),
+        emulated=sr3000_emulator(fps=50.0, loop=True, fault_every=50, replug_s=0.1),
     )
     last, begin, most = -1, None, 0.0
     with device:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.settings import gestures
 from helpers.tracking import configuration, make_tracker, sample
 from helpers.tracking import follow as follow_scene
 from hydra.utils import instantiate
@@ -19,7 +20,6 @@ from toftrack.gestures.files import read_poses
 from toftrack.gestures.recognition import (
     Gestures,
     GestureState,
-    make_gestures,
     pointing_ray,
     tell_gesture,
     update,
@@ -32,7 +32,7 @@ from toftrack.pose_space.files import make_pose_space
 
 SURE, ON = 0.9, 0.0
 """A good score, and no distance from the pose space."""
-GESTURES = make_gestures()
+GESTURES = gestures()
 SPACE = make_pose_space("pca", 4)
 
 
@@ -248,7 +248,7 @@ def write_csv(folder: Path, text: str) -> Path:
 
 def test_a_json_file_names_further_gestures(tmp_path: Path) -> None:
     path = write_json(tmp_path, [{"name": "vsign", "angles": V_SIGN}])
-    mine = make_gestures(str(path))
+    mine = gestures(str(path))
     assert mine.names == ("palm", "fist", "pointing", "vsign", "other")
     # Such a pose lies off the pose space, which must not speak against it.
     assert label_of(fingers(2, 3), mine, off=0.4) == "vsign"
@@ -259,7 +259,7 @@ def test_a_json_file_names_further_gestures(tmp_path: Path) -> None:
 
 def test_a_gesture_that_says_more_is_preferred_where_it_holds(tmp_path: Path) -> None:
     thumbs_up = np.degrees(pose("fist", "up")).tolist()
-    mine = make_gestures(str(write_json(tmp_path, [{"name": "good", "angles": thumbs_up}])))
+    mine = gestures(str(write_json(tmp_path, [{"name": "good", "angles": thumbs_up}])))
     assert label_of(pose("fist", "up"), mine) == "good"
     assert label_of(pose("fist"), mine) == "fist"
 
@@ -270,10 +270,10 @@ def test_poses_of_one_name_are_one_gesture_and_a_basic_name_is_replaced(tmp_path
         {"name": "fist", "angles": np.degrees(pose("fist")).tolist()},
         {"name": "fist", "angles": half},
     ]
-    mine = make_gestures(str(write_json(tmp_path, poses[:1])))
+    mine = gestures(str(write_json(tmp_path, poses[:1])))
     assert mine.names == ("palm", "pointing", "fist", "other")
     half |= {name: 20.0 for name in ANGLE_NAMES if name.endswith("dip_flexion")}
-    both = make_gestures(str(write_json(tmp_path, poses)))
+    both = gestures(str(write_json(tmp_path, poses)))
     assert both.names == mine.names
     loose = np.zeros(21)
     loose[[ANGLE_NAMES.index(name) for name in half]] = np.radians(list(half.values()))
@@ -322,7 +322,7 @@ def test_bad_json_is_told_in_one_sentence(
 ) -> None:
     path = write_json(tmp_path, poses, units)
     with pytest.raises(ToftrackError) as caught:
-        make_gestures(str(path))
+        gestures(str(path))
     assert words in str(caught.value) and "mine.json" in str(caught.value)
 
 
@@ -339,17 +339,17 @@ def test_bad_json_is_told_in_one_sentence(
 )
 def test_bad_csv_is_told_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
-        make_gestures(str(write_csv(tmp_path, text)))
+        gestures(str(write_csv(tmp_path, text)))
 
 
 def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="no file of gestures"):
-        make_gestures(str(tmp_path / "none.json"))
+        gestures(str(tmp_path / "none.json"))
     with pytest.raises(ToftrackError, match="neither .json nor .csv"):
-        make_gestures(str(tmp_path / "poses.txt"))
+        gestures(str(tmp_path / "poses.txt"))
     (tmp_path / "broken.json").write_text("{")
     with pytest.raises(ToftrackError, match="cannot be read as a file of gestures"):
-        make_gestures(str(tmp_path / "broken.json"))
+        gestures(str(tmp_path / "broken.json"))
 
 
 @pytest.mark.parametrize(
@@ -358,7 +358,7 @@ def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
 )
 def test_settings_out_of_range_are_told(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures"):
-        make_gestures(**bad)
+        gestures(**bad)
 
 
 def test_the_configurations_make_the_defaults() -> None:

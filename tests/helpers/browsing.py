@@ -14,11 +14,12 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
+from helpers.settings import browser_view
 from helpers.tracking import make_tracker
 
 from toftrack.devices.sample import Sample
 from toftrack.views.base import TrackedFrame
-from toftrack.views.browser.view import BrowserView, browser_view
+from toftrack.views.browser.view import BrowserView
 
 PATIENCE_S = 20
 

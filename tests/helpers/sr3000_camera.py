@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+from helpers.settings import (
+    persistence_settings,
+    sr3000,
+    sr3000_emulator,
+    usb_settings,
+)
+
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.devices.sr3000.emulator import EmulatorSettings
-from toftrack.devices.sr3000.transport import Persistence, UsbSettings
 from toftrack.recordings.sr_frame import unambiguous_range_m
 
 FAST = {"fps": 1000.0, "replug_s": 0.02, "late_s": 0.06}
@@ -21,12 +27,12 @@ def camera(*faults: str, keep: str = "every", **changes: Any) -> Sr3000:
         "persistence", {}
     )
     usb_ = {"timeout_ms": 40, "drain_ms": 3, "tail_check_ms": 1} | changes.pop("usb", {})
-    return Sr3000(
+    return sr3000(
         transport="emulated",
         keep=keep,
-        emulated=EmulatorSettings(**settings),
-        persistence=Persistence(**persistence),
-        usb=UsbSettings(**usb_),
+        emulated=sr3000_emulator(**settings),
+        persistence=persistence_settings(**persistence),
+        usb=usb_settings(**usb_),
         **changes,
     )
 

@@ -18,13 +18,14 @@ from pathlib import Path
 import hydra
 import numpy as np
 import pytest
+from helpers.settings import stdout_stream, udp_stream
 from helpers.tracking import CONF, ROOT, configuration, run
 
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.output.results import LINE_FIELDS, json_line, read_results
-from toftrack.output.stream import NoStream, ReaderGoneError, StdoutStream, UdpStream
+from toftrack.output.stream import NoStream, ReaderGoneError
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 NUMBERS = np.random.default_rng(0)
@@ -81,7 +82,7 @@ def receiver() -> Iterator[socket.socket]:
 
 def test_a_reader_of_standard_output_gets_every_line_as_in_track_jsonl() -> None:
     sent = [estimate(i) for i in range(5)]
-    with piped() as pipe, StdoutStream() as stream:
+    with piped() as pipe, stdout_stream() as stream:
         for one in sent:
             stream.send(one)
             assert lines_of(pipe, ends_with(one.index)) == [json.loads(json_line(one))]
@@ -92,7 +93,7 @@ def test_nothing_else_gets_to_standard_output() -> None:
 import os
 from toftrack.estimate import no_estimate
 from toftrack.output.stream import StdoutStream
-with StdoutStream() as stream:
+with StdoutStream(None, 25) as stream:
     print("printed")
     os.system("echo from below")
     stream.send(no_estimate(1, 0.0, 'lost', 4, 0.0))
@@ -116,7 +117,7 @@ def test_a_reader_that_falls_behind_gets_the_newest_and_whole_lines(
     found: list[dict] = []
     with piped() as pipe:
         reader = threading.Thread(target=lambda: found.extend(lines_of(pipe, ends_with(299))))
-        with StdoutStream(waiting=3) as stream:
+        with stdout_stream(waiting=3) as stream:
             for i in range(300):
                 stream.send(estimate(i))
             reader.start()
@@ -132,7 +133,7 @@ def test_a_reader_that_never_reads_stops_nothing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
-    with piped(), StdoutStream(waiting=1) as stream:
+    with piped(), stdout_stream(waiting=1) as stream:
         for i in range(300):
             stream.send(estimate(i))
     words = caplog.text.split()
@@ -145,7 +146,7 @@ def test_a_reader_that_goes_away_is_told_at_once() -> None:
     kept = os.dup(1)
     os.dup2(writing, 1)
     try:
-        with pytest.raises(ReaderGoneError, match="Broken pipe"), StdoutStream() as stream:
+        with pytest.raises(ReaderGoneError, match="Broken pipe"), stdout_stream() as stream:
             stream.send(estimate(0))
             os.close(reading)
             stream.send(estimate(1))
@@ -156,7 +157,7 @@ def test_a_reader_that_goes_away_is_told_at_once() -> None:
 
 
 def test_a_datagram_is_a_whole_line(receiver: socket.socket) -> None:
-    with UdpStream(*receiver.getsockname()) as stream:
+    with udp_stream(*receiver.getsockname()) as stream:
         for i in range(3):
             stream.send(one := estimate(i))
             assert receiver.recv(65535).decode() == json_line(one) + "\n"
@@ -167,7 +168,7 @@ def test_datagrams_that_nobody_wants_stop_nothing(caplog: pytest.LogCaptureFixtu
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with UdpStream("127.0.0.1", port) as stream:
+    with udp_stream("127.0.0.1", port) as stream:
         for i in range(50):
             stream.send(estimate(i))
     assert f"50 estimates sent to 127.0.0.1 port {port}, 0 dropped" in caplog.text
@@ -176,21 +177,21 @@ def test_datagrams_that_nobody_wants_stop_nothing(caplog: pytest.LogCaptureFixtu
 def test_datagrams_that_the_system_refuses_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     """A broadcast address, which needs a permission that the stream does not ask for."""
     caplog.set_level(logging.INFO)
-    with UdpStream("255.255.255.255", 5005) as stream:
+    with udp_stream("255.255.255.255", 5005) as stream:
         for i in range(3):
             stream.send(estimate(i))
     assert "0 estimates sent" in caplog.text and "3 dropped (" in caplog.text
 
 
 def test_a_receiver_that_never_reads_stops_nothing(receiver: socket.socket) -> None:
-    with UdpStream(*receiver.getsockname()) as stream:
+    with udp_stream(*receiver.getsockname()) as stream:
         for i in range(1000):
             stream.send(estimate(i))
     assert json.loads(receiver.recv(65535))["index"] == 0
 
 
 def test_only_the_wanted_fields_are_sent(receiver: socket.socket) -> None:
-    with UdpStream(*receiver.getsockname(), fields=["lost", "joints_m", "index"]) as stream:
+    with udp_stream(*receiver.getsockname(), fields=["lost", "joints_m", "index"]) as stream:
         stream.send(estimate(7))
     line = json.loads(receiver.recv(65535))
     assert list(line) == ["lost", "joints_m", "index"] and line["index"] == 7

@@ -107,7 +107,7 @@ def recorded(tmp_path: Path) -> Path:
 
 
 def test_recorded_motion_becomes_joint_angles(recorded: Path) -> None:
-    data = leap_data(str(recorded), poses=None)
+    data = leap_data(str(recorded), poses=None, worst_fit_mm=10.0)
     assert list(dict.fromkeys(data.labels)) == ["a", "b", "c"]
     assert data.clips.tolist() == [0] * 40 + [1] * 30 + [2] * 20
     source = data.sources[0]
@@ -122,7 +122,7 @@ def test_recorded_motion_becomes_joint_angles(recorded: Path) -> None:
 
 
 def test_a_recording_is_thinned_to_poses_that_cover_it(recorded: Path) -> None:
-    data = leap_data(str(recorded), poses=12)
+    data = leap_data(str(recorded), poses=12, worst_fit_mm=10.0)
     assert len(data) == 12
     assert set(data.labels) == {"a", "b", "c"}
 
@@ -142,16 +142,16 @@ def test_a_bad_recording_is_one_clear_error(recorded: Path, changes: dict, part:
         content = {name: archive[name] for name in archive.files} | changes
     np.savez(recorded, **{name: value for name, value in content.items() if value is not None})
     with pytest.raises(ToftrackError, match=part) as error:
-        leap_data(str(recorded))
+        leap_data(str(recorded), None, 10.0)
     assert str(recorded) in str(error.value)
 
 
 def test_a_recording_that_is_missing_or_no_archive_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="data.path"):
-        leap_data(str(tmp_path / "nothing.npz"))
+        leap_data(str(tmp_path / "nothing.npz"), None, 10.0)
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(ToftrackError, match="not a readable"):
-        leap_data(str(tmp_path / "text.npz"))
+        leap_data(str(tmp_path / "text.npz"), None, 10.0)
 
 
 def test_sources_are_mixed_by_the_configuration(recorded: Path, tmp_path: Path) -> None:

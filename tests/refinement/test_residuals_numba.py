@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from configured import refinement
+from helpers.configured import refinement
 from torch import Tensor
 
 from toftrack.compute import rigid_numba

@@ -56,7 +56,7 @@ _WITHOUT_NUMBA = """
 import logging, sys
 logging.basicConfig(level=logging.INFO, format="%(message)s")
 sys.modules["numba"] = sys.modules["llvmlite"] = None
-from tracking import follow, sample
+from helpers.tracking import follow, sample
 found = follow(sample().cut(0, 1), "renderer={renderer}")
 print(len(found), found[-1].score)
 """

@@ -29,11 +29,12 @@ from helpers.browsing import (
     raw,
     shown_again_and_again,
 )
+from helpers.settings import browser_view
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import no_estimate
 from toftrack.views.browser import view as browser
-from toftrack.views.browser.view import BrowserView, LivePicture, browser_view
+from toftrack.views.browser.view import BrowserView, LivePicture
 from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
 

@@ -28,6 +28,7 @@ from helpers.browsing import (
     ours,
     shown_again_and_again,
 )
+from helpers.settings import browser_view
 from helpers.tracking import ROOT, configuration
 
 from toftrack.devices.replay import Replay
@@ -35,7 +36,7 @@ from toftrack.devices.sample import Sample
 from toftrack.estimate import no_estimate
 from toftrack.output.results import read_results
 from toftrack.views.browser import view as browser
-from toftrack.views.browser.view import BrowserView, browser_view
+from toftrack.views.browser.view import BrowserView
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)

@@ -58,15 +58,15 @@ _RANGES = np.abs(_SUMS) @ np.diff(ANGLE_LIMITS)[:, 0]
 class GestureSettings:
     """How labels are decided; see conf/gestures for what each does."""
 
-    flexion_rad: float = 0.7
-    split_rad: float = 1.05
-    thumb_rad: float = 0.2
-    off_rad: float = 0.07
-    other: float = 1.0
-    doubtful_score: float = 0.5
-    sure_score: float = 0.75
-    smoothing: float = 0.5
-    margin: float = 0.3
+    flexion_rad: float
+    split_rad: float
+    thumb_rad: float
+    off_rad: float
+    other: float
+    doubtful_score: float
+    sure_score: float
+    smoothing: float
+    margin: float
 
     def __post_init__(self) -> None:
         widths = (self.flexion_rad, self.split_rad, self.thumb_rad, self.off_rad, self.other)

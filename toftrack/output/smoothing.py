@@ -36,7 +36,7 @@ class OneEuro:
     rotation_beta: float
     angle_beta: float
     speed_cutoff_hz: float
-    results: bool = False
+    results: bool
 
     def __post_init__(self) -> None:
         for name in ("min_cutoff_hz", "speed_cutoff_hz"):

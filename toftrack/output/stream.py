@@ -74,7 +74,7 @@ class StdoutStream:
         ReaderGoneError: by `send`, when the reader has closed the pipe or the disk is full.
     """
 
-    def __init__(self, fields: Sequence[str] | None = None, waiting: int = 25) -> None:
+    def __init__(self, fields: Sequence[str] | None, waiting: int) -> None:
         self._fields = _known(fields)
         if not isinstance(waiting, int) or waiting < 1:
             raise ToftrackError(f"stream.waiting={waiting!r} is no number of lines; give 1 or more")
@@ -142,7 +142,7 @@ class UdpStream:
         ToftrackError: an unknown field, a host that cannot be found, or an impossible port.
     """
 
-    def __init__(self, host: str, port: int, fields: Sequence[str] | None = None) -> None:
+    def __init__(self, host: str, port: int, fields: Sequence[str] | None) -> None:
         self._fields = _known(fields)
         if not isinstance(port, int) or not 1 <= port <= 65535:
             raise ToftrackError(f"stream.port={port!r} is no port; give a number from 1 to 65535")

@@ -131,11 +131,6 @@ def load_pose_space(path: str | Path) -> PoseSpace:
     return space
 
 
-def pose_space_sources(path: str | Path) -> list[dict[str, Any]]:
-    """What a model file was learned from, as train_pose_space.py recorded it."""
-    return list(_read(path)[0].get("sources", ()))
-
-
 def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of this format and version."""
     try:

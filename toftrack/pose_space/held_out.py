@@ -17,7 +17,6 @@ from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space
 from toftrack.pose_space.reach import nearest_latents
 
-DIMENSIONS = (2, 3, 4, 6, 8)
 FOLDS = 4
 
 

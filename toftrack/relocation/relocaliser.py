@@ -39,6 +39,7 @@ class RelocationSettings:
     rival_m: float
     rival_gain: float
     rival_frames: int
+    votes: float
     landmark_m: float
     landmark_sigmas: float
 
@@ -49,7 +50,7 @@ class RelocationSettings:
         check_number("relocation.rival_frames", self.rival_frames, 1, whole=True)
         check_number("relocation.least", self.least, 0, 1)
         check_number("relocation.merit", self.merit)
-        for name in ("prior", "rival_gain"):
+        for name in ("prior", "rival_gain", "votes"):
             check_number(f"relocation.{name}", getattr(self, name), 0)
         for name in ("rival_m", "landmark_m", "landmark_sigmas"):
             check_number(f"relocation.{name}", getattr(self, name), 0, above=True)

@@ -17,6 +17,11 @@ from toftrack.tracking.life_cycle import Belief, lasted, longer
 from toftrack.tracking.signs import SIGNS, Signs
 from toftrack.tracking.state import Track
 
+_HIDDEN = 0.3
+"""Share of the joints behind something from which on a hand is hidden."""
+_WAITED = 10
+"""Times as long is waited for a hidden hand."""
+
 
 @dataclass(frozen=True)
 class CalibratedBelief:
@@ -63,7 +68,9 @@ class CalibratedBelief:
         smooth = now if before is None else kept * before + (1 - kept) * now
         confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
         bad = longer(track.bad_s, dt_s) if confidence < self.give_up else 0.0
-        ends = self.patience > 0 and bad > 0 and lasted(bad, self.patience)
+        # What is hidden is waited for.
+        patience = self.patience * (_WAITED if signs.hidden > _HIDDEN else 1)
+        ends = patience > 0 and bad > 0 and lasted(bad, patience)
         lost = confidence < self.confidence
         return Belief(not ends, _state_name(signs, lost), lost, bad, 0.0, confidence, smooth)
 
@@ -74,4 +81,4 @@ def _state_name(signs: Signs, lost: bool) -> str:
         return "tracking"
     if signs.unseen > 0.4:
         return "out of view"
-    return "hidden" if signs.hidden > 0.3 else "searching"
+    return "hidden" if signs.hidden > _HIDDEN else "searching"

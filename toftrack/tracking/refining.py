@@ -12,7 +12,7 @@ from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.model import ObservedFrame
-from toftrack.tracking.relocating import hypotheses, known_scores, landmarks_of
+from toftrack.tracking.relocating import candidates, known_scores, landmarks_of, votes_word
 from toftrack.tracking.state import Track
 
 
@@ -76,24 +76,32 @@ def _onto_points(
         starts.insert(0, torch.cat((state[:, :6], before[:, 6:]), 1))
     own = len(starts)
     if glance is not None:
-        starts.append(hypotheses(glance, frame.hand, frame.model.rivals)[0])
+        starts.append(candidates(glance, frame, frame.model.rivals))
     tried = onto_points(torch.cat(starts))
-    scores = frame.log_scores(tried)
+    scores = _scores(tried, frame)
     first = 0 if scores[0] + cfg.keep_gain >= scores[own - 1] else own - 1
     found, rival = tried[first][None], None
     if glance is not None and len(tried) > own:
         found, rival = _contested(found, tried[own:], scores[own:] - scores[first], frame)
     exchanged = [swap_fingers(found, frame.model.poses, cfg.swaps, generator)]
     if glance is not None:
-        exchanged.append(exchange_fingers(found, glance.angles[:2].to(found.device)))
+        exchanged.append(exchange_fingers(found, torch.cat(starts)[own : own + 4, 6:]))
     tried = torch.cat(exchanged)
-    scores = frame.log_scores(tried)
+    scores = _scores(tried, frame)
     best = int(scores.argmax())
     if scores[best] <= scores[0] + cfg.swap_gain:
         return found, rival
     swapped = tried[best][None]
     both = torch.cat((swapped, onto_points(swapped)))
-    return both[frame.log_scores(both).argmax()][None], rival
+    return both[_scores(both, frame).argmax()][None], rival
+
+
+def _scores(states: Tensor, frame: ObservedFrame) -> Tensor:
+    """What hands (N, 27) are compared by: the image and the networks' votes."""
+    scores = frame.log_scores(states)
+    if frame.glance is None:
+        return scores
+    return scores + votes_word(frame.hand.refiner.joints(states), frame)
 
 
 def _contested(

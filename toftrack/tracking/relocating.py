@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,7 +13,7 @@ from toftrack.compute.rigid import rotated_pivot
 from toftrack.frames import DepthImage
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
-from toftrack.refinement.seen_points import seen_points
+from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
@@ -22,11 +23,18 @@ from toftrack.tracking.state import Track, TrackerState
 
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no rivals."""
+_BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
+"""How many hypotheses are bent to the votes, in how many steps; how sure the votes are at best, and
+how far an angle may go."""
+_FAR_SIGMAS = 3.0
+"""Farther off, a joint is as wrong as it can be."""
 _LEAST_WORD = float(np.log(0.001))
 """The least that the networks' word counts."""
-_STEP_M, _SPEED_M_S = 0.04, 0.5
+_IN_FRONT_M = 0.03
+"""What is so much nearer than a hidden hand is what hides it."""
+_STEP_M, _SPEED_M_S = 0.04, 0.25
 """How far a hand has moved since it was last believed: at once, and a second."""
-_FORGOTTEN_S = 1.0
+_FORGOTTEN_S = 2.0
 _NEAREST_M = 0.15
 """A camera sees nothing nearer."""
 
@@ -44,7 +52,7 @@ def glanced(
         return track, None
     best = None
     if track is None or track.doubted:
-        likely = partial(_reachable, state.seen)
+        likely = partial(_reachable, state.seen, track)
         best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
         if track is None:
             return None, best
@@ -57,11 +65,14 @@ def glanced(
     return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
 
 
-def _reachable(seen: LastSeen | None, centre_m: np.ndarray) -> float:
+def _reachable(seen: LastSeen | None, track: Track | None, centre_m: np.ndarray) -> float:
     """How likely a hand has come to a place from where it was last believed, log scale.
 
     Another hand, or the thing that hides the hand, is no place that it has jumped to.
     """
+    hidden = track is not None and track.expected is not None
+    if hidden and centre_m[2] < track.expected.nearest_m - _IN_FRONT_M:
+        return -np.inf
     if seen is None:
         return 0.0
     before = seen.particle[:, :3] + rotated_pivot(seen.particle[:, 3:6])
@@ -94,10 +105,42 @@ def hypotheses(glance: Glance, hand: SizedHand, count: int) -> tuple[Tensor, Ten
     return kept.states(ratio).to(device), kept.log_probability.to(device)
 
 
-def known_scores(states: Tensor, joints_m: Tensor, frame: ObservedFrame) -> Tensor:
+def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
+    """(H, 27) the networks' poses of the hand: the likeliest, and the likeliest bent to the votes.
+
+    The votes are more exact than the hypotheses where a finger is seen, but no pose by themselves.
+    """
+    model = frame.model
+    states, _ = hypotheses(glance, frame.hand, count)
+    if model.refinement is None:
+        return states
+    bent = states[:_BENT]
+    nothing = SeenPoints(
+        states.new_zeros(0, 3), states.new_zeros(0, 0, 2), frame.observation.k, (0, 0)
+    )
+    sigma = glance.landmarks.sigma_m.clamp(min=_BENT_M).to(model.device)
+    votes = Landmarks(glance.landmarks.points_m.to(model.device), sigma)
+    freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
+    return torch.cat((frame.hand.refiner(bent, bent[:, 6:], nothing, freely, votes), states))
+
+
+def votes_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
+    """(N,) what the votes say of hands with joints (N, 21, 3), beside log scores; at most 0."""
+    model, glance = frame.model, frame.glance
+    if model.relocaliser is None or glance is None:
+        return joints_m.new_zeros(len(joints_m))
+    votes = landmarks_of(glance, model)
+    off = ((joints_m - votes.points_m).norm(dim=-1) / votes.sigma_m).square()
+    return -model.relocaliser.settings.votes * (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
+
+
+def known_scores(
+    states: Tensor, joints_m: Tensor, frame: ObservedFrame, coverage: float | None = None
+) -> Tensor:
     """Log scores (N,) of hands (N, 27) with all that is known besides the image.
 
-    joints_m: (N, 21, 3) of the hands. The networks' word for a hand is that for the hypothesis
+    joints_m: (N, 21, 3) of the hands.  coverage: as FMeasure.log_score has it. The word of the
+    networks for a hand is that for the hypothesis
     which is most like it.
     """
     relocaliser, glance = frame.model.relocaliser, frame.glance
@@ -106,19 +149,20 @@ def known_scores(states: Tensor, joints_m: Tensor, frame: ObservedFrame) -> Tens
     away = joints_m[:, None] - glance.joints_m.to(joints_m.device)
     likest = away.norm(dim=-1).mean(-1).argmin(1)
     word = glance.log_probability.to(joints_m.device)[likest].clamp(min=_LEAST_WORD)
-    return frame.log_scores(states, 1.0) + prior(states) + relocaliser.settings.prior * word
+    word = relocaliser.settings.prior * word + votes_word(joints_m, frame)
+    return frame.log_scores(states, coverage) + prior(states) + word
 
 
 def begun(frame: ObservedFrame) -> Track:
     """A track that begins with the best of the networks' poses."""
     model, glance = frame.model, frame.glance
     assert model.relocaliser is not None and glance is not None
-    states, _ = hypotheses(glance, frame.hand, model.relocaliser.settings.hypotheses)
+    states = candidates(glance, frame, model.relocaliser.settings.hypotheses)
     if model.refinement is not None:
         seen, landmarks = seen_points(frame.observation), landmarks_of(glance, model)
         better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, landmarks)
         states = torch.cat((states, better))
-    scores = known_scores(states, frame.hand.refiner.joints(states), frame)
+    scores = known_scores(states, frame.hand.refiner.joints(states), frame, coverage=1.0)
     return track_of(states[scores.argmax()][None], model)
 
 

@@ -58,22 +58,22 @@ class RealSense(BaseDevice):
 
     def __init__(
         self,
-        transport: str = "usb",
-        bag: str | Path | None = None,
-        serial: str | int | None = None,
-        width: int = 640,
-        height: int = 480,
-        fps: int = 30,
-        infrared: bool = True,
-        preset: str | None = None,
-        keep: str = "newest",
-        queue_frames: int = 64,
-        start: int = 0,
-        stop: int | None = None,
-        timeout_s: float = 5.0,
-        realtime: bool = False,
-        camera_file: str | Path | None = None,
-        emulated: EmulatorSettings | None = None,
+        transport: str,
+        bag: str | Path | None,
+        serial: str | int | None,
+        width: int,
+        height: int,
+        fps: int,
+        infrared: bool,
+        preset: str | None,
+        keep: str,
+        queue_frames: int,
+        start: int,
+        stop: int | None,
+        timeout_s: float,
+        realtime: bool,
+        camera_file: str | Path | None,
+        emulated: EmulatorSettings,
     ) -> None:
         _check(transport, bag, keep, queue_frames, start, stop, timeout_s)
         path = None if bag is None else _recording(bag)
@@ -84,7 +84,7 @@ class RealSense(BaseDevice):
             with sdk.told(f"'{bag}' is not a recording of a RealSense", "choose another file"):
                 device, owner = rs.context().load_device(str(path)), f"'{bag}'"
         elif transport == "emulated":
-            self._emulator = EmulatedCamera(rs, emulated or EmulatorSettings())
+            self._emulator = EmulatedCamera(rs, emulated)
             device, owner = self._emulator.device, "the emulated camera"
         else:
             device = sdk.find_camera(rs, None if serial is None else str(serial))
@@ -111,7 +111,7 @@ class RealSense(BaseDevice):
         if path is None and stop is not None:
             self.frames = stop - start
         if self._emulator is not None:
-            self._describe_emulated(self._emulator, loop=(emulated or EmulatorSettings()).loop)
+            self._describe_emulated(self._emulator, loop=emulated.loop)
         self.description = {
             "device": "realsense",
             "transport": transport if path is None else "recording",

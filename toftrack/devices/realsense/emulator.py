@@ -29,13 +29,13 @@ _TURN_S = 0.005  # how soon a waiting camera notices that it may go on
 class EmulatorSettings:
     """What the virtual camera does; see conf/device/realsense.yaml."""
 
-    source: str = "sample"
+    source: str
     """The recording that it sees: `sample`, or a file."""
-    fps: float | None = None
+    fps: float | None
     """Frames a second; None = the recording's own."""
-    loop: bool = False
+    loop: bool
     """Begin again at the end; otherwise the stream ends there."""
-    unit_m: float = 0.001
+    unit_m: float
     """Metres of one step of the depth images."""
 
     def __post_init__(self) -> None:

@@ -27,7 +27,6 @@ from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
 from toftrack.recordings.sr_frame import (
-    DEFAULT_MODULATION_MHZ,
     HEIGHT,
     WIDTH,
     decode_frame,
@@ -66,20 +65,20 @@ class Sr3000(BaseDevice):
 
     def __init__(
         self,
-        transport: str = "usb",
-        serial: str | int | None = None,
-        keep: str = "newest",
-        queue_frames: int = 64,
-        stop: int | None = None,
-        fps: float = 25.0,
-        modulation_mhz: int = DEFAULT_MODULATION_MHZ,
-        integration_time: int | None = None,
-        amplitude_threshold: int = 0,
-        usb: UsbSettings | None = None,
-        libmesasr: MesaSettings | None = None,
-        emulated: EmulatorSettings | None = None,
-        persistence: Persistence | None = None,
-        camera_file: str | Path | None = None,
+        transport: str,
+        serial: str | int | None,
+        keep: str,
+        queue_frames: int,
+        stop: int | None,
+        fps: float,
+        modulation_mhz: int,
+        integration_time: int | None,
+        amplitude_threshold: int,
+        usb: UsbSettings,
+        libmesasr: MesaSettings,
+        emulated: EmulatorSettings,
+        persistence: Persistence,
+        camera_file: str | Path | None,
     ) -> None:
         if keep not in _KEEP or queue_frames < 1 or (stop is not None and stop < 1) or fps <= 0:
             raise ToftrackError(
@@ -92,18 +91,17 @@ class Sr3000(BaseDevice):
         self.counts = Counts()
         """What became of the frames; those of the latest iteration."""
         self._waiting = queue_frames if keep == "every" else None
-        self._stop, self._persistence = stop, persistence or Persistence()
+        self._stop, self._persistence = stop, persistence
         self._next_index = 0
         self._reader: Reader | None = None
         self._opened = False
         serial = None if serial is None else str(serial)
-        usb, emulated = usb or UsbSettings(), emulated or EmulatorSettings()
         self._usb = usb
         self._transport: Transport
         if transport == "usb":
             self._transport = UsbTransport(usb, self.exposure, serial)
         elif transport == "libmesasr":
-            self._transport = MesaTransport(libmesasr or MesaSettings(), self.exposure, serial)
+            self._transport = MesaTransport(libmesasr, self.exposure, serial)
         elif transport == "emulated":
             backend = self._emulate(emulated, usb)
             self._transport = UsbTransport(

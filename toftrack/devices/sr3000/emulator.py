@@ -43,21 +43,21 @@ _CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
 class EmulatorSettings:
     """What the virtual camera does; see conf/device/sr3000.yaml."""
 
-    source: str = "sample"
+    source: str
     """The recording that it sees: `sample`, or a file."""
-    fps: float | None = None
+    fps: float | None
     """Frames a second; None = the recording's own."""
-    loop: bool = False
+    loop: bool
     """Begin again at the end; otherwise the stream ends there."""
-    faults: tuple[str, ...] = ()
+    faults: tuple[str, ...]
     """See `toftrack.devices.sr3000.faults`."""
-    fault_every: int = 0
+    fault_every: int
     """Each n-th request goes wrong, in all ways in turn; 0 = none."""
-    replug_s: float = 0.3
+    replug_s: float
     """How long it stays unplugged."""
-    late_s: float = 1.1
+    late_s: float
     """How long after its time a late frame comes."""
-    serials: tuple[str, ...] = ("emulated-1",)
+    serials: tuple[str, ...]
     """Of the cameras that are plugged in."""
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class EmulatedBackend(IBackend):
         source: FrameStore,
         settings: EmulatorSettings,
         range_m: float,
-        usb: UsbSettings | None = None,
+        usb: UsbSettings,
     ) -> None:
         self.served = 0
         """Whole frames put at the endpoint, those of harmless faults included."""
@@ -111,7 +111,7 @@ class EmulatedBackend(IBackend):
         self.registers = bytearray(REGISTERS)
         self.open_handles: set[_Handle] = set()
         self._source, self._settings, self._range_m = source, settings, range_m
-        self._usb = usb or UsbSettings()
+        self._usb = usb
         self._faults = parse_faults(settings.faults)
         self._period_s = 1.0 / (settings.fps or source.fps)
         self._lock = threading.RLock()

@@ -7,12 +7,11 @@ Every number below is a setting, because some of them were never tried against a
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import (
-    DEFAULT_MODULATION_MHZ,
     MODULATION_CODES,
     REGISTERS,
     unambiguous_range_m,
@@ -77,11 +76,11 @@ class Transport(Protocol):
 class Exposure:
     """How the camera is to take its images."""
 
-    modulation_mhz: int = DEFAULT_MODULATION_MHZ
+    modulation_mhz: int
     """40, 30, 21, 20 or 19; gives the unambiguous range."""
-    integration_time: int | None = None
+    integration_time: int | None
     """0..255, (n + 1) x 0.2 ms; None leaves the camera's own."""
-    amplitude_threshold: int = 0
+    amplitude_threshold: int
     """Pixels of a smaller amplitude have no distance; 0 keeps all."""
 
     def __post_init__(self) -> None:
@@ -105,22 +104,22 @@ class Exposure:
 class UsbSettings:
     """The USB interface as far as it is known; see conf/device/sr3000.yaml."""
 
-    ids: tuple[str, ...] = KNOWN_IDS
-    interface: int = 0
-    endpoint_in: int = 0x86
-    endpoint_out: int = 0x02
-    request_type: int = 0x40
-    request: int = 0xB0
-    request_value: int = 0
-    request_index: int = 0
-    read_multiple: int = 512
-    timeout_ms: int = 1000
-    drain_ms: int = 20
-    tail_check_ms: int = 2
-    registers: Mapping[int, int] = field(default_factory=dict)
+    ids: tuple[str, ...]
+    interface: int
+    endpoint_in: int
+    endpoint_out: int
+    request_type: int
+    request: int
+    request_value: int
+    request_index: int
+    read_multiple: int
+    timeout_ms: int
+    drain_ms: int
+    tail_check_ms: int
+    registers: Mapping[int, int]
     """Raw writes when the camera is opened: address to value."""
-    integration_time_register: int | None = None
-    modulation_register: int | None = None
+    integration_time_register: int | None
+    modulation_register: int | None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ids", tuple(map(str, self.ids)))
@@ -160,10 +159,10 @@ class UsbSettings:
 class MesaSettings:
     """The vendor's library."""
 
-    library: str = "libmesasr.so"
-    mode: int = 0x05
+    library: str
+    mode: int
     """0x01 fixed-pattern correction + 0x04 median of 3x3, as the vendor proposes."""
-    timeout_ms: int = 1000
+    timeout_ms: int
 
     def __post_init__(self) -> None:
         _check_whole("libmesasr.mode", self.mode, 0, 0x7FFFFFFF)
@@ -174,14 +173,14 @@ class MesaSettings:
 class Persistence:
     """How long to go on trying."""
 
-    first_frame_s: float = 5.0
+    first_frame_s: float
     """A camera that was opened but has sent nothing for so long does not answer."""
-    give_up_s: float | None = 30.0
+    give_up_s: float | None
     """The same later on, and for an unplugged camera to come back; None = for ever."""
-    backoff_s: float = 0.1
+    backoff_s: float
     """Before the first attempt to open an unplugged camera again; doubles from one to the next."""
-    longest_backoff_s: float = 2.0
-    reopen_after: int = 5
+    longest_backoff_s: float
+    reopen_after: int
     """So many faults in a row, and the camera is closed and opened again."""
 
     def __post_init__(self) -> None:

@@ -28,7 +28,7 @@ _SAME_MM = 1.0
 """Frames whose joints differ less than this about the hand's middle are the same frame."""
 
 
-def leap_data(path: str, poses: int | None = 400, worst_fit_mm: float = 10.0) -> PoseData:
+def leap_data(path: str, poses: int | None, worst_fit_mm: float) -> PoseData:
     """Joint angles of recorded joint positions.
 
     1. Left hands are mirrored (x -> -x).

@@ -52,7 +52,7 @@ def synthetic_data() -> PoseData:
     return PoseData(poses.angles_rad, poses.labels, clips, (source,))
 
 
-def mixed_data(parts: dict[str, PoseData], poses: int | None = None) -> PoseData:
+def mixed_data(parts: dict[str, PoseData], poses: int | None) -> PoseData:
     """Several sources together.
 
     parts: by name, as the configuration gives them.

@@ -38,13 +38,13 @@ def browser_view(
     fps: float,
     frames: int | None = None,
     *,
-    host: str = "127.0.0.1",
-    port: int = 8765,
-    quality: int = 80,
-    most_fps: float = 30.0,
-    wait_s: float = 30.0,
-    linger_s: float = 5.0,
-    live: bool = True,
+    host: str,
+    port: int,
+    quality: int,
+    most_fps: float,
+    wait_s: float,
+    linger_s: float,
+    live: bool,
 ) -> BrowserView:
     """Serve the page, say on standard error where it is, and wait for a first visitor.
 

@@ -116,7 +116,7 @@ def log_ticks(low: float, high: float) -> list[float]:
 class Axes:
     """A rectangle of a picture with data coordinates.
 
-    left, right, top, bottom: pixels.  x, y: the data's limits.  log_y: the upright axis is
+    left, right, top, bottom: pixels.  x, y: the data's limits.  log_x, log_y: an axis that is
     logarithmic.
     """
 
@@ -127,15 +127,12 @@ class Axes:
     x: tuple[float, float]
     y: tuple[float, float]
     log_y: bool = False
+    log_x: bool = False
 
     def place(self, x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
         """(..., 2) pixels, float64, of data; values beyond the limits lie on the edge."""
         x, y = np.clip(x, *self.x), np.clip(y, *self.y)
-        low, high = self.y
-        if self.log_y:
-            y, low, high = np.log(y), math.log(low), math.log(high)
-        across = (x - self.x[0]) / (self.x[1] - self.x[0])
-        up = (y - low) / (high - low)
+        across, up = _share(x, self.x, self.log_x), _share(y, self.y, self.log_y)
         u = self.left + across * (self.right - self.left)
         v = self.bottom - up * (self.bottom - self.top)
         return np.stack(np.broadcast_arrays(u, v), -1)
@@ -146,7 +143,7 @@ class Axes:
             v = round(float(self.place(self.x[0], tick)[1]))
             cv2.line(picture, (self.left, v), (self.right, v), GRID, 1)
             write(picture, f"{tick:g}", (self.left - 10, v + 5), align="right", size=0.45)
-        for tick in ticks(*self.x):
+        for tick in log_ticks(*self.x) if self.log_x else ticks(*self.x):
             u = round(float(self.place(tick, self.y[0])[0]))
             cv2.line(picture, (u, self.top), (u, self.bottom), GRID, 1)
             if x_label:
@@ -178,3 +175,13 @@ class Axes:
         for start, end in zip(starts[where], ends[where], strict=True):
             left, right = (round(float(self.place(edge, self.y[0])[0])) for edge in (start, end))
             cv2.rectangle(picture, (left, self.top), (right, self.bottom), colour, -1)
+
+
+def _share(
+    value: np.ndarray | float, limits: tuple[float, float], logarithmic: bool
+) -> np.ndarray | float:
+    """How far between two limits a value lies, 0 to 1."""
+    low, high = limits
+    if logarithmic:
+        value, low, high = np.log(value), math.log(low), math.log(high)
+    return (value - low) / (high - low)
