@@ -1,14 +1,22 @@
-"""What the tests of the relocaliser share: small networks, scenes with one hand, clean sensors."""
+"""What the tests of the relocaliser share: small networks, told ones, scenes with one hand."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
 import torch
+from helpers.configured import relocation_settings
 
+from toftrack.compute.rigid import rotated_pivot
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.network import Finder, PoseNet
 from toftrack.relocation.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
+from toftrack.relocation.relocaliser import Glance
 from toftrack.relocation.scenes import HAND, Dice, Hands, Scenes, posed_hands
 from toftrack.relocation.shapes import ShapeBank, shape_bank
 
@@ -80,3 +88,43 @@ def clean_picture(
     n = len(scenes.labels)
     lens = lens_of(k, height, width, n)
     return take_pictures(scenes, lens, clean_sensors(n), (height, width), dice(1))
+
+
+def glance_of(states: torch.Tensor, log_size: float = 0.0, side: str = "right") -> Glance:
+    """What a network that is sure would say: hands (H, 27) of one size, the first the likeliest."""
+    count = len(states)
+    shape = default_hand_shape(side=side).scaled(math.exp(log_size))
+    joints = forward_kinematics(states, shape).joints_m
+    pivot = rotated_pivot(states[:, 3:6]) * math.exp(log_size)
+    return Glance(
+        pivot_m=states[:, :3] + pivot,
+        rotvec=states[:, 3:6],
+        angles=states[:, 6:],
+        joints_m=joints,
+        log_size=torch.full((count,), log_size),
+        log_probability=torch.log_softmax(-2.0 * torch.arange(count), 0),
+        error_m=torch.full((count,), 0.01),
+        landmarks=Landmarks(joints[0], torch.full((21,), 0.005)),
+        present=0.99,
+        right_side=0.95,
+    )
+
+
+class ToldRelocaliser:
+    """In the networks' place: says what it is told to, and remembers what it was asked."""
+
+    def __init__(self, found: Sequence[Glance] = (), **settings: float) -> None:
+        self.settings = relocation_settings(**settings)
+        self.found = list(found)
+        self.looked: list[np.ndarray] = []
+        self.likely: Callable[[np.ndarray], float] | None = None
+
+    def search(self, depth_m, k, side, likely) -> list[Glance]:
+        self.likely = likely
+        return self.found
+
+    def glance(self, depth_m, k, centres_m, side) -> list[Glance]:
+        self.looked.append(np.array(centres_m))
+        states = torch.zeros(len(centres_m), 27)
+        states[:, :3] = torch.from_numpy(np.asarray(centres_m)).float()
+        return [glance_of(state[None], side=side) for state in states]
