@@ -26,6 +26,10 @@ WRONG = (
     ("filter.passes=null", "filter.passes=None .*a whole number"),
     ("refine.steadying.calm=[1]", "refine.steadying.calm=.*a number"),
     ("device.repeat=5", "device.repeat=5 .*true or false"),
+    ("relocation.places=0", "relocation.places=0 .*whole number above 0"),
+    ("relocation.least=-0.1", "relocation.least=-0.1 .*at least 0"),
+    ("segmentation.reach_m=0", "segmentation.reach_m=0 .*above 0"),
+    ("lost.weights.log_score=much", "log_score=much .*a number"),
 )
 
 
@@ -43,6 +47,8 @@ def test_a_wrong_value_is_told_in_one_sentence(override: str, words: str) -> Non
         ("view=browser", "view.linger_s=inf"),
         ("lost.outside_rad=inf",),
         ("experiment=paper", "filter.particles=10"),
+        ("segmentation.reach_m=inf",),
+        ("relocation.merit=-4", "lost.intercept=-1", "lost.weights.log_score=-0.5"),
         ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
         ("start=rough", "start.pose=[0,0,0.4,0,0,0]"),
         ("+device.anything=-1",),

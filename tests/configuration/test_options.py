@@ -17,6 +17,7 @@ from helpers import fake_realsense
 from helpers.tracking import CONF, ROOT, configuration
 from omegaconf import DictConfig, OmegaConf
 
+from toftrack.api import build_tracker
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
@@ -114,9 +115,9 @@ def test_every_option_opens_with_a_line_about_what_it_is(group: str, option: str
 
 
 def test_the_defaults_are_options_that_there_are() -> None:
-    for name in ("config", "train_pose_space"):
+    for name in ("config", "train_pose_space", "train_relocaliser"):
         content = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-        chosen = [entry for entry in content["defaults"] if isinstance(entry, dict)]
+        chosen = [e for e in content.get("defaults", []) if isinstance(e, dict)]
         options = {pair for entry in chosen for pair in entry.items() if pair[1] is not None}
         assert options <= set(OPTIONS)
 
@@ -134,3 +135,10 @@ def test_a_calibrated_camera_reaches_every_device_that_replays(tmp_path: Path) -
 def test_the_same_seed_reaches_the_tracker_and_the_synthetic_device() -> None:
     config = configuration("device=synthetic", "seed=7")
     assert (config.seed, config.device.seed) == (7, 7)
+
+
+def test_belief_by_the_networks_without_networks_is_one_clear_sentence() -> None:
+    with pytest.raises(ToftrackError, match="relocation=none.*; give lost=score as well") as error:
+        build_tracker(configuration("relocation=none"))
+    assert "\n" not in str(error.value)
+    assert build_tracker(configuration("relocation=none", "lost=score")).model.rivals == 0

@@ -8,11 +8,14 @@ from typing import Any
 
 import hydra
 from helpers.tracking import configuration
+from omegaconf import OmegaConf
 
 from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.steadying import Steadying
+from toftrack.relocation.relocaliser import RelocationSettings
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import NearestSurface
+from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.search import RoughStart, SearchStart
 
@@ -55,4 +58,17 @@ def rough_start(**changes: Any) -> RoughStart:
 
 def lost_settings(**changes: Any) -> LostSettings:
     """conf/lost/score.yaml"""
-    return replace(_part("lost"), **changes)
+    return replace(_part("lost", "score"), **changes)
+
+
+def calibrated_belief(**changes: Any) -> CalibratedBelief:
+    """conf/lost/calibrated.yaml"""
+    return replace(_part("lost", "calibrated"), **changes)
+
+
+def relocation_settings(**changes: Any) -> RelocationSettings:
+    """conf/relocation/network.yaml, without its weights"""
+    config = OmegaConf.to_container(configuration("relocation=network").relocation)
+    assert isinstance(config, dict)
+    del config["_target_"], config["weights"]
+    return replace(RelocationSettings(**config), **changes)

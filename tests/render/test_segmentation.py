@@ -273,3 +273,46 @@ def test_an_image_that_must_not_be_written_to_is_segmented() -> None:
 def test_impossible_settings_are_refused(key: str, value: object) -> None:
     with pytest.raises(ToftrackError, match=f"^segmentation.{key}="):
         nearest_surface(**{key: value})
+
+
+CENTRE = Expected(0.48, 0.52, (0.0, 0.0, 0.5))
+"""A tracked hand in the middle of the image."""
+
+
+def beside(reach_m: float, column: int) -> bool:
+    """Whether a thing at the hand's depth in some column of the image is taken for the hand."""
+    depth = np.full((HEIGHT, WIDTH), 1.5, np.float32)
+    depth[26:37, 34:45] = 0.5
+    depth[26:37, column : column + 2] = 0.5
+    return bool(hand_of(depth, CENTRE, reach_m=reach_m)[31, column])
+
+
+def test_what_lies_beside_the_reach_of_a_tracked_hand_is_none_of_it() -> None:
+    # 20 pixels are 10 cm at 0.5 m.
+    assert beside(0.20, 70) and not beside(0.10, 70)
+    assert beside(0.12, 60) and not beside(0.08, 60)
+    assert beside(math.inf, 78)
+
+
+def test_what_lies_beside_the_reach_hides_nothing() -> None:
+    depth = np.full((HEIGHT, WIDTH), 1.5, np.float32)
+    depth[20:45, 25:52] = 0.5
+    depth[:, 72:] = 0.3
+    near, far = (
+        nearest_surface(reach_m=reach_m)(depth, K, CENTRE).occluder.numpy()
+        for reach_m in (0.12, math.inf)
+    )
+    assert not near.any() and far[:, 72:].all()
+
+
+def test_a_reach_beyond_the_image_or_beside_it_is_no_error() -> None:
+    depth = picture()
+    for centre in ((0.0, 0.0, 1e-3), (1e6, -1e6, 0.5), (0.0, 0.0, 1e9), (-50.0, 0.0, 0.1)):
+        seen = nearest_surface()(depth, K, Expected(0.4, 0.6, centre))
+        assert seen.hand.shape == depth.shape
+
+
+@pytest.mark.parametrize("reach_m", [0.0, -1.0, math.nan, -math.inf])
+def test_a_reach_that_cannot_be_is_refused(reach_m: float) -> None:
+    with pytest.raises(ToftrackError, match="segmentation.reach_m=.*above 0, or .inf"):
+        nearest_surface(reach_m=reach_m)

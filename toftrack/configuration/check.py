@@ -1,8 +1,8 @@
 """A light check of what was overridden, before torch is loaded: is a number a number, and possible?
 
 Each value is compared with the one in conf/ that it takes the place of: where that is a number, so
-must be the override, whole where it is whole, and not negative, as no number in conf/ is. Which
-settings must be above 0 stands here; other bounds are for the parts that use the settings. Only
+must be the override, whole where it is whole, and not negative, as hardly a number in conf/ is.
+Which settings must be above 0, and which may be below, stands here; other bounds are for the parts that use the settings. Only
 toftrack's own parts are looked at: what a part of somebody else's accepts, nobody knows.
 """
 
@@ -36,15 +36,22 @@ _ABOVE_ZERO = frozenset(
     likelihood.beta likelihood.tolerance_m
     pose_space.dims
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
+    relocation.hypotheses relocation.landmark_m relocation.landmark_sigmas relocation.places
+    relocation.rival_frames relocation.rival_m
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
+    segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
     start.hypotheses start.islands start.memory_rad start.memory_s start.samples
     stream.port stream.waiting
     view.most_fps view.quality
     """.split()
 )
-_OPEN_ENDED = frozenset({"lost.outside_rad", "view.linger_s", "view.wait_s"})
+_OPEN_ENDED = frozenset(
+    {"lost.outside_rad", "segmentation.reach_m", "view.linger_s", "view.wait_s"}
+)
 """Infinity is a value of these."""
+_LOG_ODDS = ("lost.intercept", "lost.weights.", "relocation.merit")
+"""How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
 
 
@@ -78,7 +85,8 @@ def check_value(key: str, value: object, usual: object) -> None:
     elif isinstance(usual, (int, float)):
         if value is None and key in _MAY_BE_NONE or value == math.inf and key in _OPEN_ENDED:
             return
-        check_number(key, value, 0, above=key in _ABOVE_ZERO, whole=isinstance(usual, int))
+        least = -math.inf if key.startswith(_LOG_ODDS) else 0
+        check_number(key, value, least, above=key in _ABOVE_ZERO, whole=isinstance(usual, int))
     elif isinstance(usual, list) and not isinstance(value, list):
         raise ToftrackError(f"{key}={value} is not possible; give a list, as [{value}]")
 

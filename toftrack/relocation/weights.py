@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from toftrack.errors import ToftrackError
+from toftrack.pose_space.archives import read_archive
 from toftrack.relocation.network import Finder, PoseNet, Residual
 
 FORMAT = "toftrack-relocaliser"
@@ -52,12 +52,11 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
     try:
         if path.stat().st_size > _LARGEST_BYTES:
             raise ToftrackError(f"{path} is too large for weights of the relocaliser; {again}")
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {key: content[key] for key in content.files}
+        arrays = read_archive(path)
         metadata = json.loads(str(arrays.pop("metadata")))
     except FileNotFoundError:
         raise ToftrackError(f"there are no weights of the relocaliser at {path}; {again}") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RecursionError) as error:
+    except (OSError, ValueError, KeyError, RecursionError) as error:
         raise ToftrackError(
             f"{path} is no file of the relocaliser's weights ({error}); {again}"
         ) from None
@@ -84,7 +83,7 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
             )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ToftrackError(f"{path} holds weights of another network ({error}); {again}") from None
-    return _ready(pose), _ready(finder), metadata["about"]
+    return _ready(pose), _ready(finder), metadata.get("about", {})
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -71,7 +72,7 @@ class NearestSurface:
     occluder_margin_m: what is more than this in front of the nearest point of a tracked hand hides
         it; 0 knows no occluders, as the paper.
     reach_m: what lies farther than this beside the middle of an expected hand is none of it, and
-        hides nothing of it.
+        hides nothing of it; inf knows no such place, as the paper.
     max_pixels: images with more pixels are reduced by a whole factor to at most this many.
     """
 
@@ -85,8 +86,10 @@ class NearestSurface:
     def __post_init__(self) -> None:
         for name in ("depth_range_m", "min_area_m2", "occluder_margin_m"):
             check_number(f"segmentation.{name}", getattr(self, name), 0)
-        for name in ("max_distance_m", "reach_m"):
-            check_number(f"segmentation.{name}", getattr(self, name), 0, above=True)
+        check_number("segmentation.max_distance_m", self.max_distance_m, 0, above=True)
+        if self.reach_m != math.inf:
+            remedy = ", or .inf"
+            check_number("segmentation.reach_m", self.reach_m, 0, above=True, remedy=remedy)
         check_number("segmentation.max_pixels", self.max_pixels, 1, whole=True)
 
     def __call__(
@@ -100,7 +103,7 @@ class NearestSurface:
         """
         depth_m, k = reduce_image(depth_m, k, self.max_pixels)
         valid = (depth_m > 0) & (depth_m <= self.max_distance_m)
-        if expected is not None and expected.centre_m is not None:
+        if expected is not None and expected.centre_m is not None and self.reach_m < math.inf:
             valid &= _disc(valid.shape, k, expected.centre_m, self.reach_m)
         occluder = np.zeros_like(valid)
         if expected is not None and self.occluder_margin_m > 0:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Backend
+from toftrack.errors import ToftrackError
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
@@ -66,6 +67,13 @@ class TrackerModel:
     gestures: Gestures | None
     backend: Backend
     relocaliser: Relocaliser | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.lost, CalibratedBelief) and self.relocaliser is None:
+            raise ToftrackError(
+                "lost=calibrated judges by what the networks say, but relocation=none has none;"
+                " give lost=score as well, or relocation=network"
+            )
 
     @property
     def device(self) -> torch.device:
