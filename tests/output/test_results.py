@@ -36,6 +36,10 @@ def estimate(index: int, **changes: Any) -> Estimate:
         compute_s=0.01 * (1 + index),
         gesture="palm",
         gesture_probability=0.75,
+        confidence=0.9 - index / 100,
+        outside_rad=0.1,
+        side="left",
+        side_probability=1.0,
     )
     return dataclasses.replace(whole, **changes)
 
@@ -65,17 +69,22 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "covariance": ((6, 10, 10), "f4"),
         "effective_sample_size": ((6,), "f4"),
         "gesture_probability": ((6,), "f4"),
+        "confidence": ((6,), "f4"),
+        "outside_rad": ((6,), "f4"),
+        "side_probability": ((6,), "f4"),
+        "index": ((6,), "i8"),
         "pointing_origin_m": ((6, 3), "f4"),
         "pointing_direction": ((6, 3), "f4"),
         "timestamp_s": ((6,), "f8"),
         "compute_s": ((6,), "f4"),
     }
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
-        assert set(archive.files) == {*promised, "gesture", "joint_names", "metadata"}
+        texts = {"gesture", "state_name", "side"}
+        assert set(archive.files) == {*promised, *texts, "joint_names", "metadata"}
         for name, (shape, kind) in promised.items():
             assert archive[name].shape == shape, name
             assert archive[name].dtype == np.dtype(kind), name
-        assert archive["gesture"].dtype.kind == "U"
+        assert all(archive[name].dtype.kind == "U" for name in texts)
         assert archive["joint_names"].tolist() == list(NAMES)
         assert json.loads(archive["metadata"].item()) == {"seed": 1}
 
@@ -87,9 +96,11 @@ def test_read_results_gives_back_what_was_appended(tmp_path: Path) -> None:
     assert content["joint_names"] == NAMES
     assert content["metadata"] == {"seed": 1}
     for row, one in enumerate(estimates):
-        for name in ("joints_m", "state", "latent", "covariance", "lost", "gesture"):
+        same = ("joints_m", "state", "latent", "covariance", "lost", "gesture", "index")
+        for name in (*same, "state_name", "side"):
             np.testing.assert_array_equal(content[name][row], getattr(one, name))
-        assert content["score"][row] == pytest.approx(one.score)
+        for name in ("score", "confidence", "outside_rad", "side_probability"):
+            assert content[name][row] == pytest.approx(getattr(one, name))
 
 
 def test_each_line_is_on_disk_when_its_frame_is_done(tmp_path: Path) -> None:
