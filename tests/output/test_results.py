@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import pytest
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Truth
-from toftrack.output.evaluation import evaluate
+from toftrack.output.evaluation import evaluate, metrics_table
 from toftrack.output.results import ResultWriter, read_results
+from toftrack.output.trust import Hand, trust
 
 NAMES = tuple(f"joint_{i}" for i in range(21))
 
@@ -155,8 +157,23 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     summary = write(tmp_path, estimates, truth).summary
     joints = np.array([one.joints_m for one in estimates])
     lost = np.array([one.lost for one in estimates])
-    assert summary["metrics"] == evaluate(joints, lost, truth[:12])
+    now = truth[:12]
+    headline = asdict(trust(joints, lost, Hand(now.joints_m, now.visible)))
+    assert summary["metrics"] == {"trust": headline} | evaluate(joints, lost, now)
+    assert summary["metrics"]["trust"]["usable_pct"] == 75  # one in four is flagged
+    table = metrics_table(summary).splitlines()
+    assert table[0].split() == "usable 75.0 % of the 12 visible frames".split()
+    assert table[2].split() == "false alarms 25.0 %".split()
     assert summary["metrics"]["mean_mm"] == pytest.approx(10 * math.sqrt(3), rel=1e-4)
+
+
+def test_files_of_older_versions_are_results_as_well(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(i) for i in range(3)])
+    later = {"confidence", "outside_rad", "side", "side_probability", "index", "state_name"}
+    with np.load(tmp_path / "track.npz") as archive:
+        kept = {name: archive[name] for name in archive.files if name not in later}
+    np.savez(tmp_path / "old.npz", **kept)
+    assert read_results(tmp_path / "old.npz").keys() == kept.keys()
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:

@@ -50,8 +50,8 @@ def draw_panel(
 ) -> np.ndarray:
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
-    Above both, a caption with frame number, score, confidence, state and gesture. A red caption and frame mark an
-    estimate that is lost. The skeleton is missing where the estimate is NaN.
+    Above both, a caption with frame number, score, confidence, state and gesture. A red caption and
+    frame mark an estimate that is lost. The skeleton is missing where the estimate is NaN.
 
     Args:
         depth_m: (H, W) metres, 0 = no reading; shown without amplitude, nearer is brighter.
