@@ -153,9 +153,10 @@ def metrics_table(summary: dict[str, Any]) -> str:
 def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
     """The headline, see trust.py: names and texts."""
     first, longest = trust["first_right"], trust["longest_silent"]
+    run = f", up to {longest} frames in a row" if longest else ""
     rows = [
         ("usable", f"{_figure(trust['usable_pct'])} % of the {trust['visible']} visible frames"),
-        ("silently wrong", f"{_figure(trust['silent_pct'])} %, at most {longest} frames in a row"),
+        ("silently wrong", f"{_figure(trust['silent_pct'])} %{run}"),
         ("false alarms", f"{_figure(trust['false_alarm_pct'])} %"),
         ("first right", "never" if first is None else f"in frame {first}"),
     ]
