@@ -7,6 +7,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+STATES = {
+    "tracking": "tracking",
+    "searching": "searching for the hand",
+    "hidden": "the hand is hidden",
+    "out of view": "the hand is out of view",
+    "initialising": "starting",
+    "lost": "no hand found",
+    "recovering": "trying to recover",
+}
+"""What the tracker does, Estimate.state_name, and how people are told."""
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -16,9 +27,10 @@ class Estimate:
     """Number of the input frame."""
     timestamp_s: float
     state_name: str
-    """'initialising', 'tracking', 'lost' or 'recovering'."""
+    """'tracking', or why not: 'searching', 'hidden', 'out of view', 'initialising', 'lost' or
+    'recovering'; see STATES."""
     lost: bool
-    """The estimate is not to be trusted."""
+    """Not to be used: no hand, or a joint that is likely off by more than 40 mm."""
     joints_m: np.ndarray
     """(21, 3) float32 metres, camera frame, in the order of the recordings."""
     state: np.ndarray
@@ -37,6 +49,10 @@ class Estimate:
     """Probability that every joint is within 40 mm; NaN where nothing says."""
     outside_rad: float = math.nan
     """How far the pose lies off the pose space, rms."""
+    side: str = ""
+    """'right' or 'left', whose hand it is; empty where nobody says."""
+    side_probability: float = math.nan
+    """How sure that is, 0..1; 1 where it was told."""
     gesture: str = ""
     """The gesture, 'other' where it is none of the known; empty where gesture output is off or the
     hand is lost."""
@@ -64,6 +80,7 @@ def no_estimate(
         covariance=np.full((size, size), np.nan, np.float32),
         effective_sample_size=0.0,
         compute_s=compute_s,
+        confidence=0.0,
     )
 
 
@@ -79,3 +96,18 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         confidence=0.0,
         compute_s=compute_s,
     )
+
+
+def state_words(estimate: Estimate) -> str:
+    """What goes on, for people: "tracking", "searching for the hand", "the hand is hidden"."""
+    if estimate.lost and estimate.state_name == "tracking":
+        return "not sure of the pose"
+    return STATES.get(estimate.state_name, estimate.state_name)
+
+
+def confidence_words(confidence: float) -> str:
+    """How sure an estimate is, for people: "97 % sure"; empty where nothing says."""
+    if not math.isfinite(confidence):
+        return ""
+    # Nobody is ever quite sure, whatever the rounding.
+    return f"{min(max(round(100 * confidence), 1), 99)} % sure" if confidence else "0 % sure"

@@ -50,9 +50,12 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
     assert result["ratios"]["numba, N = 8"]["naive"] > 10
     assert result["largest_difference_px"]["numba"] <= 3
     frames = {row["configuration"]: row for row in result["frames"]}
-    assert set(frames) == {"default", "default, start", "paper", "paper, start"}
+    kinds = ("", ", start", ", searching")
+    assert set(frames) == {f"{name}{kind}" for name in ("default", "paper") for kind in kinds}
     assert all(0 < row["min_ms"] <= row["median_ms"] for row in frames.values())
-    assert set(frames["default"]["parts"]) == set(frame_timing.PARTS)
+    assert all(set(row["parts"]) == set(frame_timing.PARTS) for row in frames.values())
+    looked = {name: row["parts"]["relocaliser"] for name, row in frames.items()}
+    assert looked["default"] > 10 * looked["paper"] and looked["default, start"] > looked["default"]
     assert frames["default"]["parts"]["refinement"] > frames["paper"]["parts"]["refinement"]
     assert 0 < frames["paper"]["parts"]["filter: scoring"] < frames["paper"]["median_ms"]
     spaces = {row["space"]: row for row in result["decoding"]}
@@ -61,6 +64,7 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
     assert all(0 < row["min_ms"] <= row["median_ms"] for row in spaces.values())
     printed = capsys.readouterr().out
     assert "median ms" in printed and "numba" in printed
+    assert printed.count("frames/s") == 6 and "default, searching" in printed
     assert printed.count("decoding latents") == 4 and "kernel_pca" in printed
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import pytest
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Truth
-from toftrack.output.evaluation import evaluate
+from toftrack.output.evaluation import evaluate, metrics_table
 from toftrack.output.results import ResultWriter, read_results
+from toftrack.output.trust import Hand, trust
 
 NAMES = tuple(f"joint_{i}" for i in range(21))
 
@@ -36,6 +38,10 @@ def estimate(index: int, **changes: Any) -> Estimate:
         compute_s=0.01 * (1 + index),
         gesture="palm",
         gesture_probability=0.75,
+        confidence=0.9 - index / 100,
+        outside_rad=0.1,
+        side="left",
+        side_probability=1.0,
     )
     return dataclasses.replace(whole, **changes)
 
@@ -65,17 +71,22 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "covariance": ((6, 10, 10), "f4"),
         "effective_sample_size": ((6,), "f4"),
         "gesture_probability": ((6,), "f4"),
+        "confidence": ((6,), "f4"),
+        "outside_rad": ((6,), "f4"),
+        "side_probability": ((6,), "f4"),
+        "index": ((6,), "i8"),
         "pointing_origin_m": ((6, 3), "f4"),
         "pointing_direction": ((6, 3), "f4"),
         "timestamp_s": ((6,), "f8"),
         "compute_s": ((6,), "f4"),
     }
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
-        assert set(archive.files) == {*promised, "gesture", "joint_names", "metadata"}
+        texts = {"gesture", "state_name", "side"}
+        assert set(archive.files) == {*promised, *texts, "joint_names", "metadata"}
         for name, (shape, kind) in promised.items():
             assert archive[name].shape == shape, name
             assert archive[name].dtype == np.dtype(kind), name
-        assert archive["gesture"].dtype.kind == "U"
+        assert all(archive[name].dtype.kind == "U" for name in texts)
         assert archive["joint_names"].tolist() == list(NAMES)
         assert json.loads(archive["metadata"].item()) == {"seed": 1}
 
@@ -87,9 +98,11 @@ def test_read_results_gives_back_what_was_appended(tmp_path: Path) -> None:
     assert content["joint_names"] == NAMES
     assert content["metadata"] == {"seed": 1}
     for row, one in enumerate(estimates):
-        for name in ("joints_m", "state", "latent", "covariance", "lost", "gesture"):
+        same = ("joints_m", "state", "latent", "covariance", "lost", "gesture", "index")
+        for name in (*same, "state_name", "side"):
             np.testing.assert_array_equal(content[name][row], getattr(one, name))
-        assert content["score"][row] == pytest.approx(one.score)
+        for name in ("score", "confidence", "outside_rad", "side_probability"):
+            assert content[name][row] == pytest.approx(getattr(one, name))
 
 
 def test_each_line_is_on_disk_when_its_frame_is_done(tmp_path: Path) -> None:
@@ -144,8 +157,23 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     summary = write(tmp_path, estimates, truth).summary
     joints = np.array([one.joints_m for one in estimates])
     lost = np.array([one.lost for one in estimates])
-    assert summary["metrics"] == evaluate(joints, lost, truth[:12])
+    now = truth[:12]
+    headline = asdict(trust(joints, lost, Hand(now.joints_m, now.visible)))
+    assert summary["metrics"] == {"trust": headline} | evaluate(joints, lost, now)
+    assert summary["metrics"]["trust"]["usable_pct"] == 75  # one in four is flagged
+    table = metrics_table(summary).splitlines()
+    assert table[0].split() == "usable 75.0 % of the 12 visible frames".split()
+    assert table[2].split() == "false alarms 25.0 %".split()
     assert summary["metrics"]["mean_mm"] == pytest.approx(10 * math.sqrt(3), rel=1e-4)
+
+
+def test_files_of_older_versions_are_results_as_well(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(i) for i in range(3)])
+    later = {"confidence", "outside_rad", "side", "side_probability", "index", "state_name"}
+    with np.load(tmp_path / "track.npz") as archive:
+        kept = {name: archive[name] for name in archive.files if name not in later}
+    np.savez(tmp_path / "old.npz", **kept)
+    assert read_results(tmp_path / "old.npz").keys() == kept.keys()
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:

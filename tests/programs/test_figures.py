@@ -165,7 +165,7 @@ def test_the_numbers_of_a_frame_stand_in_its_figure(
     )
     draw_figures(run, frame=3, out=tmp_path / "out")
     score = read_run(run).results["score"][3]
-    assert f"Frame 3: score {score:.2f}" in texts
+    assert any(text.startswith(f"Frame 3: score {score:.2f}, ") for text in texts)
     assert any(text.endswith(" missed") for text in texts)
     mean = json.loads((run / "summary.json").read_text())["metrics"]["mean_mm"]
     assert any(f"mean joint error {mean:.1f} mm" in text for text in texts)

@@ -216,7 +216,7 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
         left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
         assert right["y"] > left["y"] + left["height"] and left["width"] > 400
     view.show(replace(moments()[0], estimate=no_estimate(9, 0.36, "lost", 4, 0.01), insight=None))
-    eventually(lambda: text("state") == "LOST" and text("phase") == "the hand is lost")
+    eventually(lambda: text("state") == "LOST" and text("phase") == "lost: no hand found")
     assert chromium.get_log("browser") == []
 
     view._picture.set_phase("over")

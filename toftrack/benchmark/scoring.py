@@ -321,6 +321,7 @@ def show(result: dict) -> str:
         lines.append(
             f"{'whole frame':<16}{row['configuration']:<19}{row['particles']:>7}{'':>18}"
             f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}"
+            f"   {1e3 / row['median_ms']:.1f} frames/s"
         )
         lines += [f"    {part:<56}{row['parts'][part]:>15.3f}" for part in row["parts"]]
     for row in result["decoding"]:

@@ -127,6 +127,8 @@ def metrics_table(summary: dict[str, Any]) -> str:
     ]
     metrics = summary.get("metrics")
     if metrics:
+        if metrics.get("trust"):
+            rows = _trust_rows(metrics["trust"]) + rows
         rows.append(("joint error, mean", f"{_figure(metrics['mean_mm'])} mm"))
         rows.append(("joint error, median", f"{_figure(metrics['median_mm'])} mm"))
         rows.append(("fingertip error", f"{_figure(metrics['fingertip_mm'])} mm"))
@@ -146,6 +148,22 @@ def metrics_table(summary: dict[str, Any]) -> str:
             rows.append((f"{event['event']} at {event['frame']}", f"tracked {delay}"))
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
+
+
+def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
+    """The headline, see trust.py: names and texts."""
+    first, longest = trust["first_right"], trust["longest_silent"]
+    run = f", up to {longest} frames in a row" if longest else ""
+    rows = [
+        ("usable", f"{_figure(trust['usable_pct'])} % of the {trust['visible']} visible frames"),
+        ("silently wrong", f"{_figure(trust['silent_pct'])} %{run}"),
+        ("false alarms", f"{_figure(trust['false_alarm_pct'])} %"),
+        ("first right", "never" if first is None else f"in frame {first}"),
+    ]
+    after = ["never" if frames is None else str(frames) for frames in trust["found_after"]]
+    if after:
+        rows.append(("found again", f"after {', '.join(after)} frames"))
+    return rows
 
 
 def _mean(values: np.ndarray) -> float | None:

@@ -11,6 +11,7 @@ import math
 import os
 import zipfile
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -21,6 +22,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.output.evaluation import evaluate
+from toftrack.output.trust import Hand, trust
 
 _ARRAYS: dict[str, type] = {
     "joints_m": np.float32,
@@ -35,13 +37,26 @@ _ARRAYS: dict[str, type] = {
     "timestamp_s": np.float64,
     "compute_s": np.float32,
 }
-_POINTING = {"pointing_origin_m": np.float32, "pointing_direction": np.float32}
-"""Arrays beside the promised ones: files without them are results as well."""
+_LATER: dict[str, type] = {
+    "pointing_origin_m": np.float32,
+    "pointing_direction": np.float32,
+    "index": np.int64,
+    "state_name": np.str_,
+    "confidence": np.float32,
+    "outside_rad": np.float32,
+    "side": np.str_,
+    "side_probability": np.float32,
+}
+"""Arrays that came later: older files without them are results as well."""
 LINE_FIELDS = (
     "index",
     "timestamp_s",
     "state_name",
     "lost",
+    "confidence",
+    "outside_rad",
+    "side",
+    "side_probability",
     "score",
     "joints_m",
     "state",
@@ -147,9 +162,9 @@ class ResultWriter:
             return _no_frames(), []
         arrays = {
             name: np.array([getattr(estimate, name) for estimate in done], dtype=kind)
-            for name, kind in (_ARRAYS | _POINTING).items()
+            for name, kind in (_ARRAYS | _LATER).items()
         }
-        index = np.array([estimate.index for estimate in done])
+        index = arrays["index"]
         if (np.diff(index) < 1).any():  # the device counts anew; there is nothing to fill in
             return arrays, []
         every = np.arange(index[0], index[-1] + 1)
@@ -157,7 +172,7 @@ class ResultWriter:
         held = index[rows] != every
         times = np.interp(every, index, arrays["timestamp_s"])
         arrays = {name: values[rows] for name, values in arrays.items()}
-        arrays["timestamp_s"] = times
+        arrays["index"], arrays["timestamp_s"] = every, times
         arrays["compute_s"][held] = 0
         return arrays, every[held].tolist()
 
@@ -176,7 +191,9 @@ class ResultWriter:
         }
         if self._truth is not None and done:
             truth = self._truth[: len(arrays["lost"])]
-            summary["metrics"] = evaluate(arrays["joints_m"], arrays["lost"], truth)
+            joints, lost = arrays["joints_m"], arrays["lost"]
+            figures = trust(joints, lost, Hand(truth.joints_m, truth.visible))
+            summary["metrics"] = {"trust": asdict(figures)} | evaluate(joints, lost, truth)
         return summary
 
 
@@ -192,13 +209,16 @@ def json_line(estimate: Estimate, fields: Sequence[str] = LINE_FIELDS) -> str:
 def read_results(path: str | Path) -> dict[str, Any]:
     """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
 
+    A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
+    side, side_probability, the pointing ray).
+
     Raises ToftrackError when the file is missing, damaged or not a result.
     """
     path = Path(path).expanduser()
     names = (*_ARRAYS, "joint_names", "metadata")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            names += tuple(name for name in _POINTING if name in archive)
+            names += tuple(name for name in _LATER if name in archive)
             content: dict[str, Any] = {name: archive[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = json.loads(content["metadata"].item())
@@ -220,8 +240,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 def _no_frames() -> dict[str, np.ndarray]:
     shapes = {"joints_m": (0, 21, 3), "state": (0, 27), "latent": (0, 4), "covariance": (0, 10, 10)}
-    shapes |= dict.fromkeys(_POINTING, (0, 3))
-    kinds = _ARRAYS | _POINTING
+    shapes |= dict.fromkeys(("pointing_origin_m", "pointing_direction"), (0, 3))
+    kinds = _ARRAYS | _LATER
     return {name: np.zeros(shapes.get(name, 0), kind) for name, kind in kinds.items()}
 
 

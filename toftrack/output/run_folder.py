@@ -60,10 +60,11 @@ class Run:
         results = self.results
         names = {f.name for f in fields(Estimate)} & results.keys()
         values = {name: results[name][row] for name in names}
-        for name in ("timestamp_s", "score", "effective_sample_size", "compute_s"):
-            values[name] = float(values[name])
-        values["gesture"], values["lost"] = str(values["gesture"]), bool(values["lost"])
-        return Estimate(index=int(self.frames[row]), state_name=self.state_names[row], **values)
+        for name, value in values.items():
+            if np.ndim(value) == 0:
+                values[name] = value.item()
+        values |= {"index": int(self.frames[row]), "state_name": self.state_names[row]}
+        return Estimate(**values)
 
     def likelihood(self) -> FMeasure:
         """The run's likelihood; ToftrackError when it is none that this program knows."""
@@ -162,7 +163,10 @@ def read_run(folder: str | Path) -> Run:
     rows = len(results["lost"])
     if not rows:
         raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to draw")
-    frames, names = _lines(folder / "track.jsonl", rows)
+    if {"index", "state_name"} <= results.keys():
+        frames, names = results["index"], tuple(results["state_name"].tolist())
+    else:  # of an older version
+        frames, names = _lines(folder / "track.jsonl", rows)
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -7,7 +7,7 @@ Writes five PNG files into the run's folder, below `figures`:
 | `measurement.png` | a frame's input, range image, neighbourhood, classified pixels (fig. 3) |
 | `filmstrip.png` | ten frames with the skeleton, and the estimates' range images (fig. 5) |
 | `lost.png` | frames that were lost, else those of the lowest score, with their scores (fig. 6) |
-| `course.png` | joint error against the truth and score over time |
+| `course.png` | joint error against the truth, score and confidence over time |
 | `latent.png` | the way of the estimates over the training poses |
 
 The first three need the recording that the run tracked; of a run with a live camera there is none,
@@ -27,6 +27,7 @@ import torch
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
+from toftrack.estimate import confidence_words, state_words
 from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
 from toftrack.views.classified import classify
 from toftrack.views.figures.runs import (
@@ -153,12 +154,10 @@ def _measurement(run: Run, footage: Footage, row: int) -> np.ndarray:
     estimate = run.estimate(row)
     observation = observe(run, footage, row)
     pixels = classify(estimate.state, run.shape, observation, run.likelihood())
-    title = f"Frame {estimate.index}: score {estimate.score:.2f}{_lost_word(estimate.lost)}"
+    state = f"LOST: {state_words(estimate)}" if estimate.lost else ""
+    facts = (f"score {estimate.score:.2f}", confidence_words(estimate.confidence), state)
+    title = f"Frame {estimate.index}: " + ", ".join(filter(None, facts))
     return measurement_figure(observation, pixels, title)
-
-
-def _lost_word(lost: bool) -> str:
-    return ", lost" if lost else ""
 
 
 def _film(run: Run, footage: Footage) -> np.ndarray:
@@ -184,7 +183,8 @@ def _lost(run: Run, footage: Footage) -> np.ndarray:
         rows = _lowest_rows(score)
         title = f"No frame was lost: the {len(rows)} frames of the lowest score"
     panels = [_panel(run, footage, row) for row in rows]
-    return lost_figure(panels, rows, _time(run), run.frames, score, lost, title)
+    sure = run.results.get("confidence")
+    return lost_figure(panels, rows, _time(run), run.frames, score, lost, title, sure)
 
 
 def _lowest_rows(score: np.ndarray) -> list[int]:
@@ -209,7 +209,8 @@ def _course(run: Run, footage: Footage | None) -> np.ndarray:
     mean = (run.summary.get("metrics") or {}).get("mean_mm")
     if mean is not None:
         title = f"{len(run)} frames: mean joint error {mean:.1f} mm, mean score {score.mean():.2f}"
-    return course_figure(_time(run), run.frames, score, results["lost"], title, error, absent)
+    lost, sure = results["lost"], results.get("confidence")
+    return course_figure(_time(run), run.frames, score, lost, title, error, absent, sure)
 
 
 def _latent(run: Run) -> np.ndarray:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import sys
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +20,9 @@ from tqdm import tqdm
 from toftrack.api import build_tracker
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate, confidence_words
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output.advice import Watch
 from toftrack.output.evaluation import metrics_table
 from toftrack.output.results import ResultWriter
 from toftrack.output.smoothing import OneEuro, smooth
@@ -37,9 +41,20 @@ def track(config: DictConfig, device: Device) -> float:
 
 
 def _track(config: DictConfig, device: Device, stream: Stream) -> float:
+    tracker = build_tracker(config)
+    watch = Watch(float(config.segmentation.get("max_distance_m", math.inf)))
+    try:
+        return _run(config, device, tracker, stream, watch)
+    finally:  # a live run that lost the hand ends by an interruption
+        for sentence in watch.advice(tracker.shape.side):
+            print(f"note: {sentence}", file=sys.stderr)
+
+
+def _run(
+    config: DictConfig, device: Device, tracker: Tracker, stream: Stream, watch: Watch
+) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     make = hydra.utils.instantiate
-    tracker = build_tracker(config)
     smoothing: OneEuro | None = make(config.smooth)
     with device:
         make_view = make(config.view, _partial_=True)
@@ -48,7 +63,7 @@ def _track(config: DictConfig, device: Device, stream: Stream) -> float:
         with make_view(folder=folder, fps=device.fps, frames=device.frames) as view:
             with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
                 try:
-                    _loop(device, tracker, results, view, stream, smoothing)
+                    _loop(device, tracker, results, view, stream, smoothing, watch)
                 except ReaderGoneError as gone:
                     print(f"{gone}: tracking ends here", file=sys.stderr)
                 finally:
@@ -72,6 +87,7 @@ def _loop(
     view: View,
     stream: Stream,
     smoothing: OneEuro | None,
+    watch: Watch,
 ) -> None:
     smoothed = None
     progress = partial(tqdm, total=device.frames, unit=" frames", file=sys.stderr, mininterval=0.2)
@@ -82,6 +98,9 @@ def _loop(
             depth = device.camera.rectify(frame.depth, frame.radial)
             shape = tracker.shape
             estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+            # The side is told, and never guessed.
+            estimate = replace(estimate, side=shape.side, side_probability=1.0)
+            watch.see(estimate, depth, tracker.insight)
             smoothed, calm = smooth(smoothing, smoothed, estimate, shape)
             if smoothing is not None and smoothing.results:
                 estimate = calm
@@ -89,7 +108,12 @@ def _loop(
             stream.send(calm)
             view.show(TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight))
             bar.update()
-            bar.set_postfix_str(f"score {estimate.score:.2f} {estimate.state_name}", refresh=False)
+            bar.set_postfix_str(_progress_words(estimate), refresh=False)
+
+
+def _progress_words(estimate: Estimate) -> str:
+    facts = (f"score {estimate.score:.2f}", confidence_words(estimate.confidence))
+    return ", ".join(filter(None, (*facts, estimate.state_name)))
 
 
 def _metadata(config: DictConfig, device: Device, tracker: Tracker) -> dict:

@@ -15,7 +15,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.estimate import Estimate, confidence_words, state_words
 from toftrack.views.base import TrackedFrame
 from toftrack.views.model_image import model_range_image
 
@@ -50,8 +50,8 @@ def draw_panel(
 ) -> np.ndarray:
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
-    Above both, a caption with frame number, score and state. A red caption and frame mark an
-    estimate that is lost. The skeleton is missing where the estimate is NaN.
+    Above both, a caption with frame number, score, confidence, state and gesture. A red caption and
+    frame mark an estimate that is lost. The skeleton is missing where the estimate is NaN.
 
     Args:
         depth_m: (H, W) metres, 0 = no reading; shown without amplitude, nearer is brighter.
@@ -240,12 +240,9 @@ def _caption(estimate: Estimate, half_width: int) -> np.ndarray:
     colour = _RED if estimate.lost else (48, 48, 48)
     strip = np.full((CAPTION_PX, 2 * half_width, 3), colour, np.uint8)
     score = f"{estimate.score:.2f}" if math.isfinite(estimate.score) else "-"
-    state = "LOST" if estimate.lost else estimate.state_name
-    if estimate.lost and estimate.state_name != "lost":
-        state += f" ({estimate.state_name})"
-    text = f"frame {estimate.index}   score {score}   {state}"
-    if estimate.gesture:
-        text += f"   {estimate.gesture}"
+    facts = (f"frame {estimate.index}", f"score {score}", confidence_words(estimate.confidence))
+    state = ("LOST: " if estimate.lost else "") + state_words(estimate)
+    text = "   ".join(filter(None, (*facts, state, estimate.gesture)))
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 8
     size, room = 0.8, half_width - 2 * margin
     # Step by step, because not every OpenCV's text grows in proportion.

@@ -20,6 +20,7 @@ from toftrack.views.overlay import film_tile, filmstrip, range_grey
 
 _MARGIN_PX = 8
 _GAP = 16
+_SURE = chart.PURPLE
 
 
 def measurement_figure(observation: Observation, pixels: Classified, title: str) -> np.ndarray:
@@ -88,10 +89,12 @@ def lost_figure(
     score: np.ndarray,
     lost: np.ndarray,
     title: str,
+    confidence: np.ndarray | None = None,
 ) -> np.ndarray:
     """Frames that went wrong above the course of the score, in which they are marked (fig. 6).
 
-    panels: of the overlay, one for each of `rows`.  The others: (T,).
+    panels: of the overlay, one for each of `rows`.  The others: (T,), confidence as for
+    course_figure.
     """
     strip = filmstrip([film_tile(panel) for panel in panels])
     width = max(strip.shape[1], 1000)
@@ -110,6 +113,9 @@ def lost_figure(
     _write_frames(plot, axes, time_s[list(rows)], frames[list(rows)])
     chart.legend(plot, [("frames shown above", chart.VERMILLION)], (84, 318))
     chart.legend(plot, [("lost", chart.SHADE)], (290, 318), chart.box_mark)
+    if confidence is not None and np.isfinite(confidence).any():
+        axes.line(plot, time_s, confidence, _SURE)
+        chart.legend(plot, [("score", chart.BLUE), ("confidence", _SURE)], (400, 318))
     note = "Above: the camera's image with the estimated skeleton, and the estimate's range image."
     return chart.titled(np.vstack([strip, plot]), title, note)
 
@@ -135,13 +141,15 @@ def course_figure(
     title: str,
     error_mm: np.ndarray | None = None,
     absent: np.ndarray | None = None,
+    confidence: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Error and score over time, lost frames shaded.
+    """Error, score and confidence over time, lost frames shaded.
 
     Args:
         time_s, frames, score, lost: (T,).
         error_mm: (T, 21) against the truth, NaN where there is none; None draws the score alone.
         absent: (T,) the truth says that there is no hand to track, or not one of the known poses.
+        confidence: (T,) that every joint is within 40 mm, NaN where nothing says; or None.
     """
     width, above = 1100, 0 if error_mm is None else 330
     picture = chart.canvas(above + 350, width)
@@ -167,6 +175,10 @@ def course_figure(
         bar = Axes(axes.left, axes.right, axes.top, axes.top + 7, axes.x, axes.y)
         bar.shade(picture, time_s, absent, chart.GREY)
     chart.legend(picture, entries, (94, above + 330), chart.box_mark)
+    if confidence is not None and np.isfinite(confidence).any():
+        axes.line(picture, time_s, confidence, _SURE)
+        lines = [("score", chart.GREEN), ("confidence", _SURE)]
+        chart.legend(picture, lines, (axes.right - 260, above + 330))
     note = (
         "The recording has no truth, so there is no error to show."
         if error_mm is None

@@ -7,7 +7,7 @@ Entities, on the timelines `frame` (its number) and `time` (seconds of the recor
 | `world/camera` | the camera, with `depth` (a cloud of points in 3-D) and `amplitude` |
 | `world/tracker` | the image that the tracker works on, with `segmentation` and `classified` |
 | `world/hand` | the estimate: `ellipsoids`, `skeleton`, `joints`; and `particles`, by weight |
-| `plots` | `score` (and lost), `latent` coordinates, `time` (milliseconds a frame) |
+| `plots` | `score` (confidence, lost), `latent` coordinates, `time` (milliseconds a frame) |
 | `log` | changes of state and gesture |
 
 The world is the camera's frame: x right, y down, z forward, metres.
@@ -23,7 +23,7 @@ import torch
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.estimate import Estimate, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
 from toftrack.render.likelihood import FMeasure
@@ -97,7 +97,10 @@ class Entities:
         classes = tuple(enumerate(CLASSES))
         context = rr.AnnotationContext([(n, name, CLASS_RGB[n]) for n, name in classes])
         stream.log("world/tracker/classified", context, static=True)
-        lines = rr.SeriesLines(names=["score", "lost"], colors=[(86, 180, 233), _LOST_RGB])
+        lines = rr.SeriesLines(
+            names=["score", "confidence", "lost"],
+            colors=[(86, 180, 233), (0, 158, 115), _LOST_RGB],
+        )
         stream.log("plots/score", lines, static=True)
         stream.log("plots/time", rr.SeriesLines(names=["ms"], colors=[(0, 158, 115)]), static=True)
 
@@ -170,7 +173,8 @@ class Entities:
 
     def _log_plots(self, estimate: Estimate) -> None:
         log = self._stream.log
-        log("plots/score", rr.Scalars([estimate.score, float(estimate.lost)]))
+        values = [estimate.score, estimate.confidence, float(estimate.lost)]
+        log("plots/score", rr.Scalars(values))
         if not self._latent_named:
             self._latent_named = True
             names = [f"coordinate {n}" for n in range(1, len(estimate.latent) + 1)]
@@ -185,8 +189,8 @@ class Entities:
         if now == self._told:
             return
         self._told = now
-        lost = "lost" if estimate.lost else "not lost"
-        text = ", ".join(filter(None, (estimate.state_name, lost, estimate.gesture)))
+        lost = "lost" if estimate.lost else ""
+        text = ", ".join(filter(None, (lost, state_words(estimate), estimate.gesture)))
         level = rr.TextLogLevel.WARN if estimate.lost else rr.TextLogLevel.INFO
         self._stream.log("log", rr.TextLog(text, level=level))
 
@@ -244,7 +248,9 @@ def blueprint() -> rrb.Blueprint:
     )
     plots = rrb.Horizontal(
         rrb.TimeSeriesView(
-            origin="plots/score", name="score and lost", axis_y=rrb.ScalarAxis(range=(0.0, 1.05))
+            origin="plots/score",
+            name="score, confidence, lost",
+            axis_y=rrb.ScalarAxis(range=(0.0, 1.05)),
         ),
         rrb.TimeSeriesView(origin="plots/latent", name="latent coordinates"),
         rrb.TimeSeriesView(origin="plots/time", name="ms a frame"),

@@ -1,0 +1,97 @@
+"""What is said when most of a run was lost, on made-up facts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toftrack.estimate import Estimate, confidence_words, no_estimate, state_words
+from toftrack.output.advice import LostFrame, RunFacts, Watch, advice, lost_frame
+
+REACH_M = 1.05
+ORDINARY = LostFrame("searching", 0.9, 0.3, 0.5, 2.0, 900, False)
+
+
+def facts(frame: LostFrame, lost: int = 60, tracked: int = 40) -> RunFacts:
+    whole = RunFacts()
+    for _ in range(lost):
+        whole = whole.with_lost(frame)
+    for _ in range(tracked):
+        whole = whole.tracked()
+    return whole
+
+
+def test_nothing_is_said_of_runs_that_went_well() -> None:
+    assert advice(RunFacts(), "right", REACH_M) == ()
+    assert advice(facts(ORDINARY, 50, 50), "right", REACH_M) == ()
+
+
+def test_first_it_is_said_what_was_seen() -> None:
+    whole = facts(ORDINARY).with_lost(replace(ORDINARY, state_name="hidden", farthest_m=3.0))
+    assert advice(whole, "right", REACH_M)[0] == (
+        "61 of 101 frames were lost (searching for the hand: 60, the hand is hidden: 1), in which "
+        "90 % of the pixels had readings, from 0.50 to 3.00 m."
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "remedy"),
+    [
+        ({"read": 0.0, "within": 0.0, "nearest_m": np.nan, "farthest_m": np.nan}, "the lens"),
+        ({"nearest_m": 0.0005, "farthest_m": 0.002}, "in metres"),
+        ({"nearest_m": 5.0, "farthest_m": 19.0, "within": 0.0}, "in metres"),
+        (
+            {"nearest_m": 1.5, "within": 0.0},
+            "segmentation.max_distance_m=1.05: hold the hand nearer",
+        ),
+        ({"nearest_m": 0.15}, "keep the hand 0.3 to 1 m away"),
+        ({"other_side": True}, "give hand.side=left"),
+        ({"hand_px": 40}, "fewer than 150 pixels"),
+        ({}, "must be a right hand (hand.side), upright and not mirrored"),
+    ],
+)
+def test_each_cause_has_its_remedy(changes: dict, remedy: str) -> None:
+    seen, first, *more = advice(facts(replace(ORDINARY, **changes)), "right", REACH_M)
+    assert remedy in first and not more
+    assert seen.startswith("60 of 100 frames")
+
+
+def test_there_are_at_most_three_sentences() -> None:
+    everything = replace(ORDINARY, within=0.0, nearest_m=0.1, other_side=True, hand_px=20)
+    assert len(advice(facts(everything), "left", REACH_M)) == 3
+
+
+def test_a_frames_facts_are_read_off_its_image() -> None:
+    depth = np.zeros((240, 320), np.float32)
+    depth[:, 80:] = np.linspace(0.5, 2.5, 240, dtype=np.float32)
+    depth[0, 0] = np.nan
+    lost = no_estimate(0, 0.0, "lost", 4, 0.01)
+    seen = lost_frame(lost, depth, None, REACH_M)
+    assert seen.read == pytest.approx(0.75, abs=0.02)
+    assert seen.within == pytest.approx(0.75 * 0.55 / 2, abs=0.02)
+    assert (seen.nearest_m, seen.farthest_m) == pytest.approx((0.54, 2.46), abs=0.02)
+    assert (seen.hand_px, seen.other_side) == (0, None)
+    watch = Watch(REACH_M)
+    watch.see(lost, np.zeros_like(depth), None)
+    watch.see(replace(lost, lost=False), depth, None)
+    assert (watch.facts.frames, watch.facts.lost, watch.advice("right")) == (2, 1, ())
+    watch.see(lost, np.zeros_like(depth), None)
+    assert "0 % of the pixels had readings." in watch.advice("right")[0]
+
+
+def test_words_for_people() -> None:
+    lost = no_estimate(0, 0.0, "out of view", 4, 0.01)
+
+    def words(**changes: object) -> str:
+        return state_words(Estimate(**{**vars(lost), **changes}))
+
+    assert words() == "the hand is out of view"
+    assert words(state_name="tracking") == "not sure of the pose"
+    assert words(state_name="tracking", lost=False) == "tracking"
+    assert words(state_name="of another version") == "of another version"
+    assert [confidence_words(p) for p in (0.0, 0.001, 0.974, 0.9999, np.nan)] == [
+        *("0 % sure", "1 % sure", "97 % sure", "99 % sure"),
+        "",
+    ]

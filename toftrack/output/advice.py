@@ -1,0 +1,207 @@
+"""What to try when most of a run was lost: a few facts about its lost frames, and what they mean.
+
+The facts are gathered while tracking, from lost frames only, so that a good run pays nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from toftrack.estimate import STATES, Estimate
+from toftrack.tracking.state import StepInfo
+
+_LOOKED_AT_PX = 5000
+"""So many pixels of an image are enough to say how far things are."""
+_HARDLY = 0.01
+"""A share of pixels that is none."""
+_MOST = 0.5
+_FEWEST_PX = 150
+"""Fewer pixels show no fingers."""
+_TOO_NEAR_M = 0.22
+"""Cameras measure badly there, and a hand does not fit into the image."""
+_NO_CAMERA_M = 0.1
+"""No depth camera sees only what is nearer."""
+_NO_HAND_M = 4.0
+"""Nobody has a hand tracked from farther away."""
+
+
+@dataclass(frozen=True)
+class LostFrame:
+    """What was seen in a frame that was lost.
+
+    read: share of pixels with a reading.  within: share of pixels with one within reach.
+    nearest_m, farthest_m: between which nearly all readings lie; NaN without any.
+    hand_px: pixels that were taken for the hand; 0 where nothing was.
+    other_side: whether it looks rather like the other hand; None where nobody says.
+    """
+
+    state_name: str
+    read: float
+    within: float
+    nearest_m: float
+    farthest_m: float
+    hand_px: int
+    other_side: bool | None
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What is known of a run's lost frames; numbers of frames but for the following.
+
+    states: lost frames by state name.
+    read: sum of the shares of pixels with a reading.
+    nearest_m, farthest_m: between which nearly all readings of all lost frames lie.
+    """
+
+    frames: int = 0
+    lost: int = 0
+    states: Mapping[str, int] = field(default_factory=dict)
+    read: float = 0.0
+    nearest_m: float = math.inf
+    farthest_m: float = -math.inf
+    out_of_reach: int = 0
+    """Nothing was within segmentation.max_distance_m."""
+    too_near: int = 0
+    """Something was too near to be measured well."""
+    with_hand: int = 0
+    """Something was taken for a hand."""
+    small: int = 0
+    """That had too few pixels."""
+    judged: int = 0
+    """The networks said which hand it looked like."""
+    other_side: int = 0
+    """That was the other one."""
+
+    def tracked(self) -> RunFacts:
+        """With one more frame that was not lost."""
+        return replace(self, frames=self.frames + 1)
+
+    def with_lost(self, frame: LostFrame) -> RunFacts:
+        """With one more frame that was."""
+        name = frame.state_name
+        return RunFacts(
+            frames=self.frames + 1,
+            lost=self.lost + 1,
+            states={**self.states, name: self.states.get(name, 0) + 1},
+            read=self.read + frame.read,
+            # Without readings both are NaN, which min and max pass over in this order.
+            nearest_m=min(self.nearest_m, frame.nearest_m),
+            farthest_m=max(self.farthest_m, frame.farthest_m),
+            out_of_reach=self.out_of_reach + (frame.within < _HARDLY <= frame.read),
+            too_near=self.too_near + (frame.nearest_m < _TOO_NEAR_M),
+            with_hand=self.with_hand + (frame.hand_px > 0),
+            small=self.small + (0 < frame.hand_px < _FEWEST_PX),
+            judged=self.judged + (frame.other_side is not None),
+            other_side=self.other_side + (frame.other_side is True),
+        )
+
+
+def lost_frame(
+    estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None, reach_m: float
+) -> LostFrame:
+    """The facts of a lost frame.
+
+    depth_m: (H, W) metres.  insight: of the tracker.  reach_m: nothing beyond is a hand.
+    """
+    step = max(1, round(math.sqrt(depth_m.size / _LOOKED_AT_PX)))
+    few = depth_m[::step, ::step]
+    readings = few[np.isfinite(few) & (few > 0)]
+    nearest, farthest = np.percentile(readings, (2, 98)) if len(readings) else (np.nan, np.nan)
+    signs = None if insight is None else insight.signs
+    return LostFrame(
+        state_name=estimate.state_name,
+        read=len(readings) / few.size,
+        within=float(np.count_nonzero(readings <= reach_m)) / few.size,
+        nearest_m=float(nearest),
+        farthest_m=float(farthest),
+        hand_px=0 if insight is None else int(insight.observation.hand.sum()),
+        other_side=None if signs is None else signs.other_side > 0,
+    )
+
+
+class Watch:
+    """Gathers the facts of a run; reach_m: nothing beyond is a hand."""
+
+    def __init__(self, reach_m: float) -> None:
+        self.reach_m = reach_m
+        self.facts = RunFacts()
+
+    def see(self, estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None) -> None:
+        """Take one frame, see lost_frame."""
+        if estimate.lost:
+            found = lost_frame(estimate, depth_m, insight, self.reach_m)
+            self.facts = self.facts.with_lost(found)
+        else:
+            self.facts = self.facts.tracked()
+
+    def advice(self, side: str) -> tuple[str, ...]:
+        """Of the function of that name."""
+        return advice(self.facts, side, self.reach_m)
+
+
+def advice(facts: RunFacts, side: str, reach_m: float) -> tuple[str, ...]:
+    """At most three sentences: what was seen and what to try; none for a run that went well.
+
+    side: of the hand that was looked for.  reach_m: segmentation.max_distance_m.
+    """
+    if facts.lost <= _MOST * facts.frames:
+        return ()
+    return (_seen(facts), *_remedies(facts, side, reach_m)[:2])
+
+
+def _seen(facts: RunFacts) -> str:
+    by_number = sorted(facts.states.items(), key=lambda state: -state[1])
+    why = ", ".join(f"{STATES.get(name, name)}: {count}" for name, count in by_number)
+    read = facts.read / facts.lost
+    range_m = f", from {facts.nearest_m:.2f} to {facts.farthest_m:.2f} m" if read > 0 else ""
+    return (
+        f"{facts.lost} of {facts.frames} frames were lost ({why}), in which "
+        f"{100 * read:.0f} % of the pixels had readings{range_m}."
+    )
+
+
+def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
+    """What to try, the most telling first."""
+
+    def mostly(frames: int, of: int = facts.lost) -> bool:
+        return frames > _MOST * of
+
+    if facts.read < _HARDLY * facts.lost:
+        return [
+            "There was hardly anything to see: check that the lens is free, that depth_m is not "
+            "empty, and that its readings are not all invalid."
+        ]
+    if facts.farthest_m < _NO_CAMERA_M or facts.nearest_m > _NO_HAND_M:
+        return ["No hand is tracked there: check the unit, depth_m must be in metres."]
+    found = []
+    if mostly(facts.out_of_reach):
+        found.append(
+            f"Nothing was within segmentation.max_distance_m={reach_m:g}: hold the hand nearer, "
+            "or raise that."
+        )
+    if mostly(facts.too_near):
+        found.append(
+            f"Something was nearer than {_TOO_NEAR_M:g} m: keep the hand 0.3 to 1 m away, and the "
+            "view to it free."
+        )
+    if facts.judged and mostly(facts.other_side, facts.judged):
+        other = "left" if side == "right" else "right"
+        found.append(
+            f"It looked like a {other} hand: give hand.side={other}, or, if it is a {side} one, "
+            "put the image right, which is mirrored or has its rows and columns exchanged."
+        )
+    if facts.with_hand and mostly(facts.small, facts.with_hand):
+        found.append(
+            f"What was taken for the hand had fewer than {_FEWEST_PX} pixels: hold it nearer, or "
+            "let the camera give larger images."
+        )
+    if not found:
+        found.append(
+            f"If a hand was in view, look at overlay.png: it must be a {side} hand (hand.side), "
+            "upright and not mirrored (x right, y down), with nothing else nearer to the camera."
+        )
+    return found
