@@ -113,7 +113,7 @@ def count_bits(words: Tensor) -> Tensor:
 
 
 def dilate_bits(words: Tensor, radius_px: float) -> Tensor:
-    """Exact Euclidean disc dilation of bit images (N, H, words), see numba/kernel.py, _missed."""
+    """Exact Euclidean disc dilation of bit images (N, H, words), see numba/kernel.py."""
     n, height, count = words.shape
     full = (1 << _BITS) - 1
     radius = min(max(float(radius_px), 0.0), math.hypot(height, count * _BITS))

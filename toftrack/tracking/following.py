@@ -18,6 +18,8 @@ from toftrack.tracking.search import LastSeen
 from toftrack.tracking.spans import Spans
 from toftrack.tracking.state import Track
 
+_MOVEMENT_S = 0.3
+"""How long a movement goes on (to 1/e)."""
 _APPROACH_M_S = 0.05
 """How much faster than its middle a partly hidden hand may come nearer, m/s."""
 
@@ -25,9 +27,10 @@ _APPROACH_M_S = 0.05
 def displacement(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:
     """(6 + d,) how far a hand is expected to move on, in tangent coordinates.
 
-    It is trusted less the longer ago it was seen.
+    A movement fades: `settings.velocity` of it is expected in the first FRAME_S.
     """
-    return track.velocity * (settings.velocity ** (dt_s / FRAME_S) * dt_s)
+    reach_s = FRAME_S * math.expm1(-dt_s / _MOVEMENT_S) / math.expm1(-FRAME_S / _MOVEMENT_S)
+    return track.velocity * (settings.velocity * reach_s)
 
 
 def young(track: Track, settings: LostSettings) -> bool:
@@ -39,7 +42,7 @@ def filtered(
     track: Track, dt_s: float, frame: ObservedFrame, generator: torch.Generator, spans: Spans
 ) -> tuple[Tensor, Tensor]:
     """The filter's particles (N, 6 + d) and weights (N,) of a frame."""
-    model, frames = frame.model, dt_s / FRAME_S
+    model = frame.model
 
     def log_scores(particles: Tensor) -> Tensor:
         states = model.decode(particles, track.offset)
@@ -51,7 +54,7 @@ def filtered(
     # A hand that was nearly lost is looked for farther away.
     width = 1.0 + track.bad_s / FRAME_S
     sigmas = width * particle_filter.widened(
-        model.sigmas * math.sqrt(frames), ahead, model.filter.rest, model.filter.speed_gain
+        model.sigmas, dt_s / FRAME_S, ahead, model.filter.rest, model.filter.speed_gain
     )
     return particle_filter.annealed(
         particles,

@@ -82,17 +82,21 @@ class FilterSettings:
         check_number("filter.velocity_smoothing", self.velocity_smoothing, 0, 1)
 
 
-def widened(sigmas: Tensor, movement: Tensor, rest: float, gain: float) -> Tensor:
+def widened(sigmas: Tensor, frames: float, movement: Tensor, rest: float, gain: float) -> Tensor:
     """Diffusion that follows the speed: narrow for a hand at rest, wide for a fast one.
 
-    sigmas: (6 + d,) for a moderately moving hand.  movement: (6 + d,) tangent, how
-        far it moves until the frame.
+    What a hand at rest does is a random walk, whose spread grows with the root of the time; that of
+    a movement grows with the time.
+
+    sigmas: (6 + d,) for a moderately moving hand after one frame of 1/25 s.
+    frames: how many have passed.  movement: (6 + d,) tangent, how far it is expected to move.
     rest: part of the sigmas that a hand at rest keeps, 1 = the same at any speed.
-    gain: standard deviation gained per unit of movement; at most the sigmas are doubled.
+    gain: standard deviation gained per unit of movement; at most the sigmas a frame are
+        doubled.
     """
     groups = torch.split(movement, [3, 3, movement.shape[0] - 6])
     length = torch.cat([group.norm().expand(group.shape) for group in groups])
-    return torch.minimum(rest * sigmas + gain * length, 2 * sigmas)
+    return torch.minimum(rest * math.sqrt(frames) * sigmas + gain * length, 2 * frames * sigmas)
 
 
 def normalise(log_weights: Tensor) -> Tensor:

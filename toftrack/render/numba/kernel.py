@@ -211,7 +211,7 @@ def _wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wante
 
 
 @compiled
-def _missed(model, words, rows, reach, steps, wanted, buffer):
+def count_missed(model, words, rows, reach, steps, wanted, buffer):
     """How many wanted pixels lie within a disc of the silhouette: an exact Euclidean dilation.
 
     A disc is a horizontal run for each row offset. Taken from the longest run to the shortest, each
@@ -336,5 +336,5 @@ def score_hands(
             )
             out[0, first + i], out[1, first + i] = correct, false
             _wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted)
-            out[2, first + i] = _missed(model, words, rows, reach, steps, wanted, buffer)
+            out[2, first + i] = count_missed(model, words, rows, reach, steps, wanted, buffer)
             out[3, first + i] = residuals.sum()

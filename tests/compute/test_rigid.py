@@ -1,0 +1,161 @@
+"""Rigid motions: what they mean, and the compiled ones against the reference."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import roma
+import torch
+from torch import Tensor
+
+from toftrack.compute import rigid, rigid_numba
+from toftrack.compute.compiling import entry_point
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+_cached = entry_point(__file__, rigid_numba.__file__)
+
+
+@_cached
+def _rotations(before, after, back, turned):
+    """Products of rotations, and a vector turned by them, through quaternions."""
+    for i in range(len(before)):
+        p = rigid_numba.quaternion(after[i, 0], after[i, 1], after[i, 2])
+        q = rigid_numba.quaternion(before[i, 0], before[i, 1], before[i, 2])
+        both = rigid_numba.product(p, q)
+        vector = rigid_numba.rotation_vector(both)
+        x = rigid_numba.turned(both, 0.1, -0.2, 0.3)
+        for j in range(3):
+            back[i, j], turned[i, j] = vector[j], x[j]
+
+
+@_cached
+def _pose(state, base_frames, base, lengths, mirror, frames, joints):
+    rigid_numba.pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
+
+
+def particles(n: int, size: float, seed: int) -> Tensor:
+    return size * torch.randn(n, 10, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("motions", [rigid.MOTIONS, rigid_numba.motions()], ids=["torch", "numba"])
+def test_an_offset_leads_back_to_where_it_was_taken(motions) -> None:
+    reference, moved = particles(1, 0.5, 0), particles(40, 0.5, 1)
+    found = motions.compose(reference, motions.difference(moved, reference))
+    torch.testing.assert_close(found, moved, atol=1e-4, rtol=0)
+    still = motions.difference(reference, reference)
+    torch.testing.assert_close(still, torch.zeros_like(still), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("motions", [rigid.MOTIONS, rigid_numba.motions()], ids=["torch", "numba"])
+def test_turning_leaves_the_middle_of_the_hand_where_it_is(motions) -> None:
+    reference, tangent = particles(20, 0.5, 2), torch.zeros(20, 10)
+    tangent[:, 3:6] = particles(20, 0.5, 3)[:, 3:6]
+    found = motions.compose(reference, tangent)
+
+    def middle(rows: Tensor) -> Tensor:
+        turn = roma.rotvec_to_rotmat(rows[:, 3:6])
+        return rows[:, :3] + turn @ torch.tensor(rigid.PIVOT_M)
+
+    torch.testing.assert_close(middle(found), middle(reference), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-4, 0.1, 1.0, 3.0])
+def test_compiled_motions_agree_with_the_reference(size: float) -> None:
+    moved, tangent = particles(50, size, 4), particles(50, 0.1, 5)
+    compiled, reference = rigid_numba.motions(), rigid.MOTIONS
+    pairs = (
+        (compiled.compose(moved, tangent), reference.compose(moved, tangent)),
+        (compiled.compose(moved[:1], tangent), reference.compose(moved[:1], tangent)),
+        (compiled.difference(moved, moved[:1]), reference.difference(moved, moved[:1])),
+    )
+    for found, expected in pairs:
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found[:, :3], expected[:, :3], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(found[:, 6:], expected[:, 6:])
+        # Rotation vectors of length pi have two signs: compare what they do.
+        turns = (roma.rotvec_to_rotmat(rows[:, 3:6]) for rows in (found, expected))
+        torch.testing.assert_close(*turns, atol=1e-5, rtol=0)
+
+
+def test_no_particles_and_those_that_are_no_numbers() -> None:
+    compiled = rigid_numba.motions()
+    reference = particles(1, 0.5, 6)
+    assert compiled.difference(reference[:0], reference).shape == (0, 10)
+    rows = particles(3, 0.5, 7)
+    expected = compiled.difference(rows, reference)
+    rows[1] = math.nan
+    found = compiled.difference(rows, reference)
+    assert found[1].isnan().all()
+    assert torch.equal(found[::2], expected[::2])
+
+
+def test_rotations_through_quaternions_are_those_of_matrices() -> None:
+    g = np.random.default_rng(8)
+    axes = g.normal(size=(60, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = np.concatenate(([0, 1e-9, 1e-7, 1e-4, math.pi - 1e-6, math.pi], g.uniform(0, 6, 54)))
+    before, after = axes * angles[:, None], g.normal(size=(60, 3))
+    after[:6] = 0.0
+    back, turned = np.empty((60, 3)), np.empty((60, 3))
+    _rotations(before, after, back, turned)
+    p, q = (roma.rotvec_to_rotmat(torch.from_numpy(a)) for a in (after, before))
+    found = roma.rotvec_to_rotmat(torch.from_numpy(back))
+    torch.testing.assert_close(found, p @ q, atol=1e-6, rtol=0)
+    x = (p @ q @ torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)).numpy()
+    np.testing.assert_allclose(turned, x, atol=1e-7)
+    assert (np.linalg.norm(back, axis=1) < math.pi + 1e-9).all()
+
+
+def states(seed: int) -> Tensor:
+    """(30, 27) float64: any pose, also beyond the joint limits, at and behind the camera."""
+    g = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(ANGLE_LIMITS, dtype=torch.float64).T
+    angles = 1.5 * (low + (high - low) * torch.rand(30, 21, generator=g, dtype=torch.float64))
+    rows = torch.cat((2 * torch.randn(30, 6, generator=g, dtype=torch.float64), angles), 1)
+    rows[0] = 0.0
+    return rows
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_compiled_hand_is_that_of_the_reference(side: str) -> None:
+    shape, rows = default_hand_shape(side=side).to(torch.float64), states(9)
+    hand = (
+        shape.base_frames.numpy(),
+        shape.base_m.numpy(),
+        shape.bone_lengths_m.numpy(),
+        -1.0 if side == "left" else 1.0,
+    )
+    expected = forward_kinematics(rows, shape)
+    joints = np.empty((30, 21, 3))
+    rigid_numba.joints_of(rows.numpy(), *hand, joints)
+    np.testing.assert_allclose(joints, expected.joints_m.numpy(), atol=1e-7)  # metres
+    frames, one = np.empty((16, 3, 3)), np.empty((21, 3))
+    for i in (0, 7, 29):
+        _pose(rows[i].numpy(), *hand, frames, one)
+        np.testing.assert_allclose(frames, expected.frames[i].numpy(), atol=1e-7)
+        np.testing.assert_allclose(one, joints[i], atol=1e-12)
+
+
+def test_a_hand_that_is_no_number_is_none() -> None:
+    shape, rows = default_hand_shape().to(torch.float64), states(10)[:3]
+    rows[1, 3], rows[2, 0] = math.nan, math.inf
+    hand = (shape.base_frames.numpy(), shape.base_m.numpy(), shape.bone_lengths_m.numpy(), 1.0)
+    joints = np.empty((3, 21, 3))
+    rigid_numba.joints_of(rows.numpy(), *hand, joints)
+    assert np.isfinite(joints[0]).all()
+    assert not np.isfinite(joints[1:]).all((1, 2)).any()
+
+
+def test_the_mean_rotation_is_nearest_to_all() -> None:
+    rotvec = torch.tensor([[0.0, 0.0, 0.2], [0.0, 0.0, -0.2], [0.0, 0.0, 0.6]])
+    found = rigid.mean_rotation(rotvec, torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(found, torch.zeros(3), atol=1e-6, rtol=0)
+    # Across half a turn, where the vectors themselves point the other way.
+    near_pi = torch.tensor([[math.pi - 0.1, 0.0, 0.0], [-math.pi + 0.1, 0.0, 0.0]])
+    found = rigid.mean_rotation(near_pi, torch.tensor([0.5, 0.5], dtype=torch.float64))
+    assert float(found.norm()) == pytest.approx(math.pi, abs=1e-5)

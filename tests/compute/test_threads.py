@@ -1,0 +1,46 @@
+"""Who may use how many threads, and how they share tasks."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from toftrack.compute import compiling
+from toftrack.compute.compiling import entry_point
+from toftrack.compute.threads import run_shared, small_operations, threads
+
+
+@entry_point(__file__, compiling.__file__)
+def _count(counter, done):
+    while True:
+        i = compiling.take(counter)
+        if i >= len(done):
+            break
+        done[i] += 1
+
+
+def test_small_operations_leave_the_threads_to_others() -> None:
+    before = torch.get_num_threads()
+    allowed = threads()
+    with small_operations():
+        assert torch.get_num_threads() == 1
+        assert threads() == allowed
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("tasks", [0, 1, 1000])
+def test_every_task_is_done_once(tasks: int) -> None:
+    done = np.zeros(tasks, np.int64)
+    run_shared(functools.partial(_count, np.zeros(1, np.int64), done), tasks)
+    assert (done == 1).all()
+
+
+def test_what_fails_in_a_thread_fails_here() -> None:
+    def task() -> None:
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        run_shared(task, 1)

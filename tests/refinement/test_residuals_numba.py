@@ -1,0 +1,235 @@
+"""The compiled parts of the refinement, each by itself against the one reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.configured import refinement
+from torch import Tensor
+
+from toftrack.compute import rigid_numba
+from toftrack.compute.compiling import entry_point
+from toftrack.compute.rigid_numba import pose_hand
+from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
+from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.refinement import gauss_newton_numba
+from toftrack.refinement import residuals_numba as compiled
+from toftrack.refinement.gauss_newton import (
+    Landmarks,
+    Residuals,
+    landmark_residuals,
+    nearest_ellipsoids,
+    point_jacobian,
+    point_residuals,
+    silhouette_residuals,
+)
+from toftrack.refinement.gauss_newton_numba import CompiledRefiner, solve
+from toftrack.refinement.seen_points import SeenPoints
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SETTINGS = refinement()
+SIDES = ("right", "left")
+K = np.array([[220.0, 0.0, 88.0], [0.0, 215.0, 72.0], [0.0, 0.0, 1.0]])
+
+_cached = entry_point(
+    __file__, compiled.__file__, gauss_newton_numba.__file__, rigid_numba.__file__
+)
+# What an entry point calls cannot be called from Python: one that calls it.
+_choose = _cached(lambda *a: compiled.choose_points(*a))
+_nearest = _cached(lambda *a: compiled.nearest_ellipsoids(*a))
+_add_row = _cached(lambda *a: compiled.add_row(*a))
+_add_points = _cached(lambda *a: compiled.add_points(*a))
+_add_silhouette = _cached(lambda *a: compiled.add_silhouette(*a))
+_add_landmarks = _cached(lambda *a: compiled.add_landmarks(*a))
+_solve = _cached(lambda *a: solve(*a))
+
+
+@_cached
+def _pose(state, shape, surface, hand, posed):
+    base_frames, base, lengths, mirror = shape
+    pose_hand(state, base_frames, base, lengths, mirror, hand[0], hand[1])
+    compiled.joint_axes(hand[0], base_frames, mirror, hand[2])
+    compiled.pose_ellipsoids(hand[0], hand[1], surface[0], surface[1], surface[2], posed)
+
+
+@dataclass(frozen=True)
+class Posed:
+    """One hand as both sides have it, float64."""
+
+    shape: HandShape
+    surface: HandSurface
+    pose: HandPose
+    refiner: CompiledRefiner
+    hand: tuple[np.ndarray, ...]
+    ellipsoids: np.ndarray
+
+
+def posed_hand(side: str, seed: int, z: float = 0.45) -> Posed:
+    """A hand in any pose; z: of its wrist."""
+    g = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(ANGLE_LIMITS, dtype=torch.float64).T
+    state = torch.randn(27, generator=g, dtype=torch.float64)
+    state[:3] = torch.tensor([0.0, 0.03, z])
+    state[6:] = low + (high - low) * torch.rand(21, generator=g, dtype=torch.float64)
+    single = default_hand_shape(side=side)
+    shape, surface = single.to(torch.float64), hand_surface(single).to(torch.float64)
+    refiner = CompiledRefiner(single)
+    hand = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty((21, 3))
+    ellipsoids = np.empty((len(surface), 12), np.float32)
+    _pose(state.numpy(), refiner._shape, refiner._surface, hand, ellipsoids)
+    pose = forward_kinematics(state[None], shape)
+    return Posed(shape, surface, pose, refiner, hand, ellipsoids)
+
+
+def points_near(posed: Posed, n: int, seed: int) -> Tensor:
+    """(n, 3) float32 points around the joints, on both sides of the surface."""
+    g = torch.Generator().manual_seed(seed)
+    joints = posed.pose.joints_m[0, torch.randint(21, (n,), generator=g)]
+    return (joints + 0.012 * torch.randn(n, 3, generator=g)).float()
+
+
+def empty_sums() -> tuple[np.ndarray, ...]:
+    return np.empty(11), np.zeros((27, 27)), np.zeros(27)
+
+
+def check_sums(sums: tuple[np.ndarray, ...], expected: Residuals, rtol: float) -> None:
+    """The normal equations, in parts of their largest entry."""
+    rows, values = expected.rows[0].numpy(), expected.values[0].numpy()
+    normal, gradient = rows.T @ rows, rows.T @ values
+    assert np.abs(normal).max() > 0, "something is compared"
+    off = np.abs(np.tril(sums[1]) - np.tril(normal)).max() / np.abs(normal).max()
+    assert off < rtol
+    assert np.abs(sums[2] - gradient).max() < rtol * max(np.abs(gradient).max(), 1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 40, 1000])
+def test_points_are_chosen_as_by_the_reference(count: int) -> None:
+    posed = posed_hand("right", 0)
+    g = torch.Generator().manual_seed(1)
+    points = 0.1 * torch.randn(400, 3, generator=g) + posed.pose.joints_m[0].mean(0).float()
+    seen = SeenPoints(points, torch.zeros(0, 0, 2), torch.eye(3), (1, 1))
+    middle = posed.pose.joints_m.mean(1).float()
+    expected, there = seen.around(middle, count)
+    chosen = np.zeros((3, min(count, 400)), np.float32)
+    found = _choose(points.numpy(), posed.hand[1], count, chosen)
+    assert found == int(there.sum())
+    assert 0 < found <= count
+    np.testing.assert_array_equal(chosen[:, :found].T, expected[0, there[0]].numpy())
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("z", [0.45, 0.02, -0.5])
+def test_the_nearest_ellipsoid_is_that_of_the_reference(side: str, z: float) -> None:
+    posed = posed_hand(side, 2, z)
+    points = points_near(posed, 500, 3)
+    distance, nearest = np.empty(500, np.float32), np.zeros(500, np.int32)
+    _nearest(np.ascontiguousarray(points.numpy().T), 500, posed.ellipsoids, distance, nearest)
+    expected, which, normals = nearest_ellipsoids(posed.pose, points.double()[None], posed.surface)
+    np.testing.assert_allclose(distance, expected[0].numpy(), atol=1e-5)  # 0.01 mm
+    # As near to two of them, it may be either.
+    assert (nearest != which[0].numpy()).mean() < 0.02
+    torch.testing.assert_close(normals.norm(dim=-1), torch.ones_like(expected))
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_rows_are_those_of_the_jacobian(side: str) -> None:
+    posed = posed_hand(side, 4)
+    g = np.random.default_rng(5)
+    for frame in range(16):
+        x, n = 0.1 * g.normal(size=3) + posed.hand[1][0], g.normal(size=3)
+        sums = empty_sums()
+        # With a weight and a residual of 1 the gradient is the row itself.
+        _add_row(frame, tuple(x), tuple(n), 1.0, 1.0, posed.hand, sums)
+        as_tensor = (torch.from_numpy(a)[None, None] for a in (x, n))
+        expected = point_jacobian(posed.pose, posed.shape, *as_tensor, torch.tensor([frame]))
+        row = expected[0, 0].numpy()
+        np.testing.assert_allclose(sums[2], row, atol=1e-6)  # metres a radian
+        np.testing.assert_allclose(np.tril(sums[1]), np.tril(np.outer(row, row)), atol=1e-6)
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("z", [0.45, 0.02, -0.5])
+def test_seen_points_add_up_as_in_the_reference(side: str, z: float) -> None:
+    posed = posed_hand(side, 6, z)
+    points = points_near(posed, 500, 7)
+    xyz = np.ascontiguousarray(points.numpy().T)
+    matched = xyz, np.empty(500, np.float32), np.zeros(500, np.int32)
+    _nearest(xyz, 500, posed.ellipsoids, *matched[1:])
+    numbers = (5, 500, SETTINGS.reach_m, SETTINGS.point_m, 1.0, 1.0, 1.0)
+    sums, index = empty_sums(), posed.refiner._surface[0]
+    _add_points(matched, 500, index, posed.ellipsoids, posed.hand, numbers, sums)
+    there = torch.ones(1, 500, dtype=torch.bool)
+    expected = point_residuals(
+        posed.pose, points.double()[None], there, posed.shape, posed.surface, SETTINGS
+    )
+    check_sums(sums, expected, 0.01)  # points that are as near to two bones go to either
+
+
+def silhouette(seed: int, height: int, width: int) -> SeenPoints:
+    """For each pixel some other pixel: what is nearest does not matter here."""
+    g = torch.Generator().manual_seed(seed)
+    nearest = torch.stack(
+        (
+            torch.randint(width, (height, width), generator=g),
+            torch.randint(height, (height, width), generator=g),
+        ),
+        -1,
+    )
+    k = torch.from_numpy(K)
+    return SeenPoints(torch.zeros(0, 3), nearest.float(), k, (height, width), (0, 0))
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize(("z", "cut"), [(0.45, 0), (0.45, 31), (0.2, 0)])
+def test_the_silhouette_adds_up_as_in_the_reference(side: str, z: float, cut: int) -> None:
+    """cut: rows and columns that the crop lacks on either side."""
+    posed, seen = posed_hand(side, 8, z), silhouette(9, 144, 176)
+    inner = seen.nearest_px[cut : 144 - cut, cut : 176 - cut].contiguous()
+    seen = replace(seen, nearest_px=inner, corner=(cut, cut))
+    arguments = (seen.points_m.numpy(), inner.numpy(), seen.corner, seen.size, K)
+    sums = empty_sums()
+    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.5, sums)
+    settings = refinement(silhouette_px=1.5)
+    expected = silhouette_residuals(posed.pose, seen, posed.shape, settings)
+    check_sums(sums, expected, 1e-4)
+
+
+@pytest.mark.parametrize("size", [(0, 0), (1, 1), (144, 176)])
+def test_a_silhouette_that_no_bone_is_in_adds_nothing(size: tuple[int, int]) -> None:
+    """Outside of the image, an image of a pixel, or no silhouette at all."""
+    posed, nearest = posed_hand("right", 10), torch.full((*size, 2), 1e3)
+    k = K + [[0.0, 0.0, 9e3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    seen = SeenPoints(torch.zeros(0, 3), nearest, torch.from_numpy(k), size)
+    arguments = (seen.points_m.numpy(), nearest.numpy(), seen.corner, seen.size, k)
+    sums = empty_sums()
+    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.0, sums)
+    assert not sums[1].any() and not sums[2].any()
+    assert not silhouette_residuals(posed.pose, seen, posed.shape, SETTINGS).values.any()
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_landmarks_add_up_as_in_the_reference(side: str) -> None:
+    posed = posed_hand(side, 11)
+    g = torch.Generator().manual_seed(12)
+    points = posed.pose.joints_m + 0.02 * torch.randn(1, 21, 3, generator=g)
+    sigma = 0.003 + 0.02 * torch.rand(1, 21, generator=g, dtype=torch.float64)
+    sigma[0, 5], points[0, 9] = torch.inf, torch.nan
+    marks = Landmarks(points, sigma).of_each(1)
+    sums = empty_sums()
+    _add_landmarks(marks.points_m[0].numpy(), marks.sigma_m[0].numpy(), posed.hand, sums)
+    check_sums(sums, landmark_residuals(posed.pose, marks, posed.shape), 1e-5)
+
+
+def test_the_normal_equations_are_solved() -> None:
+    g = np.random.default_rng(13)
+    rows, right = g.normal(size=(60, 27)), g.normal(size=27)
+    normal = rows.T @ rows
+    expected = np.linalg.solve(normal, right)
+    lower = np.tril(normal)  # the upper triangle does not count
+    _solve(lower, right)
+    np.testing.assert_allclose(right, expected, rtol=1e-6, atol=1e-9)

@@ -1,0 +1,80 @@
+"""One back end, chosen once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from toftrack.compute import rigid, rigid_numba
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.refinement.gauss_newton import TorchRefiner
+from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+from toftrack.render.numba.scorer import NumbaScorer
+from toftrack.render.torch_scorer import TorchScorer
+from toftrack.tracking.backend import choose_backend, make_scorer
+
+SHAPE = default_hand_shape()
+TESTS = Path(__file__).parents[1]
+
+
+def test_a_back_end_is_of_one_kind() -> None:
+    kinds = {
+        "torch": (TorchScorer, TorchRefiner, rigid.compose),
+        "numba": (NumbaScorer, CompiledRefiner, rigid_numba.compose),
+    }
+    for name, (scorer, refiner, compose) in kinds.items():
+        backend = choose_backend(name, "cpu")
+        assert backend.name == name and backend.device == torch.device("cpu")
+        assert isinstance(backend.make_scorer(SHAPE), scorer)
+        assert isinstance(backend.make_refiner(SHAPE), refiner)
+        assert backend.motions.compose is compose
+
+
+def test_auto_is_the_fastest_here() -> None:
+    assert choose_backend("auto").name == "numba"
+    assert make_scorer("auto", SHAPE).name == "numba"
+
+
+@pytest.mark.parametrize("name", ["magic", "numpy"])
+def test_unknown_back_ends_are_refused(name: str) -> None:
+    with pytest.raises(ToftrackError, match=f"renderer={name} is unknown; give one of auto"):
+        choose_backend(name)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_triton_is_refused_where_it_cannot_run() -> None:
+    with pytest.raises(ToftrackError, match="renderer=triton cannot run here"):
+        choose_backend("triton")
+
+
+_WITHOUT_NUMBA = """
+import logging, sys
+logging.basicConfig(level=logging.INFO, format="%(message)s")
+sys.modules["numba"] = sys.modules["llvmlite"] = None
+from helpers.tracking import follow, sample
+found = follow(sample().cut(0, 1), "renderer={renderer}")
+print(len(found), found[-1].score)
+"""
+
+
+@pytest.mark.parametrize("renderer", ["torch", "auto"])
+def test_without_numba_torch_does_all_of_it(renderer: str) -> None:
+    code = _WITHOUT_NUMBA.format(renderer=renderer)
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=TESTS, capture_output=True, text=True, timeout=600
+    )
+    assert run.returncode == 0, run.stderr
+    frames, score = run.stdout.split()
+    assert int(frames) == 2 and float(score) > 0.3
+    assert ("numba is not available" in run.stderr) == (renderer == "auto")
+
+
+def test_without_numba_it_cannot_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "toftrack.render.numba.scorer", None)  # no such module
+    with pytest.raises(ToftrackError, match="renderer=numba cannot run here.*renderer=torch"):
+        choose_backend("numba")
