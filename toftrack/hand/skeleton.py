@@ -1,9 +1,8 @@
 """The kinematic chain of the hand: 27 degrees of freedom to joint transforms (paper, section 2.2).
 
 Hand frame (metres): origin at the wrist joint, and for a right hand held up with its palm towards
-the
-camera and its fingers up, the axes are the camera's: x towards the thumb, y towards the forearm,
-z out of the back of the hand. A left hand is the mirror image, x -> -x in the hand frame.
+the camera and its fingers up, the axes are the camera's: x towards the thumb, y towards the
+forearm, z out of the back of the hand. A left hand is the mirror image, x -> -x in the hand frame.
 
 The 21 joint angles are five for the thumb (carpometacarpal abduction and flexion,
 metacarpophalangeal abduction and flexion, interphalangeal flexion) and four for each other finger
