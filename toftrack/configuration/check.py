@@ -2,8 +2,9 @@
 
 Each value is compared with the one in conf/ that it takes the place of: where that is a number, so
 must be the override, whole where it is whole, and not negative, as hardly a number in conf/ is.
-Which settings must be above 0, and which may be below, stands here; other bounds are for the parts that use the settings. Only
-toftrack's own parts are looked at: what a part of somebody else's accepts, nobody knows.
+Which settings must be above 0, and which may be below, stands here; other bounds are for the parts
+that use the settings. Only toftrack's own parts are looked at: what a part of somebody else's
+accepts, nobody knows.
 """
 
 from __future__ import annotations

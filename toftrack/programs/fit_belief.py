@@ -53,14 +53,16 @@ def main(arguments: list[str] | None = None) -> None:
     asked.output.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(asked.seed)
     bank = shape_bank(400, generator)
-    signs, right, which = [], [], []
+    signs: list[list[float]] = []
+    right: list[bool] = []
+    numbers: list[int] = []
     for number in tqdm(range(asked.sequences), unit=" sequences", file=sys.stderr):
         sequence = random_sequence(asked.frames, bank, generator)
         rows, labels = observed(sequence, asked.overrides, asked.seed + number)
         signs += rows
         right += labels
-        which += [number] * len(rows)
-    x, y, which = np.array(signs), np.array(right), np.array(which)
+        numbers += [number] * len(rows)
+    x, y, which = np.array(signs), np.array(right), np.array(numbers)
     kept = which % _HELD_OUT == 0
     scale = StandardScaler().fit(x[~kept])
     model = LogisticRegression(C=1.0, max_iter=1000).fit(scale.transform(x[~kept]), y[~kept])

@@ -102,12 +102,12 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     middle = (side - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, side, side)
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_SAMPLES, _SAMPLES), dice)
-    read, parts = _resampled(depth, which, side.int().numpy())
-    _cut(read, parts, dice)
+    read, seen_parts = _resampled(depth, which, side.int().numpy())
+    _cut(read, seen_parts, dice)
     # One by one, so that each stays in the cache.
     each = [channels(read[i : i + 1], distance[i : i + 1].numpy()) for i in range(n)]
     image = torch.from_numpy(np.concatenate(each))
-    parts = torch.from_numpy(parts).long()
+    parts = torch.from_numpy(seen_parts).long()
     parts[parts == OTHER_HAND] = OTHER_FOREARM
     visible = (parts == HAND).sum((1, 2)) >= 12
     return Crops(

@@ -90,6 +90,10 @@ class Residual(nn.Module):
 class PoseNet(nn.Module):
     """Crops (N, 3, 64, 64) to Proposed."""
 
+    anchors: Tensor
+    limits: Tensor
+    cells: Tensor
+
     def __init__(self, width: int = 24) -> None:
         super().__init__()
         w1, w2, w3, w4 = width, 2 * width, 4 * width, 6 * width
@@ -201,8 +205,8 @@ class Finder(nn.Module):
             Residual(width, width, dilation=3),
         )
         self.heads = nn.Conv2d(width, 8, 1)
-        with torch.no_grad():
-            self.heads.bias[:2] = -5.0
+        assert self.heads.bias is not None
+        self.heads.bias.data[:2] = -5.0  # at first there are no hands anywhere
 
     def forward(self, image: Tensor) -> Found:
         """See the class."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import roma
@@ -216,7 +217,7 @@ def _mean_hand(side: str) -> HandShape:
     return default_hand_shape(side=side)
 
 
-def make_relocaliser(weights: str | None = None, **settings: float) -> Relocaliser:
+def make_relocaliser(weights: str | None = None, **settings: Any) -> Relocaliser:
     """The relocaliser of a configuration.
 
     weights: a file of train_relocaliser; None = the package's.

@@ -39,7 +39,8 @@ def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any
         "finder_width": finder.heads.in_channels,
         "about": about,
     }
-    np.savez_compressed(path, metadata=np.array(json.dumps(metadata)), **arrays)
+    content: dict[str, Any] = {"metadata": np.array(json.dumps(metadata)), **arrays}
+    np.savez_compressed(path, **content)
 
 
 def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[str, Any]]:
@@ -83,7 +84,9 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
             )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ToftrackError(f"{path} holds weights of another network ({error}); {again}") from None
-    return _ready(pose), _ready(finder), metadata.get("about", {})
+    make_ready(pose)
+    make_ready(finder)
+    return pose, finder, metadata.get("about", {})
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
@@ -94,17 +97,23 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _ready(network: nn.Module) -> nn.Module:
-    """For use: without gradients, normalisation folded into the convolutions before it."""
+def make_ready(network: nn.Module) -> None:
+    """Make a network fit for use: no gradients, normalisation folded into the convolutions."""
     network.eval().requires_grad_(False)
     for module in network.modules():
         if isinstance(module, Residual):
-            module.first = fuse_conv_bn_eval(module.first, module.norm_1)
-            module.second = fuse_conv_bn_eval(module.second, module.norm_2)
-            module.norm_1 = module.norm_2 = nn.Identity()
+            for convolution, norm in (("first", "norm_1"), ("second", "norm_2")):
+                _fold(module, convolution, norm)
         elif isinstance(module, nn.Sequential):
-            for i in range(len(module) - 1):
-                if isinstance(module[i + 1], nn.BatchNorm2d):
-                    module[i] = fuse_conv_bn_eval(module[i], module[i + 1])
-                    module[i + 1] = nn.Identity()
-    return network.to(memory_format=torch.channels_last)
+            for number in range(len(module) - 1):
+                if isinstance(module[number + 1], nn.BatchNorm2d):
+                    _fold(module, str(number), str(number + 1))
+    network.to(memory_format=torch.channels_last)
+
+
+def _fold(module: nn.Module, convolution: str, norm: str) -> None:
+    """Fold one of a module's normalisations into the convolution before it."""
+    before, after = module.get_submodule(convolution), module.get_submodule(norm)
+    assert isinstance(before, nn.Conv2d) and isinstance(after, nn.BatchNorm2d)
+    setattr(module, convolution, fuse_conv_bn_eval(before, after))
+    setattr(module, norm, nn.Identity())

@@ -70,8 +70,8 @@ def _reachable(seen: LastSeen | None, track: Track | None, centre_m: np.ndarray)
 
     Another hand, or the thing that hides the hand, is no place that it has jumped to.
     """
-    hidden = track is not None and track.expected is not None
-    if hidden and centre_m[2] < track.expected.nearest_m - _IN_FRONT_M:
+    behind = None if track is None else track.expected
+    if behind is not None and centre_m[2] < behind.nearest_m - _IN_FRONT_M:
         return -np.inf
     if seen is None:
         return 0.0

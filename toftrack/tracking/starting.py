@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from toftrack.tracking.following import displacement, young
-from toftrack.tracking.life_cycle import lasted, longer
+from toftrack.tracking.life_cycle import LostSettings, lasted, longer
 from toftrack.tracking.model import ObservedFrame, TrackerModel
 from toftrack.tracking.refining import Refined, improved
 from toftrack.tracking.relocating import begun, track_of
@@ -53,6 +53,7 @@ def begin(
     model = frame.model
     if frame.glance is not None:
         return begun(frame) if track is None else track
+    assert isinstance(model.lost, LostSettings)  # see TrackerModel
     if track is not None and not young(track, model.lost):
         return track
     return started(track, propose(state, frame, generator), dt_s, model)
@@ -77,7 +78,7 @@ def challenged(
 def started(track: Track | None, proposals: Proposals, dt_s: float, model: TrackerModel) -> Track:
     """A new track from a start; or the given young one, if the start is no better than it."""
     particles = proposals.particles
-    if track is not None:
+    if track is not None and isinstance(model.lost, LostSettings):
         ahead = displacement(track, dt_s, model.filter)
         now = model.backend.motions.compose(track.particles, ahead[None])
         log_scores = proposals.log_scores
