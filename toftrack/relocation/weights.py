@@ -81,8 +81,8 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
                     if key.startswith(name + ".")
                 }
             )
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ToftrackError(f"{path} holds weights of another network ({error}); {again}") from None
+    except (KeyError, TypeError, ValueError, RuntimeError):
+        raise ToftrackError(f"{path} holds weights of another network; {again}") from None
     return _ready(pose), _ready(finder), metadata.get("about", {})
 
 
