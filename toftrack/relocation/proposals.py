@@ -18,6 +18,8 @@ from toftrack.relocation.crops import crop, wide
 from toftrack.relocation.images import STRIDE
 from toftrack.relocation.network import Finder, PoseNet
 
+_KEPT = 12
+"""Hypotheses of a crop that are looked at further."""
 _MIRROR = torch.tensor([-1.0, 1.0, 1.0])
 _MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
 
@@ -106,11 +108,10 @@ def look(
     p = pose(image)
     turn = torch.from_numpy(np.stack(turns)).float()  # (C, 3, 3)
     centre = torch.from_numpy(centres_m).float()
-    order = p.log_probability.argsort(1, descending=True)
+    order = p.log_probability.argsort(1, descending=True)[:, :_KEPT]
 
     def ordered(values: Tensor) -> Tensor:
-        index = order.view(*order.shape, *[1] * (values.dim() - 2)).expand_as(values)
-        return values.gather(1, index)
+        return values[torch.arange(len(order))[:, None], order]
 
     pivot = ordered(p.pivot_m) @ turn.mT + centre[:, None]
     rotvec = roma.rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))

@@ -24,6 +24,8 @@ from toftrack.relocation.weights import load_weights
 
 SAME_PLACE_M = 0.06
 """Places that lie closer together are one."""
+_AGAIN = 2.0
+"""Places whose merit is so much lower than the best are not looked at again."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
@@ -132,7 +134,8 @@ class Relocaliser:
         if len(centres_m) == 0:
             return []
         seen = look(self.pose, depth_m, k, centres_m, side)
-        return [_glance(seen, row, side) for row in range(len(seen.present))]
+        joints = _joints(seen, side)
+        return [_glance(seen, joints, row) for row in range(len(seen.present))]
 
     def search(
         self,
@@ -145,8 +148,8 @@ class Relocaliser:
 
         likely: what is known of places (3,) besides the image, log scale.
 
-        Each place is looked at twice, the second time about the palm that the first one found:
-        poses are the more exact the nearer the crop's centre is to the middle of the palm.
+        The best places are looked at twice, the second time about the palm that was found: poses
+        are the more exact the nearer the crop's centre is to the middle of the palm.
         """
         cfg = self.settings
         found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)
@@ -157,15 +160,20 @@ class Relocaliser:
         order = np.argsort(-heat, kind="stable")
         order = order[_apart(centres[order])][: cfg.places]
         centres, heat = centres[order], heat[order]
-        first = self.glance(depth_m, k, centres, side)
-        again = np.array([glance.centre_m.numpy() for glance in first]).reshape(-1, 3)
-        second = self.glance(depth_m, k, again, side)
-        hands = [
-            (merit(glance, p) + likely(glance.centre_m.numpy()), glance)
-            for glance, p in zip(second, heat, strict=True)
-        ]
-        hands = [hand for hand in hands if hand[0] > cfg.merit]
-        return [glance for _, glance in sorted(hands, key=lambda hand: -hand[0])]
+        glances = self.glance(depth_m, k, centres, side)
+
+        def merits() -> np.ndarray:
+            both = zip(glances, heat, strict=True)
+            return np.array([merit(g, p) + likely(g.centre_m.numpy()) for g, p in both])
+
+        first = merits()
+        good = [row for row in range(len(first)) if first[row] > first.max() - _AGAIN]
+        again = np.array([glances[row].centre_m.numpy() for row in good]).reshape(-1, 3)
+        for row, glance in zip(good, self.glance(depth_m, k, again, side), strict=True):
+            glances[row] = glance
+        second = merits()
+        order = np.argsort(-second, kind="stable")
+        return [glances[row] for row in order if second[row] > cfg.merit]
 
 
 def merit(glance: Glance, heat: float) -> float:
@@ -188,14 +196,13 @@ def _apart(centres_m: np.ndarray) -> list[int]:
     return kept
 
 
-def _glance(seen: Look, row: int, side: str) -> Glance:
-    angles, size = seen.angles[row], seen.log_size[row]
+def _glance(seen: Look, joints_m: Tensor, row: int) -> Glance:
     return Glance(
         pivot_m=seen.pivot_m[row],
         rotvec=seen.rotvec[row],
-        angles=angles,
-        joints_m=_joints(seen.pivot_m[row], seen.rotvec[row], angles, size, side),
-        log_size=size,
+        angles=seen.angles[row],
+        joints_m=joints_m[row],
+        log_size=seen.log_size[row],
         log_probability=seen.log_probability[row],
         error_m=seen.error_m[row],
         landmarks=Landmarks(seen.joints_m[row], seen.sigma_m[row]),
@@ -204,12 +211,16 @@ def _glance(seen: Look, row: int, side: str) -> Glance:
     )
 
 
-def _joints(pivot_m: Tensor, rotvec: Tensor, angles: Tensor, log_size: Tensor, side: str) -> Tensor:
-    """(H, 21, 3) of mean hands scaled about the middle of the palm."""
-    state = torch.cat((angles.new_zeros(len(angles), 3), rotvec, angles), 1)
-    joints = forward_kinematics(state, _mean_hand(side)).joints_m
-    middle = roma.rotvec_to_rotmat(rotvec) @ rotvec.new_tensor(PIVOT_M)
-    return pivot_m[:, None] + (joints - middle[:, None]) * log_size.exp()[:, None, None]
+def _joints(seen: Look, side: str) -> Tensor:
+    """(C, H, 21, 3) of mean hands scaled about the middle of the palm."""
+    rotvec, angles = seen.rotvec.flatten(0, 1), seen.angles.flatten(0, 1)
+    pose = forward_kinematics(
+        torch.cat((torch.zeros_like(rotvec), rotvec, angles), 1), _mean_hand(side)
+    )
+    # A mirror changes nothing on the palm's middle line.
+    middle = pose.frames[:, 0] @ rotvec.new_tensor(PIVOT_M)
+    joints = (pose.joints_m - middle[:, None]).unflatten(0, seen.log_size.shape)
+    return seen.pivot_m[:, :, None] + joints * seen.log_size.exp()[..., None, None]
 
 
 @lru_cache

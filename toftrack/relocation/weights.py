@@ -82,8 +82,8 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
                     if key.startswith(name + ".")
                 }
             )
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ToftrackError(f"{path} holds weights of another network ({error}); {again}") from None
+    except (KeyError, TypeError, ValueError, RuntimeError):
+        raise ToftrackError(f"{path} holds weights of another network; {again}") from None
     make_ready(pose)
     make_ready(finder)
     return pose, finder, metadata.get("about", {})
