@@ -56,7 +56,9 @@ def commands() -> Iterator[tuple[str, ...]]:
 COMMANDS = sorted(set(commands()))
 TRACK = [words for words in COMMANDS if words[:2] == ("python", "track.py")]
 TRAIN = [words for words in COMMANDS if words[:2] == ("python", "train_pose_space.py")]
-MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m")]
+RELOCALISER = ("python", "-m", "toftrack.programs.train_relocaliser")
+"""The one command of a module that takes overrides."""
+MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m") and words != RELOCALISER]
 OF_HYDRA = ("-m", "--multirun")
 
 
@@ -101,6 +103,11 @@ def test_a_command_composes(words: tuple[str, ...]) -> None:
         return
     name = "config" if words[1] == "track.py" else "train_pose_space"
     assert configuration(*overrides_of(words), name=name)
+
+
+def test_the_command_that_trains_networks_is_shown_and_composes() -> None:
+    assert RELOCALISER in COMMANDS
+    assert configuration(name="train_relocaliser").poses.images > 0
 
 
 def program(name: str) -> ModuleType:

@@ -19,6 +19,7 @@ import pytest
 from helpers.tracking import ROOT
 from hydra.core.singleton import Singleton
 
+from toftrack.estimate import STATES
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import read_results
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
@@ -98,6 +99,10 @@ def test_track_npz_is_as_promised(whole) -> None:
         "state": ((12, 27), np.float32),
         "latent": ((12, 4), np.float32),
         "score": ((12,), np.float32),
+        "confidence": ((12,), np.float32),
+        "outside_rad": ((12,), np.float32),
+        "side_probability": ((12,), np.float32),
+        "index": ((12,), np.int64),
         "covariance": ((12, 10, 10), np.float32),
         "effective_sample_size": ((12,), np.float32),
         "gesture_probability": ((12,), np.float32),
@@ -110,6 +115,10 @@ def test_track_npz_is_as_promised(whole) -> None:
             assert archive[key].dtype == kind, key
         assert archive["gesture"].shape == (12,) and archive["gesture"].dtype.kind == "U"
         assert archive["joint_names"].tolist() == list(JOINT_NAMES)
+        assert (archive["side"] == "right").all() and (archive["side_probability"] == 1).all()
+        sure = archive["confidence"]
+        assert ((sure >= 0) & (sure <= 1)).all()
+        assert (archive["outside_rad"] >= 0).all()
         metadata = json.loads(archive["metadata"].item())
         assert np.isfinite(archive["joints_m"]).all()
         assert np.allclose(archive["timestamp_s"], np.arange(12) / 25)
@@ -127,10 +136,11 @@ def test_track_jsonl_says_the_same_a_line_a_frame(whole) -> None:
     lines = [json.loads(line) for line in (whole[0] / "track.jsonl").read_text().splitlines()]
     result = read_results(whole[0] / "track.npz")
     assert [line["index"] for line in lines] == list(range(12))
-    for name in ("joints_m", "lost", "state", "latent", "score", "covariance", "timestamp_s"):
+    exact = ("joints_m", "lost", "state", "latent", "score", "covariance", "timestamp_s")
+    for name in (*exact, "confidence", "outside_rad", "side", "state_name", "index"):
         told = np.array([line[name] for line in lines], result[name].dtype)
         assert np.array_equal(told, result[name]), name
-    assert {line["state_name"] for line in lines} <= {"initialising", "tracking", "recovering"}
+    assert {line["state_name"] for line in lines} <= STATES.keys()
 
 
 def test_the_summary_is_of_the_same_frames_and_holds_the_metrics(whole) -> None:
@@ -146,6 +156,18 @@ def test_the_summary_is_of_the_same_frames_and_holds_the_metrics(whole) -> None:
     error = 1e3 * np.linalg.norm(result["joints_m"][5:] - truth, axis=-1)
     assert summary["metrics"]["mean_mm"] == pytest.approx(error.mean(), rel=1e-4)
     assert summary["metrics"]["mean_mm"] < 15
+    assert 0 <= summary["metrics"]["trust"]["usable_pct"] <= 100
+    assert whole[2].startswith("usable ")
+
+
+def test_a_run_of_a_wall_ends_with_what_to_try(here, tmp_path: Path) -> None:
+    wall = save(tmp_path / "wall.npz", depth_m=np.full((3, 30, 40), 1.6, np.float32))
+    status, out, err = here("device=replay", f"device.path={wall}", "view=none")
+    notes = [line for line in err.splitlines() if line.startswith("note: ")]
+    assert status == 0 and "frames        3, 3 of them lost" in out
+    assert len(notes) == 2
+    assert "100 % of the pixels had readings, from 1.60 to 1.60 m" in notes[0]
+    assert "segmentation.max_distance_m" in notes[1]
 
 
 def test_the_table_goes_to_standard_output_and_the_progress_to_standard_error(whole) -> None:

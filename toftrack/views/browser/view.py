@@ -20,7 +20,7 @@ import cv2
 
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import confidence_words, state_words
+from toftrack.estimate import state_words
 from toftrack.views.base import TrackedFrame
 from toftrack.views.browser.server import BrowserServer, News
 from toftrack.views.overlay import CAPTION_PX, draw_tracked
@@ -285,7 +285,7 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
         "state": state_words(estimate),
         "lost": bool(estimate.lost),
         "score": number(estimate.score),
-        "confidence": confidence_words(estimate.confidence),
+        "confidence": number(estimate.confidence),
         "gesture": estimate.gesture,
         "gesture_probability": number(estimate.gesture_probability),
         "ms": number(1e3 * estimate.compute_s),
