@@ -26,6 +26,7 @@ _SEGMENTATION = NearestSurface(
     min_area_m2=0.0008,
     max_distance_m=1.2,
     occluder_margin_m=0.035,
+    reach_m=0.2,
     max_pixels=40_000,
 )
 _LIKELIHOOD = FMeasure(

@@ -160,7 +160,7 @@ class ResultWriter:
         done = self._estimates
         if not done:
             return _no_frames(), []
-        arrays = {
+        arrays: dict[str, Any] = {
             name: np.array([getattr(estimate, name) for estimate in done], dtype=kind)
             for name, kind in (_ARRAYS | _LATER).items()
         }
