@@ -107,7 +107,7 @@ def trust(joints_m: np.ndarray, lost: np.ndarray, hand: Hand, skip: int = 0) -> 
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
     _check(estimate.shape, lost.shape, hand)
     visible = np.asarray(hand.visible, bool)
-    finite: np.ndarray = np.isfinite(estimate).all((1, 2))
+    finite = np.asarray(np.isfinite(estimate).all((1, 2)))
     error = _errors_mm(estimate, finite, hand)
     average, largest = error.mean(1), error.max(1)
     used = np.arange(len(lost)) >= skip
