@@ -146,7 +146,8 @@ def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
         "filter.particles=60",
     )
     start = ("start.hypotheses=200", "start.islands=16", "start.samples=64")
-    one, two = (follow(scene, *quick, *start, f"renderer={name}") for name in ("numba", "torch"))
+    names = ("numba", "torch")
+    one, two = (follow(scene, *SEARCH, *quick, *start, f"renderer={name}") for name in names)
     difference = np.linalg.norm(one[-1].joints_m - two[-1].joints_m, axis=-1).mean()
     # Pixels on an outline may fall to either side, so the draws part: not the same bits.
     assert 1e3 * difference < 12
