@@ -174,6 +174,6 @@ def test_the_hypotheses_are_sorted_and_within_what_a_hand_can() -> None:
     pose, _ = small_networks()
     seen = look(pose, sample().depth_m[0], sample().k, sample().joints_m[0, [9]], "right")
     assert (seen.log_probability.diff(dim=1) <= 0).all()
-    assert float(seen.log_probability.exp().sum()) == pytest.approx(1, abs=1e-5)
+    assert 0 < float(seen.log_probability.exp().sum()) < 1 + 1e-5
     assert (seen.error_m > 0).all() and (seen.sigma_m > 0).all()
     assert torch.allclose(seen.parts.sum(1), torch.ones(1, 32, 32), atol=1e-5)
