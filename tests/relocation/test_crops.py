@@ -10,7 +10,15 @@ import torch
 from helpers.relocating import alone, clean_picture, intrinsics, one_hand, small_networks
 from helpers.tracking import sample
 
-from toftrack.relocation.crops import CROP, CROP_M, WIDE_F_PX, crop, crop_rotation, wide
+from toftrack.relocation.crops import (
+    CROP,
+    CROP_M,
+    WIDE_F_PX,
+    WIDE_LARGEST_PX,
+    crop,
+    crop_rotation,
+    wide,
+)
 from toftrack.relocation.proposals import Look, find_hands, look, mirrored
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -89,6 +97,14 @@ def test_the_whole_image_keeps_its_rays() -> None:
         assert ray == pytest.approx(true, abs=1.0 / WIDE_F_PX)
 
 
+def test_a_view_as_wide_as_the_sky_is_seen_small() -> None:
+    k = intrinsics(2.0, 144, 176)
+    image, new_k = wide(np.full((144, 176), 0.5, np.float32), k)
+    assert image.shape[2:] == (WIDE_LARGEST_PX, WIDE_LARGEST_PX)
+    assert new_k[0, 0] == pytest.approx(2.0 * WIDE_LARGEST_PX / 176)
+    assert new_k[1, 2] == pytest.approx((WIDE_LARGEST_PX - 1) / 2)
+
+
 @pytest.mark.parametrize("frame", [0, 40])
 def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int) -> None:
     scene = sample().cut(frame)
@@ -135,6 +151,8 @@ def strange_images() -> dict[str, tuple[np.ndarray, np.ndarray]]:
         "wide-angled": (flat, intrinsics(40.0, 144, 176)),
         "telescopic": (flat, intrinsics(5000.0, 144, 176)),
         "pixels that are not square": (flat, oblong),
+        "focal length of a pixel": (flat, intrinsics(1.0, 144, 176)),
+        "focal length of a millionth": (flat, intrinsics(1e-6, 144, 176)),
         "optical axis beside the image": (flat, beside),
         "large": (np.full((1200, 1600), 0.6, np.float32), intrinsics(1400.0, 1200, 1600)),
     }

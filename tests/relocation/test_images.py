@@ -11,14 +11,13 @@ from helpers.relocating import small_bank
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP, CROP_M
 from toftrack.relocation.images import (
-    PARTS,
-    SEGMENTS,
     WIDE_SIZE,
     Crops,
     WideImages,
     crop_images,
     wide_images,
 )
+from toftrack.relocation.network import PARTS, SEGMENTS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

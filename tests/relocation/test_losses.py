@@ -10,9 +10,6 @@ import torch
 from helpers.relocating import dice, small_bank
 
 from toftrack.relocation.images import (
-    PARTS,
-    SEGMENTS,
-    STRIDE,
     WIDE_SIZE,
     Crops,
     WideImages,
@@ -20,7 +17,16 @@ from toftrack.relocation.images import (
     wide_images,
 )
 from toftrack.relocation.losses import finder_loss, hypothesis_joints, pose_losses
-from toftrack.relocation.network import Finder, Found, PoseNet, Proposed, cube_rotations
+from toftrack.relocation.network import (
+    PARTS,
+    SEGMENTS,
+    STRIDE,
+    Finder,
+    Found,
+    PoseNet,
+    Proposed,
+    cube_rotations,
+)
 from toftrack.relocation.poses import sample_poses
 from toftrack.relocation.scenes import random_rotations
 

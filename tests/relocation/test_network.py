@@ -8,8 +8,7 @@ from helpers.relocating import small_networks
 
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP
-from toftrack.relocation.images import STRIDE
-from toftrack.relocation.network import PoseNet, Proposed, cube_rotations
+from toftrack.relocation.network import STRIDE, PoseNet, Proposed, cube_rotations
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,6 +11,9 @@ from toftrack.pose_space.density import latent_density
 from toftrack.tracking import particle_filter as sir
 from toftrack.tracking.tracker import Tracker
 
+SEARCH = ("relocation=none", "start=search", "lost=score", "refine=none")
+"""The filter by itself."""
+
 
 def nearness(tracker: Tracker) -> float:
     """Mean log density of the particles' latents, by weight, after some frames of the recording."""
@@ -26,8 +29,8 @@ def nearness(tracker: Tracker) -> float:
 
 def test_density_draws_the_particles_to_the_training_poses() -> None:
     # Without refinement, after which the particles follow the seen points and not the density.
-    drawn = make_tracker("filter.density=20", "refine=none")
-    assert nearness(drawn) > nearness(make_tracker("refine=none")) + 0.2
+    drawn = make_tracker(*SEARCH, "filter.density=20")
+    assert nearness(drawn) > nearness(make_tracker(*SEARCH)) + 0.2
 
 
 def test_density_is_added_to_the_log_weights(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,7 +45,7 @@ def test_density_is_added_to_the_log_weights(monkeypatch: pytest.MonkeyPatch) ->
     scene, weights = sample(), []
     for density in (0.0, 0.5):
         # One pass from the same start: the same particles, so that only the density differs.
-        tracker = make_tracker("filter.passes=1", f"filter.density={density}", "refine=none")
+        tracker = make_tracker(*SEARCH, "filter.passes=1", f"filter.density={density}")
         given.clear()
         tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
         weights.append(given[-1])

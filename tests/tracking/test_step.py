@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
 
 import numpy as np
@@ -19,12 +20,21 @@ from toftrack.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-QUICK = ("start.hypotheses=600", "start.samples=128", "filter.particles=80", "refine.swaps=16")
+SMALL = ("filter.particles=80", "refine.swaps=16")
+QUICK = (
+    *("relocation=none", "start=search", "lost=score", *SMALL),
+    *("start.hypotheses=600", "start.samples=128"),
+)
 """Fast, and found all the same in the first frames."""
 
 
 def quick(*overrides: str) -> Tracker:
     return make_tracker(*QUICK, *overrides)
+
+
+def networked(*overrides: str) -> Tracker:
+    """With the networks."""
+    return make_tracker(*SMALL, *overrides)
 
 
 def tracked(
@@ -47,9 +57,12 @@ def same(one: Estimate, two: Estimate) -> bool:
 
 
 @pytest.mark.parametrize("kept", [0, 2, 7])
-def test_a_recording_replayed_from_a_saved_state_gives_the_same_estimates(kept: int) -> None:
+@pytest.mark.parametrize("made", [quick, networked])
+def test_a_recording_replayed_from_a_saved_state_gives_the_same_estimates(
+    kept: int, made: Callable[..., Tracker]
+) -> None:
     """Before the start, while the start is still doubted, and in the middle of the size's fit."""
-    tracker, scene = quick(), sample()
+    tracker, scene = made(), sample()
     tracked(tracker, scene, range(kept))
     state = tracker.state
     first = tracked(tracker, scene, range(kept, kept + 4))
@@ -57,7 +70,7 @@ def test_a_recording_replayed_from_a_saved_state_gives_the_same_estimates(kept: 
     tracker.state = state
     again = tracked(tracker, scene, range(kept, kept + 4))
     assert all(map(same, first, again))
-    other = quick("seed=5")
+    other = made("seed=5")
     other.state = state
     assert all(map(same, first, tracked(other, scene, range(kept, kept + 4))))
 
@@ -106,7 +119,7 @@ def test_what_a_step_saw_is_told_with_the_time_of_its_stages() -> None:
     estimate = tracked(tracker, scene, range(1))[0]
     seconds = tracker.insight.seconds
     stages = {"segmentation and evidence", "start", "filter: scoring", "filter: rest"}
-    assert stages | {"refinement", "rest"} == set(seconds)
+    assert stages | {"relocaliser", "refinement", "rest"} == set(seconds)
     assert all(value > 0 for value in seconds.values())
     assert sum(seconds.values()) <= estimate.compute_s
     assert tracker.insight.particles.shape == (80, 10)
@@ -133,6 +146,12 @@ def test_a_movement_at_another_rate_has_the_same_speed() -> None:
             tracked(tracker, sample(), range(i, i + 1))
         speeds.append(tracker.track.velocity[:3])
     assert float((speeds[0] - speeds[1]).norm()) < 0.05, speeds
+
+
+def test_the_networks_follow_the_hand_at_another_rate() -> None:
+    scene = sample().cut(*range(0, 24, 2))
+    found = tracked(networked(), scene, range(len(scene)), 12.5)
+    assert errors_mm(found, scene)[4:].mean() < 20
 
 
 @pytest.mark.parametrize("jump_s", [-100.0, 1e6, math.nan, 1e-9])

@@ -16,7 +16,9 @@ CROP_M = 0.30
 CROP = 64
 """Cells of a crop, each of 2 x 2 readings."""
 WIDE_F_PX = 100.0
-"""Focal length of the whole image that the finder sees."""
+"""Focal length of the whole image that the finder sees, pixels."""
+WIDE_LARGEST_PX = 512
+"""Its most columns and rows: a wider view than 137 degrees is seen at a smaller focal length."""
 WIDE_RANGE_M = 1.6
 """Farther away, all is the same to the finder."""
 
@@ -86,9 +88,10 @@ def channels(read_m: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
 def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
     """The whole image as the finder sees it, (1, 2, h, w), and its intrinsics (3, 3)."""
     height, width = depth_m.shape
-    scale = np.array([WIDE_F_PX / k[0, 0], WIDE_F_PX / k[1, 1]])
+    focal = np.minimum(WIDE_F_PX, k.diagonal()[:2] * WIDE_LARGEST_PX / (width, height))
+    scale = focal / k.diagonal()[:2]
     # A multiple of 8, for the network's stride; what is added has no reading.
-    w, h = (8 * int(np.ceil(s * f / 8)) for s, f in zip((width, height), scale, strict=True))
+    w, h = (8 * int(np.ceil(s * f / 8 - 1e-9)) for s, f in zip((width, height), scale, strict=True))
     u = np.rint((np.arange(w) + 0.5) / scale[0] - 0.5).astype(int)
     v = np.rint((np.arange(h) + 0.5) / scale[1] - 0.5).astype(int)
     read = np.zeros((h, w), np.float32)
@@ -96,8 +99,8 @@ def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
     read[np.ix_(rows, columns)] = depth_m[np.ix_(v[rows], u[columns])]
     new_k = np.array(
         [
-            [WIDE_F_PX, 0, (k[0, 2] + 0.5) * scale[0] - 0.5],
-            [0, WIDE_F_PX, (k[1, 2] + 0.5) * scale[1] - 0.5],
+            [focal[0], 0, (k[0, 2] + 0.5) * scale[0] - 0.5],
+            [0, focal[1], (k[1, 2] + 0.5) * scale[1] - 0.5],
             [0, 0, 1],
         ]
     )

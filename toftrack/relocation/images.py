@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from toftrack.relocation.crops import CROP, CROP_M, WIDE_F_PX, channels, wide_channels
+from toftrack.relocation.network import PARTS, STRIDE
 from toftrack.relocation.pictures import Lens, random_sensors, take_pictures
 from toftrack.relocation.scenes import (
     BACKGROUND,
@@ -29,14 +30,8 @@ from toftrack.relocation.scenes import (
 from toftrack.relocation.shapes import ShapeBank
 
 _SAMPLES = 2 * CROP
-SEGMENTS = 4
-"""Background and things, the hand, its forearm, another hand or forearm."""
-PARTS = 32
-"""Side of the picture of parts that the pose network also learns."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
-STRIDE = 4
-"""Pixels of the finder's image to a cell of its map."""
 _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 

@@ -19,8 +19,13 @@ from torch import Tensor, nn
 
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP_M
-from toftrack.relocation.images import PARTS, SEGMENTS
 
+SEGMENTS = 4
+"""Background and things, the hand, its forearm, another hand or forearm."""
+PARTS = 32
+"""Side of the picture of parts that the pose network also learns."""
+STRIDE = 4
+"""Pixels of the finder's image to a cell of its map."""
 ANGLES = 21
 JOINTS = 21
 _OFFSET_M = 0.15

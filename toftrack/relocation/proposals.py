@@ -15,8 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from toftrack.relocation.crops import crop, wide
-from toftrack.relocation.images import STRIDE
-from toftrack.relocation.network import Finder, PoseNet
+from toftrack.relocation.network import STRIDE, Finder, PoseNet
 
 _KEPT = 12
 """Hypotheses of a crop that are looked at further."""
