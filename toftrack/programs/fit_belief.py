@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sklearn.linear_model import LogisticRegression
-from sklearn.preprocessing import StandardScaler
+from scipy.optimize import minimize
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
@@ -25,6 +24,8 @@ from toftrack.tracking.signs import SIGNS
 
 RIGHT_M = 0.04
 """An estimate is right when every joint is within this."""
+_SHRINK = 100.0
+"""Prior precision of the weights of signs in standard deviations, in frames."""
 _HELD_OUT = 5
 """Every so manieth sequence is kept to check the fit."""
 
@@ -64,10 +65,7 @@ def main(arguments: list[str] | None = None) -> None:
         numbers += [number] * len(rows)
     x, y, which = np.array(signs), np.array(right), np.array(numbers)
     kept = which % _HELD_OUT == 0
-    scale = StandardScaler().fit(x[~kept])
-    model = LogisticRegression(C=1.0, max_iter=1000).fit(scale.transform(x[~kept]), y[~kept])
-    weights = model.coef_[0] / scale.scale_
-    intercept = float(model.intercept_[0] - (weights * scale.mean_).sum())
+    intercept, weights = fitted_weights(x[~kept], y[~kept])
     p = 1 / (1 + np.exp(-(intercept + x[kept] @ weights)))
     log_loss = -np.mean(np.log(np.where(y[kept], p, 1 - p).clip(1e-9)))
     fitted = {name: round(float(w), 3) for name, w in zip(SIGNS, weights, strict=True)}
@@ -87,6 +85,29 @@ def main(arguments: list[str] | None = None) -> None:
     print("\n".join(f"  {name}: {value}" for name, value in fitted.items()))
     print(f"{len(y)} frames, {100 * y.mean():.0f} % right; held out: log loss {log_loss:.3f}")
     print(f"results: {asked.output}")
+
+
+def fitted_weights(signs: np.ndarray, right: np.ndarray) -> tuple[float, np.ndarray]:
+    """Intercept and weights (S,) of a logistic model of signs (N, S) and what was right (N,).
+
+    Only the score may speak for an estimate and all other signs against it: signs that go together
+    would otherwise get weights of both kinds, which hold for rendered hands only.
+    """
+    mean, spread = signs.mean(0), signs.std(0) + 1e-9
+    z, y = (signs - mean) / spread, right.astype(float)
+
+    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        odds = z @ parameters[1:] + parameters[0]
+        off = 1 / (1 + np.exp(-odds)) - y
+        slope = np.concatenate(([off.sum()], z.T @ off + _SHRINK * parameters[1:]))
+        square = 0.5 * _SHRINK * np.square(parameters[1:]).sum()
+        return float((np.logaddexp(0, odds) - y * odds).sum() + square), slope
+
+    bounds = [(None, None)] + [(0, None) if name == "log_score" else (None, 0) for name in SIGNS]
+    start = np.zeros(len(SIGNS) + 1)
+    found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x
+    weights = found[1:] / spread
+    return float(found[0] - (weights * mean).sum()), weights
 
 
 def observed(

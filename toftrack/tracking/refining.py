@@ -16,6 +16,8 @@ from toftrack.tracking.relocating import candidates, known_scores, landmarks_of,
 from toftrack.tracking.signs import out_of_sight
 from toftrack.tracking.state import Track
 
+_COVERED = 0.6
+"""Share of the joints behind something from which on a hand stays where it was."""
 _UNSEEN = 0.3
 """Share of the joints that must be out of sight for the networks not to be heard."""
 
@@ -51,6 +53,8 @@ def refined(
     pose = model.decode(mean, track.offset)
     if model.refinement is None:
         return Refined(pose, track.trend)
+    if track.pose is not None and model.relocaliser is not None and _covered(track.pose, frame):
+        return Refined(track.pose, None)
     pose, rival = _onto_points(pose, track.pose, frame, model.refinement, generator)
     if track.pose is None:
         return Refined(pose, track.trend, rival)
@@ -101,6 +105,15 @@ def _onto_points(
     swapped = tried[best][None]
     both = torch.cat((swapped, onto_points(swapped)))
     return both[_scores(both, frame).argmax()][None], rival
+
+
+def _covered(state: Tensor, frame: ObservedFrame) -> bool:
+    """Whether something hides so much of a hand (1, 27) that it is best left where it was.
+
+    What is still seen about it belongs to the thing that hides it, as often as not.
+    """
+    joints, image = frame.hand.refiner.joints(state)[0].cpu(), frame.observation
+    return out_of_sight(joints, image.depth_m, image.k)[1] > _COVERED
 
 
 def _mostly_unseen(state: Tensor, frame: ObservedFrame) -> bool:
