@@ -145,7 +145,7 @@ def test_a_hand_never_seen_or_long_ago_may_be_anywhere(age_s: float | None) -> N
 def heard(track: Track, rival: torch.Tensor | None, frames: int, hidden: bool = False, **settings):
     """The track and pose after so many frames with such a rival."""
     model = model_with(ToldRelocaliser(**settings))
-    frame = SimpleNamespace(model=model, hidden=hidden)
+    frame = SimpleNamespace(model=model, hidden=hidden, glance=object())
     own = track.pose
     for _ in range(frames):
         track, pose, _ = challenged(track, Refined(own, None, rival), FRAME_S, frame)

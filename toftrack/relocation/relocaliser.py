@@ -39,6 +39,8 @@ class RelocationSettings:
     merit: float
     hypotheses: int
     rivals: int
+    every: int
+    sure: float
     prior: float
     rival_m: float
     rival_gain: float
@@ -51,6 +53,8 @@ class RelocationSettings:
         for name in ("places", "hypotheses"):
             check_number(f"relocation.{name}", getattr(self, name), 1, whole=True)
         check_number("relocation.rivals", self.rivals, 0, whole=True)
+        check_number("relocation.every", self.every, 1, whole=True)
+        check_number("relocation.sure", self.sure, 0.5, 0.999)
         check_number("relocation.rival_frames", self.rival_frames, 1, whole=True)
         check_number("relocation.least", self.least, 0, 1)
         check_number("relocation.merit", self.merit)

@@ -14,9 +14,10 @@ from toftrack.frames import DepthImage
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.refinement.seen_points import SeenPoints, seen_points
-from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance
+from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance, RelocationSettings
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
+from toftrack.tracking.life_cycle import lasted
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.state import Track, TrackerState
@@ -43,7 +44,7 @@ def glanced(
     state: TrackerState, dt_s: float, image: DepthImage, model: TrackerModel
 ) -> tuple[Track | None, Glance | None]:
     """The track to go on with, and what the networks say of the hand: where it is, or at the best
-    place of all; None where there are no networks, or no hand.
+    place of all; None where there are no networks, or no hand, or no need to look.
 
     A track that is doubted gives way to a hand that is found elsewhere.
     """
@@ -56,6 +57,8 @@ def glanced(
         best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
         if track is None:
             return None, best
+    elif _sure(track, relocaliser.settings, dt_s):
+        return track, None
     moved = displacement(track, dt_s, model.filter)[None]
     ahead = model.backend.motions.compose(track.mean, moved)
     centre = (ahead[:, :3] + rotated_pivot(ahead[:, 3:6])).cpu().numpy()
@@ -63,6 +66,17 @@ def glanced(
     if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
         return None, best
     return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
+
+
+def _sure(track: Track, settings: RelocationSettings, dt_s: float) -> bool:
+    """Whether a track is believed so much that the networks need not look in this frame."""
+    believed = track.log_odds is not None and track.log_odds > _logit(settings.sure)
+    due = lasted(track.unlooked_s + dt_s, settings.every)
+    return believed and not due and track.challenged_s == 0
+
+
+def _logit(probability: float) -> float:
+    return float(np.log(probability / (1 - probability)))
 
 
 def _reachable(seen: LastSeen | None, track: Track | None, centre_m: np.ndarray) -> float:

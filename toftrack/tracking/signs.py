@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from torch import Tensor
 
@@ -77,6 +77,11 @@ def read_signs(
         hidden=hidden,
         young=1 / (1 + age_s / FRAME_S),
     )
+
+
+def scored(signs: Signs, score: float) -> Signs:
+    """The same signs with another score of the image, 0 .. 1."""
+    return replace(signs, log_score=math.log(max(score, _LEAST)))
 
 
 def _log_cm(metres: float) -> float:

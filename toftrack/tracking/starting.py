@@ -51,7 +51,7 @@ def begin(
 ) -> Track:
     """The track to follow in a frame: the given one, or one that begins here."""
     model = frame.model
-    if frame.glance is not None:
+    if model.relocaliser is not None:
         return begun(frame) if track is None else track
     assert isinstance(model.lost, LostSettings)  # see TrackerModel
     if track is not None and not young(track, model.lost):
@@ -67,6 +67,8 @@ def challenged(
     A rival takes over when it was better for a while; never while something hides the hand.
     """
     relocaliser, rival = frame.model.relocaliser, outcome.rival
+    if relocaliser is not None and frame.glance is None:
+        return track, outcome.pose, outcome.trend
     if relocaliser is None or rival is None or frame.hidden:
         return replace(track, challenged_s=0.0), outcome.pose, outcome.trend
     since = longer(track.challenged_s, dt_s)

@@ -32,6 +32,7 @@ class Track:
     challenged_s: how long a pose of the networks has been better.
     log_odds: that the estimate is right, smoothed over time; None where nobody says.
     doubted: the last estimate was flagged lost.
+    unlooked_s: how long ago the networks looked at it.  signs: of the last estimate.
     expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
 
@@ -48,6 +49,8 @@ class Track:
     challenged_s: float = 0.0
     log_odds: float | None = None
     doubted: bool = False
+    unlooked_s: float = 0.0
+    signs: Signs | None = None
     expected: Expected | None = None
 
 

@@ -31,7 +31,7 @@ from toftrack.tracking.life_cycle import Belief, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.refining import refined
 from toftrack.tracking.relocating import expected_of, glanced
-from toftrack.tracking.signs import Signs, read_signs
+from toftrack.tracking.signs import Signs, read_signs, scored
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.spans import Spans
 from toftrack.tracking.starting import begin, challenged
@@ -65,7 +65,7 @@ def step(
         if expected is None and glance is not None:
             expected = expected_of(glance)
         observation = model.segmentation(image.depth_m, image.k, expected)
-        nowhere = model.relocaliser is not None and glance is None
+        nowhere = model.relocaliser is not None and glance is None and track is None
         if observation.empty or nowhere:
             return _without_hand(state, image, observation, model, spans)
         frame = observed(observation, hand, model, glance, state.seen)
@@ -80,6 +80,8 @@ def step(
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
     belief, signs = _believed(track, found, score, dt_s, frame)
+    looked = frame.glance is not None
+    track = replace(track, signs=signs, unlooked_s=0.0 if looked else track.unlooked_s + dt_s)
     track = advanced(track, found, belief, expected if frame.hidden else None, dt_s, model)
     estimate = _estimate(image, found, score, belief, frame)
     gesture, estimate = tell_gesture(
@@ -105,7 +107,9 @@ def _believed(
     track: Track, found: Found, score: float, dt_s: float, frame: ObservedFrame
 ) -> tuple[Belief, Signs | None]:
     """What is thought of a frame's estimate, and by which signs."""
-    settings, signs = frame.model.lost, None
+    settings, signs = frame.model.lost, track.signs
+    if signs is not None:  # the networks did not look: what they said last still holds
+        signs = scored(signs, score)
     if frame.glance is not None:
         joints = frame.hand.refiner.joints(found.pose)[0]
         seen = frame.observation
