@@ -45,7 +45,7 @@ def test_a_wrong_value_is_told_in_one_sentence(override: str, words: str) -> Non
     [
         ("filter.exponent=30", "filter.particles=100"),  # a whole number is a number
         ("view=browser", "view.linger_s=inf"),
-        ("lost.outside_rad=inf",),
+        ("relocation=none", "lost=score", "lost.outside_rad=inf"),
         ("experiment=paper", "filter.particles=10"),
         ("segmentation.reach_m=inf",),
         ("relocation.merit=-4", "lost.intercept=-1", "lost.weights.log_score=-0.5"),

@@ -102,7 +102,7 @@ def test_the_more_the_speed_counts_the_less_it_lags() -> None:
 
 def test_without_speed_it_is_the_low_pass_of_its_cut_off() -> None:
     """A step, by hand: share = 1 / (1 + 1 / (2 pi f dt))."""
-    cfg = OneEuro(2.0, 0.0, 0.0, 0.0, 1.0)
+    cfg = OneEuro(2.0, 0.0, 0.0, 0.0, 1.0, False)
     step = REST + along(0, 0.1)
     found = filtered([estimate(REST, 0.0), estimate(step, 0.04), estimate(step, 0.08)], cfg)
     share = 1 / (1 + 1 / (2 * math.pi * 2.0 * 0.04))

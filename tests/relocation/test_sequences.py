@@ -29,8 +29,8 @@ def test_the_joints_lie_below_the_rendered_surface() -> None:
             depths.extend((joints[inside, 2] - at)[at > 0])
             nothing_there.extend(at == 0)
     below = np.array(depths)
-    # Joints are within the flesh, or hidden by a finger or a thing; noise lifts a few out of it.
-    assert (below > -0.02).mean() > 0.97
+    # Joints are within the flesh, or hidden by a finger or a thing; on edges, pixels mix.
+    assert (below > -0.02).mean() > 0.9
     assert (below < 0.03).mean() > 0.6
     assert np.mean(nothing_there) < 0.4
 
