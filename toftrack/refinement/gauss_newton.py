@@ -84,6 +84,7 @@ class Refinement:
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     swaps: other poses of single fingers that are tried; one must raise the log score by
         `swap_gain`.
+    overlap: of the log score, for fingers that are in one another (see finger_overlap).
     keep_gain: by how much the log score of another pose must exceed the last frame's.
     steadying: how much of a change from frame to frame is believed.
     carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
@@ -98,6 +99,7 @@ class Refinement:
     damping: float
     swaps: int
     swap_gain: float
+    overlap: float
     keep_gain: float
     steadying: Steadying
     carry: float
@@ -109,7 +111,7 @@ class Refinement:
             check_number(f"refine.{name}", getattr(self, name), value, whole=True, remedy=remedy)
         for name in ("reach_m", "point_m", "silhouette_px", "angle_rad"):
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
-        for name in ("damping", "swap_gain", "keep_gain"):
+        for name in ("damping", "swap_gain", "keep_gain", "overlap"):
             check_number(f"refine.{name}", getattr(self, name), 0)
         check_number("refine.carry", self.carry, 0, 1)
 

@@ -12,7 +12,7 @@ from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.model import ObservedFrame
-from toftrack.tracking.relocating import candidates, known_scores, landmarks_of, votes_word
+from toftrack.tracking.relocating import candidates, joints_word, known_scores, landmarks_of
 from toftrack.tracking.signs import out_of_sight
 from toftrack.tracking.state import Track
 
@@ -126,11 +126,9 @@ def _mostly_unseen(state: Tensor, frame: ObservedFrame) -> bool:
 
 
 def _scores(states: Tensor, frame: ObservedFrame) -> Tensor:
-    """What hands (N, 27) are compared by: the image and the networks' votes."""
-    scores = frame.log_scores(states)
-    if frame.glance is None:
-        return scores
-    return scores + votes_word(frame.hand.refiner.joints(states), frame)
+    """What hands (N, 27) are compared by: the image, the networks' votes, room for the fingers."""
+    joints = frame.hand.refiner.joints(states)
+    return frame.log_scores(states) + joints_word(joints, frame)
 
 
 def _contested(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.frames import DepthImage
+from toftrack.hand.overlap import finger_overlap
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.refinement.seen_points import SeenPoints, seen_points
@@ -138,14 +139,22 @@ def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
     return torch.cat((frame.hand.refiner(bent, bent[:, 6:], nothing, freely, votes), states))
 
 
-def votes_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
-    """(N,) what the votes say of hands with joints (N, 21, 3), beside log scores; at most 0."""
+def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
+    """(N,) what speaks against joints (N, 21, 3) besides the image, beside log scores; at most 0.
+
+    Fingers that are in one another, and joints that are not where the networks' votes are.
+    """
     model, glance = frame.model, frame.glance
+    word = joints_m.new_zeros(len(joints_m))
+    if model.refinement is not None and model.refinement.overlap:
+        length = frame.hand.shape.hand_length_m
+        word = word - model.refinement.overlap * finger_overlap(joints_m, length)
     if model.relocaliser is None or glance is None:
-        return joints_m.new_zeros(len(joints_m))
+        return word
     votes = landmarks_of(glance, model)
     off = ((joints_m - votes.points_m).norm(dim=-1) / votes.sigma_m).square()
-    return -model.relocaliser.settings.votes * (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
+    far = (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
+    return word - model.relocaliser.settings.votes * far
 
 
 def known_scores(
@@ -163,7 +172,7 @@ def known_scores(
     away = joints_m[:, None] - glance.joints_m.to(joints_m.device)
     likest = away.norm(dim=-1).mean(-1).argmin(1)
     word = glance.log_probability.to(joints_m.device)[likest].clamp(min=_LEAST_WORD)
-    word = relocaliser.settings.prior * word + votes_word(joints_m, frame)
+    word = relocaliser.settings.prior * word + joints_word(joints_m, frame)
     return frame.log_scores(states, coverage) + prior(states) + word
 
 
