@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import platform
 import sys
-from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -98,8 +97,6 @@ def _loop(
             depth = device.camera.rectify(frame.depth, frame.radial)
             shape = tracker.shape
             estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-            # The side is told, and never guessed.
-            estimate = replace(estimate, side=shape.side, side_probability=1.0)
             watch.see(estimate, depth, tracker.insight)
             smoothed, calm = smooth(smoothing, smoothed, estimate, shape)
             if smoothing is not None and smoothing.results:

@@ -88,7 +88,8 @@ def step(
         model.gestures, state.gesture, estimate, model.space, dt_s / FRAME_S
     )
     size, refused = _sized(state, found, belief, frame, generator)
-    estimate = replace(estimate, compute_s=spans.total())
+    # The side is told, and never guessed.
+    estimate = replace(estimate, side=state.side, side_probability=1.0, compute_s=spans.total())
     after = replace(
         state,
         generator=generator.get_state(),
@@ -163,7 +164,7 @@ def _without_hand(
     return (
         replace(state, track=None, gesture=gesture),
         info,
-        replace(estimate, compute_s=spans.total()),
+        replace(estimate, side=state.side, side_probability=1.0, compute_s=spans.total()),
     )
 
 
