@@ -28,6 +28,7 @@ class CalibratedBelief:
     """When an estimate is not to be used, and when its track is given up; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
+    believe: likewise, until a track was believed for the first time.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
     probation: frames after a start during which the hand is not remembered as seen.
@@ -35,6 +36,7 @@ class CalibratedBelief:
     """
 
     confidence: float
+    believe: float
     give_up: float
     patience: int
     memory: float
@@ -43,7 +45,7 @@ class CalibratedBelief:
     weights: Mapping[str, float]
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "give_up"):
+        for name in ("confidence", "believe", "give_up"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
         for name in ("patience", "probation"):
@@ -71,7 +73,7 @@ class CalibratedBelief:
         # What is hidden is waited for.
         patience = self.patience * (_WAITED if signs.hidden > _HIDDEN else 1)
         ends = patience > 0 and bad > 0 and lasted(bad, patience)
-        lost = confidence < self.confidence
+        lost = confidence < (self.confidence if track.believed else self.believe)
         return Belief(not ends, _state_name(signs, lost), lost, bad, 0.0, confidence, smooth)
 
 

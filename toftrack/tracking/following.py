@@ -135,6 +135,7 @@ def advanced(
         challenged_s=track.challenged_s,
         log_odds=belief.log_odds,
         doubted=belief.lost,
+        believed=track.believed or not belief.lost,
         unlooked_s=track.unlooked_s,
         signs=track.signs,
         expected=expected,

@@ -74,7 +74,7 @@ def challenged(
     since = longer(track.challenged_s, dt_s)
     if track.age_s > 0 and not lasted(since, relocaliser.settings.rival_frames):
         return replace(track, challenged_s=since), outcome.pose, outcome.trend
-    return track_of(rival, frame.model), rival, None
+    return replace(track_of(rival, frame.model), believed=track.believed), rival, None
 
 
 def started(track: Track | None, proposals: Proposals, dt_s: float, model: TrackerModel) -> Track:

@@ -31,7 +31,7 @@ class Track:
         The first frame of each counts FRAME_S, so that one alone says the same at any rate.
     challenged_s: how long a pose of the networks has been better.
     log_odds: that the estimate is right, smoothed over time; None where nobody says.
-    doubted: the last estimate was flagged lost.
+    doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
     unlooked_s: how long ago the networks looked at it.  signs: of the last estimate.
     expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
@@ -49,6 +49,7 @@ class Track:
     challenged_s: float = 0.0
     log_odds: float | None = None
     doubted: bool = False
+    believed: bool = False
     unlooked_s: float = 0.0
     signs: Signs | None = None
     expected: Expected | None = None
