@@ -16,6 +16,8 @@ from toftrack.tracking.relocating import candidates, joints_word, known_scores, 
 from toftrack.tracking.signs import out_of_sight
 from toftrack.tracking.state import Track
 
+_CLOSE = 16
+"""Of many poses, so many of the best by the image are compared by all that is known."""
 _COVERED = 0.6
 """Share of the joints behind something from which on a hand stays where it was."""
 _UNSEEN = 0.3
@@ -127,8 +129,14 @@ def _mostly_unseen(state: Tensor, frame: ObservedFrame) -> bool:
 
 def _scores(states: Tensor, frame: ObservedFrame) -> Tensor:
     """What hands (N, 27) are compared by: the image, the networks' votes, room for the fingers."""
-    joints = frame.hand.refiner.joints(states)
-    return frame.log_scores(states) + joints_word(joints, frame)
+    scores = frame.log_scores(states)
+    # What speaks against a pose never raises its score: it matters for the first few only.
+    rows = torch.arange(len(states), device=states.device)
+    if len(states) > _CLOSE:
+        rows = torch.cat((rows[:1], scores[1:].topk(_CLOSE - 1).indices + 1))
+    word = torch.full_like(scores, -torch.inf)
+    word[rows] = joints_word(frame.hand.refiner.joints(states[rows]), frame)
+    return scores + word
 
 
 def _contested(
