@@ -26,7 +26,8 @@ from toftrack.recordings.sr_frame import (
     encode_frame,
     unambiguous_range_m,
 )
-from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter, read_srs
+from toftrack.recordings.srs import SrsWriter, read_srs
+from toftrack.recordings.srs_facts import SrsFacts, SrsInit
 
 RANGE_M = unambiguous_range_m(20)
 FRAMES = 4

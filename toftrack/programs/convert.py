@@ -27,7 +27,8 @@ from toftrack.recordings.sr_frame import (
     to_radial,
     unambiguous_range_m,
 )
-from toftrack.recordings.srs import SrsFacts, SrsRecording, SrsWriter
+from toftrack.recordings.srs import SrsRecording, SrsWriter
+from toftrack.recordings.srs_facts import SrsFacts
 from toftrack.recordings.store import FrameStore, open_recording
 
 _MILLIMETRE = 0.001

@@ -24,7 +24,8 @@ from toftrack.configuration.compose import configuration_folder
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import REGISTERS
-from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
+from toftrack.recordings.srs import SrsWriter
+from toftrack.recordings.srs_facts import SrsFacts, SrsInit
 
 _ONLY = (
     "only the SR3000 is recorded, which needs no device=; other recordings are converted with "

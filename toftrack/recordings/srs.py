@@ -17,28 +17,24 @@ object "TOFT" (JSON: camera, range, frames a second, metadata) and before each f
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import BinaryIO, Self
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     FRAME_BYTES,
-    HEIGHT,
     REGISTERS,
-    WIDTH,
     decode_frame,
     nominal_camera,
     unambiguous_range_m,
 )
+from toftrack.recordings.srs_facts import SrsFacts, SrsInit, facts_text, parse_facts
 
 _SIGNATURE, _VERSION = 0x4F497273, 1
 _INIT, _CONFIGURE, _FRAME = 1, 2, 3
@@ -48,27 +44,6 @@ _PAIR = struct.Struct("<II")
 _THREE = struct.Struct("<III")
 _SECONDS = struct.Struct("<d")
 _LARGEST_FACTS = 1 << 20  # bytes; a damaged size must not make us read a gigabyte as text
-
-
-@dataclass(frozen=True)
-class SrsInit:
-    """Which camera made the recording."""
-
-    product_id: int = 0x0074
-    interface_type: int = 0
-    serial_number: int = 0
-
-
-@dataclass(frozen=True)
-class SrsFacts:
-    """What toftrack adds to the format."""
-
-    range_m: float | None = None
-    """What the largest distance word stands for; None = not stated."""
-    camera: Camera | None = None
-    """None = not stated."""
-    fps: float = DEFAULT_FPS
-    metadata: dict[str, Any] = field(default_factory=dict)
 
 
 class SrsWriter:
@@ -117,7 +92,7 @@ class SrsWriter:
             self._write(
                 _PAIR.pack(_SIGNATURE, _VERSION)
                 + _object(_INIT, _THREE.pack(*(n & 0xFFFFFFFF for n in numbers)))
-                + _object(_FACTS, _facts_text(facts))
+                + _object(_FACTS, facts_text(facts))
             )
             self.configure(registers)
         except BaseException:
@@ -348,38 +323,7 @@ def _other(path: Path, scan: _Scan, kind: int, stream: BinaryIO, length: int) ->
             raise ToftrackError(f"the Configure object of '{path}' is damaged; record it again")
         scan.registers = stream.read(length)
     elif kind == _FACTS and length <= _LARGEST_FACTS:
-        scan.facts = _parse_facts(path, stream.read(length))
-
-
-def _facts_text(facts: SrsFacts) -> bytes:
-    content = {
-        "range_m": facts.range_m,
-        "fps": facts.fps,
-        "camera": facts.camera and facts.camera.to_dict(),
-        "metadata": facts.metadata,
-    }
-    return json.dumps(content).encode()
-
-
-def _parse_facts(path: Path, text: bytes) -> SrsFacts:
-    """Raises ToftrackError: what the recorder stated must not be replaced by a guess in silence."""
-    damaged = ToftrackError(f"the TOFT object of the recording '{path}' is damaged")
-    try:
-        content = json.loads(text)
-        range_m, fps = content["range_m"], float(content["fps"])
-        range_m = None if range_m is None else float(range_m)
-        camera, metadata = content["camera"], content["metadata"]
-    except (ValueError, TypeError, KeyError, RecursionError):
-        raise damaged from None
-    for number in (fps, 1.0 if range_m is None else range_m):
-        if not (np.isfinite(number) and number > 0):
-            raise damaged
-    if not isinstance(metadata, dict):
-        raise damaged
-    camera = None if camera is None else Camera.from_dict(camera, path)
-    if camera is not None and (camera.width, camera.height) != (WIDTH, HEIGHT):
-        raise damaged
-    return SrsFacts(range_m, camera, fps, metadata)
+        scan.facts = parse_facts(path, stream.read(length))
 
 
 def _object(kind: int, content: bytes) -> bytes:
