@@ -138,7 +138,7 @@ def test_a_good_frame_between_begins_the_time_anew() -> None:
 
 
 def test_a_doubtful_track_is_flagged_and_kept() -> None:
-    belief, track = belief_of(patience=2, confidence=0.6, give_up=0.3), followed()
+    belief, track = belief_of(patience=2, confidence=0.6, believe=0.6, give_up=0.3), followed()
     for _ in range(20):
         found = belief.judge(track, with_odds(0.0), FRAME_S)
         assert found.lost and found.kept
@@ -201,3 +201,10 @@ def test_joints_out_of_sight_are_counted() -> None:
     u = (200.0 * joints[:, 0] / joints[:, 2] + 87.5).round()
     half[:, : int(u.median())] = 0.3
     assert 0.2 < signs_of(joints, half).hidden < 0.8
+
+
+def test_a_new_hand_must_convince_more_than_one_that_was_believed() -> None:
+    belief, new = belief_of(confidence=0.2, believe=0.6), followed()
+    old = replace(new, believed=True)
+    assert belief.judge(new, with_odds(0.0), FRAME_S).lost
+    assert not belief.judge(old, with_odds(0.0), FRAME_S).lost
