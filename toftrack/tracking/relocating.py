@@ -163,8 +163,7 @@ def known_scores(
     """Log scores (N,) of hands (N, 27) with all that is known besides the image.
 
     joints_m: (N, 21, 3) of the hands.  coverage: as FMeasure.log_score has it. The word of the
-    networks for a hand is that for the hypothesis
-    which is most like it.
+    networks for a hand is that for the hypothesis which is most like it.
     """
     relocaliser, glance = frame.model.relocaliser, frame.glance
     assert relocaliser is not None and glance is not None
