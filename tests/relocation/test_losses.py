@@ -27,7 +27,7 @@ from toftrack.relocation.network import (
     Proposed,
     cube_rotations,
 )
-from toftrack.relocation.poses import sample_poses
+from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.scenes import random_rotations
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -20,7 +20,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import HandPose
 
 # Half-breadth of the fingers at the middle of each bone, millimetres for a hand of 190 mm.
-_BONE_RADII_MM = (
+BONE_RADII_MM = (
     (12.5, 10.0, 9.0),
     (10.2, 8.9, 7.7),
     (10.3, 9.1, 7.8),
@@ -95,7 +95,7 @@ def hand_surface(shape: HandShape) -> HandSurface:
     """Flesh out a skeleton of the given sizes; on the shape's device and of its dtype."""
     base, bones = shape.base_m, shape.bone_lengths_m
     mm = shape.hand_length_m / _REFERENCE_LENGTH_M / 1000 * shape.thickness
-    radii = base.new_tensor(_BONE_RADII_MM) * mm
+    radii = base.new_tensor(BONE_RADII_MM) * mm
     depths = radii * _DEPTH_OVER_BREADTH
     frame_index: list[int] = []
     centres: list[Tensor] = []

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.rigid import PIVOT_M
+from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement.gauss_newton import Landmarks
@@ -26,6 +27,8 @@ SAME_PLACE_M = 0.06
 """Places that lie closer together are one."""
 _AGAIN = 2.0
 """Places whose merit is so much lower than the best are not looked at again."""
+_DOUBT_M = 0.06
+"""How far off a finger's outer joints may be that lies in another one, by the votes."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
@@ -138,8 +141,8 @@ class Relocaliser:
         if len(centres_m) == 0:
             return []
         seen = look(self.pose, depth_m, k, centres_m, side)
-        joints = _joints(seen, side)
-        return [_glance(seen, joints, row) for row in range(len(seen.present))]
+        joints, sigma = _joints(seen, side), _sigma_m(seen)
+        return [_glance(seen, joints, sigma, row) for row in range(len(seen.present))]
 
     def search(
         self,
@@ -200,7 +203,7 @@ def _apart(centres_m: np.ndarray) -> list[int]:
     return kept
 
 
-def _glance(seen: Look, joints_m: Tensor, row: int) -> Glance:
+def _glance(seen: Look, joints_m: Tensor, sigma_m: Tensor, row: int) -> Glance:
     return Glance(
         pivot_m=seen.pivot_m[row],
         rotvec=seen.rotvec[row],
@@ -209,10 +212,23 @@ def _glance(seen: Look, joints_m: Tensor, row: int) -> Glance:
         log_size=seen.log_size[row],
         log_probability=seen.log_probability[row],
         error_m=seen.error_m[row],
-        landmarks=Landmarks(seen.joints_m[row], seen.sigma_m[row]),
+        landmarks=Landmarks(seen.joints_m[row], sigma_m[row]),
         present=float(seen.present[row].sigmoid()),
         right_side=float(seen.right[row].sigmoid()),
     )
+
+
+def _sigma_m(seen: Look) -> Tensor:
+    """(C, 21) deviations of the votes: larger where two fingers are voted for in one place.
+
+    Of a single finger that is seen the cells do not know which one it is, and say surely that it is
+    either.
+    """
+    length = DEFAULT_HAND_LENGTH_M * float(seen.log_size[:, 0].mean().exp())
+    doubt = _DOUBT_M * overlap_of_each(seen.joints_m, length).clamp(max=1)  # (C, 5)
+    outer = torch.cat((doubt.new_zeros(len(doubt), 5, 1), doubt[..., None].expand(-1, -1, 3)), 2)
+    added = torch.cat((doubt.new_zeros(len(doubt), 1), outer.flatten(1)), 1)
+    return torch.hypot(seen.sigma_m, added)
 
 
 def _joints(seen: Look, side: str) -> Tensor:

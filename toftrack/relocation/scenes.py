@@ -15,7 +15,7 @@ from torch import Tensor
 
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.relocation.poses import sample_poses
+from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.shapes import ShapeBank
 
 BACKGROUND, HAND, FOREARM, OTHER_FOREARM, OTHER_HAND = range(5)

@@ -14,6 +14,7 @@ from toftrack.errors import ToftrackError
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
+from toftrack.pose_space.data.natural_poses import natural_poses
 from toftrack.pose_space.density import LatentDensity, latent_density
 from toftrack.refinement.gauss_newton import Refinement, Refiner
 from toftrack.relocation.relocaliser import Glance, Relocaliser
@@ -107,8 +108,8 @@ class TrackerModel:
 
     @cached_property
     def poses(self) -> Tensor:
-        """(M, 21) rad, the training poses as the space has them."""
-        return self.space.decode(self.space.training_latents)
+        """(M, 21) rad, natural poses, to take single fingers from."""
+        return natural_poses().to(self.device)
 
     def hand(self, side: str, size: SizeBelief | None) -> SizedHand:
         """The hand of a side in the size that is believed in."""

@@ -7,7 +7,7 @@ import torch
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, JOINT_NAMES, forward_kinematics
-from toftrack.relocation import poses
+from toftrack.pose_space.data import natural_poses as poses
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 
-_DATA = Path(__file__).parent.parent / "data" / "natural_poses.npz"
+_DATA = Path(__file__).parents[2] / "data" / "natural_poses.npz"
 
 # Degrees (knuckle, middle joint, last joint) and their standard deviations, of the four fingers.
 _FINGER_STATES = (
@@ -49,6 +49,12 @@ def recorded_poses() -> Tensor:
         return torch.from_numpy(content["angles_centidegrees"].astype(np.float32)) * (
             math.pi / 18000
         )
+
+
+@functools.cache
+def natural_poses(sampled: int = 800) -> Tensor:
+    """(M, 21) radians: the recorded poses and as many sampled ones, always the same."""
+    return torch.cat((recorded_poses(), sample_poses(sampled, torch.Generator().manual_seed(0))))
 
 
 def sample_poses(n: int, generator: torch.Generator) -> Tensor:
