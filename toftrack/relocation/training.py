@@ -24,6 +24,7 @@ from toftrack.relocation.images import Crops, WideImages, crop_images, wide_imag
 from toftrack.relocation.losses import finder_loss, pose_losses
 from toftrack.relocation.network import Finder, PoseNet
 from toftrack.relocation.shapes import shape_bank
+from toftrack.relocation.weights import trained_weights
 
 _READY = 6
 """Batches that wait to be trained on."""
@@ -37,12 +38,14 @@ class Schedule:
 
     images: in all.  batch: images of a step.  rate: the highest learning rate.
     width: channels of the network's first layer.
+    start: a file of weights to go on from; None begins from nothing.
     """
 
     images: int
     batch: int
     rate: float
     width: int
+    start: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("images", "batch", "width"):
@@ -59,7 +62,10 @@ Course = list[dict[str, Any]]
 def train_poses(schedule: Schedule, shapes: int, seed: int) -> tuple[PoseNet, Course]:
     """Train the pose network; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
-    network = PoseNet(schedule.width).train().to(memory_format=torch.channels_last)
+    network = PoseNet(schedule.width)
+    if schedule.start is not None:
+        network.load_state_dict(trained_weights(schedule.start, "pose", schedule.width))
+    network.train().to(memory_format=torch.channels_last)
 
     def step(crops: Crops) -> tuple[Tensor, dict[str, float]]:
         image = crops.image.to(memory_format=torch.channels_last)
@@ -81,7 +87,10 @@ def train_poses(schedule: Schedule, shapes: int, seed: int) -> tuple[PoseNet, Co
 def train_finder(schedule: Schedule, shapes: int, seed: int) -> tuple[Finder, Course]:
     """Train the finder; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
-    network = Finder(schedule.width).train().to(memory_format=torch.channels_last)
+    network = Finder(schedule.width)
+    if schedule.start is not None:
+        network.load_state_dict(trained_weights(schedule.start, "finder", schedule.width))
+    network.train().to(memory_format=torch.channels_last)
 
     def step(images: WideImages) -> tuple[Tensor, dict[str, float]]:
         image = images.image.to(memory_format=torch.channels_last)

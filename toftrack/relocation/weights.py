@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from toftrack.errors import ToftrackError
@@ -20,6 +20,7 @@ FORMAT = "toftrack-relocaliser"
 VERSION = 1
 DEFAULT_FILE = Path(__file__).parent.parent / "data" / "relocaliser.npz"
 _LARGEST_BYTES = 64 << 20
+_AGAIN = "train them anew with python -m toftrack.programs.train_relocaliser, or install again"
 
 
 def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any]) -> None:
@@ -48,45 +49,66 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
 
     Raises ToftrackError when the file is missing, damaged, not weights or of another version.
     """
-    path = DEFAULT_FILE if path is None else Path(path)
-    again = "train them anew with python -m toftrack.programs.train_relocaliser, or install again"
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise ToftrackError(f"{path} is too large for weights of the relocaliser; {again}")
-        arrays = read_archive(path)
-        metadata = json.loads(str(arrays.pop("metadata")))
-    except FileNotFoundError:
-        raise ToftrackError(f"there are no weights of the relocaliser at {path}; {again}") from None
-    except (OSError, ValueError, KeyError, RecursionError) as error:
-        raise ToftrackError(
-            f"{path} is no file of the relocaliser's weights ({error}); {again}"
-        ) from None
-    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        raise ToftrackError(f"{path} is no file of the relocaliser's weights; {again}")
-    if metadata.get("version") != VERSION:
-        raise ToftrackError(
-            f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"
-            f" version {VERSION}; {again}"
-        )
-    if metadata.get("sha256") != _checksum(arrays):
-        raise ToftrackError(f"{path} is damaged, its checksum is wrong; {again}")
+    arrays, metadata = _read(DEFAULT_FILE if path is None else Path(path))
     try:
         pose, finder = PoseNet(int(metadata["pose_width"])), Finder(int(metadata["finder_width"]))
         for name, network in (("pose", pose), ("finder", finder)):
-            network.load_state_dict(
-                {
-                    key.split(".", 1)[1]: torch.from_numpy(array).float()
-                    if array.dtype.kind == "f"
-                    else torch.from_numpy(array)
-                    for key, array in arrays.items()
-                    if key.startswith(name + ".")
-                }
-            )
+            network.load_state_dict(_tensors(arrays, name))
     except (KeyError, TypeError, ValueError, RuntimeError):
-        raise ToftrackError(f"{path} holds weights of another network; {again}") from None
+        raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
     make_ready(pose)
     make_ready(finder)
     return pose, finder, metadata.get("about", {})
+
+
+def trained_weights(path: str | Path, name: str, width: int) -> dict[str, Tensor]:
+    """One network's weights, "pose" or "finder" of so many channels, to go on training from.
+
+    Raises ToftrackError as load_weights does, and for another width.
+    """
+    arrays, metadata = _read(Path(path))
+    if metadata.get(f"{name}_width") != width:
+        raise ToftrackError(
+            f"{path} holds weights for a width of {metadata.get(f'{name}_width')}, and the width to"
+            f" train is {width}; give the same"
+        )
+    return _tensors(arrays, name)
+
+
+def _tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
+    """One network's arrays as it takes them."""
+    return {
+        key.split(".", 1)[1]: torch.from_numpy(array).float()
+        if array.dtype.kind == "f"
+        else torch.from_numpy(array)
+        for key, array in arrays.items()
+        if key.startswith(name + ".")
+    }
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and metadata of a file that is whole."""
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise ToftrackError(f"{path} is too large for weights of the relocaliser; {_AGAIN}")
+        arrays = read_archive(path)
+        metadata = json.loads(str(arrays.pop("metadata")))
+    except FileNotFoundError:
+        raise ToftrackError(f"there are no weights of the relocaliser at {path}; {_AGAIN}") from None
+    except (OSError, ValueError, KeyError, RecursionError) as error:
+        raise ToftrackError(
+            f"{path} is no file of the relocaliser's weights ({error}); {_AGAIN}"
+        ) from None
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        raise ToftrackError(f"{path} is no file of the relocaliser's weights; {_AGAIN}")
+    if metadata.get("version") != VERSION:
+        raise ToftrackError(
+            f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"
+            f" version {VERSION}; {_AGAIN}"
+        )
+    if metadata.get("sha256") != _checksum(arrays):
+        raise ToftrackError(f"{path} is damaged, its checksum is wrong; {_AGAIN}")
+    return arrays, metadata
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:

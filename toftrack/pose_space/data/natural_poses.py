@@ -39,6 +39,27 @@ _THUMBS = (
     (10, 20, 0, 15, 20),  # opposed
     (-20, 38, -10, 25, 40),  # folded over the palm
 )
+_STRAIGHT, _CURLED, _HOOKED, _HALF, _BENT = range(5)
+_OUT, _UP, _BESIDE, _ACROSS, _TUCKED, _BENT_THUMB, _OPPOSED, _FOLDED = range(8)
+# What people show: the thumbs that go with it, the four fingers, and how often it is drawn.
+_SHOWN = (
+    ((_OUT, _UP, _BESIDE), (_STRAIGHT,) * 4, 10),  # palm
+    ((_ACROSS, _TUCKED, _BENT_THUMB, _BESIDE), (_CURLED,) * 4, 10),  # fist
+    ((_ACROSS, _TUCKED, _BENT_THUMB, _FOLDED), (_STRAIGHT, _CURLED, _CURLED, _CURLED), 10),
+    ((_OUT, _UP), (_STRAIGHT, _CURLED, _CURLED, _CURLED), 8),  # pointing, without and with thumb
+    ((_OUT, _UP), (_CURLED,) * 4, 7),  # thumb up
+    ((_ACROSS, _TUCKED, _FOLDED), (_STRAIGHT, _STRAIGHT, _CURLED, _CURLED), 8),  # victory
+    ((_OUT, _UP), (_STRAIGHT, _STRAIGHT, _CURLED, _CURLED), 5),
+    ((_ACROSS, _TUCKED, _FOLDED), (_STRAIGHT, _STRAIGHT, _STRAIGHT, _CURLED), 5),  # three
+    ((_TUCKED, _FOLDED), (_STRAIGHT,) * 4, 6),  # four
+    ((_OUT, _ACROSS), (_STRAIGHT, _CURLED, _CURLED, _STRAIGHT), 2),
+    ((_OUT, _ACROSS), (_CURLED, _CURLED, _CURLED, _STRAIGHT), 3),
+    ((_ACROSS, _TUCKED), (_CURLED, _STRAIGHT, _CURLED, _CURLED), 1),
+    ((_OPPOSED,), (_HALF, _STRAIGHT, _STRAIGHT, _STRAIGHT), 4),  # towards OK
+    ((_OUT, _OPPOSED), (_HALF,) * 4, 5),  # relaxed
+    ((_OUT, _BESIDE), (_HOOKED,) * 4, 3),
+    ((_BESIDE, _OPPOSED), (_BENT,) * 4, 2),
+)
 _SPREAD = (12.0, 2.0, -8.0, -16.0)
 _TOUCHING_M = 0.020
 
@@ -66,7 +87,11 @@ def sample_poses(n: int, generator: torch.Generator) -> Tensor:
     def normal(*size: int) -> Tensor:
         return torch.randn(*size, generator=generator)
 
-    first, second = _by_finger(n, generator), _by_finger(n, generator)
+    def any_or_shown() -> Tensor:
+        shown = uniform(n, 1) < 0.5
+        return torch.where(shown, _shown(n, generator), _by_finger(n, generator))
+
+    first, second = any_or_shown(), any_or_shown()
     recorded = recorded_poses()
 
     def drawn() -> Tensor:
@@ -111,13 +136,40 @@ def _by_finger(n: int, generator: torch.Generator) -> Tensor:
     exponent = torch.exp(0.35 * normal(n, 1, 3))
     together = means[0] + (means[1] - means[0]) * closing**exponent + 5.0 * normal(n, 4, 3)
     flexion = torch.where(kind[..., None] > 0.75, together, flexion)
-    abduction = torch.tensor(_SPREAD) * (uniform(n, 1) * 1.6 - 0.4) + 4.0 * normal(n, 4)
-    fingers = torch.cat((abduction[..., None], flexion), 2).flatten(1)
-
     thumbs = torch.tensor(_THUMBS, dtype=torch.float32)
     rows = torch.randint(len(thumbs), (2, n), generator=generator)
     thumb = torch.lerp(thumbs[rows[0]], thumbs[rows[1]], (uniform(n, 1) * 1.6 - 0.3).clamp(0, 1))
-    return torch.cat((thumb + 8.0 * normal(n, 5), fingers), 1) * (math.pi / 180)
+    return _assembled(thumb, flexion, generator)
+
+
+def _shown(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) what people show a camera, each in an own way."""
+    weights = torch.tensor([float(weight) for *_, weight in _SHOWN])
+    row = torch.multinomial(weights, n, replacement=True, generator=generator)
+    state = torch.tensor([fingers for _, fingers, _ in _SHOWN])[row]
+    means = torch.tensor([m for m, _ in _FINGER_STATES])
+    deviations = torch.tensor([d for _, d in _FINGER_STATES])
+    noise = torch.randn(n, 1, 3, generator=generator)
+    # One way of bending for all fingers of a person, and a little of each finger's own.
+    noise = 0.6 * noise + 0.6 * torch.randn(n, 4, 3, generator=generator)
+    most = max(len(thumbs) for thumbs, *_ in _SHOWN)
+    allowed = torch.tensor([(thumbs * most)[:most] for thumbs, *_ in _SHOWN])[row]
+    which = torch.randint(most, (2, n), generator=generator)
+    first, second = (allowed.gather(1, rows[:, None])[:, 0] for rows in which)
+    thumbs = torch.tensor(_THUMBS, dtype=torch.float32)
+    part = 0.5 * torch.rand(n, 1, generator=generator)
+    thumb = torch.lerp(thumbs[first], thumbs[second], part)
+    return _assembled(thumb, means[state] + deviations[state] * noise, generator)
+
+
+def _assembled(thumb: Tensor, flexion: Tensor, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians from thumbs (n, 5) and the fingers' flexions (n, 4, 3), degrees."""
+    n = len(thumb)
+    part = torch.rand(n, 1, generator=generator) * 1.6 - 0.4
+    abduction = torch.tensor(_SPREAD) * part + 4.0 * torch.randn(n, 4, generator=generator)
+    fingers = torch.cat((abduction[..., None], flexion), 2).flatten(1)
+    thumb = thumb + 8.0 * torch.randn(n, 5, generator=generator)
+    return torch.cat((thumb, fingers), 1) * (math.pi / 180)
 
 
 def _pinching(poses: Tensor, generator: torch.Generator) -> Tensor:
