@@ -82,8 +82,8 @@ class Refinement:
     point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
         ones count more.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
-    swaps: other poses of single fingers that are tried; one must raise the log score by
-        `swap_gain`.
+    swaps: other poses of single fingers that are tried; the log scores by which one is better must
+        sum up to `swap_gain` over frames, of each of which `drift` is taken off.
     overlap: of the log score, for fingers that are in one another (see finger_overlap).
     keep_gain: by how much the log score of another pose must exceed the last frame's.
     steadying: how much of a change from frame to frame is believed.
@@ -99,6 +99,7 @@ class Refinement:
     damping: float
     swaps: int
     swap_gain: float
+    drift: float
     overlap: float
     keep_gain: float
     steadying: Steadying
@@ -111,7 +112,7 @@ class Refinement:
             check_number(f"refine.{name}", getattr(self, name), value, whole=True, remedy=remedy)
         for name in ("reach_m", "point_m", "silhouette_px", "angle_rad"):
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
-        for name in ("damping", "swap_gain", "keep_gain", "overlap"):
+        for name in ("damping", "swap_gain", "drift", "keep_gain", "overlap"):
             check_number(f"refine.{name}", getattr(self, name), 0)
         check_number("refine.carry", self.carry, 0, 1)
 

@@ -129,6 +129,7 @@ def advanced(
         offset=offset,
         pose=found.pose,
         trend=found.trend,
+        contender=track.contender,
         age_s=longer(track.age_s, dt_s),
         bad_s=belief.bad_s,
         outside_s=belief.outside_s,

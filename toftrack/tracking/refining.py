@@ -7,17 +7,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from toftrack.refinement.gauss_newton import Refinement
-from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
+from toftrack.tracking.contest import Alternatives, rivals_of, scored, settled, with_other_fingers
 from toftrack.tracking.model import ObservedFrame
-from toftrack.tracking.relocating import candidates, joints_word, known_scores, landmarks_of
+from toftrack.tracking.relocating import candidates, landmarks_of
 from toftrack.tracking.signs import out_of_sight
-from toftrack.tracking.state import Track
+from toftrack.tracking.state import Contender, Track
 
-_CLOSE = 16
-"""Of many poses, so many of the best by the image are compared by all that is known."""
+_EXCHANGED = 4
+"""Single fingers are taken from so many of the networks' poses."""
 _COVERED = 0.6
 """Share of the joints behind something from which on a hand stays where it was."""
 _UNSEEN = 0.3
@@ -40,11 +39,13 @@ class Refined:
 
     pose: (1, 27).  trend: (27,) see steadying.
     rival: (1, 27) a pose of the networks that is another one, and better; None where there is none.
+    contender: the pose with other fingers that is ahead; None where there is none.
     """
 
     pose: Tensor
     trend: Tensor | None
     rival: Tensor | None = None
+    contender: Contender | None = None
 
 
 def refined(
@@ -57,56 +58,49 @@ def refined(
         return Refined(pose, track.trend)
     if track.pose is not None and model.relocaliser is not None and _covered(track.pose, frame):
         return Refined(track.pose, None)
-    pose, rival = _onto_points(pose, track.pose, frame, model.refinement, generator)
+    outcome = _onto_points(pose, track, dt_s, frame, generator)
     if track.pose is None:
-        return Refined(pose, track.trend, rival)
+        return replace(outcome, trend=track.trend)
     steadying, motions = model.refinement.steadying, model.backend.motions
-    steady, trend = steadied(pose, track.pose, track.trend, dt_s, steadying, motions)
-    return Refined(steady, trend, rival)
+    steady, trend = steadied(outcome.pose, track.pose, track.trend, dt_s, steadying, motions)
+    return replace(outcome, pose=steady, trend=trend)
 
 
 def _onto_points(
-    state: Tensor,
-    before: Tensor | None,
-    frame: ObservedFrame,
-    cfg: Refinement,
-    generator: torch.Generator,
-) -> tuple[Tensor, Tensor | None]:
-    """The filter's hand brought onto the seen points, (1, 27), and a rival; `before`: the last."""
-    refiner, seen = frame.hand.refiner, seen_points(frame.observation)
+    state: Tensor, track: Track, dt_s: float, frame: ObservedFrame, generator: torch.Generator
+) -> Refined:
+    """The filter's hand (1, 27) brought onto the seen points, and what speaks against it."""
+    refiner, cfg = frame.hand.refiner, frame.model.refinement
+    assert cfg is not None
+    seen, before = seen_points(frame.observation), track.pose
     glance = None if before is not None and _mostly_unseen(state, frame) else frame.glance
-    if glance is None:
-        frame = replace(frame, glance=None)
+    frame = replace(frame, glance=glance)
     landmarks = None if glance is None else landmarks_of(glance, frame.model)
 
-    def onto_points(starts: Tensor) -> Tensor:
-        return refiner(starts, starts[:, 6:], seen, cfg, landmarks)
+    def onto_points(starts: Tensor) -> Alternatives:
+        return scored(refiner(starts, starts[:, 6:], seen, cfg, landmarks), frame)
 
-    starts = [state]
-    if before is not None:
-        # The pose of the last frame stands until another one is clearly better: what the image
-        # does not decide, such as a hidden finger, must not flicker.
-        starts.insert(0, torch.cat((state[:, :6], before[:, 6:]), 1))
+    # The pose of the last frame stands until another one is clearly better: what the image does
+    # not decide, such as a hidden finger, must not flicker. A contender moves along with it.
+    known = [pose[:, 6:] for pose in (before,) if pose is not None]
+    starts = [*(torch.cat((state[:, :6], angles), 1) for angles in known), state]
     own = len(starts)
-    if glance is not None:
-        starts.append(candidates(glance, frame, frame.model.rivals))
-    tried = onto_points(torch.cat(starts))
-    scores = _scores(tried, frame)
-    first = 0 if scores[0] + cfg.keep_gain >= scores[own - 1] else own - 1
-    found, rival = tried[first][None], None
-    if glance is not None and len(tried) > own:
-        found, rival = _contested(found, tried[own:], scores[own:] - scores[first], frame)
-    exchanged = [swap_fingers(found, frame.model.poses, cfg.swaps, generator)]
-    if glance is not None:
-        exchanged.append(exchange_fingers(found, torch.cat(starts)[own : own + 4, 6:]))
-    tried = torch.cat(exchanged)
-    scores = _scores(tried, frame)
-    best = int(scores.argmax())
-    if scores[best] <= scores[0] + cfg.swap_gain:
-        return found, rival
-    swapped = tried[best][None]
-    both = torch.cat((swapped, onto_points(swapped)))
-    return both[_scores(both, frame).argmax()][None], rival
+    if track.contender is not None:
+        starts.append(torch.cat((state[:, :6], track.contender.pose[:, 6:]), 1))
+    mine = len(starts)
+    likely = state[:0] if glance is None else candidates(glance, frame, frame.model.rivals)
+    tried = onto_points(torch.cat((*starts, likely)))
+    first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[own - 1] else own - 1
+    rows = torch.arange(len(tried.scores), device=state.device)
+    found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[own:mine]), None
+    if len(likely):
+        near, rival = rivals_of(found, tried.rows(rows[mine:]), frame)
+        others = others.and_(near)
+    swapped = with_other_fingers(found, likely[:_EXCHANGED, 6:], frame, cfg, generator)
+    if len(swapped):
+        others = others.and_(scored(swapped, frame)).and_(onto_points(swapped))
+    pose, contender = settled(found, others, track, dt_s, frame)
+    return Refined(pose, None, rival, contender)
 
 
 def _covered(state: Tensor, frame: ObservedFrame) -> bool:
@@ -125,39 +119,3 @@ def _mostly_unseen(state: Tensor, frame: ObservedFrame) -> bool:
     """
     joints, image = frame.hand.refiner.joints(state)[0].cpu(), frame.observation
     return sum(out_of_sight(joints, image.depth_m, image.k)) > _UNSEEN
-
-
-def _scores(states: Tensor, frame: ObservedFrame) -> Tensor:
-    """What hands (N, 27) are compared by: the image, the networks' votes, room for the fingers."""
-    scores = frame.log_scores(states)
-    # What speaks against a pose never raises its score: it matters for the first few only.
-    rows = torch.arange(len(states), device=states.device)
-    if len(states) > _CLOSE:
-        rows = torch.cat((rows[:1], scores[1:].topk(_CLOSE - 1).indices + 1))
-    word = torch.full_like(scores, -torch.inf)
-    word[rows] = joints_word(frame.hand.refiner.joints(states[rows]), frame)
-    return scores + word
-
-
-def _contested(
-    found: Tensor, others: Tensor, gain: Tensor, frame: ObservedFrame
-) -> tuple[Tensor, Tensor | None]:
-    """The found pose or a better one beside it; and the best of those that are other poses.
-
-    others: (R, 27) poses of the networks.  gain: (R,) their log scores less that of the found one.
-    """
-    relocaliser = frame.model.relocaliser
-    assert relocaliser is not None and frame.glance is not None
-    joints = frame.hand.refiner.joints(torch.cat((found, others)))
-    away = (joints[1:] - joints[:1]).norm(dim=-1).mean(1)
-    near = away < relocaliser.settings.rival_m
-    rival = None
-    if bool((~near).any()):
-        scores = known_scores(torch.cat((found, others)), joints, frame)
-        scores[1:][near] = -torch.inf
-        best = int(scores[1:].argmax())
-        if scores[1 + best] > scores[0] + relocaliser.settings.rival_gain:
-            rival = others[best][None]
-    gain = gain.masked_fill(~near, -torch.inf)
-    best = int(gain.argmax())
-    return (others[best][None] if gain[best] > 0 else found), rival

@@ -67,6 +67,7 @@ def challenged(
     A rival takes over when it was better for a while; never while something hides the hand.
     """
     relocaliser, rival = frame.model.relocaliser, outcome.rival
+    track = replace(track, contender=outcome.contender)
     if relocaliser is not None and frame.glance is None:
         return track, outcome.pose, outcome.trend
     if relocaliser is None or rival is None or frame.hidden:

@@ -17,6 +17,17 @@ from toftrack.tracking.size_fit import SizeBelief
 
 
 @dataclass(frozen=True, eq=False)
+class Contender:
+    """A pose with other fingers that has been better than the track's.
+
+    pose: (1, 27).  lead: by how much, log scores summed up over frames.
+    """
+
+    pose: Tensor
+    lead: float
+
+
+@dataclass(frozen=True, eq=False)
 class Track:
     """A hand that is followed.
 
@@ -26,6 +37,7 @@ class Track:
         displaced by it.
     pose: (1, 27) the last refined hand, None at the start.
     trend: (27,) its mean change a second, see steadying.
+    contender: another pose that may take its place, None where there is none.
     age_s: how long it has been followed, 0 before the first frame.
     bad_s: how long its score has been low.  outside_s: how long it has been out of the pose space.
         The first frame of each counts FRAME_S, so that one alone says the same at any rate.
@@ -43,6 +55,7 @@ class Track:
     offset: Tensor
     pose: Tensor | None = None
     trend: Tensor | None = None
+    contender: Contender | None = None
     age_s: float = 0.0
     bad_s: float = 0.0
     outside_s: float = 0.0
