@@ -6,7 +6,9 @@ import importlib
 import inspect
 import json
 import pkgutil
+from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,11 +21,16 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.pose_space.archives import read_archive
 from toftrack.pose_space.base import PoseSpace
-from toftrack.pose_space.data.pose_data import PoseData, synthetic_data
+from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
 _ADVICE = "make one with train_pose_space.py"
+_NATURAL = 120
+_DATA: dict[str, Callable[[], PoseData]] = {
+    "natural": partial(natural_data, _NATURAL),
+    "synthetic": synthetic_data,
+}
 _SAME_RAD = 1e-6
 """Poses that differ by less than this in every angle are the same."""
 
@@ -153,11 +160,23 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def make_pose_space(
-    kind: str = "pca", dims: int = 4, file: str | None = None, **settings: Any
+    kind: str = "pca",
+    dims: int = 4,
+    file: str | None = None,
+    data: str = "synthetic",
+    **settings: Any,
 ) -> PoseSpace:
-    """The pose space of a configuration: read from `file`, or learned on the spot when None."""
+    """The pose space of a configuration: read from `file`, or learned on the spot when None.
+
+    data: what it is learned from: "natural" motion, or "synthetic", the paper's 79 poses.
+    """
     if file is None:
-        return fit_pose_space(kind, dims, **settings)
+        if data not in _DATA:
+            raise ToftrackError(
+                f"pose_space.data={data} is unknown; give {' or '.join(_DATA)}, or a file of"
+                " train_pose_space.py for others: pose_space.file=FILE"
+            )
+        return fit_pose_space(kind, dims, _DATA[data](), **settings)
     space = load_pose_space(file)
     if space.kind != kind or space.dims != dims:
         raise ToftrackError(

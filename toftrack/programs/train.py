@@ -37,6 +37,7 @@ def train(config: DictConfig) -> float:
             " written into the output folder"
         )
     settings.pop("_target_", None)
+    settings.pop("data", None)  # of the tracker's; here the group of this name says it
     kind, dims = settings.pop("kind"), settings.pop("dims")
     folder = Path(HydraConfig.get().runtime.output_dir)
     data: PoseData = hydra.utils.instantiate(config.data)

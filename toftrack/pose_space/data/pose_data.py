@@ -9,7 +9,12 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
+from toftrack.pose_space.data.natural_poses import recorded_poses, sample_poses
 from toftrack.pose_space.data.training_poses import synthetic_training_poses
+
+
+_CLIP = 80
+"""Natural poses in a row that are held out together."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,22 @@ def synthetic_data() -> PoseData:
     clips = torch.tensor([names.index(label) for label in poses.labels])
     source = {"data": "synthetic", "poses": len(poses.labels)}
     return PoseData(poses.angles_rad, poses.labels, clips, (source,))
+
+
+def natural_data(poses: int) -> PoseData:
+    """Natural motion: recorded poses and sampled ones of what people show, and the paper's 79.
+
+    poses: at most so many of the recorded and of the sampled ones, picked to cover them.
+    """
+    recorded = recorded_poses().double()
+    sampled = sample_poses(4 * poses, torch.Generator().manual_seed(0)).double()
+    parts = {"synthetic": synthetic_data()}
+    for name, angles in (("recorded", recorded), ("sampled", sampled)):
+        source = {"data": "natural", "part": name}
+        # Neighbours in time are next to each other among the recorded ones.
+        clips = torch.arange(len(angles)) // _CLIP
+        parts[name] = PoseData(angles, (name,) * len(angles), clips, (source,))
+    return mixed_data(parts, poses)
 
 
 def mixed_data(parts: dict[str, PoseData], poses: int | None) -> PoseData:
