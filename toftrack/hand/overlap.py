@@ -34,7 +34,9 @@ def overlap_of_each(joints_m: Tensor, hand_length_m: float) -> Tensor:
     pairs = pairs_overlap(joints_m, hand_length_m)
     of_finger = pairs.new_zeros(len(pairs), 5)
     for column in (0, 1):
-        of_finger.index_add_(1, torch.tensor([p[column] for p in _PAIRS], device=pairs.device), pairs)
+        of_finger.index_add_(
+            1, torch.tensor([p[column] for p in _PAIRS], device=pairs.device), pairs
+        )
     return of_finger
 
 

@@ -14,9 +14,9 @@ import roma
 import torch
 from torch import Tensor
 
+from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.images import random_scenes
 from toftrack.relocation.pictures import Lens, random_sensors, take_pictures
-from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.scenes import HAND, Dice, posed_hands, random_rotations
 from toftrack.relocation.shapes import ShapeBank
 

@@ -94,7 +94,9 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays = read_archive(path)
         metadata = json.loads(str(arrays.pop("metadata")))
     except FileNotFoundError:
-        raise ToftrackError(f"there are no weights of the relocaliser at {path}; {_AGAIN}") from None
+        raise ToftrackError(
+            f"there are no weights of the relocaliser at {path}; {_AGAIN}"
+        ) from None
     except (OSError, ValueError, KeyError, RecursionError) as error:
         raise ToftrackError(
             f"{path} is no file of the relocaliser's weights ({error}); {_AGAIN}"

@@ -127,9 +127,9 @@ def _needed(track: Track, frame: ObservedFrame) -> float:
     return gain * min(1.0, max(_LEAST_CREDIT, 2 * believed))
 
 
-def rivals_of(found: Alternatives, others: Alternatives, frame: ObservedFrame) -> tuple[
-    Alternatives, Tensor | None
-]:
+def rivals_of(
+    found: Alternatives, others: Alternatives, frame: ObservedFrame
+) -> tuple[Alternatives, Tensor | None]:
     """Those of the networks' poses that are about the found one, and the best that is not.
 
     The latter, (1, 27), is another hand or another way round; None where none is better.

@@ -12,7 +12,6 @@ from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.natural_poses import recorded_poses, sample_poses
 from toftrack.pose_space.data.training_poses import synthetic_training_poses
 
-
 _CLIP = 80
 """Natural poses in a row that are held out together."""
 
