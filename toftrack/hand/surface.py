@@ -78,13 +78,13 @@ class _Pad(NamedTuple):
 
 _THUMB_BONES = (
     _Bone(depth=1.06, palmward=0.21, before=0.57, beyond=0.4),
-    _Bone(depth=0.85, palmward=0.21, before=0.5, beyond=0.54),
+    _Bone(depth=0.82, palmward=0.21, before=0.5, beyond=0.54),
     _Bone(depth=0.87, palmward=0.26, before=0.67, beyond=0.0),
 )
 _FINGER_BONES = (
     _Bone(depth=0.96, palmward=0.24, before=0.74, beyond=0.41),
-    _Bone(depth=0.85, palmward=0.16, before=0.51, beyond=0.5),
-    _Bone(depth=0.84, palmward=0.06, before=0.65, beyond=0.0),
+    _Bone(depth=0.78, palmward=0.21, before=0.51, beyond=0.5),
+    _Bone(depth=0.76, palmward=0.1, before=0.65, beyond=0.0),
 )
 """The last one ends exactly at the finger's tip."""
 _THUMB_KNUCKLE = _Knuckle(breadth=0.91, along=0.99, depth=0.92, palmward=0.17)
