@@ -126,17 +126,6 @@ def test_flexion_curls_towards_the_palm_and_abduction_towards_the_thumb() -> Non
     assert forward_kinematics(spread, shape).joints_m[0, tip, 0] > straight[tip, 0] + 0.01
 
 
-def test_the_last_ellipsoid_of_every_finger_ends_at_its_tip() -> None:
-    shape = default_hand_shape().to(torch.float64)
-    pose = forward_kinematics(random_states(5), shape)
-    surface = hand_surface(shape)
-    ellipsoids = surface.pose(pose)
-    for finger in range(5):
-        index = int((surface.frame_index == 3 + 3 * finger).nonzero()[0])
-        end = ellipsoids.centres_m[:, index] - ellipsoids.axes_m[:, index, :, 1]
-        torch.testing.assert_close(end, pose.joints_m[:, 4 + 4 * finger], atol=1e-9, rtol=0)
-
-
 def test_scaling_the_shape_scales_joints_and_ellipsoids() -> None:
     shape = default_hand_shape().to(torch.float64)
     states = random_states(3)
