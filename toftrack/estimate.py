@@ -57,6 +57,10 @@ class Estimate:
     """The gesture, 'other' where it is none of the known; empty where gesture output is off or the
     hand is lost."""
     gesture_probability: float = math.nan
+    pinch: float = math.nan
+    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where no gesture is."""
+    pinching: bool = False
+    """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, else NaN."""
     pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))

@@ -32,10 +32,13 @@ _UNITS = ("degrees", "radians")
 
 
 class NamedPose(NamedTuple):
-    """name: of the gesture.  angles_rad: (21,) float64, NaN where the angle does not matter."""
+    """name: of the gesture.  angles_rad: (21,) float64, NaN where the angle does not matter.
+    spread_rad: (21,) by how much each may vary more than usual, 0 where nobody says.
+    """
 
     name: str
     angles_rad: np.ndarray
+    spread_rad: np.ndarray = np.zeros(len(ANGLE_NAMES))
 
 
 def read_poses(path: str | Path) -> list[NamedPose]:

@@ -38,6 +38,8 @@ _ARRAYS: dict[str, type] = {
     "compute_s": np.float32,
 }
 _LATER: dict[str, type] = {
+    "pinch": np.float32,
+    "pinching": np.bool_,
     "pointing_origin_m": np.float32,
     "pointing_direction": np.float32,
     "index": np.int64,
@@ -65,6 +67,8 @@ LINE_FIELDS = (
     "effective_sample_size",
     "gesture",
     "gesture_probability",
+    "pinch",
+    "pinching",
     "pointing_origin_m",
     "pointing_direction",
     "compute_s",
