@@ -131,14 +131,8 @@ def make_gestures(
     Raises ToftrackError for a setting out of range, a file that cannot be understood, and two
     classes that look alike.
     """
-    if known not in SETS:
-        raise ToftrackError(f"gestures.known={known} is unknown; give {' or '.join(SETS)}")
     named = [] if file is None else read_poses(file)
-    taken = {pose.name for pose in named}
-    if OTHER in taken:
-        raise ToftrackError(f"{file} names a gesture 'other', which is what is none of the classes")
-    basic = [definition for definition in SETS[known] if definition.name not in taken]
-    return _gestures(basic, named, GestureSettings(pinch=pinch, **settings), file)
+    return gestures_with(known, named, GestureSettings(pinch=pinch, **settings), str(file))
 
 
 def no_gestures() -> None:
@@ -153,12 +147,18 @@ def definition_of(pose: NamedPose, settings: GestureSettings) -> Definition:
     return Definition(pose.name, values - half, values + half)
 
 
-def _gestures(
-    basic: Sequence[Definition],
-    named: Sequence[NamedPose],
-    settings: GestureSettings,
-    file: str | None,
+def gestures_with(
+    known: str, named: Sequence[NamedPose], settings: GestureSettings, source: str
 ) -> Gestures:
+    """The known gestures and a user's poses, which are from `source`; as make_gestures."""
+    if known not in SETS:
+        raise ToftrackError(f"gestures.known={known} is unknown; give {' or '.join(SETS)}")
+    taken = {pose.name for pose in named}
+    if OTHER in taken:
+        raise ToftrackError(
+            f"{source} names a gesture 'other', which is what is none of the classes"
+        )
+    basic = [definition for definition in SETS[known] if definition.name not in taken]
     definitions = [*basic, *(definition_of(pose, settings) for pose in named)]
     names = [name for name in dict.fromkeys(d.name for d in definitions) if name != OTHER]
     names.append(OTHER)
@@ -174,14 +174,15 @@ def _gestures(
         name = definitions[own].name
         if np.isnan(definitions[own].low[features.FLEXION]).all():
             raise ToftrackError(
-                f"{file}: gesture {name!r} says nothing of any finger's flexion; give all three"
+                f"{source}: gesture {name!r} says nothing of any finger's flexion; give all three"
                 " flexions of at least one finger"
             )
         for other in range(own):
-            if gestures.classes[own] != gestures.classes[other] and _alike(gestures, own, other):
+            different = definitions[other].name not in (name, OTHER)
+            if different and _alike(gestures, own, other):
                 raise ToftrackError(
-                    f"{file}: gestures {definitions[other].name!r} and {name!r} are too much alike"
-                    " to be told apart; give them one name, or angles that differ more"
+                    f"{source}: gestures {definitions[other].name!r} and {name!r} are too much"
+                    " alike to be told apart; give them one name, or angles that differ more"
                 )
     return gestures
 
