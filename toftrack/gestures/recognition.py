@@ -120,12 +120,12 @@ class GestureState:
 
 
 def make_gestures(
-    known: str, pinch: PinchSettings, file: str | None = None, **settings: float
+    file: str | None = None, *, known: str, pinch: PinchSettings, **settings: float
 ) -> Gestures:
     """The gestures that are known, and those that a file names (see gestures.files).
 
-    known: a name of definitions.SETS.
     file: its poses become further classes; those with the name of a known gesture take its place.
+    known: a name of definitions.SETS.
     settings: of GestureSettings.
 
     Raises ToftrackError for a setting out of range, a file that cannot be understood, and two

@@ -214,7 +214,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
 
     A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
-    side, side_probability, the pointing ray).
+    side, side_probability, the pointing ray, the pinch).
 
     Raises ToftrackError when the file is missing, damaged or not a result.
     """
