@@ -267,9 +267,11 @@ def tell_gesture(
             pointing_direction=nowhere,
         )
     angles = estimate.state[6:].astype(np.float64)
-    latent = space.lower.new_tensor(estimate.latent)[None]
-    off = angles - space.decode(latent)[0].cpu().numpy()
-    off_rad = float(np.sqrt(np.square(off).mean()))
+    off_rad = math.nan
+    if gestures.settings.off_rad is not None:
+        latent = space.lower.new_tensor(estimate.latent)[None]
+        off = angles - space.decode(latent)[0].cpu().numpy()
+        off_rad = float(np.sqrt(np.square(off).mean()))
     joints = estimate.joints_m.astype(np.float64)
     values = features.features(angles, joints)
     state, label, probability = update(state, values, estimate.score, off_rad, gestures, frames)
