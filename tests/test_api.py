@@ -59,6 +59,7 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
     assert {field.name for field in dataclasses.fields(toftrack.Estimate)} == {
         *("index", "timestamp_s", "state_name", "lost", "joints_m", "state", "latent", "score"),
         *("covariance", "effective_sample_size", "compute_s", "gesture", "gesture_probability"),
+        *("pinch", "pinching"),
         *("pointing_origin_m", "pointing_direction", "confidence", "outside_rad"),
         *("side", "side_probability"),
     }

@@ -193,9 +193,9 @@ def track(stream: str, *overrides: str, folder: Path, **pipes: object) -> subpro
 
 
 def read(printed: list[str]) -> list[int]:
-    """The frames that a client printed, each with a gesture and three coordinates."""
+    """The frames that a client printed, each with a gesture and coordinates, some with a pinch."""
     rows = [line.split() for line in printed]
-    assert all(len(row) == 5 and 0.3 < float(row[4]) < 1.0 for row in rows)
+    assert all(len(row) in (5, 6) and 0.3 < float(row[-1]) < 1.0 for row in rows)
     return [int(row[0]) for row in rows]
 
 

@@ -54,11 +54,16 @@ class Estimate:
     side_probability: float = math.nan
     """How sure that is, 0..1; 1 where it was told."""
     gesture: str = ""
-    """The gesture, 'other' where it is none of the known; empty where gesture output is off or the
-    hand is lost."""
+    """The gesture ("palm", "pointing_thumb", ... or a name of the user's), 'other' where it is none
+    of the known; empty where gesture output is off or the hand is lost."""
     gesture_probability: float = math.nan
+    pinch: float = math.nan
+    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where no gesture is."""
+    pinching: bool = False
+    """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
-    """(3,) float32 metres, camera frame: the index finger's base while it points, else NaN."""
+    """(3,) float32 metres, camera frame: the index finger's base while it points, with or without
+    the thumb stretched away, else NaN."""
     pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 unit vector from there to the finger's tip, else NaN."""
 
@@ -103,6 +108,12 @@ def state_words(estimate: Estimate) -> str:
     if estimate.lost and estimate.state_name == "tracking":
         return "not sure of the pose"
     return STATES.get(estimate.state_name, estimate.state_name)
+
+
+def gesture_words(estimate: Estimate) -> str:
+    """The gesture, for people: "thumb up", "ok, pinching"; empty where there is none."""
+    pinching = "pinching" if estimate.pinching else ""
+    return ", ".join(filter(None, (estimate.gesture.replace("_", " "), pinching)))
 
 
 def confidence_words(confidence: float) -> str:

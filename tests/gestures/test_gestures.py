@@ -1,4 +1,4 @@
-"""Gestures: labels that follow from the angles, do not flicker, and can be taught by a file."""
+"""Gestures: labels that follow from the pose, do not flicker, and can be taught by a file."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.settings import gestures
+from helpers.settings import gestures, part
 from helpers.tracking import configuration, make_tracker, sample
 from helpers.tracking import follow as follow_scene
 from hydra.utils import instantiate
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.gestures.files import read_poses
+from toftrack.gestures.features import features, features_of_angles
+from toftrack.gestures.files import NamedPose, read_poses, save_poses
 from toftrack.gestures.recognition import (
     Gestures,
     GestureState,
+    gestures_with,
     pointing_ray,
     tell_gesture,
     update,
@@ -33,6 +35,7 @@ from toftrack.pose_space.files import make_pose_space
 SURE, ON = 0.9, 0.0
 """A good score, and no distance from the pose space."""
 GESTURES = gestures()
+PAPER = part("gestures=paper", "gestures")
 SPACE = make_pose_space("pca", 4)
 
 
@@ -49,15 +52,19 @@ def fingers(*curled: int) -> np.ndarray:
     return angles
 
 
+def seen(angles: np.ndarray) -> np.ndarray:
+    return features_of_angles(angles)
+
+
 def label_of(angles: np.ndarray, gestures: Gestures = GESTURES, off: float = ON) -> str:
-    return update(None, angles, SURE, off, gestures)[1]
+    return update(None, seen(angles), SURE, off, gestures)[1]
 
 
 def follow(frames: list[np.ndarray], score: float = SURE) -> list[tuple[str, float]]:
     state: GestureState | None = None
     told = []
     for angles in frames:
-        state, label, probability = update(state, angles, score, ON, GESTURES)
+        state, label, probability = update(state, seen(angles), score, ON, GESTURES)
         told.append((label, probability))
     return told
 
@@ -82,12 +89,88 @@ def estimate(angles: np.ndarray, name: str = "tracking", lost: bool = False) -> 
     )
 
 
+V = np.radians([12.0, 0, 0, 0, -10, 0, 0, 0])
+"""Index and middle finger in a V."""
+
+
+def spread_v(angles: np.ndarray) -> np.ndarray:
+    angles = angles.copy()
+    angles[5:13] = V
+    return angles
+
+
+def of_thumb(angles: np.ndarray, thumb: str) -> np.ndarray:
+    angles = angles.copy()
+    angles[:5] = pose("palm", thumb)[:5]
+    return angles
+
+
+SHOWN = [
+    ("palm", fingers(), ("out", "up", "beside")),
+    ("four", fingers(), ("across", "tucked")),
+    ("fist", fingers(0, 1, 2, 3), ("across", "tucked", "beside")),
+    ("thumb_up", fingers(0, 1, 2, 3), ("out", "up")),
+    ("pointing", fingers(1, 2, 3), ("across", "tucked", "beside")),
+    ("pointing_thumb", fingers(1, 2, 3), ("out", "up")),
+    ("pointing", fingers(2, 3), ("across", "tucked")),
+    ("pointing_thumb", fingers(2, 3), ("out", "up")),
+    ("victory", spread_v(fingers(2, 3)), ("across", "tucked")),
+    ("three", spread_v(fingers(2, 3)), ("out", "up")),
+    ("three", fingers(3), ("out", "across", "tucked")),
+]
+
+
+@pytest.mark.parametrize(("label", "angles", "thumbs"), SHOWN)
+def test_a_gesture_is_told_by_its_fingers_and_thumb(
+    label: str, angles: np.ndarray, thumbs: tuple[str, ...]
+) -> None:
+    if label.startswith("pointing"):
+        angles = angles.copy()
+        angles[[5, 9]] = np.radians([-3.0, 4.0])  # two fingers side by side
+    for thumb in thumbs:
+        _, told, probability = update(None, seen(of_thumb(angles, thumb)), SURE, ON, GESTURES)
+        assert told == label, thumb
+        assert probability > 0.6, thumb
+
+
+def test_a_half_closed_hand_is_relaxed_and_a_pinch_with_straight_fingers_ok() -> None:
+    assert label_of((pose("palm") + pose("fist", "out")) / 2) == "relaxed"
+    angles = fingers()
+    angles[:9] = np.radians([8, 20, -21, 26, 23, -9, 23, 68, 22])
+    assert label_of(angles) == "ok"
+    angles[5:9] = np.radians([5, 0, 0, 0])
+    assert label_of(angles) != "ok", "the tips are apart"
+
+
+@pytest.mark.parametrize("flexions", [(0, 90, 50), (75, 5, 5)], ids=["hook", "table top"])
+def test_bent_hands_that_are_near_a_gesture_and_none_are_other(
+    flexions: tuple[int, int, int],
+) -> None:
+    angles = pose("palm")
+    for finger in range(4):
+        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians(flexions)
+    assert label_of(angles) == "other"
+
+
+@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_gesture_is_the_same_whichever_way_the_hand_is_turned(turn: int, side: str) -> None:
+    generator = torch.Generator().manual_seed(turn)
+    state = torch.zeros(1, 27)
+    state[0, :6] = torch.randn(6, generator=generator)
+    for _, angles, thumbs in SHOWN:
+        state[0, 6:] = torch.from_numpy(of_thumb(angles, thumbs[0]))
+        joints = forward_kinematics(state, default_hand_shape(0.15, side)).joints_m[0].numpy()
+        turned = features(state[0, 6:].numpy(), joints)
+        assert turned == pytest.approx(seen(of_thumb(angles, thumbs[0])), abs=1e-3)
+
+
 @pytest.mark.parametrize("thumb", [None, "out", "up", "beside", "across", "tucked"])
 @pytest.mark.parametrize(("basic", "label"), [("palm",) * 2, ("fist",) * 2, ("gun", "pointing")])
-def test_basic_poses_have_their_names_whatever_the_thumb_does(
+def test_the_papers_gestures_have_their_names_whatever_the_thumb_does(
     basic: str, label: str, thumb: str | None
 ) -> None:
-    _, told, probability = update(None, pose(basic, thumb), SURE, ON, GESTURES)
+    _, told, probability = update(None, seen(pose(basic, thumb)), SURE, ON, PAPER)
     assert told == label
     assert probability > 0.95
 
@@ -98,7 +181,7 @@ def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
     for way in ("palm-fist", "palm-gun", "gun-fist"):
         first, last = (names[end] for end in way.split("-"))
         rows = [a.numpy() for a, b in zip(*poses, strict=True) if b == way]
-        labels = [label_of(angles) for angles in rows]
+        labels = [label_of(angles, PAPER) for angles in rows]
         assert labels[0] == first and labels[-1] == last
         assert labels.index(last) > len(labels) // 3
         # The little finger leads, so that a closing hand passes a pose like pointing.
@@ -106,37 +189,41 @@ def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
 
 
 @pytest.mark.parametrize(
-    "curled", [(2, 3), (0, 1, 2), (1, 2), (3,), (1, 3)], ids=["V", "little", "rock", "3", "odd"]
+    "curled", [(0, 1, 2), (1, 2), (1, 3), (0, 2)], ids=["little", "rock", "odd", "odder"]
 )
 def test_poses_that_are_none_of_the_classes_are_other(curled: tuple[int, ...]) -> None:
     assert label_of(fingers(*curled)) == "other"
+    assert label_of(fingers(*curled), PAPER) == "other"
 
 
-def test_the_half_way_pose_is_other_and_noise_leaves_a_gesture_what_it_is() -> None:
-    assert label_of((pose("palm") + pose("fist")) / 2) == "other"
+def test_noise_leaves_a_gesture_what_it_is() -> None:
     rng = np.random.default_rng(0)
-    for basic, label in (("palm", "palm"), ("fist", "fist"), ("gun", "pointing")):
-        for _ in range(50):
-            noisy = pose(basic) + rng.normal(0, math.radians(12), 21)
+    for label, angles, thumbs in SHOWN[:6]:
+        for _ in range(20):
+            noisy = of_thumb(angles, thumbs[0]) + rng.normal(0, math.radians(6), 21)
             assert label_of(noisy) == label
 
 
-def test_a_pose_far_off_the_pose_space_is_less_of_a_gesture() -> None:
-    probabilities = [update(None, pose("palm"), SURE, off, GESTURES)[2] for off in (0.0, 0.2, 0.3)]
+def test_a_pose_far_off_the_pose_space_is_less_of_a_gesture_of_the_papers() -> None:
+    flat = seen(pose("palm"))
+    probabilities = [update(None, flat, SURE, off, PAPER)[2] for off in (0.0, 0.2, 0.3)]
     assert probabilities[0] > probabilities[1] > probabilities[2]
-    assert label_of(pose("palm"), off=0.5) == "other"
-    assert update(None, pose("palm"), SURE, math.nan, GESTURES)[1] == "palm"
+    assert label_of(pose("palm"), PAPER, off=0.5) == "other"
+    assert update(None, flat, SURE, math.nan, PAPER)[1] == "palm"
+    # Not so for those that a space of three gestures cannot hold.
+    assert label_of(pose("palm"), off=0.5) == "palm"
 
 
 def test_a_bad_score_says_nothing() -> None:
-    _, _, probability = update(None, pose("fist"), 0.3, ON, GESTURES)
-    assert probability == pytest.approx(1 / 4)
+    fist, classes = seen(pose("fist")), len(GESTURES.names)
+    _, _, probability = update(None, fist, 0.3, ON, GESTURES)
+    assert probability == pytest.approx(1 / classes)
     frames = follow([pose("palm")] * 3)
     assert frames[-1][0] == "palm"
-    state = update(None, pose("palm"), SURE, ON, GESTURES)[0]
-    for _ in range(10):
-        state, label, probability = update(state, pose("fist"), 0.4, ON, GESTURES)
-    assert label == "palm" and probability == pytest.approx(0.25, abs=0.01)
+    state = update(None, seen(pose("palm")), SURE, ON, GESTURES)[0]
+    for _ in range(12):
+        state, label, probability = update(state, fist, 0.4, ON, GESTURES)
+    assert label == "palm" and probability == pytest.approx(1 / classes, abs=0.01)
 
 
 def test_labels_do_not_flicker_at_a_border() -> None:
@@ -156,7 +243,7 @@ def test_labels_do_not_flicker_at_a_border() -> None:
 
 
 def test_a_new_gesture_is_told_within_three_frames_and_one_odd_frame_changes_nothing() -> None:
-    labels = [label for label, _ in follow([pose("palm")] * 5 + [pose("gun")] * 4)]
+    labels = [label for label, _ in follow([pose("palm")] * 5 + [pose("gun", "tucked")] * 4)]
     assert labels[:5] == ["palm"] * 5 and labels[7:] == ["pointing"] * 2
     labels = [
         label for label, _ in follow([pose("palm")] * 5 + [pose("fist")] + [pose("palm")] * 5)
@@ -165,16 +252,16 @@ def test_a_new_gesture_is_told_within_three_frames_and_one_odd_frame_changes_not
 
 
 def test_update_does_not_change_its_state() -> None:
-    state = update(None, pose("palm"), SURE, ON, GESTURES)[0]
+    state = update(None, seen(pose("palm")), SURE, ON, GESTURES)[0]
     before = state.probabilities.copy()
-    update(state, pose("fist"), SURE, ON, GESTURES)
+    update(state, seen(pose("fist")), SURE, ON, GESTURES)
     assert (state.probabilities == before).all()
     assert state.probabilities.sum() == pytest.approx(1)
 
 
 def test_the_pointing_ray_runs_along_the_index_finger() -> None:
     _, told = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
-    assert told.gesture == "pointing"
+    assert told.gesture == "pointing_thumb"
     assert told.pointing_origin_m == pytest.approx(told.joints_m[5])
     assert np.linalg.norm(told.pointing_direction) == pytest.approx(1)
     reach = told.joints_m[8] - told.joints_m[5]
@@ -200,11 +287,12 @@ def test_only_a_pointing_hand_that_is_followed_has_a_ray() -> None:
         state, told = tell_gesture(GESTURES, state, lost, SPACE)
         assert state is None
         assert told.gesture == "" and math.isnan(told.gesture_probability)
+        assert math.isnan(told.pinch) and not told.pinching
         assert np.isnan(told.pointing_origin_m).all() and np.isnan(told.pointing_direction).all()
 
 
 def test_a_followed_hand_out_of_the_pose_space_is_other() -> None:
-    _, told = tell_gesture(GESTURES, None, estimate(fingers(2, 3), "tracking", True), SPACE)
+    _, told = tell_gesture(GESTURES, None, estimate(fingers(1, 2), "tracking", True), SPACE)
     assert told.lost and told.gesture == "other"
 
 
@@ -219,7 +307,9 @@ def test_results_carry_the_gesture_and_the_ray(tmp_path: Path) -> None:
         writer.append(told)
         writer.append(no_estimate(1, 0.04, "lost", 4, 0.0))
     found = read_results(tmp_path / "track.npz")
-    assert found["gesture"].tolist() == ["pointing", ""]
+    assert found["gesture"].tolist() == ["pointing_thumb", ""]
+    assert found["pinch"][0] == pytest.approx(told.pinch) and np.isnan(found["pinch"][1])
+    assert found["pinching"].tolist() == [False, False]
     assert found["pointing_direction"][0] == pytest.approx(told.pointing_direction)
     assert np.isnan(found["pointing_origin_m"][1]).all()
     lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
@@ -227,9 +317,9 @@ def test_results_carry_the_gesture_and_the_ray(tmp_path: Path) -> None:
     assert lines[1]["pointing_direction"] == [None] * 3
 
 
-V_SIGN = {name: 0.0 for name in ANGLE_NAMES if name.startswith(("index", "middle"))} | {
+ROCK = {name: 0.0 for name in ANGLE_NAMES if name.startswith(("index", "little"))} | {
     f"{finger}_{joint}_flexion": value
-    for finger in ("ring", "little")
+    for finger in ("middle", "ring")
     for joint, value in (("mcp", 90.0), ("pip", 102.0), ("dip", 50.0))
 }
 
@@ -247,21 +337,25 @@ def write_csv(folder: Path, text: str) -> Path:
 
 
 def test_a_json_file_names_further_gestures(tmp_path: Path) -> None:
-    path = write_json(tmp_path, [{"name": "vsign", "angles": V_SIGN}])
-    mine = gestures(str(path))
-    assert mine.names == ("palm", "fist", "pointing", "vsign", "other")
+    path = write_json(tmp_path, [{"name": "rock", "angles": ROCK}])
+    mine = part("gestures=paper", "gestures", file=str(path))
+    assert mine.names == ("palm", "fist", "pointing", "rock", "other")
     # Such a pose lies off the pose space, which must not speak against it.
-    assert label_of(fingers(2, 3), mine, off=0.4) == "vsign"
-    assert label_of(fingers(2, 3)) == "other"
+    assert label_of(fingers(1, 2), mine, off=0.4) == "rock"
+    assert label_of(fingers(1, 2)) == "other"
+    assert label_of(fingers(1, 2), gestures(str(path))) == "rock"
     for basic, label in (("palm", "palm"), ("fist", "fist"), ("gun", "pointing")):
         assert label_of(pose(basic), mine) == label
 
 
 def test_a_gesture_that_says_more_is_preferred_where_it_holds(tmp_path: Path) -> None:
     thumbs_up = np.degrees(pose("fist", "up")).tolist()
-    mine = gestures(str(write_json(tmp_path, [{"name": "good", "angles": thumbs_up}])))
+    path = write_json(tmp_path, [{"name": "good", "angles": thumbs_up}])
+    mine = part("gestures=paper", "gestures", file=str(path))
     assert label_of(pose("fist", "up"), mine) == "good"
     assert label_of(pose("fist"), mine) == "fist"
+    with pytest.raises(ToftrackError, match="'thumb_up' and 'good' are too much alike"):
+        gestures(str(path))
 
 
 def test_poses_of_one_name_are_one_gesture_and_a_basic_name_is_replaced(tmp_path: Path) -> None:
@@ -270,37 +364,64 @@ def test_poses_of_one_name_are_one_gesture_and_a_basic_name_is_replaced(tmp_path
         {"name": "fist", "angles": np.degrees(pose("fist")).tolist()},
         {"name": "fist", "angles": half},
     ]
-    mine = gestures(str(write_json(tmp_path, poses[:1])))
+    mine = gestures(str(write_json(tmp_path, poses[:1])), known="paper")
     assert mine.names == ("palm", "pointing", "fist", "other")
     half |= {name: 20.0 for name in ANGLE_NAMES if name.endswith("dip_flexion")}
-    both = gestures(str(write_json(tmp_path, poses)))
+    both = gestures(str(write_json(tmp_path, poses)), known="paper")
     assert both.names == mine.names
     loose = np.zeros(21)
     loose[[ANGLE_NAMES.index(name) for name in half]] = np.radians(list(half.values()))
     assert label_of(loose, both) == "fist"
     assert label_of(pose("fist"), both) == "fist"
-    assert label_of(loose) == "other"
+    assert label_of(loose, PAPER) == "other"
 
 
 def test_a_csv_file_reads_as_the_json_file(tmp_path: Path) -> None:
-    names, values = list(V_SIGN), [math.radians(value) for value in V_SIGN.values()]
+    names, values = list(ROCK), [math.radians(value) for value in ROCK.values()]
     text = f"# units: radians\nname,{','.join(names)},thumb_ip_flexion\n"
-    text += f"vsign,{','.join(map(str, values))},\n"
+    text += f"rock,{','.join(map(str, values))},\n"
     from_csv = read_poses(write_csv(tmp_path, text))
-    from_json = read_poses(write_json(tmp_path, [{"name": "vsign", "angles": V_SIGN}]))
-    assert [one.name for one in from_csv] == ["vsign"]
+    from_json = read_poses(write_json(tmp_path, [{"name": "rock", "angles": ROCK}]))
+    assert [one.name for one in from_csv] == ["rock"]
     np.testing.assert_allclose(from_csv[0].angles_rad, from_json[0].angles_rad)
     assert np.isnan(from_csv[0].angles_rad).sum() == 7, "thumb, and two abductions"
+
+
+def test_poses_are_read_as_they_were_saved(tmp_path: Path) -> None:
+    spread = np.zeros(21)
+    spread[7] = 0.1
+    saved = [NamedPose("rock", fingers(1, 2), spread), NamedPose("any thumb", fingers(0, 2))]
+    saved[1].angles_rad[:5] = math.nan
+    save_poses(tmp_path / "mine.json", saved)
+    for one, other in zip(read_poses(tmp_path / "mine.json"), saved, strict=True):
+        assert one.name == other.name
+        np.testing.assert_allclose(one.angles_rad, other.angles_rad, atol=1e-3)
+        np.testing.assert_allclose(one.spread_rad, other.spread_rad, atol=1e-3)
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        save_poses(tmp_path / "none" / "mine.json", saved)
+
+
+def test_a_gesture_that_was_seen_to_vary_forgives_more() -> None:
+    spread = np.zeros(21)
+    spread[[18, 19]] = math.radians(40)  # the little finger's knuckle and middle joint
+    far = fingers(1, 2)
+    far[[18, 19]] = math.radians(80)
+    chances = []
+    for varied in (np.zeros(21), spread):
+        named = [NamedPose("rock", fingers(1, 2), varied)]
+        mine = gestures_with("all", named, GESTURES.settings, "here")
+        chances.append(mine.probabilities(seen(far), SURE, ON)[mine.names.index("rock")])
+    assert chances[1] > 2 * chances[0]
 
 
 @pytest.mark.parametrize(
     ("poses", "units", "words"),
     [
-        ([{"name": "v", "angles": V_SIGN}], None, "does not say its units"),
-        ([{"name": "v", "angles": V_SIGN}], "turns", "unknown units 'turns'"),
-        ([{"name": "v", "angles": V_SIGN}], "radians", "if they are degrees"),
+        ([{"name": "v", "angles": ROCK}], None, "does not say its units"),
+        ([{"name": "v", "angles": ROCK}], "turns", "unknown units 'turns'"),
+        ([{"name": "v", "angles": ROCK}], "radians", "if they are degrees"),
         ([{"name": "v", "angles": {"index_mcp_flexion": 1.2}}], "degrees", "if they are radians"),
-        ([{"angles": V_SIGN}], "degrees", "pose 1 has no name"),
+        ([{"angles": ROCK}], "degrees", "pose 1 has no name"),
         ([{"name": "v", "angles": {"index_flexion": 9}}], "degrees", "unknown angle"),
         (
             [{"name": "v", "angles": {"index_mcp_flexion": "bent"}}],
@@ -311,10 +432,12 @@ def test_a_csv_file_reads_as_the_json_file(tmp_path: Path) -> None:
         ([{"name": "v", "angles": [0] * 20}], "degrees", "a list of 21"),
         ([{"name": "v", "angles": {"index_mcp_flexion": -80}}], "degrees", "joint limits"),
         ([{"name": "v", "angles": {"index_mcp_flexion": 80}}], "degrees", "any finger's flexion"),
-        ([{"name": "other", "angles": V_SIGN}], "degrees", "none of the classes"),
-        ([{"name": n, "angles": V_SIGN} for n in "ab"], "degrees", "too much alike"),
+        ([{"name": "other", "angles": ROCK}], "degrees", "none of the classes"),
+        ([{"name": n, "angles": ROCK} for n in "ab"], "degrees", "too much alike"),
         ([], "degrees", "names no pose"),
         ("v", "degrees", "no list 'poses'"),
+        ([{"name": "v", "angles": ROCK, "spread": [1]}], "degrees", "must have 'spread'"),
+        ([{"name": "v", "angles": ROCK, "spread": [-1] * 21}], "degrees", "a spread below 0"),
     ],
 )
 def test_bad_json_is_told_in_one_sentence(
@@ -335,6 +458,7 @@ def test_bad_json_is_told_in_one_sentence(
         ("# units: degrees\nname,index_mcp_flexion\nv,inf\n", "'inf', not a finite number"),
         ("# units: degrees\nname,index_mcp_flexion\n", "names no pose"),
         ("", "no column 'name'"),
+        ("# units: degrees\nname,spread\nv,3\n", "unknown angle 'spread'"),
     ],
 )
 def test_bad_csv_is_told_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:
@@ -354,7 +478,14 @@ def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "bad",
-    [{"flexion_rad": 0.0}, {"other": -1.0}, {"smoothing": 1.0}, {"doubtful_score": 0.8}],
+    [
+        {"flexion_rad": 0.0},
+        {"other": -1.0},
+        {"smoothing": 1.0},
+        {"doubtful_score": 0.8},
+        {"off_rad": 0.0},
+        {"known": "most"},
+    ],
 )
 def test_settings_out_of_range_are_told(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures"):
@@ -365,6 +496,8 @@ def test_the_configurations_make_the_defaults() -> None:
     made = instantiate(configuration().gestures)
     assert made.names == GESTURES.names and made.settings == GESTURES.settings
     assert instantiate(configuration("gestures=none").gestures) is None
+    paper = instantiate(configuration("experiment=paper").gestures)
+    assert paper.names == ("palm", "fist", "pointing", "other") and paper.settings.off_rad
 
 
 def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
@@ -373,7 +506,7 @@ def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
     told = follow_scene(scene.cut(*rows))
     labels = [one.gesture for one in told]
     assert "palm" in labels[:9] and set(labels[:9]) <= {"palm", ""}
-    assert labels[-10:] == ["pointing"] * 10
+    assert labels[-10:] == ["pointing_thumb"] * 10
     assert min(one.gesture_probability for one in told[-10:]) > 0.9
     last = told[-1]
     reach = scene.joints_m[rows[-1], 8] - scene.joints_m[rows[-1], 5]

@@ -106,6 +106,8 @@ def test_track_npz_is_as_promised(whole) -> None:
         "covariance": ((12, 10, 10), np.float32),
         "effective_sample_size": ((12,), np.float32),
         "gesture_probability": ((12,), np.float32),
+        "pinch": ((12,), np.float32),
+        "pinching": ((12,), np.bool_),
         "timestamp_s": ((12,), np.float64),
         "compute_s": ((12,), np.float32),
     }

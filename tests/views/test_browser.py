@@ -70,6 +70,8 @@ def test_the_picture_is_the_overlay_of_the_newest_frame(view) -> None:
     assert (facts["state"], facts["lost"]) == (state_words(estimate), estimate.lost)
     assert facts["confidence"] == pytest.approx(estimate.confidence, abs=1e-3)
     assert facts["gesture"] == estimate.gesture and facts["side"] == "right"
+    assert facts["pinch"] == pytest.approx(estimate.pinch, abs=1e-3)
+    assert facts["pinching"] == estimate.pinching
     assert facts["ms"] == pytest.approx(1e3 * estimate.compute_s, abs=1e-3)
 
 

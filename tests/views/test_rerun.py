@@ -119,11 +119,13 @@ def test_every_frames_estimate_can_be_read_back(written: Path) -> None:
     assert sorted(joints) == [0, 1, 2, 3, 4, 5, 7]  # frame 6 has no estimate
     scores = rows(written, "plots/score", "Scalars:scalars")
     latent = rows(written, "plots/latent", "Scalars:scalars")
+    pinches = rows(written, "plots/pinch", "Scalars:scalars")
     times = rows(written, "plots/time", "Scalars:scalars")
     for moment in moments():
         estimate, number = moment.estimate, moment.estimate.index
         told = [estimate.score, estimate.confidence, float(estimate.lost)]
         assert scores[number] == pytest.approx(told, nan_ok=True)
+        assert pinches[number] == pytest.approx([estimate.pinch], nan_ok=True)
         assert latent[number] == pytest.approx(estimate.latent)
         assert times[number] == pytest.approx(1e3 * estimate.compute_s)
         if number != 6:

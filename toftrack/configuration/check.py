@@ -31,7 +31,8 @@ _ABOVE_ZERO = frozenset(
     device.persistence.longest_backoff_s device.persistence.reopen_after
     device.usb.drain_ms device.usb.read_multiple device.usb.timeout_ms
     filter.exponent filter.exponent_growth filter.particles filter.passes filter.shrink
-    gestures.flexion_rad gestures.off_rad gestures.other gestures.split_rad gestures.thumb_rad
+    gestures.flexion_rad gestures.off_rad gestures.other gestures.pinch.open gestures.split_rad
+    gestures.thumb_rad gestures.tips_palms
     hand.length_m hand.fit.beta hand.fit.exponent hand.fit.frames hand.fit.largest hand.fit.prior
     hand.fit.samples hand.fit.step
     likelihood.beta likelihood.tolerance_m

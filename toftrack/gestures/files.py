@@ -5,7 +5,8 @@
      "poses": [{"name": "vsign", "angles": {"index_mcp_flexion": 0, "index_pip_flexion": 0, ...}},
                {"name": "fist", "angles": [null, null, null, null, null, 0, 88, 100, 50, ...]}]}
     `angles` is an object with names of hand.skeleton.ANGLE_NAMES, or a list of all 21 in their
-    order.
+    order. `spread`, likewise and beside it, says by how much the angles vary (standard deviation)
+    where somebody has seen; `python -m toftrack.gesture add` writes it.
 
 .csv: a first line `# units: degrees` or `# units: radians`, a header with `name` and any of the 21
 angle names, one pose a row.
@@ -18,7 +19,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,10 +33,13 @@ _UNITS = ("degrees", "radians")
 
 
 class NamedPose(NamedTuple):
-    """name: of the gesture.  angles_rad: (21,) float64, NaN where the angle does not matter."""
+    """name: of the gesture.  angles_rad: (21,) float64, NaN where the angle does not matter.
+    spread_rad: (21,) by how much each may vary more than usual, 0 where nobody says.
+    """
 
     name: str
     angles_rad: np.ndarray
+    spread_rad: np.ndarray = np.zeros(len(ANGLE_NAMES))
 
 
 def read_poses(path: str | Path) -> list[NamedPose]:
@@ -64,12 +68,55 @@ def read_poses(path: str | Path) -> list[NamedPose]:
         what = "does not say its units" if units is None else f"has the unknown units {units!r}"
         raise ToftrackError(f"{path} {what}; say degrees or radians in it")
     names = [_name(path, number, row) for number, row in enumerate(rows, 1)]
-    angles = np.array([_angles(path, name, row) for name, row in zip(names, rows, strict=True)])
+    named = list(zip(names, rows, strict=True))
+    angles = np.array([_angles(path, name, row) for name, row in named])
+    spread = np.nan_to_num([_angles(path, name, row.get("spread") or {}) for name, row in named])
+    if (spread < 0).any():
+        raise ToftrackError(f"{path} has a spread below 0, and a standard deviation is none")
     radians = _in_radians(path, angles, units)
     return [
-        NamedPose(name, _within_limits(path, name, row))
-        for name, row in zip(names, radians, strict=True)
+        NamedPose(name, _within_limits(path, name, row), varied)
+        for name, row, varied in zip(
+            names, radians, np.radians(spread) if units == "degrees" else spread, strict=True
+        )
     ]
+
+
+def save_poses(path: str | Path, poses: Sequence[NamedPose]) -> None:
+    """Write named poses as .json, in degrees; what the file held before is gone.
+
+    Raises ToftrackError when it cannot be written.
+    """
+    path = Path(path).expanduser()
+    content = {
+        "units": "degrees",
+        "poses": [
+            {
+                "name": pose.name,
+                "angles": _in_degrees(pose.angles_rad),
+                "spread": _in_degrees(pose.spread_rad),
+            }
+            for pose in poses
+        ],
+    }
+    half = path.with_name(path.name + ".part")
+    try:
+        half.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        half.replace(path)
+    except OSError as error:
+        raise ToftrackError(
+            f"the file of gestures '{path}' cannot be written ({error.strerror}); choose another"
+            " place with --file FILE"
+        ) from error
+
+
+def _in_degrees(angles_rad: np.ndarray) -> dict[str, float]:
+    """Angles by their names, without those that do not matter."""
+    return {
+        name: round(math.degrees(angle), 1)
+        for name, angle in zip(ANGLE_NAMES, angles_rad, strict=True)
+        if math.isfinite(angle)
+    }
 
 
 _Row = Mapping[str, Any]
@@ -84,7 +131,9 @@ def _name(path: Path, number: int, row: _Row) -> str:
 
 def _angles(path: Path, name: str, row: _Row) -> list[float]:
     """The 21 angles of a row as they stand there, NaN where there is none."""
-    unknown = [key for key in row if key != "name" and key not in ANGLE_NAMES]
+    # A table's cell is no spread, which has values for all angles.
+    known = ("name", *ANGLE_NAMES, *(["spread"] if isinstance(row.get("spread"), dict) else []))
+    unknown = [key for key in row if key not in known]
     if unknown:
         raise ToftrackError(
             f"{path}: pose {name!r} has the unknown angle {unknown[0]!r}; known are"
@@ -146,17 +195,24 @@ def _read_json(path: Path) -> _Content:
         raise ToftrackError(f"{path} has no list 'poses' of objects with 'name' and 'angles'")
     rows: list[_Row] = []
     for number, pose in enumerate(poses, 1):
-        angles = pose.get("angles") if isinstance(pose, dict) else None
-        if isinstance(angles, list) and len(angles) == len(ANGLE_NAMES):
-            angles = dict(zip(ANGLE_NAMES, angles, strict=True))
-        if not isinstance(angles, dict):
-            raise ToftrackError(
-                f"{path}: pose {number} must have 'angles', an object of angle names or a list of"
-                f" {len(ANGLE_NAMES)}"
-            )
-        rows.append(angles | {"name": pose.get("name")})
+        pose = pose if isinstance(pose, dict) else {}
+        angles = _by_name(path, number, "angles", pose.get("angles"))
+        spread = _by_name(path, number, "spread", pose.get("spread", {}))
+        rows.append(angles | {"name": pose.get("name"), "spread": spread})
     units = content.get("units")
     return None if units is None else str(units).lower(), rows
+
+
+def _by_name(path: Path, number: int, key: str, given: object) -> dict[str, Any]:
+    """Angles as an object, also where they were given as a list of all."""
+    if isinstance(given, list) and len(given) == len(ANGLE_NAMES):
+        return dict(zip(ANGLE_NAMES, given, strict=True))
+    if not isinstance(given, dict):
+        raise ToftrackError(
+            f"{path}: pose {number} must have '{key}', an object of angle names or a list of"
+            f" {len(ANGLE_NAMES)}"
+        )
+    return given
 
 
 def _read_csv(path: Path) -> _Content:

@@ -1,57 +1,36 @@
-"""Which gesture a hand makes: palm, fist, pointing, other, and classes that a user names.
+"""Which gesture a hand makes: one of those that are known, of those that a user names, or other.
 
-A gesture is one or more named poses. A pose is looked at through ten sums of its joint angles,
-which a depth image determines better than the angles themselves: of each finger the total flexion,
-and how much more of it the two outer joints have than the knuckle; of the thumb the total flexion
-and the abduction. The fingers' abduction is not looked at.
+A pose is looked at through the numbers of `features`, which do not depend on how the hand is
+turned. A class says that these lie in its ranges, with normal tails to both sides; or says nothing
+of some of them. "other" says nothing at all: everything is equally likely within the joint limits.
+Bayes' rule with equal priors gives the probabilities. The tails are wide, for people make a gesture
+each in their own way, and the tracker errs: palm and fist differ by 240 degrees in a finger's total
+flexion.
 
-A class says that these lie about its pose (normal distribution); or says nothing of some of them,
-as the basic poses say nothing of the thumb. "other" says nothing at all: all sums are equally
-likely within the joint limits. Bayes' rule with equal priors gives the probabilities. The widths
-come from the definition alone: palm and fist differ by 240 degrees in a finger's total flexion, and
-a finger half way lies three standard deviations from both.
+A user's gesture is one or more named poses of joint angles: each with a range of a tail's width,
+and of what it varied by where it was recorded, to both sides.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
+from toftrack.gestures import features
+from toftrack.gestures.definitions import OTHER, RAY_GESTURES, SETS, Definition
 from toftrack.gestures.files import NamedPose, read_poses
-from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, JOINT_NAMES
+from toftrack.gestures.pinch import PinchSettings, PinchState, pinch_of, update_pinch
+from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.pose_space.base import PoseSpace
-from toftrack.pose_space.data.training_poses import basic_pose
 
-OTHER = "other"
-POINTING = "pointing"
-_BASIC = {"palm": "palm", "fist": "fist", POINTING: "gun"}
-_THUMB_ANGLES = 5
 _RAY = JOINT_NAMES.index("index_mcp"), JOINT_NAMES.index("index_tip")
 _OFF_RANGE_RAD = 0.5
 """How far off the pose space a hand may be at all, rms over the angles."""
-
-
-def _sums() -> np.ndarray:
-    """(10, 21): what is added up of the angles; thumb abduction, then flexions, then splits."""
-    sums = np.zeros((10, len(ANGLE_NAMES)))
-    sums[0, 0] = 1.0
-    sums[1, [1, 3, 4]] = 1.0
-    for finger in range(4):
-        knuckle, *outer = range(_THUMB_ANGLES + 4 * finger + 1, _THUMB_ANGLES + 4 * finger + 4)
-        sums[2 + finger, [knuckle, *outer]] = 1.0
-        sums[6 + finger, outer] = 1.0
-        sums[6 + finger, knuckle] = -1.0
-    return sums
-
-
-_SUMS = _sums()
-_RANGES = np.abs(_SUMS) @ np.diff(ANGLE_LIMITS)[:, 0]
-"""(10,) rad, from the least to the largest value of each sum within the joint limits."""
 
 
 @dataclass(frozen=True)
@@ -61,65 +40,70 @@ class GestureSettings:
     flexion_rad: float
     split_rad: float
     thumb_rad: float
-    off_rad: float
+    tips_palms: float
+    off_rad: float | None
     other: float
     doubtful_score: float
     sure_score: float
     smoothing: float
     margin: float
+    pinch: PinchSettings
 
     def __post_init__(self) -> None:
-        widths = (self.flexion_rad, self.split_rad, self.thumb_rad, self.off_rad, self.other)
+        widths = [self.flexion_rad, self.split_rad, self.thumb_rad, self.tips_palms, self.other]
+        if self.off_rad is not None:
+            widths.append(self.off_rad)
         if not all(0 < width < math.inf for width in widths):
-            raise ToftrackError("gestures: the *_rad widths and other must be above 0")
+            raise ToftrackError("gestures: the *_rad and *_palms widths and other must be above 0")
         if not self.doubtful_score < self.sure_score:
             raise ToftrackError("gestures.doubtful_score must be below gestures.sure_score")
         if not (0 <= self.smoothing < 1 and 0 <= self.margin < 1):
             raise ToftrackError("gestures.smoothing and gestures.margin must be in 0 .. below 1")
+
+    @property
+    def widths(self) -> np.ndarray:
+        """(13,) rad and palm lengths, standard deviations of the features' tails."""
+        sizes = (self.thumb_rad, self.flexion_rad, self.flexion_rad, self.split_rad)
+        return np.append(np.repeat(sizes, (1, 1, 4, 4)), [self.tips_palms] * 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Gestures:
     """The classes that are told apart.
 
-    names: C class names, "other" last.  centres: (M, 10) the sums of their poses, rad.
-    known: (M, 10) bool, the sums that a pose says something of.  classes: (M,) a pose's class.
-    in_space: (M,) bool, poses that the pose space was learned from.
+    names: C class names, "other" last.  low, high: (M, 13) the ranges of their definitions'
+    features, NaN where a definition says nothing.  classes: (M,) a definition's class.  own: (M,)
+    bool, those of the user.
     """
 
     names: tuple[str, ...]
-    centres: np.ndarray
-    known: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
     classes: np.ndarray
-    in_space: np.ndarray
+    own: np.ndarray
     settings: GestureSettings
 
-    @property
-    def widths(self) -> np.ndarray:
-        """(10,) rad, standard deviations of the sums."""
-        cfg = self.settings
-        return np.repeat(
-            (cfg.thumb_rad, cfg.flexion_rad, cfg.flexion_rad, cfg.split_rad), (1, 1, 4, 4)
-        )
-
-    def probabilities(self, angles: np.ndarray, score: float, off_rad: float) -> np.ndarray:
+    def probabilities(self, values: np.ndarray, score: float, off_rad: float) -> np.ndarray:
         """Of each class for one frame by itself, (C,), sum 1.
 
-        angles: (21,) rad.  score: 0..1; below `doubtful_score` all classes are equally probable.
-        off_rad: rms distance of the angles from the pose space; NaN says nothing.
+        values: (13,), see features.  score: 0..1; below `doubtful_score` all classes are equally
+        probable.  off_rad: rms distance of the angles from the pose space; NaN says nothing.
         """
-        cfg, widths = self.settings, self.widths
+        cfg, widths = self.settings, self.settings.widths
         # Logarithms of densities, in parts of the uniform density of "other".
-        z = (_SUMS @ angles - self.centres) / widths
-        normal = np.log(_RANGES / (widths * math.sqrt(2 * math.pi))) - 0.5 * z**2
-        log_poses = np.where(self.known, normal, 0.0).sum(1)
-        if math.isfinite(off_rad):
+        beyond = np.maximum(np.maximum(self.low - values, values - self.high), 0.0) / widths
+        extent = self.high - self.low + widths * math.sqrt(2 * math.pi)
+        ranges = np.maximum(features.RANGES, extent)
+        log_poses = np.nansum(np.log(ranges / extent) - 0.5 * beyond**2, axis=1)
+        if cfg.off_rad is not None and math.isfinite(off_rad):
             near = math.log(_OFF_RANGE_RAD * 2 / (cfg.off_rad * math.sqrt(2 * math.pi)))
-            log_poses += np.where(self.in_space, near - 0.5 * (off_rad / cfg.off_rad) ** 2, 0.0)
-        log_classes = np.full(len(self.names), math.log(cfg.other))
-        for number in range(len(self.names) - 1):
-            own = log_poses[self.classes == number]
+            log_poses += np.where(self.own, 0.0, near - 0.5 * (off_rad / cfg.off_rad) ** 2)
+        log_poses = np.append(log_poses, 0.0)
+        log_classes = np.empty(len(self.names))
+        for number in range(len(self.names)):
+            own = log_poses[np.append(self.classes, len(self.names) - 1) == number]
             log_classes[number] = np.logaddexp.reduce(own) - math.log(len(own))
+        log_classes[-1] += math.log(cfg.other)
         trust = (score - cfg.doubtful_score) / (cfg.sure_score - cfg.doubtful_score)
         log_classes *= min(max(trust, 0.0), 1.0)
         parts = np.exp(log_classes - log_classes.max())
@@ -128,85 +112,98 @@ class Gestures:
 
 @dataclass(frozen=True, eq=False)
 class GestureState:
-    """What is carried from frame to frame: the smoothed probabilities (C,) and the label."""
+    """What is carried from frame to frame: smoothed probabilities (C,), the label, the pinch."""
 
     probabilities: np.ndarray
     label: str
+    pinch: PinchState = field(default_factory=PinchState)
 
 
-def make_gestures(file: str | None = None, **settings: float) -> Gestures:
-    """The basic gestures, and those that a file names (see gesture_files).
+def make_gestures(
+    file: str | None = None, *, known: str, pinch: PinchSettings, **settings: float
+) -> Gestures:
+    """The gestures that are known, and those that a file names (see gestures.files).
 
-    file: its poses become further classes; those named palm, fist or pointing take the place of the
-        basic ones.
+    file: its poses become further classes; those with the name of a known gesture take its place.
+    known: a name of definitions.SETS.
     settings: of GestureSettings.
 
     Raises ToftrackError for a setting out of range, a file that cannot be understood, and two
     classes that look alike.
     """
     named = [] if file is None else read_poses(file)
-    taken = {pose.name for pose in named}
-    if OTHER in taken:
-        raise ToftrackError(f"{file} names a gesture 'other', which is what is none of the classes")
-    basic = [pose for pose in basic_gestures() if pose.name not in taken]
-    return _gestures(basic, named, GestureSettings(**settings), file)
+    return gestures_with(known, named, GestureSettings(pinch=pinch, **settings), str(file))
 
 
 def no_gestures() -> None:
     """No gesture output: gestures=none."""
 
 
-def basic_gestures() -> list[NamedPose]:
-    """Palm, fist and pointing as the pose spaces are trained on them, with any thumb."""
-    poses = []
-    for name, basic in _BASIC.items():
-        angles = basic_pose(basic).numpy()
-        angles[:_THUMB_ANGLES] = math.nan
-        poses.append(NamedPose(name, angles))
-    return poses
+def definition_of(pose: NamedPose, settings: GestureSettings) -> Definition:
+    """A user's pose as ranges: a tail's width and its spread to both sides."""
+    values = features.features_of_angles(pose.angles_rad)
+    half = settings.widths
+    half[: len(features.SUMS)] += np.sqrt(features.SUMS**2 @ pose.spread_rad**2)
+    return Definition(pose.name, values - half, values + half)
 
 
-def _gestures(
-    basic: Sequence[NamedPose],
-    named: Sequence[NamedPose],
-    settings: GestureSettings,
-    file: str | None,
+def gestures_with(
+    known: str, named: Sequence[NamedPose], settings: GestureSettings, source: str
 ) -> Gestures:
-    poses = [*basic, *named]
-    names = list(dict.fromkeys(pose.name for pose in poses))
-    angles = np.stack([pose.angles_rad for pose in poses])
+    """The known gestures and a user's poses, which are from `source`; as make_gestures."""
+    if known not in SETS:
+        raise ToftrackError(f"gestures.known={known} is unknown; give {' or '.join(SETS)}")
+    taken = {pose.name for pose in named}
+    if OTHER in taken:
+        raise ToftrackError(
+            f"{source} names a gesture 'other', which is what is none of the classes"
+        )
+    basic = [definition for definition in SETS[known] if definition.name not in taken]
+    definitions = [*basic, *(definition_of(pose, settings) for pose in named)]
+    names = [name for name in dict.fromkeys(d.name for d in definitions) if name != OTHER]
+    names.append(OTHER)
     gestures = Gestures(
-        names=(*names, OTHER),
-        centres=np.nan_to_num(angles) @ _SUMS.T,
-        known=(np.isnan(angles) @ np.abs(_SUMS).T) == 0,
-        classes=np.array([names.index(pose.name) for pose in poses]),
-        in_space=np.arange(len(poses)) < len(basic),
+        names=tuple(names),
+        low=np.stack([definition.low for definition in definitions]),
+        high=np.stack([definition.high for definition in definitions]),
+        classes=np.array([names.index(definition.name) for definition in definitions]),
+        own=np.arange(len(definitions)) >= len(basic),
         settings=settings,
     )
-    for a in range(len(poses)):
-        if not gestures.known[a].any():
+    for own in range(len(basic), len(definitions)):
+        name = definitions[own].name
+        if np.isnan(definitions[own].low[features.FLEXION]).all():
             raise ToftrackError(
-                f"{file}: gesture {poses[a].name!r} says nothing of any finger's flexion; give all"
-                " three flexions of at least one finger"
+                f"{source}: gesture {name!r} says nothing of any finger's flexion; give all three"
+                " flexions of at least one finger"
             )
-        for b in range(max(a + 1, len(basic)), len(poses)):
-            known = gestures.known[a]
-            apart = np.abs(gestures.centres[a] - gestures.centres[b]) / gestures.widths
-            if (
-                gestures.classes[a] != gestures.classes[b]
-                and (known == gestures.known[b]).all()
-                and (apart[known] < 1).all()
-            ):
+        for other in range(own):
+            different = definitions[other].name not in (name, OTHER)
+            if different and _alike(gestures, own, other):
                 raise ToftrackError(
-                    f"{file}: gestures {poses[a].name!r} and {poses[b].name!r} are too much alike"
-                    " to be told apart; give them one name, or angles that differ more"
+                    f"{source}: gestures {definitions[other].name!r} and {name!r} are too much"
+                    " alike to be told apart; give them one name, or angles that differ more"
                 )
     return gestures
 
 
+def _alike(gestures: Gestures, own: int, other: int) -> bool:
+    """Whether a user's pose lies within another definition, of which it knows no more."""
+    low, high = gestures.low[[own, other]], gestures.high[[own, other]]
+    if gestures.own[other]:
+        low = high = (low + high) / 2
+    value = (low[0] + high[0]) / 2
+    known = ~np.isnan(low)
+    thumb = [features.THUMB_ABDUCTION, features.THUMB_FLEXION, features.REACH, features.GAP]
+    said = np.column_stack((known[:, features.FLEXION], known[:, thumb].any(1)))
+    more = said[0] & ~said[1] if not gestures.own[other] else said[0] != said[1]
+    apart = np.maximum(np.maximum(low[1] - value, value - high[1]), 0) / gestures.settings.widths
+    return not more.any() and bool((apart[known.all(0)] < 1).all())
+
+
 def update(
     state: GestureState | None,
-    angles: np.ndarray,
+    values: np.ndarray,
     score: float,
     off_rad: float,
     gestures: Gestures,
@@ -218,12 +215,12 @@ def update(
     its own by `margin`; so the probability of a label that is about to change may be the smaller.
 
     state: of the frame before; None at the start or after the hand was lost.
-    angles: (21,) rad, the refined estimate.  score: its score, 0..1.
+    values: (13,) features of the refined estimate.  score: its score, 0..1.
     off_rad: rms distance of the angles from the pose space, rad; NaN where there is none.
     frames: how many times 1/25 s have passed since the state.
     """
     cfg = gestures.settings
-    smooth = gestures.probabilities(angles, score, off_rad)
+    smooth = gestures.probabilities(values, score, off_rad)
     if state is not None:
         keep = cfg.smoothing**frames
         smooth = keep * state.probabilities + (1 - keep) * smooth
@@ -232,7 +229,8 @@ def update(
         current = gestures.names.index(state.label)
         best = best if smooth[best] > smooth[current] + cfg.margin else current
     label = gestures.names[best]
-    return GestureState(smooth, label), label, float(smooth[best])
+    pinch = PinchState() if state is None else state.pinch
+    return GestureState(smooth, label, pinch), label, float(smooth[best])
 
 
 def pointing_ray(joints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -252,7 +250,7 @@ def tell_gesture(
     space: PoseSpace,
     frames: float = 1.0,
 ) -> tuple[GestureState | None, Estimate]:
-    """The estimate with its gesture, and with the pointing ray while it points.
+    """The estimate with its gesture and pinch, and with the pointing ray while it points.
 
     A hand that is lost has no gesture ("" and NaN), except one that is followed well and counts as
     lost only because its pose is none of the pose space: this is a pose like any other.
@@ -263,16 +261,31 @@ def tell_gesture(
             estimate,
             gesture="",
             gesture_probability=math.nan,
+            pinch=math.nan,
+            pinching=False,
             pointing_origin_m=nowhere,
             pointing_direction=nowhere,
         )
     angles = estimate.state[6:].astype(np.float64)
-    latent = space.lower.new_tensor(estimate.latent)[None]
-    off = angles - space.decode(latent)[0].cpu().numpy()
-    off_rad = float(np.sqrt(np.square(off).mean()))
-    state, label, probability = update(state, angles, estimate.score, off_rad, gestures, frames)
-    estimate = replace(estimate, gesture=label, gesture_probability=probability)
-    if label == POINTING:
+    off_rad = math.nan
+    if gestures.settings.off_rad is not None:
+        latent = space.lower.new_tensor(estimate.latent)[None]
+        off = angles - space.decode(latent)[0].cpu().numpy()
+        off_rad = float(np.sqrt(np.square(off).mean()))
+    joints = estimate.joints_m.astype(np.float64)
+    values = features.features(angles, joints)
+    state, label, probability = update(state, values, estimate.score, off_rad, gestures, frames)
+    pinch = pinch_of(joints, gestures.settings.pinch)
+    pinched = update_pinch(state.pinch, pinch, gestures.settings.pinch, frames)
+    state = replace(state, pinch=pinched)
+    estimate = replace(
+        estimate,
+        gesture=label,
+        gesture_probability=probability,
+        pinch=pinch,
+        pinching=pinched.pinching,
+    )
+    if label in RAY_GESTURES:
         origin, direction = pointing_ray(estimate.joints_m)
         estimate = replace(estimate, pointing_origin_m=origin, pointing_direction=direction)
     return state, estimate

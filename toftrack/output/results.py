@@ -38,6 +38,8 @@ _ARRAYS: dict[str, type] = {
     "compute_s": np.float32,
 }
 _LATER: dict[str, type] = {
+    "pinch": np.float32,
+    "pinching": np.bool_,
     "pointing_origin_m": np.float32,
     "pointing_direction": np.float32,
     "index": np.int64,
@@ -65,6 +67,8 @@ LINE_FIELDS = (
     "effective_sample_size",
     "gesture",
     "gesture_probability",
+    "pinch",
+    "pinching",
     "pointing_origin_m",
     "pointing_direction",
     "compute_s",
@@ -210,7 +214,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
 
     A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
-    side, side_probability, the pointing ray).
+    side, side_probability, the pointing ray, the pinch).
 
     Raises ToftrackError when the file is missing, damaged or not a result.
     """

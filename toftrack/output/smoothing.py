@@ -78,7 +78,8 @@ def smooth(
 ) -> tuple[SmoothState | None, Estimate]:
     """One frame on: the new state, and the estimate with `state`, `joints_m` and pointing smoothed.
 
-    Its other fields stay: covariance, latent, score and gesture speak of the estimate as it was.
+    Its other fields stay: covariance, latent, score, gesture and pinch speak of the estimate as it
+    was.
     Time is that of the frames' time stamps, so dropped frames and uneven intervals do no harm.
 
     An estimate of a hand that is not followed (lost, being recovered, or never found) passes as it

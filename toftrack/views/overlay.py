@@ -15,7 +15,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, confidence_words, state_words
+from toftrack.estimate import Estimate, confidence_words, gesture_words, state_words
 from toftrack.views.base import TrackedFrame
 from toftrack.views.model_image import model_range_image
 
@@ -242,7 +242,7 @@ def _caption(estimate: Estimate, half_width: int) -> np.ndarray:
     score = f"{estimate.score:.2f}" if math.isfinite(estimate.score) else "-"
     facts = (f"frame {estimate.index}", f"score {score}", confidence_words(estimate.confidence))
     state = ("LOST: " if estimate.lost else "") + state_words(estimate)
-    text = "   ".join(filter(None, (*facts, state, estimate.gesture)))
+    text = "   ".join(filter(None, (*facts, state, gesture_words(estimate))))
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 8
     size, room = 0.8, half_width - 2 * margin
     # Step by step, because not every OpenCV's text grows in proportion.

@@ -288,6 +288,8 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
         "confidence": number(estimate.confidence),
         "gesture": estimate.gesture,
         "gesture_probability": number(estimate.gesture_probability),
+        "pinch": number(estimate.pinch),
+        "pinching": bool(estimate.pinching),
         "ms": number(1e3 * estimate.compute_s),
         "side": tracked.shape.side,
     }

@@ -7,8 +7,8 @@ Entities, on the timelines `frame` (its number) and `time` (seconds of the recor
 | `world/camera` | the camera, with `depth` (a cloud of points in 3-D) and `amplitude` |
 | `world/tracker` | the image that the tracker works on, with `segmentation` and `classified` |
 | `world/hand` | the estimate: `ellipsoids`, `skeleton`, `joints`; and `particles`, by weight |
-| `plots` | `score` (confidence, lost), `latent` coordinates, `time` (milliseconds a frame) |
-| `log` | changes of state and gesture |
+| `plots` | `score` (confidence, lost), `latent` coordinates, `pinch`, `time` (milliseconds) |
+| `log` | changes of state, gesture and pinching |
 
 The world is the camera's frame: x right, y down, z forward, metres.
 """
@@ -23,7 +23,7 @@ import torch
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, state_words
+from toftrack.estimate import Estimate, gesture_words, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
 from toftrack.render.likelihood import FMeasure
@@ -102,6 +102,8 @@ class Entities:
             colors=[(86, 180, 233), (0, 158, 115), _LOST_RGB],
         )
         stream.log("plots/score", lines, static=True)
+        pinch = rr.SeriesLines(names=["pinch"], colors=[FINGER_RGB[1]])
+        stream.log("plots/pinch", pinch, static=True)
         stream.log("plots/time", rr.SeriesLines(names=["ms"], colors=[(0, 158, 115)]), static=True)
 
     def _log_pinhole(self, entity: str, k: np.ndarray, height: int, width: int) -> None:
@@ -182,15 +184,16 @@ class Entities:
             lines = rr.SeriesLines(names=names, colors=colours)
             log("plots/latent", lines, static=True)
         log("plots/latent", rr.Scalars(estimate.latent))
+        log("plots/pinch", rr.Scalars([estimate.pinch]))
         log("plots/time", rr.Scalars([1e3 * estimate.compute_s]))
 
     def _log_changes(self, estimate: Estimate) -> None:
-        now = (estimate.state_name, estimate.gesture, str(estimate.lost))
+        now = (estimate.state_name, gesture_words(estimate), str(estimate.lost))
         if now == self._told:
             return
         self._told = now
         lost = "lost" if estimate.lost else ""
-        text = ", ".join(filter(None, (lost, state_words(estimate), estimate.gesture)))
+        text = ", ".join(filter(None, (lost, state_words(estimate), gesture_words(estimate))))
         level = rr.TextLogLevel.WARN if estimate.lost else rr.TextLogLevel.INFO
         self._stream.log("log", rr.TextLog(text, level=level))
 
@@ -253,6 +256,7 @@ def blueprint() -> rrb.Blueprint:
             axis_y=rrb.ScalarAxis(range=(0.0, 1.05)),
         ),
         rrb.TimeSeriesView(origin="plots/latent", name="latent coordinates"),
+        rrb.TimeSeriesView(origin="plots/pinch", name="pinch"),
         rrb.TimeSeriesView(origin="plots/time", name="ms a frame"),
     )
     above = rrb.Horizontal(scene, rrb.Vertical(images, labels), column_shares=[3, 2])

@@ -1,0 +1,81 @@
+"""Pinch: how nearly thumb and index finger touch, and one event a pinch."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers.settings import part
+
+from toftrack.errors import ToftrackError
+from toftrack.gestures.pinch import PinchSettings, PinchState, pinch_of, tip_gap, update_pinch
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+
+SETTINGS: PinchSettings = part("gestures=default", "gestures.pinch")
+PINCHED = (3, 20, -28, 19, 23, -8, 26, 71, 30)
+"""Degrees of the thumb's and the index finger's joints, the tips together."""
+
+
+def joints(open_part: float, length_m: float = 0.19) -> np.ndarray:
+    """(21, 3) of a hand between a pinch, 0, and straight fingers, 1."""
+    state = torch.zeros(1, 27)
+    state[0, :6] = torch.tensor([0.1, 0.0, 0.5, 0.3, 1.0, -0.4])
+    state[0, 6:15] = torch.tensor(PINCHED).deg2rad() * (1 - open_part)
+    return forward_kinematics(state, default_hand_shape(length_m)).joints_m[0].numpy()
+
+
+def follow(values: list[float], frames: float = 1.0) -> list[bool]:
+    state, told = PinchState(), []
+    for value in values:
+        state = update_pinch(state, value, SETTINGS, frames)
+        told.append(state.pinching)
+    return told
+
+
+def test_a_pinch_goes_from_1_to_0_as_the_fingers_open() -> None:
+    pinches = [pinch_of(joints(part), SETTINGS) for part in np.linspace(0, 1, 11)]
+    assert pinches[0] == 1.0 and pinches[-1] == 0.0
+    assert all(a >= b for a, b in zip(pinches, pinches[1:], strict=False))
+    assert any(0.2 < pinch < 0.8 for pinch in pinches)
+
+
+def test_a_small_hand_pinches_as_a_large_one() -> None:
+    assert tip_gap(joints(0.3, 0.14)) == pytest.approx(tip_gap(joints(0.3, 0.21)), abs=1e-4)
+
+
+def test_pads_that_lie_on_each_other_touch_as_tips_that_meet() -> None:
+    """Last phalanges side by side, a radius of each between their axes."""
+    flat = joints(1.0).astype(np.float64)
+    along = (flat[8] - flat[7]) / np.linalg.norm(flat[8] - flat[7])
+    across = np.cross(along, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    flat[4] = flat[8] + 0.0155 * across  # 8.3 and 7.1 mm of a hand of 190 mm
+    flat[3] = flat[4] - 0.025 * along
+    assert abs(tip_gap(flat)) < 0.01
+    assert pinch_of(flat, SETTINGS) == 1.0
+
+
+def test_a_pinch_that_trembles_about_a_threshold_begins_and_ends_once() -> None:
+    rng = np.random.default_rng(0)
+    way = np.concatenate((np.linspace(0, 1, 60), np.linspace(1, 0, 60)))
+    told = follow((way + rng.normal(0, 0.06, 120)).clip(0, 1).tolist())
+    assert sum(a != b for a, b in zip(told, told[1:], strict=False)) == 2
+    assert not told[0] and told[60] and not told[-1]
+
+
+def test_one_odd_frame_is_no_pinch_and_ends_none() -> None:
+    assert not any(follow([0.0] * 3 + [1.0] + [0.0] * 3))
+    assert all(follow([1.0] * 4 + [0.0] + [1.0] * 3)[2:])
+    # At a low frame rate a frame lasts as long as that.
+    assert follow([0.0, 1.0, 0.0], frames=4.0) == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    "bad", [{"touching": 0.5}, {"begin": 1.2}, {"end": 0.9}, {"frames": -1.0}], ids=str
+)
+def test_settings_out_of_range_are_told(bad: dict[str, float]) -> None:
+    with pytest.raises(ToftrackError, match="gestures.pinch"):
+        dataclasses.replace(SETTINGS, **bad)

@@ -1,0 +1,123 @@
+"""The gestures that toftrack knows, said by finger: straight, bent or curled, and the thumb.
+
+A finger's state is a range of its total flexion and of its split (see features.py), in degrees;
+the ranges are those of functional motion (Bain et al., J. Hand Surg. Eur. 40(4), 2015): a straight
+finger is within 30 degrees of straight, one curled into the palm has about 90, 100 and 50 degrees
+in its joints, and the fingers of a resting hand 30, 40 and 15, the little one the most. The thumb
+is told by where its tip is. Nothing here was fitted to recordings.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from toftrack.gestures import features
+
+OTHER = "other"
+POINTING = "pointing"
+POINTING_THUMB = "pointing_thumb"
+RAY_GESTURES = (POINTING, POINTING_THUMB)
+"""Those that have a pointing ray."""
+
+_Range = tuple[float, float]
+_Features = dict[int, _Range]
+
+
+class Definition(NamedTuple):
+    """One way to make a gesture.
+
+    name: of the gesture.  low, high: (13,) the features' ranges, rad and palm lengths; NaN where a
+    feature does not matter.
+    """
+
+    name: str
+    low: np.ndarray
+    high: np.ndarray
+
+
+class _Finger(NamedTuple):
+    """Ranges of total flexion and of split, degrees."""
+
+    flexion: _Range
+    split: _Range
+
+
+_STRAIGHT = _Finger((-30, 30), (-25, 25))
+_CURLED = _Finger((205, 270), (20, 100))
+_RESTING = _Finger((55, 130), (-5, 60))
+_HOOKED = _Finger((120, 190), (100, 180))
+_FLAT_BENT = _Finger((60, 110), (-110, -40))
+_PINCHING = _Finger((70, 160), (-10, 90))
+_NEARLY_STRAIGHT = _Finger((-30, 60), (-25, 40))
+
+# Where the thumb's tip is: reach and gap in palm lengths, total flexion in degrees.
+_ANY: _Features = {}
+_STRETCHED: _Features = {features.REACH: (1.30, 1.75)}
+_NOT_STRETCHED: _Features = {features.REACH: (0.60, 1.00)}
+_ACROSS: _Features = {features.REACH: (0.60, 0.85), features.THUMB_FLEXION: (70, 160)}
+_BESIDE: _Features = {features.REACH: (0.75, 1.05), features.THUMB_FLEXION: (-40, 40)}
+_OPEN: _Features = {features.REACH: (0.95, 1.75), features.THUMB_FLEXION: (-40, 40)}
+_ON_INDEX_TIP: _Features = {features.GAP: (0.0, 0.2)}
+# Whether index and middle finger are side by side or make a V, at the tips.
+_TOGETHER: _Features = {features.APART: (0.15, 0.28)}
+_APART: _Features = {features.APART: (0.42, 0.80)}
+
+
+def _define(name: str, fingers: str, tips: _Features) -> Definition:
+    """fingers: a letter each, index to little: Straight, Curled, Resting, Hooked, Flat and bent
+    at the knuckle, Pinching, Nearly straight."""
+    states = {
+        "S": _STRAIGHT,
+        "C": _CURLED,
+        "R": _RESTING,
+        "H": _HOOKED,
+        "F": _FLAT_BENT,
+        "P": _PINCHING,
+        "N": _NEARLY_STRAIGHT,
+    }
+    low, high = np.full((2, features.COUNT), math.nan)
+    for number, letter in enumerate(fingers):
+        state = states[letter]
+        for feature, values in (
+            (features.FLEXION.start + number, state.flexion),
+            (features.SPLIT.start + number, state.split),
+        ):
+            low[feature], high[feature] = np.radians(values)
+    for feature, values in tips.items():
+        length = feature in (features.REACH, features.GAP, features.APART)
+        low[feature], high[feature] = values if length else np.radians(values)
+    return Definition(name, low, high)
+
+
+# What is near a gesture and none: a hooked hand is no fist, one bent at the knuckles not relaxed.
+_NONE = (_define(OTHER, "HHHH", _ANY), _define(OTHER, "FFFF", _ANY))
+_ALL = (
+    _define("palm", "SSSS", _OPEN),
+    _define("palm", "SSSS", _BESIDE),
+    _define("fist", "CCCC", _NOT_STRETCHED),
+    _define(POINTING, "SCCC", _NOT_STRETCHED),
+    _define(POINTING_THUMB, "SCCC", _STRETCHED),
+    # Two fingers side by side point as well; in a V they are a number.
+    _define(POINTING, "SSCC", _NOT_STRETCHED | _TOGETHER),
+    _define(POINTING_THUMB, "SSCC", _STRETCHED | _TOGETHER),
+    _define("thumb_up", "CCCC", _STRETCHED),
+    _define("victory", "SSCC", _NOT_STRETCHED | _APART),
+    # Three is counted from the index finger on, or from the thumb on.
+    _define("three", "SSSC", _ANY),
+    _define("three", "SSCC", _STRETCHED | _APART),
+    _define("four", "SSSS", _ACROSS),
+    _define("ok", "PNNN", _ON_INDEX_TIP),
+    _define("relaxed", "RRRR", _ANY),
+    *_NONE,
+)
+_PAPER = (
+    _define("palm", "SSSS", _ANY),
+    _define("fist", "CCCC", _ANY),
+    _define(POINTING, "SCCC", _ANY),
+)
+SETS = {"all": _ALL, "paper": _PAPER}
+"""By the name that conf/gestures gives: all that are known, or the paper's three, whatever the
+thumb does."""

@@ -1,0 +1,83 @@
+"""What a gesture is told by: thirteen numbers of a hand's pose, whichever way the hand is turned.
+
+Ten are sums of joint angles, which a depth image determines better than the angles themselves: of
+the thumb the abduction and the total flexion; of each other finger the total flexion, and how much
+more of it the two outer joints have than the knuckle. Three are distances in units of the palm
+(wrist to the middle finger's knuckle), since where the tips lie says more than single angles do:
+how far the thumb *reaches* away from the little finger's knuckle (0.6 .. 0.9 folded over palm or
+fist, 1.0 beside the index finger, 1.3 .. 1.7 stretched away), its *gap* to the index finger's tip,
+and how far index and middle fingertips are *apart* (0.25 side by side, 0.5 in a V). The fingers'
+abduction is not looked at else.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, JOINT_NAMES, forward_kinematics
+
+THUMB_ANGLES = 5
+THUMB_ABDUCTION, THUMB_FLEXION = 0, 1
+FLEXION, SPLIT = slice(2, 6), slice(6, 10)
+REACH, GAP, APART = 10, 11, 12
+COUNT = 13
+"""Where each feature stands; the fingers from the index to the little one."""
+
+_DISTANCE_RANGES = (1.3, 2.0, 1.6)
+"""From the least to the largest of the three distances within the joint limits, palm lengths."""
+_WRIST, _MIDDLE, _LITTLE = (JOINT_NAMES.index(n) for n in ("wrist", "middle_mcp", "little_mcp"))
+_THUMB_TIP, _INDEX_TIP, _MIDDLE_TIP = (
+    JOINT_NAMES.index(f"{finger}_tip") for finger in ("thumb", "index", "middle")
+)
+_DISTANCES = (_THUMB_TIP, _LITTLE), (_THUMB_TIP, _INDEX_TIP), (_INDEX_TIP, _MIDDLE_TIP)
+
+
+def _sums() -> np.ndarray:
+    """(10, 21): what is added up of the angles."""
+    sums = np.zeros((REACH, len(ANGLE_NAMES)))
+    sums[THUMB_ABDUCTION, 0] = 1.0
+    sums[THUMB_FLEXION, [1, 3, 4]] = 1.0
+    for finger in range(4):
+        knuckle, *outer = range(THUMB_ANGLES + 4 * finger + 1, THUMB_ANGLES + 4 * finger + 4)
+        sums[FLEXION.start + finger, [knuckle, *outer]] = 1.0
+        sums[SPLIT.start + finger, outer] = 1.0
+        sums[SPLIT.start + finger, knuckle] = -1.0
+    return sums
+
+
+SUMS = _sums()
+RANGES = np.append(np.abs(SUMS) @ np.diff(ANGLE_LIMITS)[:, 0], _DISTANCE_RANGES)
+"""(13,) rad and palm lengths, from the least to the largest value within the joint limits."""
+
+
+def features(angles_rad: np.ndarray, joints_m: np.ndarray) -> np.ndarray:
+    """(13,) of one hand: rad, and palm lengths.
+
+    angles_rad: (21,).  joints_m: (21, 3) of the same pose, in any frame.
+    """
+    palm = float(np.linalg.norm(joints_m[_MIDDLE] - joints_m[_WRIST]))
+    distances = [np.linalg.norm(joints_m[a] - joints_m[b]) / palm for a, b in _DISTANCES]
+    return np.append(SUMS @ angles_rad, distances)
+
+
+def features_of_angles(angles_rad: np.ndarray) -> np.ndarray:
+    """(13,) of the mean adult hand in a pose; NaN where an angle that is needed is NaN.
+
+    angles_rad: (21,), NaN where an angle does not matter.
+    """
+    state = torch.zeros(1, 6 + len(ANGLE_NAMES))
+    state[0, 6:] = torch.from_numpy(np.nan_to_num(angles_rad)).float()
+    joints = forward_kinematics(state, default_hand_shape()).joints_m[0].numpy()
+    found = features(np.nan_to_num(angles_rad), joints.astype(np.float64))
+    unknown = np.isnan(angles_rad)
+    thumb, index, middle = unknown[:THUMB_ANGLES], unknown[5:9], unknown[9:13]
+    missing = np.append(
+        (np.abs(SUMS) @ unknown) > 0,
+        (thumb.any(), (thumb.any() or index.any()), (index.any() or middle.any())),
+    )
+    found[missing.astype(bool)] = math.nan
+    return found

@@ -1,0 +1,104 @@
+"""How nearly the thumb and the index finger touch, and whether they pinch.
+
+The gap is between the surfaces of the two fingertips: from the centre of each tip's rounded end, a
+radius short of its end on the last phalanx's axis, less both radii. So pads that lie on each other
+and tips that meet count alike. It is measured in lengths of the hand, and is the same for a child.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.hand.surface import hand_surface
+
+_THUMB, _INDEX = (JOINT_NAMES.index(n) for n in ("thumb_tip", "index_tip"))
+_LAST_BONES = 3, 6
+"""Frames of the last bones of thumb and index finger, see hand.skeleton.HandPose."""
+_MIDDLE_FINGER = [JOINT_NAMES.index("wrist"), *range(9, 13)]
+
+
+@dataclass(frozen=True)
+class PinchSettings:
+    """What counts as a pinch; see conf/gestures for what each does."""
+
+    touching: float
+    open: float
+    begin: float
+    end: float
+    frames: float
+
+    def __post_init__(self) -> None:
+        if not -math.inf < self.touching < self.open < math.inf:
+            raise ToftrackError("gestures.pinch.touching must be below gestures.pinch.open")
+        if not 0 <= self.end < self.begin <= 1:
+            raise ToftrackError(
+                "gestures.pinch.end must be below gestures.pinch.begin, both in 0 .. 1"
+            )
+        if not 0 <= self.frames < math.inf:
+            raise ToftrackError("gestures.pinch.frames must be 0 or more")
+
+
+@dataclass(frozen=True)
+class PinchState:
+    """What is carried from frame to frame.
+
+    pinching: as told.  against: for how many times 1/25 s the pinch has said otherwise.
+    """
+
+    pinching: bool = False
+    against: float = 0.0
+
+
+@functools.cache
+def _tip_radii() -> tuple[float, float]:
+    """Half the depth of the last phalanges of thumb and index finger, in lengths of the hand."""
+    shape = default_hand_shape()
+    surface = hand_surface(shape)
+    thumb, index = (
+        float(surface.axes_m[surface.frame_index == bone][0, 2, 2]) / shape.hand_length_m
+        for bone in _LAST_BONES
+    )
+    return thumb, index
+
+
+def tip_gap(joints_m: np.ndarray) -> float:
+    """Between the surfaces of thumb tip and index tip, in lengths of the hand; below 0 in overlap.
+
+    joints_m: (21, 3) metres.
+    """
+    length = float(np.linalg.norm(np.diff(joints_m[_MIDDLE_FINGER], axis=0), axis=1).sum())
+    radii = _tip_radii()
+    ends = []
+    for tip, radius in zip((_THUMB, _INDEX), radii, strict=True):
+        way = joints_m[tip] - joints_m[tip - 1]
+        ends.append(joints_m[tip] - radius * length * way / np.linalg.norm(way))
+    return float(np.linalg.norm(ends[0] - ends[1])) / length - sum(radii)
+
+
+def pinch_of(joints_m: np.ndarray, settings: PinchSettings) -> float:
+    """0 open .. 1 touching.  joints_m: (21, 3) metres."""
+    part = (settings.open - tip_gap(joints_m)) / (settings.open - settings.touching)
+    return min(max(part, 0.0), 1.0)
+
+
+def update_pinch(
+    state: PinchState, pinch: float, settings: PinchSettings, frames: float = 1.0
+) -> PinchState:
+    """One frame on: a pinch begins and ends at two thresholds, and only when it stays beyond one.
+
+    frames: how many times 1/25 s have passed since the state.
+    """
+    beyond = pinch < settings.end if state.pinching else pinch >= settings.begin
+    if not beyond:
+        return PinchState(state.pinching)
+    against = state.against + frames
+    if against < settings.frames:
+        return PinchState(state.pinching, against)
+    return PinchState(not state.pinching)

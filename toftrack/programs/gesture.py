@@ -1,0 +1,189 @@
+"""Your own gestures: `python -m toftrack.gesture add NAME RECORDING --from 2.0 --to 3.0`.
+
+`add` tracks that part of a recording, takes the pose that the hand holds there, and writes it into
+a file of gestures, which `gestures.file=FILE` gives to the tracker. `list` and `remove` show what
+is in the file and take a gesture out of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from hydra.utils import instantiate
+from tqdm import tqdm
+
+from toftrack.api import build_tracker
+from toftrack.configuration.compose import configuration, one_sentence
+from toftrack.errors import ToftrackError
+from toftrack.gestures.definitions import OTHER, SETS
+from toftrack.gestures.files import NamedPose, read_poses, save_poses
+from toftrack.gestures.learning import learned_pose
+from toftrack.gestures.recognition import Gestures, gestures_with
+from toftrack.programs import command_line
+from toftrack.recordings.store import FrameStore, open_source
+
+_FILE = "gestures.json"
+_LEAD_S = 1.0
+"""So long before the part that is asked for the tracking begins, to have found the hand by then."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line and do what it says. Raises ToftrackError."""
+    options = _parser().parse_intermixed_args(arguments)
+    path = Path(options.file).expanduser()
+    if path.suffix.lower() != ".json":
+        raise ToftrackError(f"--file {path} is no .json, which is the kind that can be written")
+    poses = read_poses(path) if path.exists() else []
+    words = options.words
+    if options.command == "list" and not words:
+        _list(path, poses)
+    elif options.command == "remove" and len(words) == 1:
+        _remove(path, poses, words[0])
+    elif options.command == "add" and len(words) >= 2:
+        if options.begin is None or options.end is None:
+            raise ToftrackError("say which part of the recording it is: --from 2.0 --to 3.0")
+        name, recording, *overrides = words
+        part_s = options.begin, options.end
+        add(path, poses, name, recording, part_s, options.replace, overrides)
+    else:
+        raise ToftrackError(
+            f"'{' '.join((options.command, *words))}' is not complete or too much; give"
+            " add NAME RECORDING --from 2.0 --to 3.0, list, or remove NAME"
+        )
+
+
+def add(
+    path: Path,
+    poses: Sequence[NamedPose],
+    name: str,
+    recording: str,
+    part_s: tuple[float, float],
+    replace: bool = False,
+    overrides: Sequence[str] = (),
+) -> NamedPose:
+    """Learn a gesture from a part of a recording and write it into the file.
+
+    Args:
+        path: the file, a .json; made where there is none.
+        poses: what is in it.
+        part_s: from and to, seconds from the recording's first frame.
+        replace: whether a gesture of that name, the user's or a known one, gives way.
+        overrides: of the tracker's configuration, "hand.side=left".
+
+    Raises:
+        ToftrackError: the recording cannot be read, the name is taken, the hand was not followed or
+            moved in that part, or the gesture looks like another.
+    """
+    with one_sentence():
+        config = configuration(*overrides)
+        gestures: Gestures | None = instantiate(config.gestures)
+    if gestures is None:
+        raise ToftrackError("gestures=none knows no gesture; leave it out")
+    known: str = config.gestures.known
+    names = [*(pose.name for pose in poses), *(d.name for d in SETS[known])]
+    _check_name(name, names, replace)
+    with_it = [pose for pose in poses if pose.name != name]
+    frames = open_source(recording)
+    try:
+        angles, believed = _track(frames, recording, part_s, overrides)
+    finally:
+        frames.close()
+    pose = learned_pose(name, angles, believed, gestures.settings.flexion_rad)
+    with_it.append(pose)
+    gestures_with(known, with_it, gestures.settings, str(path))
+    save_poses(path, with_it)
+    print(f"{path}: {name}, from {int(believed.sum())} of {len(believed)} frames")
+    print(f"use it: python track.py gestures.file={path}")
+    return pose
+
+
+def _track(
+    frames: FrameStore, recording: str, part_s: tuple[float, float], overrides: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joint angles, (T, 21) rad, and which frames are believed, (T,), of a part of a recording."""
+    begin_s, end_s = part_s
+    times = np.asarray(frames.timestamp_s) - frames.timestamp_s[0]
+    if not 0 <= begin_s < end_s < math.inf:
+        raise ToftrackError(
+            f"--from {begin_s:g} --to {end_s:g} is no part of a recording; give seconds from its"
+            " beginning, the later ones last"
+        )
+    rows = np.flatnonzero((times >= begin_s) & (times <= end_s))
+    if end_s > times[-1] + 1 / frames.fps or not len(rows):
+        raise ToftrackError(
+            f"--from {begin_s:g} --to {end_s:g} is not within '{recording}', which lasts"
+            f" {times[-1]:.2f} s; give seconds from its beginning"
+        )
+    with one_sentence():
+        tracker = build_tracker(configuration("gestures=none", *overrides))
+    first = int(np.searchsorted(times, begin_s - _LEAD_S))
+    angles, believed = [], []
+    for row in tqdm(range(first, rows[-1] + 1), unit=" frames", file=sys.stderr):
+        depth_m = frames.camera.rectify(frames.image(row)[0], frames.radial)
+        estimate = tracker.step(depth_m, frames.camera.K, row, float(times[row]))
+        if row >= rows[0]:
+            angles.append(estimate.state[6:])
+            believed.append(not estimate.lost)
+    return np.array(angles), np.array(believed)
+
+
+def _check_name(name: str, taken: Sequence[str], replace: bool) -> None:
+    if not name.strip() or name != name.strip() or not name.isprintable():
+        raise ToftrackError(f"{name!r} is no name for a gesture; give a word, as 'peace'")
+    if name == OTHER:
+        raise ToftrackError(f"'{OTHER}' is what is none of the gestures; give another name")
+    if name in taken and not replace:
+        raise ToftrackError(
+            f"there is a gesture '{name}' already; give another name, or --replace to have the new"
+            " one in its place"
+        )
+
+
+def _list(path: Path, poses: Sequence[NamedPose]) -> None:
+    names = [pose.name for pose in poses]
+    for name in dict.fromkeys(names):
+        count = names.count(name)
+        print(name if count == 1 else f"{name} ({count} poses)")
+    if not names:
+        print(f"no gesture of yours in {path}", file=sys.stderr)
+
+
+def _remove(path: Path, poses: Sequence[NamedPose], name: str) -> None:
+    left = [pose for pose in poses if pose.name != name]
+    if len(left) == len(poses):
+        known = ", ".join(dict.fromkeys(pose.name for pose in poses)) or "none"
+        raise ToftrackError(f"there is no gesture '{name}' in {path}; there is: {known}")
+    if left:
+        save_poses(path, left)
+    else:  # a file that names no pose is none of gestures
+        path.unlink()
+    print(f"{path}: without {name}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m toftrack.gesture",
+        description="Your own gestures: learn one from a recording, list or remove them.",
+        usage="%(prog)s add NAME RECORDING --from S --to S [OVERRIDE ...] | list | remove NAME",
+    )
+    parser.add_argument("command", choices=("add", "list", "remove"))
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="NAME RECORDING OVERRIDE",
+        help="its name; the recording that shows it (or sample); as for track.py, hand.side=left",
+    )
+    parser.add_argument("--from", dest="begin", type=float, metavar="S", help="seconds")
+    parser.add_argument("--to", dest="end", type=float, metavar="S", help="seconds")
+    parser.add_argument("--file", default=_FILE, help=f"the file of gestures ({_FILE})")
+    parser.add_argument("--replace", action="store_true", help="in place of one of that name")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(command_line.run(main))
