@@ -32,6 +32,8 @@ _ABOVE_ZERO = frozenset(
     device.usb.drain_ms device.usb.read_multiple device.usb.timeout_ms
     filter.exponent filter.exponent_growth filter.particles filter.passes filter.shrink
     gestures.flexion_rad gestures.off_rad gestures.other gestures.split_rad gestures.thumb_rad
+    hand.adapt.certain_poses hand.adapt.contradiction hand.adapt.length_sigma hand.adapt.memory
+    hand.adapt.sure_m
     hand.length_m hand.fit.beta hand.fit.exponent hand.fit.frames hand.fit.largest hand.fit.prior
     hand.fit.samples hand.fit.step
     likelihood.beta likelihood.tolerance_m
