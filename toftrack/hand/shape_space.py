@@ -18,9 +18,10 @@ taken as independent. Log(circumference / length) has 0.056 and goes with the br
 is why breadth thickens the flesh as well; what is left of the circumference, 0.021, comes to 0.1 of
 the palm's thickness if its section is a stadium.
 
-Assumed: 0.12 for the length, since children are users too and army personnel are all adult. 0.06 for
-the thumb and 0.05 for the outer fingers: single phalanges vary by 7 to 16 % (Buryanov and Kotiuk,
-"Proportions of hand segments", Int. J. Morphol. 28(3), 2010), most of it with the hand's size.
+Assumed: 0.12 for the length, since children are users too and army personnel are all adult; 0.06
+for the thumb and 0.05 for the outer fingers: single phalanges vary by 7 to 16 % (Buryanov and
+Kotiuk, "Proportions of hand segments", Int. J. Morphol. 28(3), 2010), most of it with the hand's
+size.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement.gauss_newton import Landmarks, landmark_residuals
@@ -43,6 +43,9 @@ _KEYS = 24
 """Key poses that are kept; then only surer ones come in."""
 _ENOUGH = 2.0
 """Weight of the frames of a key pose from which on no more are looked at."""
+_VOTES_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
+"""By how much the votes put the components wrong: means of uncertain places shorten the fingers. Of
+rendered sequences of other hands, like what is said above."""
 _LEAST = 0.02
 """Weight below which a frame says nothing."""
 _WORN = (0.01, 0.02, 0.02, 0.02, 0.02, 0.02)
@@ -55,13 +58,14 @@ class ShapeFit:
 
     sure_m: float
     length_sigma: float
+    votes: float
     alike: float
     certain_poses: float
     contradiction: float
     memory: float
 
     def __post_init__(self) -> None:
-        for name in ("sure_m", "length_sigma", "certain_poses", "contradiction"):
+        for name in ("sure_m", "length_sigma", "votes", "certain_poses", "contradiction"):
             check_number(f"hand.adapt.{name}", getattr(self, name), 0, above=True)
         check_number("hand.adapt.alike", self.alike, 0, 1)
         check_number("hand.adapt.memory", self.memory, 1)
@@ -96,9 +100,10 @@ class KeyPoses:
 
     def summed(self) -> tuple[float, Tensor, Tensor]:
         """How many sure poses this amounts to, and their evidence (6, 6) and (6,)."""
-        weight = self.weight.clamp(min=1e-9)
-        information = (self.information / weight[:, None, None]).sum(0)
-        return float((self.square / weight).sum()), information, (self.vector / weight[:, None]).sum(0)
+        each = self.weight.clamp(min=1e-9)
+        information = (self.information / each[:, None, None]).sum(0)
+        vector = (self.vector / each[:, None]).sum(0)
+        return float((self.square / each).sum()), information, vector
 
 
 def _no_poses() -> KeyPoses:
@@ -132,14 +137,15 @@ class ShapeBelief:
     off: float = 0.0
     heard: float = 0.0
 
-    @property
-    def sigma(self) -> tuple[float, ...]:
-        """(6,) standard deviations of the components."""
-        return tuple(self.covariance.diagonal().sqrt().tolist())
-
     def frozen(self, fit: ShapeFit) -> bool:
         """Whether the hand is known so well that no more is learned."""
         return self.poses >= fit.certain_poses
+
+    def summary(self, fit: ShapeFit) -> Fitted:
+        """For the file of the shape."""
+        covariance = tuple(tuple(row) for row in self.covariance.tolist())
+        mean = tuple(self.mean.tolist())
+        return Fitted(COMPONENTS, mean, covariance, self.poses, self.frozen(fit))
 
 
 def first_belief() -> ShapeBelief:
@@ -158,7 +164,9 @@ def told(belief: ShapeBelief, length_m: float, first: HandShape) -> ShapeBelief:
     sigma = POPULATION_SIGMA[0]
     log_length = math.log(length_m / first.hand_length_m)
     worn = min(max(log_length, -3 * sigma), 3 * sigma)
-    return replace(belief, worn=(worn, *belief.worn[1:]))
+    mean = belief.mean.clone()
+    mean[0] = worn
+    return replace(belief, mean=mean, worn=(worn, *belief.worn[1:]))
 
 
 def weight_of(glance: Glance, fit: ShapeFit) -> float:
@@ -214,9 +222,10 @@ def learned(
         if float(belief.keys.square[row] / belief.keys.weight[row]) >= weight:
             return belief
     information, vector = votes_system(state, shape, derivatives, votes)
+    told_here = torch.tensor(belief.worn) - torch.tensor(_VOTES_OFF)
     # The network's length and its votes rest on the same image: each counts half.
-    vector = 0.5 * (information @ torch.tensor(belief.worn) + vector)
-    information = 0.5 * information
+    vector = 0.5 * fit.votes * (information @ told_here + vector)
+    information = 0.5 * fit.votes * information
     precision = 0.5 / fit.length_sigma**2
     information[0, 0] += precision
     vector[0] += precision * math.log(glance.length_m / first.hand_length_m)
