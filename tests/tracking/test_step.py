@@ -97,14 +97,14 @@ def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() 
     tracked(tracker, scene, range(9))
     before = tracker.state
     assert before.track is not None and before.seen is not None and before.gesture is not None
-    assert before.size is not None and before.size.poses > 0 and before.last is not None
+    assert before.size is not None and before.size.frames > 0 and before.last is not None
     tracker.restart()
     kept = {"generator": before.generator, "next_index": 9}
     for field in fields(TrackerState):
         value = getattr(tracker.state, field.name)
         if field.name == "size":
-            assert (value.worn, value.poses) == (fresh.size.worn, 0)
-            assert torch.equal(value.covariance, fresh.size.covariance)
+            assert torch.equal(value.log_likelihood, fresh.size.log_likelihood)
+            assert (value.index, value.frames) == (fresh.size.index, 0)
         else:
             assert value is kept.get(field.name, value) or value == kept[field.name]
             if field.name not in kept:

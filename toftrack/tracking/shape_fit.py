@@ -41,15 +41,17 @@ _KEY_RAD, _KEY_TURN_RAD = 0.25, 0.35
 """Poses are another key pose when their angles, rms, or their rotations differ by so much."""
 _KEYS = 24
 """Key poses that are kept; then only surer ones come in."""
-_ENOUGH = 2.0
-"""Weight of the frames of a key pose from which on no more are looked at."""
+_ENOUGH, _ENOUGH_FRAMES, _SURER = 2.0, 8, 1.5
+"""Weight of the frames of a key pose from which on no more are looked at; or their number, from
+which on only frames that count so many times as much are: a look costs a millisecond."""
 _VOTES_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
 """By how much the votes put the components wrong: means of uncertain places shorten the fingers. Of
 rendered sequences of other hands, like what is said above."""
 _LEAST = 0.02
 """Weight below which a frame says nothing."""
-_WORN = (0.01, 0.02, 0.02, 0.02, 0.02, 0.02)
-"""Change of a component for which another hand is made, which costs a millisecond or two."""
+_STEP, _STEP_SIGMAS = 0.01, 0.5
+"""Change of a component for which another hand is made, which costs some milliseconds: at least so
+much, and so many of its standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,15 @@ class ShapeFit:
 class KeyPoses:
     """What M different poses said of the hand; all on the CPU.
 
-    angles: (M, 21) rad.  rotations: (M, 3, 3).  weight: (M,) sum of their frames' weights.
-    square: (M,) sum of the weights' squares.  information: (M, 6, 6), vector: (M, 6), the frames'
-    evidence by its weight's square: precision, and precision times the components.
+    angles: (M, 21) rad.  rotations: (M, 3, 3).
+    frames, weight, square: (M,) how many frames each has, sums of their weights and of the squares.
+    information: (M, 6, 6), vector: (M, 6), the frames' evidence by its weight's square: precision,
+    and precision times the components.
     """
 
     angles: Tensor
     rotations: Tensor
+    frames: Tensor
     weight: Tensor
     square: Tensor
     information: Tensor
@@ -98,6 +102,12 @@ class KeyPoses:
         row = int(far.argmin())
         return row, float(far[row])
 
+    def heard(self, row: int, weight: float) -> bool:
+        """Whether a key pose has said enough for a frame of this weight to add little."""
+        total, frames = float(self.weight[row]), float(self.frames[row])
+        often = frames >= _ENOUGH_FRAMES and weight < _SURER * total / frames
+        return total > _ENOUGH or often
+
     def summed(self) -> tuple[float, Tensor, Tensor]:
         """How many sure poses this amounts to, and their evidence (6, 6) and (6,)."""
         each = self.weight.clamp(min=1e-9)
@@ -111,6 +121,7 @@ def _no_poses() -> KeyPoses:
     return KeyPoses(
         torch.zeros(0, 21),
         torch.zeros(0, 3, 3),
+        none,
         none,
         none,
         torch.zeros(0, _COUNT, _COUNT),
@@ -215,7 +226,7 @@ def learned(
         return belief
     row, far = belief.keys.nearest(state)
     known = far <= 1
-    if known and belief.keys.weight[row] > _ENOUGH:
+    if known and belief.keys.heard(row, weight):
         return belief
     if not known and len(belief.keys.weight) == _KEYS:
         row = int((belief.keys.square / belief.keys.weight).argmin())
@@ -279,6 +290,7 @@ def _kept(
     new = (
         state[0, 6:].clone(),
         roma.rotvec_to_rotmat(state[0, 3:6]),
+        torch.tensor(1.0),
         torch.tensor(weight),
         torch.tensor(weight**2),
         weight**2 * information,
@@ -287,6 +299,7 @@ def _kept(
     old = (
         keys.angles,
         keys.rotations,
+        keys.frames,
         keys.weight,
         keys.square,
         keys.information,
@@ -310,7 +323,7 @@ def _posterior(belief: ShapeBelief, fit: ShapeFit) -> ShapeBelief:
     precision = torch.tensor(POPULATION_SIGMA).square().reciprocal().diag() + shared * information
     covariance = torch.linalg.inv(precision)
     mean = covariance @ (shared * vector)
-    now = tuple(mean.tolist())
-    changed = any(abs(a - b) > c for a, b, c in zip(now, belief.worn, _WORN, strict=True))
-    worn = now if changed else belief.worn
+    off = (mean - torch.tensor(belief.worn)).abs()
+    least = (_STEP_SIGMAS * covariance.diagonal().sqrt()).clamp(min=_STEP)
+    worn = tuple(mean.tolist()) if bool((off > least).any()) else belief.worn
     return replace(belief, mean=mean, covariance=covariance, poses=poses, worn=worn)
