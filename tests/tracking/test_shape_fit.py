@@ -28,7 +28,7 @@ FIT = ShapeFit(
     alike=0.65,
     certain_poses=12,
     contradiction=3.5,
-    memory=50,
+    memory=20,
 )
 VOTES_OFF = torch.tensor(shape_fit._VOTES_OFF)
 BETWEEN_FINGERS = torch.tensor([0.05, 0.06, 0.0, 0.0, -0.05, 0.04])

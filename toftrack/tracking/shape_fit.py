@@ -41,7 +41,9 @@ _KEY_RAD, _KEY_TURN_RAD = 0.25, 0.35
 """Poses are another key pose when their angles, rms, or their rotations differ by so much."""
 _KEYS = 24
 """Key poses that are kept; then only surer ones come in."""
-_ENOUGH, _ENOUGH_FRAMES, _SURER = 2.0, 8, 1.5
+_EVERY = 3
+"""Frames from one look to the next: they are alike, and a look costs a millisecond."""
+_ENOUGH, _ENOUGH_FRAMES, _SURER = 1.5, 3, 1.2
 """Weight of the frames of a key pose from which on no more are looked at; or their number, from
 which on only frames that count so many times as much are: a look costs a millisecond."""
 _VOTES_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
@@ -96,9 +98,9 @@ class KeyPoses:
         if not len(self.weight):
             return -1, math.inf
         bent = (self.angles - state[:, 6:]).square().mean(1).sqrt() / _KEY_RAD
-        turn = self.rotations.mT @ roma.rotvec_to_rotmat(state[0, 3:6])
-        turned = roma.rotmat_to_rotvec(turn).norm(dim=-1) / _KEY_TURN_RAD
-        far = torch.hypot(bent, turned)
+        rotation = roma.rotvec_to_rotmat(state[0, 3:6])
+        cosine = 0.5 * ((self.rotations * rotation).sum((1, 2)) - 1)
+        far = torch.hypot(bent, cosine.clamp(-1, 1).acos() / _KEY_TURN_RAD)
         row = int(far.argmin())
         return row, float(far[row])
 
@@ -138,6 +140,7 @@ class ShapeBelief:
     worn: the components of the hand in use, which follows the mean in steps.
     off, heard: by how much the network's log length has differed from the mean lately, summed by
     weight, and the sum of these weights.
+    frames: how many were seen, looked at or not.
     """
 
     mean: Tensor
@@ -147,6 +150,7 @@ class ShapeBelief:
     poses: float = 0.0
     off: float = 0.0
     heard: float = 0.0
+    frames: int = 0
 
     def frozen(self, fit: ShapeFit) -> bool:
         """Whether the hand is known so well that no more is learned."""
@@ -190,8 +194,9 @@ def weight_of(glance: Glance, fit: ShapeFit) -> float:
 def contradicted(
     belief: ShapeBelief, glance: Glance, fit: ShapeFit, first: HandShape
 ) -> ShapeBelief:
-    """The belief after one more look, believed or not; begun anew where looks contradict it."""
-    if not belief.poses:
+    """The belief after one more frame, believed or not; begun anew where looks contradict it."""
+    belief = replace(belief, frames=belief.frames + 1)
+    if not belief.poses or belief.frames % _EVERY:
         return belief
     weight = weight_of(glance, fit) * glance.present
     keep = 1 - 1 / fit.memory
@@ -221,8 +226,10 @@ def learned(
     state: (1, 27).  shape: the hand worn.  derivatives: see shape_derivatives.
     votes: the glance's, as the refinement takes them.  first: the hand whose components are 0.
     """
+    if belief.frozen(fit) or (belief.poses and belief.frames % _EVERY):
+        return belief
     weight = weight_of(glance, fit)
-    if belief.frozen(fit) or weight < _LEAST:
+    if weight < _LEAST:
         return belief
     row, far = belief.keys.nearest(state)
     known = far <= 1
