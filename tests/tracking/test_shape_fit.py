@@ -59,9 +59,11 @@ def fitted(
     sigma_m: float = 0.004,
     fit: ShapeFit = FIT,
 ) -> ShapeBelief:
-    """After believed estimates of a hand, whose poses are right."""
+    """After believed estimates of a hand, whose poses are right: so many frames of each pose that
+    one is looked at.
+    """
     first = default_hand_shape(side=shape.side)
-    for state in states[:, None]:
+    for state in states[:, None].repeat_interleave(shape_fit._EVERY, 0):
         seen = glance(shape, state, sigma_m)
         belief = shape_fit.contradicted(belief, seen, fit, first)
         worn = torch.tensor(belief.worn)
