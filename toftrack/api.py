@@ -63,6 +63,7 @@ def build_tracker(config: DictConfig) -> Tracker:
 
     device = compute_device(config.compute)
     hand = instantiate(config.hand)
+    relocaliser = instantiate(config.relocation)
     model = TrackerModel(
         shape=hand.shape.to(device),
         space=instantiate(config.pose_space).to(device),
@@ -75,7 +76,8 @@ def build_tracker(config: DictConfig) -> Tracker:
         fit=hand.fit,
         gestures=instantiate(config.gestures),
         backend=choose_backend(config.renderer, device),
-        relocaliser=instantiate(config.relocation),
+        relocaliser=relocaliser,
+        adapt=None if relocaliser is None else hand.adapt,
     )
     return Tracker(model, config.seed)
 

@@ -1,6 +1,7 @@
 """Kinematics, shape and surface of the hand."""
 
 import dataclasses
+import json
 import math
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from toftrack.errors import ToftrackError
 from toftrack.hand import make_hand_shape
-from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.skeleton import (
     ANGLE_LIMITS,
     ANGLE_NAMES,
@@ -160,6 +161,31 @@ def test_a_shape_file_round_trips(tmp_path) -> None:
     torch.testing.assert_close(loaded.bone_lengths_m, shape.bone_lengths_m)
     torch.testing.assert_close(loaded.base_frames, shape.base_frames)
     assert (loaded.side, loaded.thickness) == ("left", 1.1)
+
+
+def test_a_shape_file_says_how_the_shape_was_fitted(tmp_path) -> None:
+    fitted = Fitted(("length", "thumb"), (-0.1, 0.02), ((4e-4, 1e-5), (1e-5, 9e-4)), 7.5, True)
+    path = tmp_path / "shape.json"
+    dataclasses.replace(default_hand_shape(), fitted=fitted).save(path)
+    assert make_hand_shape(str(path)).fitted == fitted
+    assert json.loads(path.read_text())["fitted"]["sigma"] == pytest.approx(
+        {"length": 0.02, "thumb": 0.03}
+    )
+    content = json.loads(path.read_text())
+    for damage in ({"components": 3}, {"poses": "many"}, {"covariance": [[1]]}):
+        path.write_text(json.dumps({**content, "fitted": {**content["fitted"], **damage}}))
+        with pytest.raises(ToftrackError, match="damaged"):
+            make_hand_shape(str(path))
+
+
+def test_a_shape_file_of_the_first_version_is_still_read(tmp_path) -> None:
+    path = tmp_path / "shape.json"
+    default_hand_shape(0.18).save(path)
+    content = json.loads(path.read_text())
+    del content["fitted"]
+    path.write_text(json.dumps({**content, "version": 1}))
+    old = make_hand_shape(str(path))
+    assert math.isclose(old.hand_length_m, 0.18, abs_tol=1e-6) and old.fitted is None
 
 
 @pytest.mark.parametrize(

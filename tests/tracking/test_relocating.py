@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -14,7 +15,6 @@ from helpers.tracking import make_tracker
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.frames import DepthImage
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.relocation.relocaliser import SAME_PLACE_M
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.refining import Refined
@@ -22,7 +22,7 @@ from toftrack.tracking.relocating import expected_of, glanced, hypotheses, landm
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.starting import challenged
 from toftrack.tracking.state import Track, TrackerState
-from toftrack.tracking.step import _size_told, first_state
+from toftrack.tracking.step import _hand_told, first_state
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -183,33 +183,15 @@ def test_a_track_that_has_just_begun_gives_way_at_once() -> None:
     assert torch.equal(heard(begun, rival, 1, rival_frames=5)[1], rival)
 
 
-def told_size(size, track: Track | None, length_m: float, model: TrackerModel):
-    state = replace(state_of(track), size=size)
-    return _size_told(state, track, SimpleNamespace(length_m=length_m), model)
-
-
-@pytest.mark.parametrize("ratio", [0.8, 1.0, 1.2])
-def test_the_networks_say_the_size_that_a_track_begins_with(ratio: float) -> None:
-    model = plain_model()
-    first = first_state(model, 0).size
-    size = told_size(first, None, ratio * DEFAULT_HAND_LENGTH_M, model)
-    assert size.ratio(model.fit) == pytest.approx(ratio, rel=0.5 * model.fit.step + 1e-3)
-    assert model.hand("right", size).shape.hand_length_m == pytest.approx(0.19 * ratio, rel=0.02)
-    # Neither far too large nor too small: the fit's limits hold.
-    for absurd in (0.1, 10.0):
-        told = told_size(first, None, absurd * DEFAULT_HAND_LENGTH_M, model)
-        assert 1 / model.fit.largest <= told.ratio(model.fit) <= model.fit.largest
-        assert told.log_likelihood.isfinite().all()
-
-
-def test_estimates_know_the_size_better_than_the_networks() -> None:
-    model = plain_model()
-    first = first_state(model, 0).size
-    fitted = replace(first, frames=3)
-    assert told_size(fitted, None, 0.16, model) is fitted
-    assert told_size(first, track_at(0.0), 0.16, model) is first
-    fixed = replace(model, fit=None)
-    assert told_size(None, None, 0.16, fixed) is None
+def test_the_networks_say_the_length_that_a_track_begins_with() -> None:
+    model = make_tracker("filter.particles=20").model
+    first = first_state(model, 0)
+    said = glance_of(hand_at(0.0), log_size=math.log(0.8))
+    belief = _hand_told(first, None, said, model)
+    assert model.hand("right", belief).shape.hand_length_m == pytest.approx(0.152, rel=1e-3)
+    # A track goes on as it began, and a hand that is not fitted stays as it is.
+    assert _hand_told(first, track_at(0.0), said, model) is first.size
+    assert _hand_told(replace(first, size=None), None, said, replace(model, adapt=None)) is None
 
 
 def test_what_is_expected_of_a_hand_that_is_not_tracked_yet() -> None:

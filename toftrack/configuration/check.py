@@ -33,6 +33,8 @@ _ABOVE_ZERO = frozenset(
     filter.exponent filter.exponent_growth filter.particles filter.passes filter.shrink
     gestures.flexion_rad gestures.off_rad gestures.other gestures.pinch.open gestures.split_rad
     gestures.thumb_rad gestures.tips_palms
+    hand.adapt.certain_poses hand.adapt.contradiction hand.adapt.length_sigma hand.adapt.memory
+    hand.adapt.sure_m hand.adapt.votes
     hand.length_m hand.fit.beta hand.fit.exponent hand.fit.frames hand.fit.largest hand.fit.prior
     hand.fit.samples hand.fit.step
     likelihood.beta likelihood.tolerance_m

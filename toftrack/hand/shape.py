@@ -14,6 +14,7 @@ import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,7 +26,9 @@ DEFAULT_HAND_LENGTH_M = 0.190
 """Wrist to middle fingertip: ANSUR II, between the means of men (193 mm) and women (181 mm)."""
 
 _FORMAT = "toftrack-hand-shape"
-_VERSION = 1
+_VERSION = 2
+_READABLE = (1, 2)
+"""Version 1 has nothing of how the shape was fitted."""
 
 # Everything below is in millimetres for a hand of 190 mm and scaled from there.
 _REFERENCE_LENGTH_MM = 190.0
@@ -59,6 +62,53 @@ _REST_DEGREES = (
 
 
 @dataclass(frozen=True)
+class Fitted:
+    """How a shape was fitted to its user, in components (hand/shape_space.py).
+
+    names: of the components.  mean: (K,).  covariance: (K, K), rows.
+    poses: how many different, well seen poses it rests on.  frozen: nothing more was learned.
+    """
+
+    names: tuple[str, ...]
+    mean: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    poses: float
+    frozen: bool
+
+    @property
+    def sigma(self) -> tuple[float, ...]:
+        """(K,) standard deviations of the components."""
+        return tuple(math.sqrt(row[k]) for k, row in enumerate(self.covariance))
+
+    def content(self) -> dict[str, Any]:
+        """As it stands in the file."""
+        return {
+            "components": dict(zip(self.names, self.mean, strict=True)),
+            "sigma": dict(zip(self.names, self.sigma, strict=True)),
+            "covariance": [list(row) for row in self.covariance],
+            "poses": self.poses,
+            "frozen": self.frozen,
+        }
+
+    @staticmethod
+    def of(content: dict[str, Any]) -> Fitted:
+        """What `content` wrote; KeyError, TypeError or ValueError when it is not that."""
+        names, mean = zip(*content["components"].items(), strict=True)
+        covariance = tuple(tuple(map(float, row)) for row in content["covariance"])
+        if [len(row) for row in covariance] != [len(names)] * len(names):
+            raise ValueError("a covariance of another size than the components")
+        if any(row[k] < 0 for k, row in enumerate(covariance)):
+            raise ValueError("a variance below 0")
+        return Fitted(
+            names,
+            tuple(map(float, mean)),
+            covariance,
+            float(content["poses"]),
+            bool(content["frozen"]),
+        )
+
+
+@dataclass(frozen=True)
 class HandShape:
     """Sizes of one hand, metres, in the hand frame of a right hand.
 
@@ -68,6 +118,7 @@ class HandShape:
         surface.
     thickness: scale of all thicknesses relative to the default hand's proportions.
     side: "right" or "left".
+    fitted: how it was fitted to its user; None where it was not.
     """
 
     base_m: Tensor
@@ -75,6 +126,7 @@ class HandShape:
     bone_lengths_m: Tensor
     thickness: float = 1.0
     side: str = "right"
+    fitted: Fitted | None = None
 
     def to(self, *args: object, **kwargs: object) -> HandShape:
         """The same shape on another device or of another dtype, as `torch.Tensor.to`."""
@@ -114,6 +166,7 @@ class HandShape:
             "base_m": self.base_m.tolist(),
             "base_frames": self.base_frames.tolist(),
             "bone_lengths_m": self.bone_lengths_m.tolist(),
+            "fitted": None if self.fitted is None else self.fitted.content(),
         }
         Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -130,11 +183,12 @@ class HandShape:
             raise ToftrackError(f"{path} is not a readable hand shape file: {error}") from None
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
-        if content.get("version") != _VERSION:
+        if content.get("version") not in _READABLE:
             raise ToftrackError(
                 f"{path} is a hand shape of version {content.get('version')}, and this toftrack"
-                f" reads version {_VERSION}; write it again with this version"
+                f" reads versions up to {_VERSION}; write it again with this version"
             )
+        fitted = content.get("fitted")
         try:
             shape = HandShape(
                 base_m=torch.tensor(content["base_m"], dtype=torch.float32),
@@ -142,8 +196,9 @@ class HandShape:
                 bone_lengths_m=torch.tensor(content["bone_lengths_m"], dtype=torch.float32),
                 thickness=float(content["thickness"]),
                 side=str(content["side"]),
+                fitted=None if fitted is None else Fitted.of(fitted),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ToftrackError(f"{path} is a damaged hand shape file: {error!r}") from None
         sizes = (shape.base_m.shape, shape.base_frames.shape, shape.bone_lengths_m.shape)
         if sizes != ((5, 3), (5, 3, 3), (5, 3)) or shape.side not in SIDES:

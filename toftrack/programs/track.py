@@ -66,7 +66,7 @@ def _run(
                 except ReaderGoneError as gone:
                     print(f"{gone}: tracking ends here", file=sys.stderr)
                 finally:
-                    tracker.shape.to("cpu").save(folder / "hand_shape.json")
+                    tracker.fitted.to("cpu").save(folder / "hand_shape.json")
     summary = results.summary or {}
     if not summary.get("frames"):
         raise ToftrackError("the device delivered no frame; nothing was tracked")

@@ -13,6 +13,7 @@ from toftrack.compute.backend import Backend
 from toftrack.errors import ToftrackError
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand.shape import HandShape
+from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.data.natural_poses import natural_poses
 from toftrack.pose_space.density import LatentDensity, latent_density
@@ -25,6 +26,7 @@ from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
 from toftrack.tracking.search import LastSeen, Start
+from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit
 from toftrack.tracking.size_fit import HandFit, SizeBelief
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
@@ -33,16 +35,26 @@ the 90 % region of a joint hold the truth in about 93 % of the frames of rendere
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
 _HANDS = 32
-"""Sizes of the hand that are kept made; a fit tries no more."""
+"""Hands that are kept made; a fit of the size tries no more."""
 
 
 @dataclass(frozen=True, eq=False)
 class SizedHand:
-    """A hand of one side and size, and what was made for it."""
+    """A hand of one side and shape, and what was made for it.
+
+    first: the hand whose components `worn` is away from; see hand/shape_space.py.
+    """
 
     shape: HandShape
     scorer: Scorer
     refiner: Refiner
+    first: HandShape
+    worn: tuple[float, ...] = ()
+
+    @cached_property
+    def derivatives(self) -> tuple[Tensor, Tensor]:
+        """How roots and bones change with the components, on the CPU, see shape_derivatives."""
+        return shape_derivatives(self.first.to("cpu"), torch.tensor(self.worn))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +63,8 @@ class TrackerModel:
 
     shape: the hand as configured, before any of its size was fitted.
     refinement: None leaves the filter's estimate as it is.
-    fit: None leaves the size as it is.
+    fit: of the size alone, where there are no networks; None leaves the hand as it is.
+    adapt: of the shape, by what the networks say; None likewise.
     gestures: None tells none.
     relocaliser: None searches for starts, and challenges no track.
     """
@@ -68,6 +81,7 @@ class TrackerModel:
     gestures: Gestures | None
     backend: Backend
     relocaliser: Relocaliser | None = None
+    adapt: ShapeFit | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.lost, CalibratedBelief) and self.relocaliser is None:
@@ -111,13 +125,15 @@ class TrackerModel:
         """(M, 21) rad, natural poses, to take single fingers from."""
         return natural_poses().to(self.device)
 
-    def hand(self, side: str, size: SizeBelief | None) -> SizedHand:
-        """The hand of a side in the size that is believed in."""
-        ratio = 1.0 if size is None or self.fit is None else size.ratio(self.fit)
-        return self._hands(side, ratio)
+    def hand(self, side: str, belief: SizeBelief | ShapeBelief | None) -> SizedHand:
+        """The hand of a side in the size or the shape that is believed in."""
+        if isinstance(belief, ShapeBelief):
+            return self._hands(side, 1.0, belief.worn)
+        ratio = 1.0 if belief is None or self.fit is None else belief.ratio(self.fit)
+        return self._hands(side, ratio, ())
 
     @cached_property
-    def _hands(self) -> Callable[[str, float], SizedHand]:
+    def _hands(self) -> Callable[[str, float, tuple[float, ...]], SizedHand]:
         return lru_cache(_HANDS)(partial(_sized_hand, self.shape, self.backend))
 
     def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
@@ -137,9 +153,12 @@ class TrackerModel:
         return particle, state[0, 6:] - self.space.decode(particle[:, 6:])[0]
 
 
-def _sized_hand(shape: HandShape, backend: Backend, side: str, ratio: float) -> SizedHand:
-    sized = shape.of_side(side).scaled(ratio)
-    return SizedHand(sized, backend.make_scorer(sized), backend.make_refiner(sized))
+def _sized_hand(
+    shape: HandShape, backend: Backend, side: str, ratio: float, worn: tuple[float, ...]
+) -> SizedHand:
+    first = shape.of_side(side)
+    sized = shaped(first, torch.tensor(worn)) if worn else first.scaled(ratio)
+    return SizedHand(sized, backend.make_scorer(sized), backend.make_refiner(sized), first, worn)
 
 
 @dataclass(frozen=True, eq=False)

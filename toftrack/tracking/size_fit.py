@@ -1,4 +1,6 @@
-"""Fitting the hand's size to the user over the first second of tracking.
+"""Fitting the hand's size to the user over the first second of tracking, without networks.
+
+With networks the whole shape is fitted, and more exactly: see shape_fit.py.
 
 Depth is metric, so an image tells the size of a hand whose pose is known. Each believed estimate is
 tried again at a few sizes, with the pose free to follow a little, and the best scores at each size,
@@ -30,9 +32,9 @@ from toftrack.compute.rigid import rotated_pivot
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
 from toftrack.render.scoring import Evidence
+from toftrack.tracking.shape_fit import ShapeFit
 
 _REACH = 3  # sizes tried on either side of the present one
-_TOLD = 0.06  # standard deviation of the logarithm of a size that somebody else tells
 _TRIED = (1.0, 1.12, 0.9, 1.24, 0.8)  # sizes of starts, in turn
 
 
@@ -67,15 +69,20 @@ class HandFit:
 
 @dataclass(frozen=True)
 class Hand:
-    """The hand of a configuration: a shape, and how it is fitted to the user (None: it is not)."""
+    """The hand of a configuration: a shape, and how it is fitted to the user (None: it is not).
+
+    fit: of the size, where there are no networks.  adapt: of the shape, where there are.
+    """
 
     shape: HandShape
     fit: HandFit | None
+    adapt: ShapeFit | None
 
 
-def make_hand(shape: str, side: str, length_m: float, fit: HandFit) -> Hand:
+def make_hand(shape: str, side: str, length_m: float, fit: HandFit, adapt: ShapeFit) -> Hand:
     """See toftrack.hand.make_hand_shape; only shape="auto" is fitted."""
-    return Hand(make_hand_shape(shape, side, length_m), fit if shape == "auto" else None)
+    made = make_hand_shape(shape, side, length_m)
+    return Hand(made, fit, adapt) if shape == "auto" else Hand(made, None, None)
 
 
 @dataclass(frozen=True)
@@ -100,19 +107,6 @@ def first_belief(fit: HandFit) -> SizeBelief:
     half = int(math.log(fit.largest) / math.log1p(fit.step))
     log_size = torch.arange(-half, half + 1) * math.log1p(fit.step)
     return SizeBelief(-0.5 * (log_size / fit.prior).square(), half)
-
-
-def told(fit: HandFit, length_m: float, first: HandShape) -> SizeBelief:
-    """Before any estimate, when somebody else says how long the hand is.
-
-    first: the hand that sizes are ratios of.
-    """
-    belief = first_belief(fit)
-    log_size = math.log(length_m / first.hand_length_m)
-    steps = torch.arange(len(belief.log_likelihood)) - len(belief.log_likelihood) // 2
-    off = steps * math.log1p(fit.step) - log_size
-    log_likelihood = -0.5 * (off / _TOLD).square()
-    return SizeBelief(log_likelihood, int(log_likelihood.argmax()))
 
 
 def retried(fit: HandFit, attempt: int) -> SizeBelief:

@@ -12,6 +12,7 @@ from toftrack.estimate import Estimate
 from toftrack.gestures.recognition import GestureState
 from toftrack.render.segmentation import Expected, Observation
 from toftrack.tracking.search import LastSeen
+from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.signs import Signs
 from toftrack.tracking.size_fit import SizeBelief
 
@@ -76,7 +77,7 @@ class TrackerState:
     side: "right" or "left", whose hand is followed.
     track: None while there is no hand to follow.
     seen: the last hand that was believed.
-    size: what is believed of the hand's size; None where it is not fitted.
+    size: what is believed of the hand's size, or of its whole shape; None where it is not fitted.
     refused: how many starts in a row were not believed.
     gesture: smoothed probabilities of the gestures.
     last: the last estimate that there was.
@@ -88,7 +89,7 @@ class TrackerState:
     side: str
     track: Track | None = None
     seen: LastSeen | None = None
-    size: SizeBelief | None = None
+    size: SizeBelief | ShapeBelief | None = None
     refused: int = 0
     gesture: GestureState | None = None
     last: Estimate | None = None

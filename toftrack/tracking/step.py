@@ -14,10 +14,11 @@ from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
+from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.relocaliser import Glance
 from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
-from toftrack.tracking import particle_filter, size_fit
+from toftrack.tracking import particle_filter, shape_fit, size_fit
 from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.following import (
     Found,
@@ -30,7 +31,8 @@ from toftrack.tracking.following import (
 from toftrack.tracking.life_cycle import Belief, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.refining import refined
-from toftrack.tracking.relocating import expected_of, glanced
+from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
+from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.signs import Signs, read_signs, scored
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.spans import Spans
@@ -41,7 +43,11 @@ from toftrack.tracking.state import StepInfo, Track, TrackerState, resumed
 def first_state(model: TrackerModel, seed: int) -> TrackerState:
     """Before any frame."""
     generator = torch.Generator(model.device).manual_seed(seed)
-    size = None if model.fit is None else size_fit.first_belief(model.fit)
+    size: SizeBelief | ShapeBelief | None = None
+    if model.adapt is not None:
+        size = shape_fit.first_belief()
+    elif model.fit is not None:
+        size = size_fit.first_belief(model.fit)
     return TrackerState(generator.get_state(), model.shape.side, size=size)
 
 
@@ -58,7 +64,7 @@ def step(
     state = _at(state, image)
     with spans("relocaliser"):
         track, glance = glanced(state, dt_s, image, model)
-        state = replace(state, size=_size_told(state, track, glance, model))
+        state = replace(state, size=_hand_told(state, track, glance, model))
     hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
         expected = expected_depths(track, dt_s, hand, model)
@@ -123,14 +129,18 @@ def _believed(
     return believe(track, score, off_rad, dt_s, settings), signs
 
 
-def _size_told(
+def _hand_told(
     state: TrackerState, track: Track | None, glance: Glance | None, model: TrackerModel
-) -> SizeBelief | None:
-    """The size to begin a track with is what the networks say, until estimates say better."""
-    size = state.size
-    if model.fit is None or size is None or glance is None or track is not None:
-        return size
-    return size if size.frames else size_fit.told(model.fit, glance.length_m, model.shape)
+) -> SizeBelief | ShapeBelief | None:
+    """What the networks say of the hand: its length to begin a track with, until estimates say
+    better; and whether it still is the hand that was fitted.
+    """
+    belief, fit = state.size, model.adapt
+    if fit is None or glance is None or not isinstance(belief, ShapeBelief):
+        return belief
+    if track is None:
+        belief = shape_fit.told(belief, glance.length_m, model.shape)
+    return shape_fit.contradicted(belief, glance, fit, model.shape)
 
 
 def _at(state: TrackerState, image: DepthImage) -> TrackerState:
@@ -174,12 +184,14 @@ def _sized(
     belief: Belief,
     frame: ObservedFrame,
     generator: torch.Generator,
-) -> tuple[SizeBelief | None, int]:
-    """What a frame says of the hand's size; and how many starts were refused.
+) -> tuple[SizeBelief | ShapeBelief | None, int]:
+    """What a frame says of the hand's size or shape; and how many starts were refused.
 
     A believed estimate says how large the hand is; while there is none, another size is tried.
     """
     model, size, refused = frame.model, state.size, state.refused
+    if isinstance(size, ShapeBelief):
+        return (size if belief.lost else _shape_learned(size, found, frame)), refused
     if model.fit is None or size is None or size.frames >= model.fit.frames:
         return size, refused
     if not belief.lost:
@@ -196,6 +208,19 @@ def _sized(
         refused += 1
         size = size_fit.retried(model.fit, refused)
     return size, refused
+
+
+def _shape_learned(belief: ShapeBelief, found: Found, frame: ObservedFrame) -> ShapeBelief:
+    """What is believed of the hand's shape after a believed estimate."""
+    model, hand, glance = frame.model, frame.hand, frame.glance
+    if model.adapt is None or glance is None or frame.hidden:
+        return belief
+    votes = landmarks_of(glance, model)
+    votes = Landmarks(votes.points_m.cpu(), votes.sigma_m.cpu())
+    shape, state = hand.shape.to("cpu"), found.pose.cpu()
+    return shape_fit.learned(
+        belief, state, shape, hand.derivatives, glance, votes, model.adapt, hand.first
+    )
 
 
 def _estimate(

@@ -14,6 +14,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.scoring import Scorer
 from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.step import first_state, step
 
@@ -69,6 +70,14 @@ class Tracker:
     def shape(self) -> HandShape:
         """The hand that the next frame is compared with."""
         return self.model.hand(self.state.side, self.state.size).shape
+
+    @property
+    def fitted(self) -> HandShape:
+        """The same hand, with how sure the fit is of it."""
+        belief, fit = self.state.size, self.model.adapt
+        if fit is None or not isinstance(belief, ShapeBelief):
+            return self.shape
+        return replace(self.shape, fitted=belief.summary(fit))
 
     @property
     def scorer(self) -> Scorer:
