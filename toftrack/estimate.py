@@ -57,6 +57,11 @@ class Estimate:
     """The gesture, 'other' where it is none of the known; empty where gesture output is off or the
     hand is lost."""
     gesture_probability: float = math.nan
+    joint_sigma_m: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan, np.float32))
+    """(21, 3) float32 standard deviations of the joints along the camera's ray, along the finger
+    and across both; see hand/regions.py. NaN where nothing says."""
+    joint_confidence: np.ndarray = field(default_factory=lambda: np.full(21, np.nan, np.float32))
+    """(21,) float32 probabilities that the joints are within 40 mm; NaN where nothing says."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, else NaN."""
     pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
@@ -81,6 +86,7 @@ def no_estimate(
         effective_sample_size=0.0,
         compute_s=compute_s,
         confidence=0.0,
+        joint_confidence=np.zeros(21, np.float32),
     )
 
 
@@ -94,6 +100,8 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         lost=True,
         score=0.0,
         confidence=0.0,
+        joint_sigma_m=np.full((21, 3), np.nan, np.float32),
+        joint_confidence=np.zeros(21, np.float32),
         compute_s=compute_s,
     )
 
