@@ -17,6 +17,9 @@ _TAILS = 4.0
 Gaussian."""
 _SHRINK = 1e-3
 """Prior precision of the weights of signs in standard deviations, per joint."""
+_SHRINK_QUANTILE = 0.1
+"""The same of what the quantile changes. It is that strong because tails belong to few sequences,
+those with wrong tracks: weaker, regions of good frames get too small, and of doubtful too large."""
 _INSIDE = 0.9
 _SOFT = 0.05
 """Width of the kink of the quantile's loss, log scale."""
@@ -57,9 +60,10 @@ def fitted_joint_belief(rows: JointRows) -> JointBelief:
     every, every_unit = _design(rows.signs)
     odds = _fit_odds(every, rows.near.reshape(-1))
     table = np.column_stack((_plain(sigma, unit), _plain(odds[:, None], every_unit)))
-    lines = [[round(float(value), 3) for value in row] for row in table]
+    lines = [[round(float(value), 3) + 0.0 for value in row] for row in table]
     return JointBelief(
         scale=1.0,
+        odds=0.0,
         kinds=dict(zip(KINDS, lines, strict=False)),
         weights=dict(zip(JOINT_SIGNS, lines[len(KINDS) :], strict=True)),
     )
@@ -90,7 +94,7 @@ def _fit_spread(design: np.ndarray, error: np.ndarray) -> np.ndarray:
         slope = 1 - (_TAILS + 3) * square / (_TAILS + total)[:, None]
         return float(value.mean()), design.T @ slope / len(error)
 
-    return _minimised(loss, (design.shape[1], 3), np.zeros((design.shape[1], 3)))
+    return _minimised(loss, np.zeros((design.shape[1], 3)), _SHRINK)
 
 
 def _fit_quantile(design: np.ndarray, log_off: np.ndarray, most_less: np.ndarray) -> np.ndarray:
@@ -105,7 +109,7 @@ def _fit_quantile(design: np.ndarray, log_off: np.ndarray, most_less: np.ndarray
         slope = _INSIDE - expit(-above / _SOFT)
         return float(value.mean()), -(design.T @ slope / len(log_off))[:, None]
 
-    return _minimised(loss, (design.shape[1], 1), -most_less[:, None])[:, 0]
+    return _minimised(loss, -most_less[:, None], _SHRINK_QUANTILE)[:, 0]
 
 
 def _fit_odds(design: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -116,23 +120,20 @@ def _fit_odds(design: np.ndarray, near: np.ndarray) -> np.ndarray:
         value = np.logaddexp(0, odds) - near * odds
         return float(value.mean()), -(design.T @ (expit(odds) - near) / len(near))[:, None]
 
-    size = design.shape[1]
-    return -_minimised(loss, (size, 1), np.zeros((size, 1)))[:, 0]
+    return -_minimised(loss, np.zeros((design.shape[1], 1)), _SHRINK)[:, 0]
 
 
 def _minimised(
-    loss: Callable[[np.ndarray], tuple[float, np.ndarray]],
-    shape: tuple[int, int],
-    least: np.ndarray,
+    loss: Callable[[np.ndarray], tuple[float, np.ndarray]], least: np.ndarray, shrink: float
 ) -> np.ndarray:
-    """Weights of that shape; those of signs are shrunk, and at least `least`."""
-    signs = slice(len(KINDS), None)
+    """Weights (K + S, C); those of signs are shrunk, and at least `least`."""
+    shape, signs = least.shape, slice(len(KINDS), None)
 
     def shrunk(flat: np.ndarray) -> tuple[float, np.ndarray]:
         weights = flat.reshape(shape)
         value, slope = loss(weights)
-        slope[signs] += 2 * _SHRINK * weights[signs]
-        return value + _SHRINK * float(np.square(weights[signs]).sum()), slope.ravel()
+        slope[signs] += 2 * shrink * weights[signs]
+        return value + shrink * float(np.square(weights[signs]).sum()), slope.ravel()
 
     lower = np.full(shape, -np.inf)
     lower[signs] = least[signs]

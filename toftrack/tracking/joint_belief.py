@@ -70,17 +70,19 @@ _LEAST_CM, _MOST_CM = 0.1, 30.0
 class JointBelief:
     """What makes a joint's standard deviations and probability; see conf/lost/calibrated.yaml.
 
-    scale: times all standard deviations.
+    scale: times all standard deviations.  odds: added to all log odds.
     kinds: what each kind of joint begins with, in the order of COLUMNS.
     weights: of the signs, likewise.
     """
 
     scale: float
+    odds: float
     kinds: Mapping[str, Sequence[float]]
     weights: Mapping[str, Sequence[float]]
 
     def __post_init__(self) -> None:
         check_number("lost.joints.scale", self.scale, 0, above=True)
+        check_number("lost.joints.odds", self.odds)
         for name, known in (("kinds", KINDS), ("weights", JOINT_SIGNS)):
             rows = getattr(self, name)
             if set(rows) != set(known):
@@ -108,7 +110,7 @@ class JointBelief:
         """Standard deviations (21, 3), m, and probabilities (21,) from signs (21, S)."""
         told = signs @ self._weights + self._kinds
         sigma = (self.scale * np.exp(told[:, :3])).clip(_LEAST_CM, _MOST_CM) / 100
-        odds = told[:, 3].clip(-30.0, 30.0)
+        odds = (told[:, 3] + self.odds).clip(-30.0, 30.0)
         return sigma.astype(np.float32), (1 / (1 + np.exp(-odds))).astype(np.float32)
 
 
