@@ -86,7 +86,6 @@ def no_estimate(
         effective_sample_size=0.0,
         compute_s=compute_s,
         confidence=0.0,
-        joint_confidence=np.zeros(21, np.float32),
     )
 
 

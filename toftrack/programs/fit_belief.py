@@ -169,8 +169,8 @@ def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], li
         "joints: # how far off each joint may be; see toftrack/tracking/joint_belief.py",
         "  _target_: toftrack.tracking.joint_belief.JointBelief",
         # Not fitted on rendered sequences: what stands there may stay.
-        "  scale: 1.1 # times all standard deviations; larger holds joints oftener",
-        "  odds: 1.0 # added to all log odds; larger trusts joints more",
+        "  scale: 1.0 # times all standard deviations; larger holds joints oftener",
+        "  odds: 1.5 # added to all log odds; larger trusts joints more",
         "  kinds: # log cm along ray, finger, across; log odds of being within 40 mm; fitted",
         *_table(belief.kinds),
         "  weights: # of the signs, see JOINT_SIGNS, likewise; fitted",
