@@ -10,21 +10,25 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from scipy.special import expit
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
+from toftrack.errors import ToftrackError
 from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.programs import command_line
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
 from toftrack.relocation.sequences import Sequence, random_sequence, read_sequence, write_sequence
 from toftrack.relocation.shapes import shape_bank
+from toftrack.tracking.belief import CalibratedBelief
+from toftrack.tracking.joint_belief import JOINT_SIGNS
 from toftrack.tracking.signs import SIGNS
 
 RIGHT_M = 0.04
@@ -91,13 +95,14 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     seen = _together([part for part in parts if part is not None])
     kept = seen.sequence % _HELD_OUT == 0
-    p, summary, lines = _fitted_frames(seen, kept)
+    log_odds, summary, lines = _fitted_frames(seen, kept)
+    seen = with_doubt(seen, log_odds, _memory(asked.overrides))
     more, joint_lines = _fitted_joints(seen, kept)
     summary |= more
     (asked.output / "belief.json").write_text(json.dumps(summary, indent=1) + "\n")
     pasted = "\n".join(lines + joint_lines)
     (asked.output / "belief.yaml").write_text(pasted + "\n")
-    picture = reliability_figure({"held out": (p, seen.right[kept])})
+    picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
     cv2.imwrite(str(asked.output / "reliability.png"), picture)
     np.savez_compressed(
         asked.output / "signs.npz",
@@ -132,10 +137,11 @@ def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
 def _fitted_frames(
     seen: Observed, kept: np.ndarray
 ) -> tuple[np.ndarray, dict[str, Any], list[str]]:
-    """Probabilities of the kept frames, figures about them, and the lines of the configuration."""
+    """Log odds (T,), figures about the kept frames, and the lines of the configuration."""
     x, y = seen.signs, seen.right
     intercept, weights = fitted_weights(x[~kept], y[~kept])
-    p = 1 / (1 + np.exp(-(intercept + x[kept] @ weights)))
+    log_odds = intercept + x @ weights
+    p = expit(log_odds[kept])
     log_loss = -np.mean(np.log(np.where(y[kept], p, 1 - p).clip(1e-9)))
     fitted = {name: round(float(w), 3) for name, w in zip(SIGNS, weights, strict=True)}
     summary = {
@@ -148,7 +154,30 @@ def _fitted_frames(
     }
     lines = [f"intercept: {summary['intercept']} # log odds where all signs are 0; fitted"]
     lines += ["weights: # of the signs, see toftrack/tracking/signs.py"]
-    return p, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
+    return log_odds, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
+
+
+def _memory(overrides: list[str]) -> float:
+    """The part of the log odds that the tracker takes from the frames before."""
+    settings = make_tracker(*overrides).model.lost
+    if not isinstance(settings, CalibratedBelief):
+        raise ToftrackError("fit_belief fits lost=calibrated; leave lost= as it is")
+    return settings.memory
+
+
+def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
+    """The same with the sign `doubt` of joints as newly fitted log odds (T,) of the frames make it.
+
+    As the tracker does, it smooths them within each track.
+    """
+    smooth = log_odds.copy()
+    begins = seen.signs[:, SIGNS.index("young")] == 1
+    for row in range(1, len(smooth)):
+        if not begins[row] and seen.sequence[row] == seen.sequence[row - 1]:
+            smooth[row] = memory * smooth[row - 1] + (1 - memory) * log_odds[row]
+    signs = seen.joints.signs.copy()
+    signs[..., JOINT_SIGNS.index("doubt")] = np.logaddexp(0, -smooth)[:, None]
+    return replace(seen, joints=seen.joints._replace(signs=signs))
 
 
 def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], list[str]]:
