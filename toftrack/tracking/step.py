@@ -84,7 +84,7 @@ def step(
     looked = frame.glance is not None
     unlooked_s = 0.0 if looked else track.unlooked_s + dt_s
     estimate = _estimate(image, found, score, belief, frame)
-    estimate, seen_signs = _joints_judged(estimate, track, found, belief, frame)
+    estimate, seen_signs = _joints_judged(image, estimate, track, found, belief, frame)
     track = replace(track, signs=signs, joint_signs=seen_signs, unlooked_s=unlooked_s)
     track = advanced(track, found, belief, expected if frame.hidden else None, dt_s, model)
     gesture, estimate = tell_gesture(
@@ -227,10 +227,15 @@ def _estimate(
 
 
 def _joints_judged(
-    estimate: Estimate, track: Track, found: Found, belief: Belief, frame: ObservedFrame
+    image: DepthImage,
+    estimate: Estimate,
+    track: Track,
+    found: Found,
+    belief: Belief,
+    frame: ObservedFrame,
 ) -> tuple[Estimate, np.ndarray | None]:
     """The estimate with what is thought of each joint, and by which signs."""
-    model, glance, image = frame.model, frame.glance, frame.observation
+    model, glance = frame.model, frame.glance
     if not isinstance(model.lost, CalibratedBelief) or belief.log_odds is None:
         return replace(estimate, joint_sigma_m=_spread(estimate.joints_m, found, frame)), None
     signs = joint_signs(
@@ -239,8 +244,8 @@ def _joints_judged(
         track.joint_signs,
         estimate.score,
         belief.log_odds,
-        image.depth_m.cpu().numpy(),
-        image.k.cpu().numpy(),
+        image.depth_m,  # as the camera took it, and not reduced
+        image.k,
     )
     sigma, confidence = model.lost.joints.judge(signs)
     return replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence), signs
