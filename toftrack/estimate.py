@@ -61,6 +61,11 @@ class Estimate:
     """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where no gesture is."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
+    joint_sigma_m: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan, np.float32))
+    """(21, 3) float32 standard deviations of the joints along the camera's ray, along the finger
+    and across both; see hand/regions.py. NaN where nothing says."""
+    joint_confidence: np.ndarray = field(default_factory=lambda: np.full(21, np.nan, np.float32))
+    """(21,) float32 probabilities that the joints are within 40 mm; NaN where nothing says."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, with or without
     the thumb stretched away, else NaN."""
@@ -99,6 +104,8 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         lost=True,
         score=0.0,
         confidence=0.0,
+        joint_sigma_m=np.full((21, 3), np.nan, np.float32),
+        joint_confidence=np.zeros(21, np.float32),
         compute_s=compute_s,
     )
 

@@ -15,6 +15,7 @@ import pytest
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Truth
+from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate, metrics_table
 from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.trust import Hand, trust
@@ -44,6 +45,7 @@ def estimate(index: int, **changes: Any) -> Estimate:
         outside_rad=0.1,
         side="left",
         side_probability=1.0,
+        joint_sigma_m=np.full((21, 3), 0.01, np.float32),
     )
     return dataclasses.replace(whole, **changes)
 
@@ -71,6 +73,8 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "latent": ((6, 4), "f4"),
         "score": ((6,), "f4"),
         "covariance": ((6, 10, 10), "f4"),
+        "joint_sigma_m": ((6, 21, 3), "f4"),
+        "joint_confidence": ((6, 21), "f4"),
         "effective_sample_size": ((6,), "f4"),
         "gesture_probability": ((6,), "f4"),
         "pinch": ((6,), "f4"),
@@ -163,11 +167,14 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     lost = np.array([one.lost for one in estimates])
     now = truth[:12]
     headline = asdict(trust(joints, lost, Hand(now.joints_m, now.visible)))
-    assert summary["metrics"] == {"trust": headline} | evaluate(joints, lost, now)
+    regions = asdict(coverage(joints, np.full(joints.shape, 0.01), now))
+    expected = {"trust": headline, "coverage": regions} | evaluate(joints, lost, now)
+    assert summary["metrics"] == expected
     assert summary["metrics"]["trust"]["usable_pct"] == 75  # one in four is flagged
     table = metrics_table(summary).splitlines()
     assert table[0].split() == "usable 75.0 % of the 12 visible frames".split()
     assert table[2].split() == "false alarms 25.0 %".split()
+    assert "in their 90 % region  100.0 % of the joints" in table
     assert summary["metrics"]["mean_mm"] == pytest.approx(10 * math.sqrt(3), rel=1e-4)
 
 

@@ -9,6 +9,7 @@ import roma
 import torch
 from helpers.relocating import dice, small_bank
 
+from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.images import (
     WIDE_SIZE,
     Crops,
@@ -27,7 +28,6 @@ from toftrack.relocation.network import (
     Proposed,
     cube_rotations,
 )
-from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.scenes import random_rotations
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -89,6 +89,17 @@ def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None)
     assert is_grey(right)
 
 
+def test_joints_that_are_not_trusted_are_hollow() -> None:
+    confidence = np.full(21, 0.9, np.float32)
+    confidence[4] = 0.3
+    one = dataclasses.replace(hand(), joint_confidence=confidence)
+    _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))
+    for joint, colour in ((4, (0, 0, 0)), (20, LITTLE)):
+        u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
+        np.testing.assert_allclose(left[v, u], colour, atol=2)
+    assert colour_share(left, THUMB) > 0  # the ring has the finger's colour
+
+
 def test_a_nearer_hand_has_thicker_bones() -> None:
     far, near = hand(), hand()
     near = dataclasses.replace(near, joints_m=near.joints_m * np.float32(0.5))

@@ -38,6 +38,7 @@ _ABOVE_ZERO = frozenset(
     hand.length_m hand.fit.beta hand.fit.exponent hand.fit.frames hand.fit.largest hand.fit.prior
     hand.fit.samples hand.fit.step
     likelihood.beta likelihood.tolerance_m
+    lost.joints.scale
     pose_space.dims
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
     relocation.hypotheses relocation.landmark_m relocation.landmark_sigmas relocation.places
@@ -54,7 +55,7 @@ _OPEN_ENDED = frozenset(
     {"lost.outside_rad", "segmentation.reach_m", "view.linger_s", "view.wait_s"}
 )
 """Infinity is a value of these."""
-_LOG_ODDS = ("lost.intercept", "lost.weights.", "relocation.merit")
+_LOG_ODDS = ("lost.intercept", "lost.weights.", "lost.joints.odds", "relocation.merit")
 """How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
 

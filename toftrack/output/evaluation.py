@@ -143,6 +143,7 @@ def metrics_table(summary: dict[str, Any]) -> str:
         if precision is not None or recall is not None:
             text = f"precision {_figure(precision, 2)}, recall {_figure(recall, 2)}"
             rows.append(("lost frames", text))
+        rows += _region_rows(metrics.get("coverage"))
         for event in metrics["reacquisition"]:
             delay = "never" if event["delay"] is None else f"after {event['delay']} frames"
             rows.append((f"{event['event']} at {event['frame']}", f"tracked {delay}"))
@@ -164,6 +165,16 @@ def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
     if after:
         rows.append(("found again", f"after {', '.join(after)} frames"))
     return rows
+
+
+def _region_rows(coverage: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """How often 90 % regions hold, see coverage.py; nothing where there are none."""
+    if coverage is None or coverage["in_region_90_pct"] is None:
+        return []
+    hidden = coverage["hidden_in_region_90_pct"]
+    of_hidden = "" if hidden is None else f", {_figure(hidden)} % of the hidden ones"
+    share = _figure(coverage["in_region_90_pct"])
+    return [("in their 90 % region", f"{share} % of the joints{of_hidden}")]
 
 
 def _mean(values: np.ndarray) -> float | None:

@@ -21,6 +21,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
+from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate
 from toftrack.output.trust import Hand, trust
 
@@ -42,6 +43,8 @@ _LATER: dict[str, type] = {
     "pinching": np.bool_,
     "pointing_origin_m": np.float32,
     "pointing_direction": np.float32,
+    "joint_sigma_m": np.float32,
+    "joint_confidence": np.float32,
     "index": np.int64,
     "state_name": np.str_,
     "confidence": np.float32,
@@ -64,6 +67,8 @@ LINE_FIELDS = (
     "state",
     "latent",
     "covariance",
+    "joint_sigma_m",
+    "joint_confidence",
     "effective_sample_size",
     "gesture",
     "gesture_probability",
@@ -198,6 +203,8 @@ class ResultWriter:
             joints, lost = arrays["joints_m"], arrays["lost"]
             figures = trust(joints, lost, Hand(truth.joints_m, truth.visible))
             summary["metrics"] = {"trust": asdict(figures)} | evaluate(joints, lost, truth)
+            regions = coverage(joints, arrays["joint_sigma_m"], truth)
+            summary["metrics"]["coverage"] = asdict(regions)
         return summary
 
 
@@ -214,7 +221,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
 
     A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
-    side, side_probability, the pointing ray, the pinch).
+    side, side_probability, the joints' regions and confidence, the pointing ray, the pinch).
 
     Raises ToftrackError when the file is missing, damaged or not a result.
     """
@@ -244,6 +251,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 def _no_frames() -> dict[str, np.ndarray]:
     shapes = {"joints_m": (0, 21, 3), "state": (0, 27), "latent": (0, 4), "covariance": (0, 10, 10)}
+    shapes |= {"joint_sigma_m": (0, 21, 3), "joint_confidence": (0, 21)}
     shapes |= dict.fromkeys(("pointing_origin_m", "pointing_direction"), (0, 3))
     kinds = _ARRAYS | _LATER
     return {name: np.zeros(shapes.get(name, 0), kind) for name, kind in kinds.items()}

@@ -9,17 +9,26 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from scipy.special import expit
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
+from toftrack.errors import ToftrackError
+from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.programs import command_line
-from toftrack.relocation.sequences import Sequence, random_sequence
+from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
+from toftrack.relocation.sequences import Sequence, random_sequence, read_sequence, write_sequence
 from toftrack.relocation.shapes import shape_bank
+from toftrack.tracking.belief import CalibratedBelief
+from toftrack.tracking.joint_belief import JOINT_SIGNS
 from toftrack.tracking.signs import SIGNS
 
 RIGHT_M = 0.04
@@ -30,17 +39,42 @@ _HELD_OUT = 5
 """Every so manieth sequence is kept to check the fit."""
 
 
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What the tracker's estimates of T frames were formed from, and how right they were.
+
+    signs: (T, S).  right: (T,) every joint is within 40 mm.  joints: of each joint.
+    sequence: (T,) numbers of the sequences.
+    """
+
+    signs: np.ndarray
+    right: np.ndarray
+    joints: JointRows
+    sequence: np.ndarray
+
+    def of(self, rows: np.ndarray) -> Observed:
+        """Some of the frames."""
+        joints = self.joints.of(rows)
+        return Observed(self.signs[rows], self.right[rows], joints, self.sequence[rows])
+
+
 def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(
         prog="python -m toftrack.programs.fit_belief",
-        description="Fit lost=calibrated: prints the intercept and weights for its configuration.",
+        description="Fit lost=calibrated: prints what is fitted of its configuration.",
     )
     parser.add_argument("overrides", nargs="*", help="of the tracker, as for track.py")
     parser.add_argument("--sequences", type=int, default=150, help="how many are rendered (150)")
     parser.add_argument("--frames", type=int, default=50, help="of each (50)")
     parser.add_argument("--seed", type=int, default=1, help="of everything random (1)")
     parser.add_argument("--output", type=Path, default=Path("belief"), help="folder (belief)")
+    parser.add_argument(
+        "--sequences-from",
+        type=Path,
+        metavar="FOLDER",
+        help="track the sequences that an earlier run kept here, or render and keep them",
+    )
     return parser.parse_args(arguments)
 
 
@@ -52,21 +86,62 @@ def main(arguments: list[str] | None = None) -> None:
 
     asked = read_arguments(arguments)
     asked.output.mkdir(parents=True, exist_ok=True)
+    count, sequences = _sequences(asked)
+    parts = [
+        observed(sequence, asked.overrides, asked.seed + number, number)
+        for number, sequence in enumerate(
+            tqdm(sequences, total=count, unit=" sequences", file=sys.stderr)
+        )
+    ]
+    seen = _together([part for part in parts if part is not None])
+    kept = seen.sequence % _HELD_OUT == 0
+    log_odds, summary, lines = _fitted_frames(seen, kept)
+    seen = with_doubt(seen, log_odds, _memory(asked.overrides))
+    more, joint_lines = _fitted_joints(seen, kept)
+    summary |= more
+    (asked.output / "belief.json").write_text(json.dumps(summary, indent=1) + "\n")
+    pasted = "\n".join(lines + joint_lines)
+    (asked.output / "belief.yaml").write_text(pasted + "\n")
+    picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
+    cv2.imwrite(str(asked.output / "reliability.png"), picture)
+    np.savez_compressed(
+        asked.output / "signs.npz",
+        signs=seen.signs,
+        right=seen.right,
+        sequence=seen.sequence,
+        **{f"joint_{name}": values for name, values in seen.joints._asdict().items()},
+    )
+    print(f"{pasted}\n\n{_words(summary)}\nresults: {asked.output}")
+
+
+def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
+    """How many sequences, and one after the other."""
+    folder: Path | None = asked.sequences_from
+    files = [] if folder is None else sorted(folder.glob("*.npz"))
+    if files:
+        return len(files), (read_sequence(file) for file in files)
     generator = torch.Generator().manual_seed(asked.seed)
     bank = shape_bank(400, generator)
-    signs: list[list[float]] = []
-    right: list[bool] = []
-    numbers: list[int] = []
-    for number in tqdm(range(asked.sequences), unit=" sequences", file=sys.stderr):
-        sequence = random_sequence(asked.frames, bank, generator)
-        rows, labels = observed(sequence, asked.overrides, asked.seed + number)
-        signs += rows
-        right += labels
-        numbers += [number] * len(rows)
-    x, y, which = np.array(signs), np.array(right), np.array(numbers)
-    kept = which % _HELD_OUT == 0
+
+    def rendered() -> Iterator[Sequence]:
+        for number in range(asked.sequences):
+            sequence = random_sequence(asked.frames, bank, generator)
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                write_sequence(folder / f"{number:04d}.npz", sequence)
+            yield sequence
+
+    return asked.sequences, rendered()
+
+
+def _fitted_frames(
+    seen: Observed, kept: np.ndarray
+) -> tuple[np.ndarray, dict[str, Any], list[str]]:
+    """Log odds (T,), figures about the kept frames, and the lines of the configuration."""
+    x, y = seen.signs, seen.right
     intercept, weights = fitted_weights(x[~kept], y[~kept])
-    p = 1 / (1 + np.exp(-(intercept + x[kept] @ weights)))
+    log_odds = intercept + x @ weights
+    p = expit(log_odds[kept])
     log_loss = -np.mean(np.log(np.where(y[kept], p, 1 - p).clip(1e-9)))
     fitted = {name: round(float(w), 3) for name, w in zip(SIGNS, weights, strict=True)}
     summary = {
@@ -77,14 +152,72 @@ def main(arguments: list[str] | None = None) -> None:
         "intercept": round(intercept, 3),
         "weights": fitted,
     }
-    (asked.output / "belief.json").write_text(json.dumps(summary, indent=1) + "\n")
-    picture = reliability_figure({"held out": (p, y[kept])})
-    cv2.imwrite(str(asked.output / "reliability.png"), picture)
-    np.savez_compressed(asked.output / "signs.npz", signs=x, right=y, sequence=which)
-    print(f"intercept: {summary['intercept']}\nweights:")
-    print("\n".join(f"  {name}: {value}" for name, value in fitted.items()))
-    print(f"{len(y)} frames, {100 * y.mean():.0f} % right; held out: log loss {log_loss:.3f}")
-    print(f"results: {asked.output}")
+    lines = [f"intercept: {summary['intercept']} # log odds where all signs are 0; fitted"]
+    lines += ["weights: # of the signs, see toftrack/tracking/signs.py"]
+    return log_odds, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
+
+
+def _memory(overrides: list[str]) -> float:
+    """The part of the log odds that the tracker takes from the frames before."""
+    settings = make_tracker(*overrides).model.lost
+    if not isinstance(settings, CalibratedBelief):
+        raise ToftrackError("fit_belief fits lost=calibrated; leave lost= as it is")
+    return settings.memory
+
+
+def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
+    """The same with the sign `doubt` of joints as newly fitted log odds (T,) of the frames make it.
+
+    As the tracker does, it smooths them within each track.
+    """
+    smooth = log_odds.copy()
+    begins = seen.signs[:, SIGNS.index("young")] == 1
+    for row in range(1, len(smooth)):
+        if not begins[row] and seen.sequence[row] == seen.sequence[row - 1]:
+            smooth[row] = memory * smooth[row - 1] + (1 - memory) * log_odds[row]
+    signs = seen.joints.signs.copy()
+    signs[..., JOINT_SIGNS.index("doubt")] = np.logaddexp(0, -smooth)[:, None]
+    return replace(seen, joints=seen.joints._replace(signs=signs))
+
+
+def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], list[str]]:
+    """Figures about joints in kept frames, and the lines of the configuration."""
+    belief = fitted_joint_belief(seen.joints.of(~kept))
+    check = seen.joints.of(kept)
+    told = [belief.judge(signs) for signs in check.signs]
+    sigma, near = np.stack([one[0] for one in told]), np.stack([one[1] for one in told])
+    off = np.sqrt(np.square(check.error_cm / (100 * sigma)).sum(2))[check.counted]
+    right = np.where(check.near, near, 1 - near)
+    summary = {
+        "held_out_joints_in_90_pct_region": round(100 * float((off <= REGION_90).mean()), 1),
+        "held_out_joints_near": round(float(check.near.mean()), 3),
+        "held_out_joints_said_near": round(float(near.mean()), 3),
+        "held_out_joints_log_loss": round(-float(np.log(right.clip(1e-9)).mean()), 4),
+    }
+    lines = [
+        "joints: # how far off each joint may be; see toftrack/tracking/joint_belief.py",
+        "  _target_: toftrack.tracking.joint_belief.JointBelief",
+        # Not fitted on rendered sequences: what stands there may stay.
+        "  scale: 1.0 # times all standard deviations; larger holds joints oftener",
+        "  odds: 1.5 # added to all log odds; larger trusts joints more",
+        "  kinds: # log cm along ray, finger, across; log odds of being within 40 mm; fitted",
+        *_table(belief.kinds),
+        "  weights: # of the signs, see JOINT_SIGNS, likewise; fitted",
+        *_table(belief.weights),
+    ]
+    return summary, lines
+
+
+def _table(rows: Mapping[str, Iterable[float]]) -> list[str]:
+    return [f"    {name}: {list(row)}" for name, row in rows.items()]
+
+
+def _words(summary: dict[str, Any]) -> str:
+    return (
+        f"{summary['frames']} frames, {100 * summary['right']:.0f} % right; held out: log loss"
+        f" {summary['held_out_log_loss']:.3f}; 90 % regions hold"
+        f" {summary['held_out_joints_in_90_pct_region']} % of the joints"
+    )
 
 
 def fitted_weights(signs: np.ndarray, right: np.ndarray) -> tuple[float, np.ndarray]:
@@ -110,21 +243,35 @@ def fitted_weights(signs: np.ndarray, right: np.ndarray) -> tuple[float, np.ndar
     return float(found[0] - (weights * mean).sum()), weights
 
 
-def observed(
-    sequence: Sequence, overrides: list[str], seed: int
-) -> tuple[list[list[float]], list[bool]]:
-    """The signs of every estimate of a sequence, and whether it was right."""
+def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -> Observed | None:
+    """What the tracker makes of a sequence; None where it never saw a hand."""
     tracker = make_tracker(f"hand.side={sequence.side}", f"seed={seed}", *overrides)
-    rows, labels = [], []
+    rows = []
     for index, depth in enumerate(sequence.depth_m):
         estimate = tracker.step(depth, sequence.k, index, index / 25)
         info = tracker.info
-        if info is None or info.signs is None:
+        if info is None or info.signs is None or info.joint_signs is None:
             continue
-        error = np.linalg.norm(estimate.joints_m - sequence.joints_m[index], axis=1)
-        rows.append(info.signs.values())
-        labels.append(bool(error.max() < RIGHT_M and sequence.visible[index]))
-    return rows, labels
+        joints, there = estimate.joints_m.astype(np.float64), bool(sequence.visible[index])
+        off = sequence.joints_m[index] - joints
+        near = there & (np.linalg.norm(off, axis=1) < RIGHT_M)
+        error_cm = 100 * np.einsum("jab,jb->ja", joint_axes(joints), off)
+        counted = there and not estimate.lost
+        rows.append((info.signs.values(), near.all(), info.joint_signs, error_cm, near, counted))
+    if not rows:
+        return None
+    signs, right, *joint_rows = map(np.array, zip(*rows, strict=True))
+    return Observed(signs, right, JointRows(*joint_rows), np.full(len(rows), number))
+
+
+def _together(parts: list[Observed]) -> Observed:
+    joints = zip(*(part.joints for part in parts), strict=True)
+    return Observed(
+        np.concatenate([part.signs for part in parts]),
+        np.concatenate([part.right for part in parts]),
+        JointRows(*map(np.concatenate, joints)),
+        np.concatenate([part.sequence for part in parts]),
+    )
 
 
 if __name__ == "__main__":

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import roma
 import torch
 from torch import Tensor
 
+from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.images import random_scenes
 from toftrack.relocation.pictures import Lens, random_sensors, take_pictures
@@ -88,6 +91,30 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         np.array(seen),
         "left" if bool(left) else "right",
     )
+
+
+def write_sequence(path: Path, sequence: Sequence) -> None:
+    """Keep a sequence as an npz file."""
+    np.savez_compressed(
+        path,
+        depth=sequence.depth_m,
+        k=sequence.k,
+        joints=sequence.joints_m,
+        visible=sequence.visible,
+        side=sequence.side,
+    )
+
+
+def read_sequence(path: Path) -> Sequence:
+    """A sequence that was kept. Raises ToftrackError where the file holds none."""
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            fields = (kept["depth"], kept["k"], kept["joints"], kept["visible"])
+            return Sequence(*fields, str(kept["side"]))
+    except (OSError, KeyError, ValueError, BadZipFile) as error:
+        raise ToftrackError(
+            f"'{path}' holds no rendered sequence; give a folder that fit_belief wrote"
+        ) from error
 
 
 def _places(keys: int, wide: float, high: float, dice: Dice) -> Tensor:

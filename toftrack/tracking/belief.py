@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from toftrack.checks import check_number
 from toftrack.compute.pace import FRAME_S
 from toftrack.errors import ToftrackError
+from toftrack.tracking.joint_belief import JointBelief
 from toftrack.tracking.life_cycle import Belief, lasted, longer
 from toftrack.tracking.signs import SIGNS, Signs
 from toftrack.tracking.state import Track
@@ -33,6 +34,7 @@ class CalibratedBelief:
     memory: part of the log odds that comes from the frames before.
     probation: frames after a start during which the hand is not remembered as seen.
     intercept, weights: of the signs, by name.
+    joints: what is thought of each joint.
     """
 
     confidence: float
@@ -43,6 +45,7 @@ class CalibratedBelief:
     probation: int
     intercept: float
     weights: Mapping[str, float]
+    joints: JointBelief
 
     def __post_init__(self) -> None:
         for name in ("confidence", "believe", "give_up"):

@@ -139,6 +139,7 @@ def advanced(
         believed=track.believed or not belief.lost,
         unlooked_s=track.unlooked_s,
         signs=track.signs,
+        joint_signs=track.joint_signs,
         expected=expected,
     )
 

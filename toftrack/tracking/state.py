@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -46,6 +47,7 @@ class Track:
     log_odds: that the estimate is right, smoothed over time; None where nobody says.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
     unlooked_s: how long ago the networks looked at it.  signs: of the last estimate.
+    joint_signs: (21, S) likewise, see JOINT_SIGNS; None where there are none.
     expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
 
@@ -66,6 +68,7 @@ class Track:
     believed: bool = False
     unlooked_s: float = 0.0
     signs: Signs | None = None
+    joint_signs: np.ndarray | None = None
     expected: Expected | None = None
 
 
@@ -104,7 +107,7 @@ class StepInfo:
     particles: (N, 6 + d) before the estimate was refined; none where nothing can be a hand.
     weights: (N,) normalised.
     seconds: wall seconds of each stage.
-    signs: what the belief was formed from; None where there are no networks.
+    signs, joint_signs: what the beliefs were formed from; None where there are no networks.
     """
 
     observation: Observation
@@ -112,6 +115,7 @@ class StepInfo:
     weights: Tensor
     seconds: Mapping[str, float]
     signs: Signs | None = None
+    joint_signs: np.ndarray | None = None
 
 
 def resumed(generator: Tensor, device: torch.device) -> torch.Generator:

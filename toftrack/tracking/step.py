@@ -28,6 +28,7 @@ from toftrack.tracking.following import (
     filtered,
     remembered,
 )
+from toftrack.tracking.joint_belief import joint_signs, propagated_sigma
 from toftrack.tracking.life_cycle import Belief, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.refining import refined
@@ -87,9 +88,11 @@ def step(
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
     belief, signs = _believed(track, found, score, dt_s, frame)
     looked = frame.glance is not None
-    track = replace(track, signs=signs, unlooked_s=0.0 if looked else track.unlooked_s + dt_s)
-    track = advanced(track, found, belief, expected if frame.hidden else None, dt_s, model)
+    unlooked_s = 0.0 if looked else track.unlooked_s + dt_s
     estimate = _estimate(image, found, score, belief, frame)
+    estimate, seen_signs = _joints_judged(image, estimate, track, found, belief, frame)
+    track = replace(track, signs=signs, joint_signs=seen_signs, unlooked_s=unlooked_s)
+    track = advanced(track, found, belief, expected if frame.hidden else None, dt_s, model)
     gesture, estimate = tell_gesture(
         model.gestures, state.gesture, estimate, model.space, dt_s / FRAME_S
     )
@@ -106,7 +109,7 @@ def step(
         gesture=gesture,
         last=estimate,
     )
-    info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs)
+    info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs, seen_signs)
     return after, info, estimate
 
 
@@ -246,6 +249,45 @@ def _estimate(
         effective_sample_size=float(particle_filter.effective_sample_size(found.weights)),
         compute_s=math.nan,
     )
+
+
+def _joints_judged(
+    image: DepthImage,
+    estimate: Estimate,
+    track: Track,
+    found: Found,
+    belief: Belief,
+    frame: ObservedFrame,
+) -> tuple[Estimate, np.ndarray | None]:
+    """The estimate with what is thought of each joint, and by which signs."""
+    model, glance = frame.model, frame.glance
+    if not isinstance(model.lost, CalibratedBelief) or belief.log_odds is None:
+        return replace(estimate, joint_sigma_m=_spread(estimate.joints_m, found, frame)), None
+    signs = joint_signs(
+        estimate.joints_m,
+        None if glance is None else glance.landmarks,
+        track.joint_signs,
+        estimate.score,
+        belief.log_odds,
+        image.depth_m,  # as the camera took it, and not reduced
+        image.k,
+    )
+    sigma, confidence = model.lost.joints.judge(signs)
+    return replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence), signs
+
+
+def _spread(joints_m: np.ndarray, found: Found, frame: ObservedFrame) -> np.ndarray:
+    """(21, 3) standard deviations of joints by the particles alone, as joint_sigma_m has them."""
+    model = frame.model
+    motions = model.backend.motions
+
+    def joints_of(tangents: Tensor) -> Tensor:
+        moved = motions.compose(found.refined.repeat(len(tangents), 1), tangents)
+        return frame.hand.refiner.joints(model.decode(moved, found.offset))
+
+    around = motions.difference(found.particles, found.mean)
+    covariance = particle_filter.covariance(around, found.weights)
+    return propagated_sigma(joints_m, covariance + torch.diag(model.model_variance), joints_of)
 
 
 def _host(tensor: Tensor) -> np.ndarray:

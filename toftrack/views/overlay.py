@@ -26,6 +26,8 @@ _WHITE = (255, 255, 255)
 CAPTION_PX = 36
 """Height of the caption above a panel's two sides."""
 _BONE_M = 0.004
+_TRUSTED = 0.5
+"""Joints that are less likely within 40 mm are drawn hollow."""
 _NEAREST_GREY, _FARTHEST_GREY = 40, 215
 _SUBPIXEL_BITS = 3
 
@@ -51,7 +53,8 @@ def draw_panel(
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
     Above both, a caption with frame number, score, confidence, state and gesture. A red caption and
-    frame mark an estimate that is lost. The skeleton is missing where the estimate is NaN.
+    frame mark an estimate that is lost. The skeleton is missing where the estimate is NaN; joints
+    that are more likely wrong than right are hollow.
 
     Args:
         depth_m: (H, W) metres, 0 = no reading; shown without amplitude, nearer is brighter.
@@ -71,7 +74,10 @@ def draw_panel(
     grey = _depth_grey(depth_m) if amplitude is None else _amplitude_grey(amplitude)
     smooth = cv2.INTER_NEAREST if amplitude is None else cv2.INTER_LINEAR
     left = cv2.cvtColor(cv2.resize(grey, size, interpolation=smooth), cv2.COLOR_GRAY2BGR)
-    _draw_skeleton(left, camera, estimate.joints_m, size[0] / width, size[1] / height)
+    # A comparison with NaN is false: what nothing is known of is drawn as ever.
+    doubted = estimate.joint_confidence < _TRUSTED
+    scales = size[0] / width, size[1] / height
+    _draw_skeleton(left, camera, estimate.joints_m, doubted, *scales)
     model: np.ndarray = np.full((height, width), 255, np.uint8)
     if model_depth is not None:
         model = range_grey(model_depth)
@@ -203,9 +209,17 @@ def range_grey(model_depth: np.ndarray) -> np.ndarray:
 
 
 def _draw_skeleton(
-    picture: np.ndarray, camera: Camera, joints_m: np.ndarray, scale_x: float, scale_y: float
+    picture: np.ndarray,
+    camera: Camera,
+    joints_m: np.ndarray,
+    doubted: np.ndarray,
+    scale_x: float,
+    scale_y: float,
 ) -> None:
-    """Draw (21, 3) joints into the picture, in place, as wide as 4 mm would look there."""
+    """Draw (21, 3) joints into the picture, in place, as wide as 4 mm would look there.
+
+    doubted: (21,) joints that are drawn as rings.
+    """
     joints_m = np.asarray(joints_m, np.float64)
     if not np.isfinite(joints_m).all() or (joints_m[:, 2] <= 0).any():
         return
@@ -233,6 +247,9 @@ def _draw_skeleton(
             for joint in chain[1:]:
                 radius = (thick + outline // 2) * 2**_SUBPIXEL_BITS
                 cv2.circle(picture, points[joint], radius, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+    for joint in np.flatnonzero(doubted[1:]) + 1:
+        hole = max(1, thick // 2) * 2**_SUBPIXEL_BITS
+        cv2.circle(picture, points[joint], hole, (0, 0, 0), -1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _caption(estimate: Estimate, half_width: int) -> np.ndarray:
