@@ -107,10 +107,15 @@ def step(
         size=size,
         refused=refused,
         gesture=gesture,
-        last=estimate,
+        last=_worth_keeping(state.last, estimate),
     )
     info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs, seen_signs)
     return after, info, estimate
+
+
+def _worth_keeping(last: Estimate | None, estimate: Estimate) -> Estimate:
+    """What is told while there is no hand: the last estimate that was believed, if one was."""
+    return last if estimate.lost and last is not None and not last.lost else estimate
 
 
 def _believed(
