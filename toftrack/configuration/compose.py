@@ -14,7 +14,7 @@ from hydra.core.singleton import Singleton
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
 from hydra.version import VersionBase
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import toftrack
@@ -59,6 +59,14 @@ def configuration_folder() -> Path:
     package = Path(toftrack.__file__).parent
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
+
+
+def setting_names() -> frozenset[str]:
+    """The groups, and the settings that stand in none: how the keys of overrides begin."""
+    folder = configuration_folder()
+    own = [str(name) for path in folder.glob("*.yaml") for name in OmegaConf.load(path)]
+    groups = [path.name for path in folder.iterdir() if path.is_dir()]
+    return frozenset({*own, *groups, "hydra"})
 
 
 @contextmanager

@@ -1,0 +1,68 @@
+"""`toftrack track FILE`: a recording's name in place of device=replay device.path=FILE."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from toftrack.errors import ToftrackError
+
+_WITH_VALUE = frozenset(
+    "--config-path -cp --config-name -cn --config-dir -cd --cfg -c --package -p "
+    "--experimental-rerun".split()
+)
+"""Hydra's options that are followed by a value."""
+_KEY = re.compile(r"[+~]{0,2}[\w./@:]+")
+
+
+def with_recording(arguments: Sequence[str], known: Collection[str]) -> list[str]:
+    """The arguments with a file's name as two overrides.
+
+    known: the first parts of keys, groups and settings: what begins with one and has a = is one,
+    whatever files there are.
+
+    Raises ToftrackError for two recordings, or one beside another device.
+    """
+    others: list[str] = []
+    files: list[str] = []
+    value_follows = False
+    for argument in arguments:
+        if value_follows or not _is_file(argument, known):
+            others.append(argument)
+            value_follows = not value_follows and argument in _WITH_VALUE
+        else:
+            files.append(argument)
+    if not files:
+        return others
+    if len(files) > 1:
+        raise ToftrackError(
+            f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"
+            " a name that has blanks in it"
+        )
+    if device := next((word for word in others if word.startswith("device=")), None):
+        raise ToftrackError(
+            f"both {device} and the recording '{files[0]}' say where frames come from; leave one out"
+        )
+    return ["device=replay", f"device.path={quoted(files[0])}", *others]
+
+
+def quoted(text: str) -> str:
+    """A text as a value of Hydra's that stands for just that, whatever signs are in it."""
+    # Hydra takes a backslash for itself only before a quote, OmegaConf only before ${.
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
+    text = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    text = re.sub(r"(\\+)$", r"\1\1", text)
+    return f"'{text}'"
+
+
+def _is_file(argument: str, known: Collection[str]) -> bool:
+    if argument.startswith("-") and not Path(argument).exists():
+        return False
+    key, separator, _ = argument.partition("=")
+    if not separator:  # without one, only a deletion is an override
+        return not argument.startswith("~") or Path(argument).expanduser().exists()
+    if not _KEY.fullmatch(key):
+        return True
+    first = re.split(r"[./@:]", key.lstrip("+~"))[0]
+    return first not in known and Path(argument).expanduser().exists()
