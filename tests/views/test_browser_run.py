@@ -118,7 +118,7 @@ def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path) -> None:
             bodies += [answer.read()] if answer.status == 200 else []
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and out == "", err
+    assert process.returncode == 130 and "time a frame" in out, err
     assert "interrupted" in err and "Traceback" not in err
     assert bodies[0] != bodies[1]
     (results,) = tmp_path.glob("outputs/*/*/track.npz")

@@ -72,7 +72,9 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
     keys = [name for name in _keys(root) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]
-    likely = nearest(key, keys) or (same[0] if same else None)
+    likely = nearest(key, [name for name in keys if not key.startswith(f"{name}.")]) or (
+        same[0] if same else None
+    )
     text = f"there is no setting {key}"
     if key == "device.path":
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"

@@ -42,7 +42,7 @@ _OVERVIEW = """toftrack follows a human hand in the depth images of a camera or 
 commands (toftrack COMMAND --help says more):
 {commands}"""
 
-_TRACK = """toftrack track follows a hand and writes its 21 joints, state and gesture for every frame.
+_TRACK = """toftrack track follows a hand and writes joints, state and gesture of every frame.
 
   toftrack track                              the recording that comes with it
   toftrack track FILE hand.side=left          a recording of your own, of a left hand

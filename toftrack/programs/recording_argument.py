@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Collection, Sequence
-from pathlib import Path
 
 from toftrack.errors import ToftrackError
 
@@ -42,9 +42,11 @@ def with_recording(arguments: Sequence[str], known: Collection[str]) -> list[str
         )
     if device := next((word for word in others if word.startswith("device=")), None):
         raise ToftrackError(
-            f"both {device} and the recording '{files[0]}' say where frames come from; leave one out"
+            f"{device} and the recording '{files[0]}' both give the frames; leave one out"
         )
-    return ["device=replay", f"device.path={quoted(files[0])}", *others]
+    # What the shell has left of a ~ is the file's own, where there is one.
+    name = f"./{files[0]}" if files[0][0] == "~" and os.path.exists(files[0]) else files[0]
+    return ["device=replay", f"device.path={quoted(name)}", *others]
 
 
 def quoted(text: str) -> str:
@@ -57,12 +59,16 @@ def quoted(text: str) -> str:
 
 
 def _is_file(argument: str, known: Collection[str]) -> bool:
-    if argument.startswith("-") and not Path(argument).exists():
+    if argument.startswith("-") and not os.path.exists(argument):
         return False
     key, separator, _ = argument.partition("=")
     if not separator:  # without one, only a deletion is an override
-        return not argument.startswith("~") or Path(argument).expanduser().exists()
+        return not argument.startswith("~") or _exists(argument)
     if not _KEY.fullmatch(key):
         return True
     first = re.split(r"[./@:]", key.lstrip("+~"))[0]
-    return first not in known and Path(argument).expanduser().exists()
+    return first not in known and _exists(argument)
+
+
+def _exists(name: str) -> bool:
+    return os.path.exists(name) or os.path.exists(os.path.expanduser(name))

@@ -19,6 +19,8 @@ from toftrack.output.files import LINES, LineFile
 from toftrack.output.results import finish, read_run_facts
 from toftrack.output.run_folder import found_again, open_tracked
 from toftrack.recordings.store import open_source
+from toftrack.views.overlay import VIDEO
+from toftrack.views.video import cut_to_whole
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -50,6 +52,8 @@ def recover(folder: Path, recording: str | Path | None = None) -> dict[str, Any]
     try:
         lines = LineFile(folder, keep=True)
         try:
+            if (folder / VIDEO).is_file():
+                cut_to_whole(folder / VIDEO)
             return finish(folder, facts, _truth(facts, recording))
         finally:
             lines.close()

@@ -32,6 +32,7 @@ _BONE_M = 0.004
 _NEAREST_GREY, _FARTHEST_GREY = 40, 215
 _SUBPIXEL_BITS = 3
 
+VIDEO, STRIP = "overlay.mp4", "overlay.png"
 _STRIP_TILES = 10
 _STRIP_COLUMNS = 5
 _STRIP_TILE_PX = 320
@@ -112,8 +113,8 @@ class VideoView:
     """
 
     def __init__(self, folder: str | Path, fps: float, frames: int | None = None) -> None:
-        self.video_path = Path(folder) / "overlay.mp4"
-        self.strip_path = Path(folder) / "overlay.png"
+        self.video_path = Path(folder) / VIDEO
+        self.strip_path = Path(folder) / STRIP
         self._fps = fps
         self._video: VideoFile | None = None
         self._size = (0, 0)

@@ -8,6 +8,7 @@ not play their MPEG-4, and their VP8 takes 38 ms a frame where this takes 3.
 from __future__ import annotations
 
 import math
+import os
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from toftrack.errors import ToftrackError
 
 _OPTIONS = {"preset": "ultrafast", "tune": "zerolatency", "crf": "23"}
 """3 ms and 10 kB for 1056 x 468 pixels; no frame is held back."""
-_FRAGMENTS = {"movflags": "frag_keyframe+empty_moov+default_base_moof"}
+_FRAGMENTS = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"}
 
 
 class VideoFile:
@@ -63,6 +64,7 @@ class VideoFile:
             try:
                 self._file.close()
             except OSError as error:
+                cut_to_whole(self._path)
                 raise unwritable(self._path) from error
 
     def _write(self, frame: Any) -> None:
@@ -70,6 +72,25 @@ class VideoFile:
             self._file.mux(self._stream.encode(frame))
         except OSError as error:
             raise unwritable(self._path) from error
+
+
+def cut_to_whole(path: Path) -> None:
+    """Take from a video's end the second that was not written as a whole, where there is one.
+
+    Players stop there with an error. Raises OSError.
+    """
+    with open(path, "r+b") as file:
+        size, whole = os.fstat(file.fileno()).st_size, 0
+        position = 0
+        while len(header := file.read(8)) == 8:  # an MP4 is a row of boxes: length, then kind
+            length, kind = int.from_bytes(header[:4], "big"), header[4:]
+            if length < 8 or position + length > size:
+                break
+            position += length
+            if kind != b"moof":  # it describes the box of pictures that follows
+                whole = position
+            file.seek(position)
+        file.truncate(whole)
 
 
 def unwritable(path: Path) -> ToftrackError:
