@@ -17,15 +17,7 @@ from toftrack.programs.recording_argument import quoted, with_recording
 
 KNOWN = setting_names()
 ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')
-ODDER = (
-    "1,2,3.npz",
-    "${oc.env:HOME}.npz",
-    "\\${x}.npz",
-    "back\\slash\\'s.npz",
-    "ends\\",
-    "~x",
-    "#",
-)
+ODDER = ("1,2,3.npz", "${oc.env:HOME}.npz", "\\${x}.npz", "back\\slash\\'s", "ends\\", "#", "-")
 
 
 @pytest.mark.parametrize("words", [["--help"], ["track", "--help"], ["train", "device=x", "-h"]])
@@ -103,6 +95,13 @@ def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypat
     Path("my_conf").mkdir()
     Path("seed=1").mkdir()  # as sweeps name their folders
     assert with_recording(words, KNOWN) == words
+
+
+def test_a_name_that_begins_with_a_tilde_is_not_somebody_s_home(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert with_recording(["~x"], KNOWN) == ["~x"]
+    Path("~x").touch()
+    assert with_recording(["~x"], KNOWN)[1] == "device.path='./~x'"
 
 
 def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missing() -> None:

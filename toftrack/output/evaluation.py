@@ -144,7 +144,8 @@ def metrics_table(summary: dict[str, Any]) -> str:
         for name, value in metrics.items():
             if name.startswith("frames_max_below_"):
                 limit = name.removeprefix("frames_max_below_").removesuffix("mm_pct")
-                rows.append((f"frames below {limit} mm", f"{_figure(value)} %"))
+                share = value if metrics["frames"] else None
+                rows.append((f"frames below {limit} mm", f"{_figure(share)} %"))
         if metrics["missing_pct"]:
             rows.append(("without estimate", f"{_figure(metrics['missing_pct'])} %"))
         precision, recall = metrics.get("lost_precision"), metrics.get("lost_recall")
@@ -188,8 +189,8 @@ def _mean(values: np.ndarray) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def _share_pct(part: np.ndarray, whole: np.ndarray) -> float | None:
-    return 100.0 * float(part.sum()) / float(whole.sum()) if whole.any() else None
+def _share_pct(part: np.ndarray, whole: np.ndarray) -> float:
+    return 100.0 * float(part.sum()) / max(1.0, float(whole.sum()))
 
 
 def _in_sight(error: np.ndarray, truth: Truth) -> np.ndarray:
