@@ -329,8 +329,8 @@ def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here
         (["camera.file=gone.json"], "gone.json"),
         (["filter.particles=0"], "filter.particles"),
         (["device=replay"], "device.path"),
-        (["device=telescope"], "device/telescope"),
-        (["experiment=other"], "experiment/other"),
+        (["device=telescope"], "device=telescope"),
+        (["experiment=other"], "experiment=other"),
         (["particles=3"], "particles"),
     ],
 )

@@ -12,10 +12,7 @@ from toftrack.configuration.compose import configuration_folder, setting_names
 from toftrack.programs import command_line
 from toftrack.programs.recording_argument import with_recording
 
-_CONF = str(configuration_folder())
 
-
-@hydra.main(version_base="1.3", config_path=_CONF, config_name="config")
 @command_line.sweep_job
 def track_job(config: DictConfig) -> float:
     """Track, write the results, and return what a sweep minimises."""
@@ -26,7 +23,6 @@ def track_job(config: DictConfig) -> float:
     return app.track(config, device)
 
 
-@hydra.main(version_base="1.3", config_path=_CONF, config_name="train_pose_space")
 @command_line.sweep_job
 def train_job(config: DictConfig) -> float:
     """Train, write the model and its figures, and return what a sweep minimises."""
@@ -37,19 +33,23 @@ def train_job(config: DictConfig) -> float:
 
 def track(arguments: Sequence[str]) -> None:
     """Track as a command line says, which may name a recording."""
-    _start(track_job, "track", with_recording(arguments, setting_names()))
+    _start(track_job, "track", "config", with_recording(arguments, setting_names()))
 
 
 def train(arguments: Sequence[str]) -> None:
     """Train as a command line says."""
-    _start(train_job, "train", arguments)
+    _start(train_job, "train", "train_pose_space", arguments)
 
 
-def _start(job: Callable[[], object], name: str, arguments: Sequence[str]) -> None:
-    """Hydra reads the command line of the process."""
+def _start(
+    job: Callable[[DictConfig], float], name: str, config: str, arguments: Sequence[str]
+) -> None:
+    """Run a Hydra application; it reads the command line of the process."""
+    folder = str(configuration_folder())
+    application = hydra.main(version_base="1.3", config_path=folder, config_name=config)(job)
     before = sys.argv
     sys.argv = [f"toftrack {name}", *arguments]
     try:
-        job()
+        application()
     finally:
         sys.argv = before
