@@ -64,8 +64,8 @@ def test_a_hand_of_the_other_side_that_is_followed_is_told() -> None:
     for i in range(10):
         followed = followed.tracked(other_side=i < 6)
     assert advice(followed, "left", REACH_M) == (
-        "In 6 of 10 frames it looked like the other hand: give hand.side=right, or, if it is a left "
-        "one, put the image right, which is mirrored or has its rows and columns exchanged.",
+        "In 6 of 10 frames it looked like the other hand: give hand.side=right, or, if it is a "
+        "left one, put the image right, which is mirrored or has its rows and columns exchanged.",
     )
     for _ in range(2):
         followed = followed.tracked(other_side=False)

@@ -217,8 +217,8 @@ def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
     if not found:
         found.append(
             f"If a hand was in view, look at overlay.png (view=video): it must be a {side} hand "
-            "(hand.side), upright and not mirrored (x right, y down), with nothing else nearer to the "
-            "camera, and depth_m must have the order frames, rows, columns."
+            "(hand.side), upright and not mirrored (x right, y down), with nothing else nearer to "
+            "the camera, and depth_m must have the order frames, rows, columns."
         )
     return found
 
@@ -226,6 +226,6 @@ def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
 def _if_it_is_the_other(side: str) -> str:
     other = "left" if side == "right" else "right"
     return (
-        f"give hand.side={other}, or, if it is a {side} one, put the image right, which is mirrored "
-        "or has its rows and columns exchanged"
+        f"give hand.side={other}, or, if it is a {side} one, put the image right, which is "
+        "mirrored or has its rows and columns exchanged"
     )
