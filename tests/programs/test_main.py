@@ -50,6 +50,7 @@ def test_every_command_is_a_function_that_there_is() -> None:
     [
         (["trak"], "did you mean toftrack track?"),
         (["hand.side=left"], "did you mean toftrack track hand.side=left?"),
+        (["gone.npz"], "did you mean toftrack track gone.npz?"),
         (["xyz"], "give one of track, train"),
     ],
 )

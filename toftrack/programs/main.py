@@ -137,7 +137,7 @@ def _unknown(word: str) -> str:
     import difflib
 
     names = ", ".join(_COMMANDS)
-    if "=" in word or Path(word).exists():
+    if "=" in word or Path(word).suffix or Path(word).exists():
         return f"there is no command '{word}'; did you mean toftrack track {word}?"
     if near := difflib.get_close_matches(word, _COMMANDS, n=1):
         return f"there is no command '{word}'; did you mean toftrack {near[0]}?"
