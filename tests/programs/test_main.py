@@ -17,7 +17,7 @@ from toftrack.programs.recording_argument import quoted, with_recording
 
 KNOWN = setting_names()
 ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')
-ODDER = ("1,2,3.npz", "${oc.env:HOME}.npz", "\\${x}.npz", "back\\slash\\'s", "ends\\", "#", "-")
+ODDER = ("1,2,3.npz", "$HOME.npz", "back\\slash\\'s", "ends\\", "#", "-")
 
 
 @pytest.mark.parametrize("words", [["--help"], ["track", "--help"], ["train", "device=x", "-h"]])
@@ -114,9 +114,10 @@ def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missi
     ("words", "told"),
     [
         (["a.npz", "b.npz"], "two recordings, 'a.npz' and 'b.npz'"),
+        (["${x}.npz"], "rename the file"),
         (["a.npz", "device=sr3000"], "device=sr3000 and the recording 'a.npz'"),
     ],
 )
-def test_two_sources_of_frames_are_told(words: list[str], told: str) -> None:
+def test_what_cannot_be_one_recording_is_told(words: list[str], told: str) -> None:
     with pytest.raises(ToftrackError, match=told):
         with_recording(words, KNOWN)

@@ -40,6 +40,11 @@ def with_recording(arguments: Sequence[str], known: Collection[str]) -> list[str
             f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"
             " a name that has blanks in it"
         )
+    if "${" in files[0]:  # OmegaConf would look for a setting of that name, however it is quoted
+        raise ToftrackError(
+            f"the recording's name, '{files[0]}', has ${{ in it, which means something else in "
+            "settings; rename the file"
+        )
     if device := next((word for word in others if word.startswith("device=")), None):
         raise ToftrackError(
             f"{device} and the recording '{files[0]}' both give the frames; leave one out"
@@ -51,8 +56,7 @@ def with_recording(arguments: Sequence[str], known: Collection[str]) -> list[str
 
 def quoted(text: str) -> str:
     """A text as a value of Hydra's that stands for just that, whatever signs are in it."""
-    # Hydra takes a backslash for itself only before a quote, OmegaConf only before ${.
-    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
+    # Hydra takes a backslash for itself only before a quote.
     text = re.sub(r"(\\*)'", r"\1\1\\'", text)
     text = re.sub(r"(\\+)$", r"\1\1", text)
     return f"'{text}'"
