@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -64,8 +65,11 @@ class VideoFile:
             try:
                 self._file.close()
             except OSError as error:
-                cut_to_whole(self._path)
                 raise unwritable(self._path) from error
+            finally:
+                # Not every failure to write is told by the library.
+                with suppress(OSError):
+                    cut_to_whole(self._path)
 
     def _write(self, frame: Any) -> None:
         try:
