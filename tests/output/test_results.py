@@ -250,7 +250,7 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_lives(tmp_path: P
         first.append(estimate(1))
     assert len(read_results(tmp_path / "track.npz")["lost"]) == 2
     with ResultWriter(tmp_path, {}, NAMES):
-        pass
+        assert not (tmp_path / "track.npz").exists(), "it would be that of the first run"
     assert (tmp_path / "track.jsonl").read_text() == ""
 
 

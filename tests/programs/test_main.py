@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from helpers.tracking import ROOT, configuration
 
-from toftrack.configuration.compose import setting_names
+from toftrack.configuration.compose import devices_of_files, setting_names
 from toftrack.errors import ToftrackError
 from toftrack.programs import main as front
 from toftrack.programs.recording_argument import quoted, with_recording
 
-KNOWN = setting_names()
+KNOWN = setting_names(), devices_of_files()
 ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')
 ODDER = ("1,2,3.npz", "$HOME.npz", "back\\slash\\'s", "ends\\", "#", "-")
 
@@ -74,7 +74,7 @@ def test_any_name_arrives_as_it_is(name: str, tmp_path, monkeypatch) -> None:
     assert config.device.path == name
     monkeypatch.chdir(tmp_path)
     Path(name).touch()
-    assert with_recording([name, "seed=1"], KNOWN) == [
+    assert with_recording([name, "seed=1"], *KNOWN) == [
         "device=replay",
         f"device.path={quoted(name)}",
         "seed=1",
@@ -95,19 +95,24 @@ def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     Path("my_conf").mkdir()
     Path("seed=1").mkdir()  # as sweeps name their folders
-    assert with_recording(words, KNOWN) == words
+    assert with_recording(words, *KNOWN) == words
+
+
+def test_a_device_that_plays_files_may_be_chosen_beside_the_name() -> None:
+    words = ["device=folder", "device.unit_m=0.0001"]
+    assert with_recording([*words, "a b"], *KNOWN) == ["device.path='a b'", *words]
 
 
 def test_a_name_that_begins_with_a_tilde_is_not_somebody_s_home(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert with_recording(["~x"], KNOWN) == ["~x"]
+    assert with_recording(["~x"], *KNOWN) == ["~x"]
     Path("~x").touch()
-    assert with_recording(["~x"], KNOWN)[1] == "device.path='./~x'"
+    assert with_recording(["~x"], *KNOWN)[1] == "device.path='./~x'"
 
 
 def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missing() -> None:
     for name in ("gone.npz", "gone [2]=x.npz"):
-        assert with_recording([name], KNOWN)[1] == f"device.path={quoted(name)}"
+        assert with_recording([name], *KNOWN)[1] == f"device.path={quoted(name)}"
 
 
 @pytest.mark.parametrize(
@@ -120,4 +125,4 @@ def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missi
 )
 def test_what_cannot_be_one_recording_is_told(words: list[str], told: str) -> None:
     with pytest.raises(ToftrackError, match=told):
-        with_recording(words, KNOWN)
+        with_recording(words, *KNOWN)

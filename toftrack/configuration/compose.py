@@ -69,6 +69,12 @@ def setting_names() -> frozenset[str]:
     return frozenset({*own, *groups, "hydra"})
 
 
+def devices_of_files() -> frozenset[str]:
+    """The choices of the group device that play a file: those with a path."""
+    paths = (configuration_folder() / "device").glob("*.yaml")
+    return frozenset(path.stem for path in paths if "path" in OmegaConf.load(path).keys())
+
+
 @contextmanager
 def _own_hydra() -> Iterator[None]:
     """Hydra has one state a process, which may be that of an application around us."""

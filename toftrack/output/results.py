@@ -56,7 +56,8 @@ class ResultWriter:
     was, with no time spent on it, and is listed in the metadata as `held_frames`.
 
     Args:
-        folder: made when it does not exist; locked until the writer is closed.
+        folder: made when it does not exist; locked until the writer is closed. The results of an
+            earlier run in it go.
         metadata: facts about the run, JSON-able, for `run.json` and `track.npz`.
         joint_names: the 21 names, in the order of the joints.
         truth: ground truth; adds `metrics` to the summary.
@@ -94,6 +95,8 @@ class ResultWriter:
         except OSError as error:
             raise _unwritable(self.folder, error) from error
         try:
+            for made_at_the_end in ("track.npz", "summary.json"):  # of an earlier run
+                (self.folder / made_at_the_end).unlink(missing_ok=True)
             _write_json(self.folder / "run.json", self._facts)
         except OSError as error:
             self._lines.close()

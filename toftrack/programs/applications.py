@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import hydra
 from omegaconf import DictConfig
 
-from toftrack.configuration.compose import configuration_folder, setting_names
+from toftrack.configuration.compose import configuration_folder, devices_of_files, setting_names
 from toftrack.programs import command_line
 from toftrack.programs.recording_argument import with_recording
 
@@ -33,7 +33,8 @@ def train_job(config: DictConfig) -> float:
 
 def track(arguments: Sequence[str]) -> None:
     """Track as a command line says, which may name a recording."""
-    _start(track_job, "track", "config", with_recording(arguments, setting_names()))
+    words = with_recording(arguments, setting_names(), devices_of_files())
+    _start(track_job, "track", "config", words)
 
 
 def train(arguments: Sequence[str]) -> None:

@@ -16,13 +16,16 @@ _WITH_VALUE = frozenset(
 _KEY = re.compile(r"[+~]{0,2}[\w./@:]+")
 
 
-def with_recording(arguments: Sequence[str], known: Collection[str]) -> list[str]:
-    """The arguments with a file's name as two overrides.
+def with_recording(
+    arguments: Sequence[str], known: Collection[str], players: Collection[str]
+) -> list[str]:
+    """The arguments with a file's name as overrides.
 
     known: the first parts of keys, groups and settings: what begins with one and has a = is one,
     whatever files there are.
+    players: the devices that play a file; replay is taken where none is chosen.
 
-    Raises ToftrackError for two recordings, or one beside another device.
+    Raises ToftrackError for two recordings, or one beside a device that plays none.
     """
     others: list[str] = []
     files: list[str] = []
@@ -45,13 +48,15 @@ def with_recording(arguments: Sequence[str], known: Collection[str]) -> list[str
             f"the recording's name, '{files[0]}', has ${{ in it, which means something else in "
             "settings; rename the file"
         )
-    if device := next((word for word in others if word.startswith("device=")), None):
+    device = next((word for word in others if word.startswith("device=")), None)
+    if device is not None and device.removeprefix("device=") not in players:
         raise ToftrackError(
             f"{device} and the recording '{files[0]}' both give the frames; leave one out"
         )
     # What the shell has left of a ~ is the file's own, where there is one.
     name = f"./{files[0]}" if files[0][0] == "~" and os.path.exists(files[0]) else files[0]
-    return ["device=replay", f"device.path={quoted(name)}", *others]
+    chosen = [] if device is not None else ["device=replay"]
+    return [*chosen, f"device.path={quoted(name)}", *others]
 
 
 def quoted(text: str) -> str:
