@@ -72,6 +72,7 @@ def setting_names() -> frozenset[str]:
 def devices_of_files() -> frozenset[str]:
     """The choices of the group device that play a file: those with a path."""
     paths = (configuration_folder() / "device").glob("*.yaml")
+    # By its keys, since a configuration does not count what is still to be given.
     return frozenset(path.stem for path in paths if "path" in OmegaConf.load(path).keys())
 
 
