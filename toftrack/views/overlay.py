@@ -20,7 +20,7 @@ from toftrack.estimate import Estimate, confidence_words, state_words
 from toftrack.output.files import write_whole
 from toftrack.views.base import TrackedFrame
 from toftrack.views.model_image import model_range_image
-from toftrack.views.video import VideoFile, unwritable
+from toftrack.views.video import VideoFile, unwritable, video_library
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
 FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
@@ -109,12 +109,13 @@ class VideoView:
         frames: how many panels are to come at most, or None where nobody knows.
 
     Raises:
-        ToftrackError: by `add` and `close`, when a file cannot be written, or nothing encodes.
+        ToftrackError: nothing encodes; by `add` and `close`, when a file cannot be written.
     """
 
     def __init__(self, folder: str | Path, fps: float, frames: int | None = None) -> None:
         self.video_path = Path(folder) / VIDEO
         self.strip_path = Path(folder) / STRIP
+        video_library()  # better missed now than at the first frame
         self._fps = fps
         self._video: VideoFile | None = None
         self._size = (0, 0)

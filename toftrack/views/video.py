@@ -36,7 +36,7 @@ class VideoFile:
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
-        av = _library()
+        av = video_library()
         self._path, self._new_frame = path, av.VideoFrame.from_ndarray
         # Two decimals, so that the clock's steps are whole numbers of modest size.
         rate = min(max(round(float(fps), 2), 1.0), 120.0) if math.isfinite(fps) else 25.0
@@ -104,7 +104,8 @@ def unwritable(path: Path) -> ToftrackError:
     )
 
 
-def _library() -> Any:
+def video_library() -> Any:
+    """The package that encodes; ToftrackError where it is not installed."""
     try:
         import av
     except ImportError as error:
