@@ -43,13 +43,24 @@ class Truth:
     """(T,) share of the hand that is in view and uncovered, 0..1."""
     joint_visible: np.ndarray | None = None
     """(T, 21) bool."""
+    first: int = 0
+    """Number of the first row's frame; the other rows' follow."""
 
     def __len__(self) -> int:
         return len(self.joints_m)
 
     def __getitem__(self, rows: slice) -> Truth:
-        """The truth of a range of frames."""
+        """The truth of a range of frames, by their positions."""
+        return self._taken(rows, self.first + rows.indices(len(self))[0])
 
+    def of_frames(self, numbers: np.ndarray) -> Truth:
+        """The truth of the frames of these numbers (n,), in their order; IndexError for others."""
+        rows = np.asarray(numbers) - self.first
+        if len(rows) and rows.min() < 0:
+            raise IndexError(f"there is no truth of frame {rows.min() + self.first}")
+        return self._taken(rows, int(numbers[0]) if len(rows) else self.first)
+
+    def _taken(self, rows: slice | np.ndarray, first: int) -> Truth:
         def cut(values: np.ndarray | None) -> np.ndarray | None:
             return None if values is None else values[rows]
 
@@ -59,6 +70,7 @@ class Truth:
             in_space=self.in_space[rows],
             visible_fraction=cut(self.visible_fraction),
             joint_visible=cut(self.joint_visible),
+            first=first,
         )
 
 

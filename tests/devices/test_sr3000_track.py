@@ -59,7 +59,7 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*command, f"hydra.run.dir={tmp_path}"], cwd=ROOT, stderr=subprocess.PIPE, text=True
     )
-    lines, deadline = tmp_path / "track.jsonl", time.monotonic() + 60
+    lines, deadline = tmp_path / "track.jsonl", time.monotonic() + 200
     while not (lines.exists() and lines.stat().st_size) and time.monotonic() < deadline:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)

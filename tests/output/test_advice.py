@@ -19,7 +19,7 @@ def facts(frame: LostFrame, lost: int = 60, tracked: int = 40) -> RunFacts:
     for _ in range(lost):
         whole = whole.with_lost(frame)
     for _ in range(tracked):
-        whole = whole.tracked()
+        whole = whole.tracked(other_side=None)
     return whole
 
 
@@ -50,12 +50,26 @@ def test_first_it_is_said_what_was_seen() -> None:
         ({"other_side": True}, "give hand.side=left"),
         ({"hand_px": 40}, "fewer than 150 pixels"),
         ({}, "must be a right hand (hand.side), upright and not mirrored"),
+        ({}, "the order frames, rows, columns"),
     ],
 )
 def test_each_cause_has_its_remedy(changes: dict, remedy: str) -> None:
     seen, first, *more = advice(facts(replace(ORDINARY, **changes)), "right", REACH_M)
     assert remedy in first and not more
     assert seen.startswith("60 of 100 frames")
+
+
+def test_a_hand_of_the_other_side_that_is_followed_is_told() -> None:
+    followed = RunFacts()
+    for i in range(10):
+        followed = followed.tracked(other_side=i < 6)
+    assert advice(followed, "left", REACH_M) == (
+        "In 6 of 10 frames it looked like the other hand: give hand.side=right, or, if it is a "
+        "left one, put the image right, which is mirrored or has its rows and columns exchanged.",
+    )
+    for _ in range(2):
+        followed = followed.tracked(other_side=False)
+    assert advice(followed, "left", REACH_M) == ()
 
 
 def test_there_are_at_most_three_sentences() -> None:

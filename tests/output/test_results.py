@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import io
 import json
 import math
+import tracemalloc
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,8 +20,11 @@ from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Truth
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate, metrics_table
-from toftrack.output.results import ResultWriter, read_results
+from toftrack.output.files import save_whole, write_whole
+from toftrack.output.lines import KINDS, LINE_FIELDS, read_lines
+from toftrack.output.results import ResultWriter, read_results, read_run_facts
 from toftrack.output.trust import Hand, trust
+from toftrack.programs.recover import recover
 
 NAMES = tuple(f"joint_{i}" for i in range(21))
 
@@ -203,6 +209,152 @@ def test_no_frame_at_all_still_gives_whole_files(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "summary.json").read_text())["mean_ms"] is None
 
 
+def test_truth_is_found_by_the_frames_numbers(tmp_path: Path) -> None:
+    done = [estimate(i) for i in range(3, 15) if i != 7]  # 0 to 2 were faulty, 7 came too late
+    truth = truth_of([estimate(i) for i in range(20)], 20)[1:]
+    summary = write(tmp_path, done, truth).summary
+    assert truth.first == 1 and summary["frames"] == 12
+    errors = np.full(12, 10 * math.sqrt(3))
+    errors[4] = 1e3 * np.linalg.norm(done[3].joints_m - truth.joints_m[6], axis=1).mean()
+    assert summary["metrics"]["mean_mm"] == pytest.approx(errors[5:].mean(), rel=1e-3)
+    assert summary["metrics"]["trust"]["mean_all_mm"] == pytest.approx(
+        np.minimum(errors, 1e3).mean(), rel=1e-3
+    )
+
+
+def test_frames_beyond_the_truth_are_not_judged(tmp_path: Path) -> None:
+    summary = write(tmp_path / "a", [estimate(i) for i in range(9)], truth_of([], 4)).summary
+    assert summary["metrics"]["trust"]["frames"] == 4
+    summary = write(tmp_path / "b", [estimate(i) for i in range(9, 12)], truth_of([], 4)).summary
+    assert "metrics" not in summary
+
+
+def test_the_table_has_a_dash_where_nothing_was_judged(tmp_path: Path) -> None:
+    done = [estimate(i) for i in (0, 1, 5)]
+    hidden = Truth(np.zeros((6, 21, 3)), np.zeros(6, bool), np.ones(6, bool))
+    rows = dict(
+        line.split("  ", 1)
+        for line in metrics_table(write(tmp_path, done, hidden).summary).split("\n")
+    )
+    told = {name: text.strip() for name, text in rows.items()}
+    assert told["usable"] == "- % of the 0 visible frames" and told["first right"] == "-"
+    assert told["false alarms"] == told["frames below 40 mm"] == "- %"
+    assert told["frames"] == "6, 0 of them lost, 3 dropped"
+
+
+def test_run_json_is_there_from_the_start(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, {"seed": 1}, NAMES, truth_of([], 5)):
+        facts = read_run_facts(tmp_path)
+    assert facts["metadata"] == {"seed": 1} and facts["joint_names"] == list(NAMES)
+    assert facts["truth"] is True and facts["working_folder"]
+    with pytest.raises(ToftrackError, match="has no run.json"):
+        read_run_facts(tmp_path / "nowhere")
+
+
+def test_a_second_run_into_a_folder_is_refused_while_the_first_lives(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, {}, NAMES) as first:
+        first.append(estimate(0))
+        with pytest.raises(ToftrackError, match="another run is writing.*hydra.run.dir"):
+            ResultWriter(tmp_path, {}, NAMES)
+        with pytest.raises(ToftrackError, match="another run is writing"):
+            recover(tmp_path)
+        first.append(estimate(1))
+    assert len(read_results(tmp_path / "track.npz")["lost"]) == 2
+    with ResultWriter(tmp_path, {}, NAMES):
+        assert not (tmp_path / "track.npz").exists(), "it would be that of the first run"
+    assert (tmp_path / "track.jsonl").read_text() == ""
+
+
+class FullDisk:
+    """Takes so many bytes of a file."""
+
+    def __init__(self, file: io.FileIO, room: int) -> None:
+        self._file, self._room = file, room
+
+    def write(self, data: memoryview) -> int:
+        if not self._room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        count = self._file.write(data[: self._room])
+        self._room -= count
+        return count
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def test_a_disk_that_fills_keeps_what_was_whole(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="No space left.*the 3 frames.*make room.*recover"):
+        with ResultWriter(tmp_path, {}, NAMES) as writer:
+            for i in range(3):
+                writer.append(estimate(i))
+            writer._lines._file = FullDisk(writer._lines._file, 1000)
+            writer.append(estimate(3))
+    assert (tmp_path / "track.jsonl").read_text().count("\n") == 3
+    assert len(read_results(tmp_path / "track.npz")["lost"]) == 3
+
+
+def test_a_file_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
+    def half(stream: Any) -> None:
+        stream.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "hand_shape.json"
+    path.write_text("whole")
+    with pytest.raises(OSError):
+        write_whole(path, half)
+    with pytest.raises(OSError):
+        save_whole(path, lambda partial: half(open(partial, "wb")))
+    assert path.read_text() == "whole" and list(tmp_path.iterdir()) == [path]
+
+
+def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
+    def peak(frames: int) -> int:
+        tracemalloc.start()
+        with ResultWriter(tmp_path / str(frames), {}, NAMES) as writer:
+            for i in range(frames):
+                writer.append(dataclasses.replace(one, index=i))
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    one = estimate(0)
+    few, many = peak(600), peak(1400)
+    assert many - few < 800 * 200  # a frame's numbers alone are 1100 bytes
+
+
+def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(i) for i in range(4)])
+    path = tmp_path / "track.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    for bad, words in (("{]\n", "line 2 of"), ('{"index":1}\n', "shortly before")):
+        path.write_text("".join([lines[0], bad, *lines[2:]]))
+        with pytest.raises(ToftrackError, match=words):
+            recover(tmp_path)
+
+
+@pytest.mark.parametrize("rest", [b'{"index":9,"jo', b"\0\0\0\0", b""])
+def test_what_a_killed_run_left_unfinished_is_dropped(tmp_path: Path, rest: bytes) -> None:
+    write(tmp_path, [estimate(i) for i in range(4)])
+    lines = tmp_path / "track.jsonl"
+    whole = lines.read_bytes()
+    lines.write_bytes(whole + rest)
+    (tmp_path / "track.npz").unlink()
+    assert recover(tmp_path)["frames"] == 4
+    assert lines.read_bytes() == whole
+    assert len(read_results(tmp_path / "track.npz")["lost"]) == 4
+
+
+def test_every_field_of_an_estimate_is_in_lines_and_arrays(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(i) for i in range(2)])
+    names = {field.name for field in dataclasses.fields(Estimate)}
+    assert names == set(KINDS) == set(LINE_FIELDS) == set(read_lines_of(tmp_path)[0])
+    assert names <= read_results(tmp_path / "track.npz").keys()
+
+
+def read_lines_of(folder: Path) -> list[dict[str, Any]]:
+    return list(read_lines(folder / "track.jsonl"))
+
+
 def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     done = [estimate(i) for i in (2, 3, 6, 7)]
     truth = Truth(np.zeros((6, 21, 3)), np.ones(6, bool), np.ones(6, bool))
@@ -229,6 +381,7 @@ def test_closing_twice_writes_once(tmp_path: Path) -> None:
 def test_no_partial_file_is_left(tmp_path: Path) -> None:
     write(tmp_path, [estimate(0)])
     assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "run.json",
         "summary.json",
         "track.jsonl",
         "track.npz",

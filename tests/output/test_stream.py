@@ -24,7 +24,8 @@ from helpers.tracking import CONF, ROOT, configuration, run
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.output.results import LINE_FIELDS, json_line, read_results
+from toftrack.output.lines import LINE_FIELDS, json_line
+from toftrack.output.results import read_results
 from toftrack.output.stream import NoStream, ReaderGoneError
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")

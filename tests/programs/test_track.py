@@ -7,6 +7,7 @@ import logging
 import os
 import pickle
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,18 +15,30 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from helpers.tracking import ROOT
 from hydra.core.singleton import Singleton
 
 from toftrack.estimate import STATES
+from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import read_results
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
+from toftrack.programs.recover import recover
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])
+
+
+def video_frames(path: Path) -> list[np.ndarray]:
+    reader, frames = cv2.VideoCapture(str(path)), []
+    while True:
+        there, frame = reader.read()
+        if not there:
+            return frames
+        frames.append(frame)
 
 
 def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
@@ -182,22 +195,49 @@ def test_the_table_goes_to_standard_output_and_the_progress_to_standard_error(wh
     assert "error" not in err and "Traceback" not in err
 
 
-def test_ctrl_c_keeps_what_was_done(tmp_path: Path) -> None:
-    process = start("hydra.run.dir=out", "view=none", *QUICK, cwd=tmp_path)
+def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:
+    process = start("hydra.run.dir=out", *QUICK, cwd=tmp_path)
     lines, deadline = tmp_path / "out" / "track.jsonl", time.monotonic() + 200
     while time.monotonic() < deadline:
         if lines.exists() and lines.read_text().count("\n") >= 3:
             break
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGHUP)  # as a system does that shuts down
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
+    assert process.returncode in (143, 129), err
     assert "interrupted" in err and "Traceback" not in err
+    assert "time a frame" in out and "overlay.mp4" in out
     done = [json.loads(line) for line in lines.read_text().splitlines()]
     assert 3 <= len(done) < 100
     result = read_results(tmp_path / "out" / "track.npz")
     assert len(result["joints_m"]) == len(done)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["frames"] == len(done)
+    assert len(video_frames(tmp_path / "out" / "overlay.mp4")) == len(done)
+    assert HandShape.load(tmp_path / "out" / "hand_shape.json").side == "right"
+
+
+def test_a_recording_is_tracked_by_its_name_alone_and_a_killed_run_recovered(
+    here, tmp_path: Path
+) -> None:
+    name = "Übung 'eins' [2]=a,b.npz"
+    shutil.copy(ROOT / "toftrack" / "data" / "sample.npz", tmp_path / name)
+    status, _, err = here(name, "device.start=10", "device.stop=18", "view=none", *QUICK)
+    assert status == 0 and f"tracking {name} (8 frames): a right hand" in err
+    before = read_results(tmp_path / "out" / "track.npz")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert before["metadata"]["device"]["recording"] == name
+    for made in ("track.npz", "summary.json"):
+        (tmp_path / "out" / made).unlink()
+    with open(tmp_path / "out" / "track.jsonl", "a") as lines:
+        lines.write('{"index":18,"times')  # as a killed run leaves it
+    recover(tmp_path / "out")
+    after = read_results(tmp_path / "out" / "track.npz")
+    assert after.keys() == before.keys()
+    for key, values in before.items():
+        np.testing.assert_array_equal(after[key], values, key)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
+    assert summary["metrics"]["trust"]["visible"] == 8 and summary["hand"]["side"] == "right"
 
 
 def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
@@ -291,8 +331,8 @@ def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here
         (["camera.file=gone.json"], "gone.json"),
         (["filter.particles=0"], "filter.particles"),
         (["device=replay"], "device.path"),
-        (["device=telescope"], "device/telescope"),
-        (["experiment=other"], "experiment/other"),
+        (["device=telescope"], "device=telescope"),
+        (["experiment=other"], "experiment=other"),
         (["particles=3"], "particles"),
     ],
 )
@@ -330,7 +370,6 @@ def test_a_recording_without_a_hand_is_lost_and_no_error(here, tmp_path) -> None
 
 def test_what_was_written_before_an_error_is_kept(here, tmp_path) -> None:
     """A folder of images whose third one is damaged."""
-    cv2 = pytest.importorskip("cv2")
     with np.load(ROOT / "toftrack" / "data" / "sample.npz") as sample:
         depth, k = sample["depth_m"][:4].astype(np.float32), sample["K"]
     folder = tmp_path / "images"

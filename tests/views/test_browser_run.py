@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -39,8 +38,6 @@ from toftrack.views.browser import view as browser
 from toftrack.views.browser.view import BrowserView
 
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-DRIVER = shutil.which("chromedriver")
 
 
 def test_frames_with_an_end_wait_for_a_visitor_but_not_for_ever(capsys) -> None:
@@ -118,7 +115,7 @@ def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path) -> None:
             bodies += [answer.read()] if answer.status == 200 else []
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and out == "", err
+    assert process.returncode == 130 and "time a frame" in out, err
     assert "interrupted" in err and "Traceback" not in err
     assert bodies[0] != bodies[1]
     (results,) = tmp_path.glob("outputs/*/*/track.npz")
@@ -141,33 +138,6 @@ def test_the_page_stays_after_the_last_frame_until_ctrl_c(monkeypatch, capsys) -
     with pytest.raises(ZeroDivisionError), made():
         1 / 0  # noqa: B018
     assert len(stayed) == 2 and ours() == []
-
-
-@pytest.fixture
-def chromium(tmp_path: Path) -> Iterator:
-    """Headless Chromium under WebDriver."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="pip install '.[browser-test]'")
-    if not (CHROMIUM and DRIVER):
-        pytest.skip("needs chromium and chromedriver (Debian: chromium, chromium-driver)")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for argument in (
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-quic",
-        "--no-first-run",
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-sync",
-        f"--user-data-dir={tmp_path / 'profile'}",
-        "--window-size=1200,900",
-    ):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    yield driver
-    driver.quit()
 
 
 @pytest.fixture

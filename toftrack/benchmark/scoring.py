@@ -284,7 +284,7 @@ def run(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m toftrack.benchmark", description=__doc__)
+    parser = argparse.ArgumentParser(prog="toftrack benchmark", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     parser.add_argument("--particles", type=int, nargs="+", default=list(PARTICLES), metavar="N")

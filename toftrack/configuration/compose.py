@@ -14,7 +14,7 @@ from hydra.core.singleton import Singleton
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
 from hydra.version import VersionBase
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import toftrack
@@ -59,6 +59,21 @@ def configuration_folder() -> Path:
     package = Path(toftrack.__file__).parent
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
+
+
+def setting_names() -> frozenset[str]:
+    """The groups, and the settings that stand in none: how the keys of overrides begin."""
+    folder = configuration_folder()
+    own = [str(name) for path in folder.glob("*.yaml") for name in OmegaConf.load(path)]
+    groups = [path.name for path in folder.iterdir() if path.is_dir()]
+    return frozenset({*own, *groups, "hydra"})
+
+
+def devices_of_files() -> frozenset[str]:
+    """The choices of the group device that play a file: those with a path."""
+    paths = (configuration_folder() / "device").glob("*.yaml")
+    # By its keys, since a configuration does not count what is still to be given.
+    return frozenset(path.stem for path in paths if "path" in OmegaConf.load(path).keys())
 
 
 @contextmanager

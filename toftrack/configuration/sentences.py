@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from hydra.errors import HydraException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from toftrack.configuration.suggestions import better_sentence
 from toftrack.errors import ToftrackError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -33,7 +34,7 @@ def sentence(error: BaseException) -> str:
             "name, and that its module lies beside the program or on PYTHONPATH"
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
-        return _of_config(error)
+        return better_sentence(chain) or _of_config(error)
     text = _one_line(str(error))
     name = type(error).__name__
     return f"unexpected {name}{f': {text}' if text else ''} ({FULL_ERROR}=1 shows the traceback)"

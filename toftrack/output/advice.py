@@ -75,15 +75,24 @@ class RunFacts:
     """The networks said which hand it looked like."""
     other_side: int = 0
     """That was the other one."""
+    tracked_judged: int = 0
+    """The same of frames that were not lost."""
+    tracked_other_side: int = 0
 
-    def tracked(self) -> RunFacts:
-        """With one more frame that was not lost."""
-        return replace(self, frames=self.frames + 1)
+    def tracked(self, other_side: bool | None) -> RunFacts:
+        """With one more frame that was not lost; other_side as in LostFrame."""
+        return replace(
+            self,
+            frames=self.frames + 1,
+            tracked_judged=self.tracked_judged + (other_side is not None),
+            tracked_other_side=self.tracked_other_side + (other_side is True),
+        )
 
     def with_lost(self, frame: LostFrame) -> RunFacts:
         """With one more frame that was."""
         name = frame.state_name
-        return RunFacts(
+        return replace(
+            self,
             frames=self.frames + 1,
             lost=self.lost + 1,
             states={**self.states, name: self.states.get(name, 0) + 1},
@@ -111,7 +120,6 @@ def lost_frame(
     few = depth_m[::step, ::step]
     readings = few[np.isfinite(few) & (few > 0)]
     nearest, farthest = np.percentile(readings, (2, 98)) if len(readings) else (np.nan, np.nan)
-    signs = None if insight is None else insight.signs
     return LostFrame(
         state_name=estimate.state_name,
         read=len(readings) / few.size,
@@ -119,8 +127,13 @@ def lost_frame(
         nearest_m=float(nearest),
         farthest_m=float(farthest),
         hand_px=0 if insight is None else int(insight.observation.hand.sum()),
-        other_side=None if signs is None else signs.other_side > 0,
+        other_side=_other_side(insight),
     )
+
+
+def _other_side(insight: StepInfo | None) -> bool | None:
+    signs = None if insight is None else insight.signs
+    return None if signs is None else signs.other_side > 0
 
 
 class Watch:
@@ -136,7 +149,7 @@ class Watch:
             found = lost_frame(estimate, depth_m, insight, self.reach_m)
             self.facts = self.facts.with_lost(found)
         else:
-            self.facts = self.facts.tracked()
+            self.facts = self.facts.tracked(_other_side(insight))
 
     def advice(self, side: str) -> tuple[str, ...]:
         """Of the function of that name."""
@@ -149,6 +162,12 @@ def advice(facts: RunFacts, side: str, reach_m: float) -> tuple[str, ...]:
     side: of the hand that was looked for.  reach_m: segmentation.max_distance_m.
     """
     if facts.lost <= _MOST * facts.frames:
+        # A hand of the wrong side may be followed all the same, facing the wrong way.
+        if facts.tracked_other_side > _MOST * facts.tracked_judged:
+            return (
+                f"In {facts.tracked_other_side} of {facts.frames} frames it looked like the other "
+                f"hand: {_if_it_is_the_other(side)}.",
+            )
         return ()
     return (_seen(facts), *_remedies(facts, side, reach_m)[:2])
 
@@ -189,11 +208,7 @@ def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
             "view to it free."
         )
     if facts.judged and mostly(facts.other_side, facts.judged):
-        other = "left" if side == "right" else "right"
-        found.append(
-            f"It looked like a {other} hand: give hand.side={other}, or, if it is a {side} one, "
-            "put the image right, which is mirrored or has its rows and columns exchanged."
-        )
+        found.append(f"It looked like the other hand: {_if_it_is_the_other(side)}.")
     if facts.with_hand and mostly(facts.small, facts.with_hand):
         found.append(
             f"What was taken for the hand had fewer than {_FEWEST_PX} pixels: hold it nearer, or "
@@ -201,7 +216,16 @@ def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
         )
     if not found:
         found.append(
-            f"If a hand was in view, look at overlay.png: it must be a {side} hand (hand.side), "
-            "upright and not mirrored (x right, y down), with nothing else nearer to the camera."
+            f"If a hand was in view, look at overlay.png (view=video): it must be a {side} hand "
+            "(hand.side), upright and not mirrored (x right, y down), with nothing else nearer to "
+            "the camera, and depth_m must have the order frames, rows, columns."
         )
     return found
+
+
+def _if_it_is_the_other(side: str) -> str:
+    other = "left" if side == "right" else "right"
+    return (
+        f"give hand.side={other}, or, if it is a {side} one, put the image right, which is "
+        "mirrored or has its rows and columns exchanged"
+    )

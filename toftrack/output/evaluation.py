@@ -120,11 +120,19 @@ def evaluate(
 
 def metrics_table(summary: dict[str, Any]) -> str:
     """The content of summary.json as a short text table for the terminal, without final newline."""
+    dropped = summary.get("dropped_frames")
     rows = [
-        ("frames", f"{summary['frames']}, {summary['lost_frames']} of them lost"),
+        (
+            "frames",
+            f"{summary['frames']}, {summary['lost_frames']} of them lost"
+            + (f", {dropped} dropped" if dropped else ""),
+        ),
         ("time a frame", f"{_figure(summary['mean_ms'])} ms ({_figure(summary['fps'])} frames/s)"),
         ("mean score", _figure(summary["mean_score"], 3)),
     ]
+    if hand := summary.get("hand"):
+        length = f"{_figure(hand['length_mm'], 0)} mm long{', fitted' if hand['fitted'] else ''}"
+        rows.append(("hand", f"{hand['side']}, {length}"))
     metrics = summary.get("metrics")
     if metrics:
         if metrics.get("trust"):
@@ -136,7 +144,8 @@ def metrics_table(summary: dict[str, Any]) -> str:
         for name, value in metrics.items():
             if name.startswith("frames_max_below_"):
                 limit = name.removeprefix("frames_max_below_").removesuffix("mm_pct")
-                rows.append((f"frames below {limit} mm", f"{_figure(value)} %"))
+                share = value if metrics["frames"] else None
+                rows.append((f"frames below {limit} mm", f"{_figure(share)} %"))
         if metrics["missing_pct"]:
             rows.append(("without estimate", f"{_figure(metrics['missing_pct'])} %"))
         precision, recall = metrics.get("lost_precision"), metrics.get("lost_recall")
@@ -153,13 +162,16 @@ def metrics_table(summary: dict[str, Any]) -> str:
 
 def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
     """The headline, see trust.py: names and texts."""
-    first, longest = trust["first_right"], trust["longest_silent"]
+    first, longest, seen = trust["first_right"], trust["longest_silent"], trust["visible"]
     run = f", up to {longest} frames in a row" if longest else ""
+    usable, alarms = (
+        _figure(trust[name] if seen else None) for name in ("usable_pct", "false_alarm_pct")
+    )
     rows = [
-        ("usable", f"{_figure(trust['usable_pct'])} % of the {trust['visible']} visible frames"),
-        ("silently wrong", f"{_figure(trust['silent_pct'])} %{run}"),
-        ("false alarms", f"{_figure(trust['false_alarm_pct'])} %"),
-        ("first right", "never" if first is None else f"in frame {first}"),
+        ("usable", f"{usable} % of the {seen} visible frames"),
+        ("silently wrong", f"{_figure(trust['silent_pct'] if trust['frames'] else None)} %{run}"),
+        ("false alarms", f"{alarms} %"),
+        ("first right", _first_right(first, seen)),
     ]
     after = ["never" if frames is None else str(frames) for frames in trust["found_after"]]
     if after:
@@ -175,6 +187,12 @@ def _region_rows(coverage: dict[str, Any] | None) -> list[tuple[str, str]]:
     of_hidden = "" if hidden is None else f", {_figure(hidden)} % of the hidden ones"
     share = _figure(coverage["in_region_90_pct"])
     return [("in their 90 % region", f"{share} % of the joints{of_hidden}")]
+
+
+def _first_right(first: int | None, seen: int) -> str:
+    if not seen:
+        return "-"
+    return "never" if first is None else f"in frame {first}"
 
 
 def _mean(values: np.ndarray) -> float | None:

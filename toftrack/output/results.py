@@ -1,84 +1,52 @@
-"""The result files of a run: track.npz, track.jsonl and summary.json.
+"""The result files of a run: run.json, track.jsonl, track.npz and summary.json.
 
-`track.jsonl` grows by a line as each frame is done. `track.npz` and `summary.json` are written when
-the writer is closed, also after an interruption, for the frames that were done until then.
+`run.json` is written at the start, `track.jsonl` grows by a line as each frame is done. The two
+others are made of these when the writer is closed, also after an interruption, for the frames that
+were done until then; or later, by `finish`, if it never was.
 """
 
 from __future__ import annotations
 
+import datetime
 import json
-import math
 import os
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
+from toftrack.hand.shape import HandShape
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate
+from toftrack.output.files import LINES, LineFile, write_whole
+from toftrack.output.lines import KINDS, json_line, strict
+from toftrack.output.records import Records, write_archive
 from toftrack.output.trust import Hand, trust
 
-_ARRAYS: dict[str, type] = {
-    "joints_m": np.float32,
-    "lost": np.bool_,
-    "state": np.float32,
-    "latent": np.float32,
-    "score": np.float32,
-    "covariance": np.float32,
-    "effective_sample_size": np.float32,
-    "gesture": np.str_,
-    "gesture_probability": np.float32,
-    "timestamp_s": np.float64,
-    "compute_s": np.float32,
-}
-_LATER: dict[str, type] = {
-    "pinch": np.float32,
-    "pinching": np.bool_,
-    "pointing_origin_m": np.float32,
-    "pointing_direction": np.float32,
-    "joint_sigma_m": np.float32,
-    "joint_confidence": np.float32,
-    "index": np.int64,
-    "state_name": np.str_,
-    "confidence": np.float32,
-    "outside_rad": np.float32,
-    "side": np.str_,
-    "side_probability": np.float32,
-}
-"""Arrays that came later: older files without them are results as well."""
-LINE_FIELDS = (
-    "index",
-    "timestamp_s",
-    "state_name",
-    "lost",
-    "confidence",
-    "outside_rad",
-    "side",
-    "side_probability",
-    "score",
+RUN_FORMAT = "toftrack-run"
+_VERSION = 1
+
+_FROM_THE_START = (
     "joints_m",
+    "lost",
     "state",
     "latent",
+    "score",
     "covariance",
-    "joint_sigma_m",
-    "joint_confidence",
     "effective_sample_size",
     "gesture",
     "gesture_probability",
-    "pinch",
-    "pinching",
-    "pointing_origin_m",
-    "pointing_direction",
+    "timestamp_s",
     "compute_s",
 )
-"""What a line of track.jsonl says, fields of Estimate, in their order."""
+"""Arrays that every track.npz has; older files without the others are results as well."""
 
 
 class ResultWriter:
@@ -89,13 +57,15 @@ class ResultWriter:
     was, with no time spent on it, and is listed in the metadata as `held_frames`.
 
     Args:
-        folder: made when it does not exist.
-        metadata: facts about the run, JSON-able, for `track.npz`.
+        folder: made when it does not exist; locked until the writer is closed. The results of an
+            earlier run in it go.
+        metadata: facts about the run, JSON-able, for `run.json` and `track.npz`.
         joint_names: the 21 names, in the order of the joints.
-        truth: ground truth from the first appended frame on; adds `metrics` to the summary.
+        truth: ground truth; adds `metrics` to the summary.
 
     Raises:
-        ToftrackError: the folder cannot be made or written, or a file in it cannot.
+        ToftrackError: the folder cannot be made or written, another run is writing into it, or a
+            file in it cannot be written.
     """
 
     def __init__(
@@ -108,25 +78,39 @@ class ResultWriter:
         self.folder = Path(folder)
         self.summary: dict[str, Any] | None = None
         """The content of summary.json once the writer is closed."""
-        self._metadata = metadata
-        self._joint_names = tuple(joint_names)
+        self.frames = 0
+        """How many were appended."""
         self._truth = truth
-        self._estimates: list[Estimate] = []
-        self._closed = False
+        self._facts = {
+            "format": RUN_FORMAT,
+            "version": _VERSION,
+            "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+            "working_folder": os.getcwd(),
+            "truth": truth is not None,
+            "joint_names": list(joint_names),
+            "metadata": strict(metadata),
+        }
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._lines = open(self.folder / "track.jsonl", "w", encoding="utf-8")
+            self._lines = LineFile(self.folder)
         except OSError as error:
             raise _unwritable(self.folder, error) from error
+        try:
+            for made_at_the_end in ("track.npz", "summary.json"):  # of an earlier run
+                (self.folder / made_at_the_end).unlink(missing_ok=True)
+            _write_json(self.folder / "run.json", self._facts)
+        except OSError as error:
+            self._lines.close()
+            raise _unwritable(self.folder, error) from error
+        self._closed = False
 
     def append(self, estimate: Estimate) -> None:
-        """Add a frame's estimate and write its line to disk. Raises ToftrackError if it cannot."""
+        """Write a frame's line to disk. Raises ToftrackError if it cannot be written."""
         try:
-            self._lines.write(json_line(estimate) + "\n")
-            self._lines.flush()
+            self._lines.append(json_line(estimate))
         except OSError as error:
-            raise _unwritable(self.folder, error) from error
-        self._estimates.append(estimate)
+            raise _unwritable(self.folder, error, self.frames) from error
+        self.frames += 1
 
     def close(self) -> None:
         """Write track.npz and summary.json; a second call does nothing.
@@ -137,21 +121,11 @@ class ResultWriter:
             return
         self._closed = True
         try:
-            self._lines.close()
-            arrays, held = self._arrays()
-            metadata = self._metadata | ({"held_frames": held} if held else {})
-            arrays["joint_names"] = np.array(self._joint_names, np.str_)
-            arrays["metadata"] = np.array(json.dumps(_strict(metadata)))
-            self.summary = self._summarise(arrays)
-            _write_atomically(
-                self.folder / "track.npz", lambda stream: np.savez_compressed(stream, **arrays)
-            )
-            text = json.dumps(_strict(self.summary), indent=1, allow_nan=False) + "\n"
-            _write_atomically(
-                self.folder / "summary.json", lambda stream: stream.write(text.encode())
-            )
+            self.summary = finish(self.folder, self._facts, self._truth)
         except OSError as error:
-            raise _unwritable(self.folder, error) from error
+            raise _unwritable(self.folder, error, self.frames) from error
+        finally:
+            self._lines.close()
 
     def __enter__(self) -> Self:
         return self
@@ -164,57 +138,106 @@ class ResultWriter:
     ) -> None:
         self.close()
 
-    def _arrays(self) -> tuple[dict[str, Any], list[int]]:
-        """The arrays of track.npz, and the indices of the frames that were dropped."""
-        done = self._estimates
-        if not done:
-            return _no_frames(), []
-        arrays: dict[str, Any] = {
-            name: np.array([getattr(estimate, name) for estimate in done], dtype=kind)
-            for name, kind in (_ARRAYS | _LATER).items()
-        }
-        index = arrays["index"]
-        if (np.diff(index) < 1).any():  # the device counts anew; there is nothing to fill in
-            return arrays, []
-        every = np.arange(index[0], index[-1] + 1)
-        rows = np.searchsorted(index, every, side="right") - 1
-        held = index[rows] != every
-        times = np.interp(every, index, arrays["timestamp_s"])
-        arrays = {name: values[rows] for name, values in arrays.items()}
-        arrays["index"], arrays["timestamp_s"] = every, times
-        arrays["compute_s"][held] = 0
-        return arrays, every[held].tolist()
 
-    def _summarise(self, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-        done = self._estimates
-        seconds = np.array([estimate.compute_s for estimate in done])
-        scores = np.array([estimate.score for estimate in done])
-        total = float(seconds.sum())
-        summary: dict[str, Any] = {
-            "frames": len(arrays["lost"]),
-            "lost_frames": int(arrays["lost"].sum()),
-            "mean_ms": 1e3 * float(seconds.mean()) if done else None,
-            "median_ms": 1e3 * float(np.median(seconds)) if done else None,
-            "fps": len(done) / total if total > 0 else None,
-            "mean_score": float(scores.mean()) if done else None,
-        }
-        if self._truth is not None and done:
-            truth = self._truth[: len(arrays["lost"])]
-            joints, lost = arrays["joints_m"], arrays["lost"]
-            figures = trust(joints, lost, Hand(truth.joints_m, truth.visible))
-            summary["metrics"] = {"trust": asdict(figures)} | evaluate(joints, lost, truth)
-            regions = coverage(joints, arrays["joint_sigma_m"], truth)
-            summary["metrics"]["coverage"] = asdict(regions)
-        return summary
+def finish(folder: Path, facts: dict[str, Any], truth: Truth | None) -> dict[str, Any]:
+    """Make track.npz and summary.json of a run's lines; returns the summary.
 
+    folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
 
-def json_line(estimate: Estimate, fields: Sequence[str] = LINE_FIELDS) -> str:
-    """An estimate as one line of strict JSON, without newline; NaN becomes null.
-
-    fields: which of LINE_FIELDS, in this order.
+    Raises ToftrackError for damaged lines, OSError when something cannot be read or written.
     """
-    content = {name: _strict(getattr(estimate, name)) for name in fields}
-    return json.dumps(content, allow_nan=False, separators=(",", ":"))
+    metadata = facts["metadata"]
+    latent_size = int((metadata.get("pose_space") or {}).get("dims", 4))
+    with Records(folder / LINES, latent_size) as records:
+        rows, changed, held = _every_frame(records)
+        if held:
+            metadata = metadata | {"held_frames": held}
+        small = {
+            "joint_names": np.array(facts["joint_names"], np.str_),
+            "metadata": np.array(json.dumps(metadata)),
+        }
+        summary = _summarise(records, rows, len(held)) | _hand(folder, metadata)
+        if truth is not None and len(rows):
+            metrics = _metrics(records, rows, changed["index"], truth)
+            summary |= {"metrics": metrics} if metrics else {}
+        write_whole(
+            folder / "track.npz",
+            lambda stream: write_archive(stream, records, rows, changed, small),
+        )
+    _write_json(folder / "summary.json", summary)
+    return summary
+
+
+def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray], list[int]]:
+    """Which record each row of track.npz is, the columns that are not copied, the dropped frames.
+
+    The columns are index, timestamp_s and compute_s.
+    """
+    names = ("index", "timestamp_s", "compute_s")
+    index, times, seconds = (records.column(name) for name in names)
+    if not len(index) or (np.diff(index) < 1).any():
+        # Where the device counts anew there is nothing to fill in.
+        changed = dict(zip(names, (index, times, seconds), strict=True))
+        return np.arange(len(index)), changed, []
+    every = np.arange(index[0], index[-1] + 1)
+    rows = np.searchsorted(index, every, side="right") - 1
+    held = index[rows] != every
+    seconds = np.where(held, np.float32(0), seconds[rows])
+    changed = {
+        "index": every,
+        "timestamp_s": np.interp(every, index, times),
+        "compute_s": seconds,
+    }
+    return rows, changed, every[held].tolist()
+
+
+def _summarise(records: Records, rows: np.ndarray, dropped: int) -> dict[str, Any]:
+    """The summary without metrics."""
+    done = records.count
+    seconds = records.column("compute_s").astype(np.float64)
+    scores = records.column("score").astype(np.float64)
+    total = float(seconds.sum())
+    return {
+        "frames": len(rows),
+        "lost_frames": int(records.column("lost").sum()),
+        "dropped_frames": dropped,
+        "mean_ms": 1e3 * float(seconds.mean()) if done else None,
+        "median_ms": 1e3 * float(np.median(seconds)) if done else None,
+        "fps": done / total if total > 0 else None,
+        "mean_score": float(scores.mean()) if done else None,
+    }
+
+
+def _hand(folder: Path, metadata: dict[str, Any]) -> dict[str, Any]:
+    """The hand that was tracked, where its file is in the folder."""
+    try:
+        shape = HandShape.load(folder / "hand_shape.json")
+    except ToftrackError:
+        return {}
+    fitted = bool((metadata.get("hand_shape") or {}).get("fitted"))
+    return {"hand": {"side": shape.side, "length_mm": 1e3 * shape.hand_length_m, "fitted": fitted}}
+
+
+def _metrics(
+    records: Records, rows: np.ndarray, index: np.ndarray, truth: Truth
+) -> dict[str, Any] | None:
+    """The metrics over those frames whose numbers the truth has; None where it has none.
+
+    rows: records.  index: numbers of their frames.
+    """
+    true = index - truth.first
+    known = (true >= 0) & (true < len(truth))
+    if not known.any():
+        return None
+    found = truth.of_frames(index[known])
+    joints = records.column("joints_m", rows[known])
+    lost = records.column("lost", rows[known])
+    figures = trust(joints, lost, Hand(found.joints_m, found.visible))
+    metrics = {"trust": asdict(figures)} | evaluate(joints, lost, found)
+    if "joint_sigma_m" in records.names:
+        regions = coverage(joints, records.column("joint_sigma_m", rows[known]), found)
+        metrics["coverage"] = asdict(regions)
+    return metrics
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
@@ -226,10 +249,10 @@ def read_results(path: str | Path) -> dict[str, Any]:
     Raises ToftrackError when the file is missing, damaged or not a result.
     """
     path = Path(path).expanduser()
-    names = (*_ARRAYS, "joint_names", "metadata")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            names += tuple(name for name in _LATER if name in archive)
+            known = (*_FROM_THE_START, *(name for name in KINDS if name in archive))
+            names = (*dict.fromkeys(known), "joint_names", "metadata")
             content: dict[str, Any] = {name: archive[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = json.loads(content["metadata"].item())
@@ -249,42 +272,41 @@ def read_results(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def _no_frames() -> dict[str, np.ndarray]:
-    shapes = {"joints_m": (0, 21, 3), "state": (0, 27), "latent": (0, 4), "covariance": (0, 10, 10)}
-    shapes |= {"joint_sigma_m": (0, 21, 3), "joint_confidence": (0, 21)}
-    shapes |= dict.fromkeys(("pointing_origin_m", "pointing_direction"), (0, 3))
-    kinds = _ARRAYS | _LATER
-    return {name: np.zeros(shapes.get(name, 0), kind) for name, kind in kinds.items()}
-
-
-def _strict(value: Any) -> Any:
-    """`value` without what JSON cannot say: arrays become lists, NaN and infinity None."""
-    if isinstance(value, dict):
-        return {str(key): _strict(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_strict(item) for item in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        return _strict(value.tolist())
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill a binary stream; `path` changes only when all of it is on the disk."""
-    partial = path.with_name(path.name + ".part")
+def read_run_facts(folder: Path) -> dict[str, Any]:
+    """The content of a folder's run.json; ToftrackError when there is none that can be used."""
+    path = folder / "run.json"
     try:
-        with open(partial, "wb") as stream:
-            write(stream)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ToftrackError(
+            f"'{folder}' is not the output folder of a run: it has no run.json; give a folder that "
+            "`toftrack track` wrote, such as outputs/DATE/TIME"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise ToftrackError(f"'{path}' cannot be read ({error}); track again") from None
+    if not isinstance(facts, dict) or facts.get("format") != RUN_FORMAT:
+        raise ToftrackError(f"'{path}' does not describe a run; give another folder")
+    if facts.get("version") != _VERSION:
+        raise ToftrackError(
+            f"'{path}' is of version {facts.get('version')}, but this toftrack reads version "
+            f"{_VERSION}; use the toftrack that wrote it"
+        )
+    return facts
 
 
-def _unwritable(folder: Path, error: OSError) -> ToftrackError:
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(strict(content), indent=1, allow_nan=False) + "\n"
+    write_whole(path, lambda stream: stream.write(text.encode()))
+
+
+def _unwritable(folder: Path, error: OSError, frames: int | None = None) -> ToftrackError:
+    reason = error.strerror or error
+    if frames:
+        return ToftrackError(
+            f"the output folder '{folder}' cannot be written any more ({reason}); the {frames} "
+            f"frames until then are in its {LINES}: make room, then `toftrack recover {folder}`"
+        )
     return ToftrackError(
-        f"the output folder '{folder}' cannot be written ({error.strerror or error}); choose "
-        "another with hydra.run.dir=DIR"
+        f"the output folder '{folder}' cannot be written ({reason}); choose another with "
+        "hydra.run.dir=DIR"
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
-from toftrack.output.results import read_results
+from toftrack.output.results import read_results, read_run_facts
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.recordings.npz import Recording
@@ -89,14 +90,17 @@ class Run:
 
     def found(self, path: str | Path) -> Path:
         """A path of the run's configuration as it is now: relative to here, or to where it ran."""
-        path = Path(path).expanduser()
-        if path.exists() or path.is_absolute():
-            return path
-        try:
-            ran_in = OmegaConf.load(self.folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
+        return found_again(path, self._ran_in)
+
+    @property
+    def _ran_in(self) -> str | None:
+        """The working folder of the run; None: nobody knows."""
+        if (self.folder / "run.json").is_file():
+            return str(read_run_facts(self.folder)["working_folder"])
+        try:  # of an older version
+            return str(OmegaConf.load(self.folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd)
         except Exception:  # no such file, or whatever a YAML reader may say about it
-            return path
-        return Path(ran_in) / path
+            return None
 
     def _settings(self, group: str) -> dict[str, Any]:
         settings = self.config.get(group)
@@ -157,7 +161,7 @@ def read_run(folder: str | Path) -> Run:
     if missing:
         raise ToftrackError(
             f"'{folder}' lacks {' and '.join(missing)}, so the run did not finish or the file was "
-            "moved; run track.py again"
+            f"moved; try `toftrack recover {folder}`"
         )
     results = read_results(folder / "track.npz")
     rows = len(results["lost"])
@@ -174,6 +178,14 @@ def read_run(folder: str | Path) -> Run:
             f"'{folder / 'summary.json'}' cannot be read ({error}); run track.py again"
         ) from None
     return Run(folder, results, frames, names, summary, HandShape.load(folder / "hand_shape.json"))
+
+
+def found_again(path: str | Path, ran_in: str | None) -> Path:
+    """A path of a run's configuration as it is now: relative to here, or to where the run was."""
+    path = Path(path).expanduser()
+    if path.exists() or path.is_absolute() or ran_in is None:
+        return path
+    return Path(ran_in) / path
 
 
 def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -205,38 +217,52 @@ def open_footage(run: Run, recording: str | Path | None = None) -> Footage | Non
     """
     device = run.config.get("device") or {}
     about = run.results["metadata"].get("device") or {}
-    name = about.get("recording")
-    if recording is None and name is None and about.get("device") != "synthetic":
+    opened = open_tracked(about, device, run.found, recording)
+    if opened is None:
         return None
-    if recording is None and about.get("device") == "synthetic":
-        store: FrameStore = _synthetic(device)
-        name = "the synthetic frames"
-    elif recording is None and about.get("device") == "sample":
-        store = open_source("sample")
-    else:
-        path = Path(recording).expanduser() if recording is not None else run.found(str(name))
-        if not path.exists():
-            raise ToftrackError(
-                f"the recording '{path}' is not there{' any more' if recording is None else ''}; "
-                "say where it is with --recording FILE"
-            )
-        camera_file = about.get("camera_file")
-        store = open_recording(
-            path,
-            None if camera_file is None else run.found(camera_file),
-            device.get("modulation_mhz", DEFAULT_MODULATION_MHZ),
-        )
-        name = path
+    store, name = opened
     camera = store.camera
     if about.get("camera_file"):
         camera = Camera.load(run.found(about["camera_file"]))
     rows = _rows(run, store, camera, about, device, name)
     truth = store.truth
-    if truth is not None:
-        values = {f.name: getattr(truth, f.name) for f in fields(Truth)}
-        some = {name: value[rows] for name, value in values.items() if value is not None}
-        truth = replace(truth, **some)
-    return Footage(store, camera, rows, truth)
+    return Footage(store, camera, rows, None if truth is None else truth.of_frames(rows))
+
+
+def open_tracked(
+    about: dict[str, Any],
+    device: dict[str, Any],
+    found: Callable[[str | Path], Path],
+    recording: str | Path | None = None,
+) -> tuple[FrameStore, object] | None:
+    """The recording that a device played, and its name; None when it was a live camera.
+
+    Args:
+        about: what the device said of itself, in the metadata.
+        device: its configuration.
+        found: where a path of the configuration is now.
+        recording: where the recording is now, when it is not where it was.
+
+    Raises:
+        ToftrackError: it is gone, or cannot be read.
+    """
+    name, kind = about.get("recording"), about.get("device")
+    if recording is None and kind == "synthetic":
+        return _synthetic(device), "the synthetic frames"
+    if recording is None and kind == "sample":
+        return open_source("sample"), name
+    if recording is None and name is None:
+        return None
+    path = Path(recording).expanduser() if recording is not None else found(str(name))
+    if not path.exists():
+        raise ToftrackError(
+            f"the recording '{path}' is not there{' any more' if recording is None else ''}; "
+            "say where it is with --recording FILE"
+        )
+    camera_file = about.get("camera_file")
+    modulation_mhz = device.get("modulation_mhz", DEFAULT_MODULATION_MHZ)
+    camera_path = None if camera_file is None else found(camera_file)
+    return open_recording(path, camera_path, modulation_mhz), path
 
 
 def _rows(

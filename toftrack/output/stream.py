@@ -19,7 +19,7 @@ from typing import Any, Protocol, Self
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.output.results import LINE_FIELDS, json_line
+from toftrack.output.lines import LINE_FIELDS, json_line
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class StdoutStream:
     end, its last line may be cut short.
 
     Args:
-        fields: what to send of each estimate, of results.LINE_FIELDS; None for all.
+        fields: what to send of each estimate, of lines.LINE_FIELDS; None for all.
         waiting: lines, at least 1.
 
     Raises:
@@ -136,7 +136,7 @@ class UdpStream:
     Args:
         host: address or name of the receiving machine.
         port: 1 to 65535.
-        fields: what to send of each estimate, of results.LINE_FIELDS; None for all.
+        fields: what to send of each estimate, of lines.LINE_FIELDS; None for all.
 
     Raises:
         ToftrackError: an unknown field, a host that cannot be found, or an impossible port.

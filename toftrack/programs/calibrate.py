@@ -1,5 +1,5 @@
 """Calibrate a depth camera from a recording of a chequerboard:
-`python -m toftrack.calibrate RECORDING --board 7x5 --square 0.03`.
+`toftrack calibrate RECORDING --board 7x5 --square 0.03`.
 
 Move a flat chequerboard about before the camera: wholly in view, near and far over the distances
 that matter, turned to all sides, slowly. The camera file serves every device: `camera.file=FILE`.
@@ -48,7 +48,7 @@ class Calibration:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, calibrate, and write the files. Raises ToftrackError."""
     parser = argparse.ArgumentParser(
-        prog="python -m toftrack.calibrate",
+        prog="toftrack calibrate",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

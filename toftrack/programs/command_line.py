@@ -1,15 +1,15 @@
 """What the command-line programs share: clear errors, exit statuses, and sweeps that carry on.
 
-A program is a thin script:
+A program of Hydra's:
 
     @hydra.main(version_base="1.3", config_path="conf", config_name="track")
     @sweep_job
     def main(config: DictConfig) -> float: ...
 
-    if __name__ == "__main__":
-        sys.exit(run(main))
+    sys.exit(run(main))
 
-Exit status: 0 done, 1 an error (one sentence on standard error), 130 interrupted.
+Exit status: 0 done, 1 an error (one sentence on standard error), 130 interrupted, 143 terminated
+(SIGTERM), 129 hung up (SIGHUP).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
+from toftrack.programs import endings
 
 
 @dataclass
@@ -62,17 +63,19 @@ def run(main: Callable[[], object]) -> int:
         main: usually a function under `@hydra.main` and `@sweep_job`.
 
     Returns:
-        0 done, 1 after an error (also of one job of a sweep), 130 after Ctrl-C.
+        What main returns if it is an int; else 0 done, 1 after an error (also of one job of a
+        sweep), 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
     """
     _program.running = True
     _program.tracebacks = os.environ.get(FULL_ERROR) == "1"
     _program.failed_jobs.clear()
     try:
-        with _hydra_raises():
-            main()
-    except KeyboardInterrupt:
-        print("interrupted: what was done until then is kept", file=sys.stderr)
-        return 130
+        with endings.obeyed(), _hydra_raises():
+            status = main()
+    except KeyboardInterrupt as end:
+        endings.say("interrupted: what was done until then is kept", sys.stderr)
+        endings.forget_streams()
+        return endings.exit_status(end)
     except SystemExit as end:  # of Hydra's options, as --help, and of its argument parser
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
@@ -93,7 +96,7 @@ def run(main: Callable[[], object]) -> int:
         count = len(_program.failed_jobs)
         print(f"error: {count} of the jobs failed, see above", file=sys.stderr)
         return 1
-    return 0
+    return status if isinstance(status, int) else 0
 
 
 def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:

@@ -1,4 +1,4 @@
-"""Convert a recording: `python -m toftrack.convert IN OUT`.
+"""Convert a recording: `toftrack convert IN OUT`.
 
 IN and OUT are each a `.srs` (the SR3000's stream), a `.npz` (toftrack's recording) or a folder of
 16-bit PNG images with a camera file; the kind follows from the name.
@@ -36,7 +36,7 @@ _MILLIMETRE = 0.001
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and convert. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(prog="python -m toftrack.convert", description=__doc__)
+    parser = argparse.ArgumentParser(prog="toftrack convert", description=__doc__)
     parser.add_argument("source", metavar="IN", help="the recording to read")
     parser.add_argument("target", metavar="OUT", help=".srs, .npz, or a folder")
     parser.add_argument("--camera", help="camera file instead of the recording's own camera")

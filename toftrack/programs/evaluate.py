@@ -1,4 +1,4 @@
-"""Evaluate the tracker on a public data set: `python -m toftrack.evaluate MSRA15 FOLDER`.
+"""Evaluate the tracker on a public data set: `toftrack evaluate MSRA15 FOLDER`.
 
 Each sequence is tracked from its first frame by a tracker of its own, with the side of the data
 set's hands. The figures are those of toftrack's own recordings, over the joints that the labels
@@ -106,7 +106,7 @@ def _track(
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m toftrack.evaluate",
+        prog="toftrack evaluate",
         description="Evaluate the tracker on a public data set of labelled depth images.",
     )
     parser.add_argument("data_set", metavar="DATASET", help=", ".join(DATA_SETS))

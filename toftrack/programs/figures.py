@@ -1,4 +1,4 @@
-"""Pictures of a finished run, as in the paper: `python -m toftrack.figures outputs/DATE/TIME`.
+"""Pictures of a finished run, as in the paper: `toftrack figures outputs/DATE/TIME`.
 
 Writes five PNG files into the run's folder, below `figures`:
 
@@ -51,7 +51,7 @@ _SAME_SPACE = 0.01
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and draw. Raises ToftrackError."""
     parser = argparse.ArgumentParser(
-        prog="python -m toftrack.figures",
+        prog="toftrack figures",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,7 +1,7 @@
-"""Record what an SR3000 sends: `python -m toftrack.record OUT.srs`, until Ctrl-C.
+"""Record what an SR3000 sends: `toftrack record OUT.srs`, until Ctrl-C.
 
 The camera's settings are those of conf/device/sr3000.yaml, changed as for `track.py`:
-`python -m toftrack.record OUT.srs device.transport=emulated`.
+`toftrack record OUT.srs device.transport=emulated`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from tqdm import tqdm
 from toftrack.configuration.compose import configuration_folder
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
+from toftrack.programs.endings import ENDINGS, EndedError
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.srs_facts import SrsFacts, SrsInit
@@ -34,9 +35,9 @@ _ONLY = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the command line and record. Raises ToftrackError, and KeyboardInterrupt at the end of
-    an interrupted recording, whose frames are all in the file."""
-    parser = argparse.ArgumentParser(prog="python -m toftrack.record", description=__doc__)
+    """Parse the command line and record. Raises ToftrackError, and EndedError at the end of an
+    interrupted recording, whose frames are all in the file."""
+    parser = argparse.ArgumentParser(prog="toftrack record", description=__doc__)
     parser.add_argument("out", metavar="OUT.srs", help="the new recording")
     parser.add_argument("--frames", type=int, help="stop after so many (default: at Ctrl-C)")
     parser.add_argument("--seconds", type=float, help="stop after so long")
@@ -61,8 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         interrupted = record(
             device, options.out, options.frames, options.seconds, options.overwrite
         )
-    if interrupted:
-        raise KeyboardInterrupt
+    if interrupted is not None:
+        raise EndedError(interrupted)
 
 
 def record(
@@ -71,10 +72,10 @@ def record(
     frames: int | None = None,
     seconds: float | None = None,
     overwrite: bool = False,
-) -> bool:
+) -> int | None:
     """Write every frame of an opened camera to a `.srs` file.
 
-    SIGINT and SIGTERM end the recording after the frames that were received until then.
+    SIGINT, SIGTERM and SIGHUP end the recording after the frames that were received until then.
 
     Args:
         device: of keep=every, or what comes too fast is dropped.
@@ -84,7 +85,7 @@ def record(
         overwrite: replace an existing file.
 
     Returns:
-        Whether a signal ended it.
+        The number of the signal that ended it; None: none did.
 
     Raises:
         ToftrackError: the file cannot be written, or the camera was given up; the frames until then
@@ -117,17 +118,18 @@ def record(
 
 
 class _Signals:
-    """While entered, SIGINT and SIGTERM ask the camera to stop; `came` tells that one did."""
+    """While entered, signals ask the camera to stop; `came` tells which one did."""
 
     def __init__(self, device: Sr3000) -> None:
-        self.came = False
+        self.came: int | None = None
         self._device = device
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> _Signals:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._stop)
+            for number in ENDINGS:
+                if signal.getsignal(number) != signal.SIG_IGN:  # as by nohup
+                    self._before[number] = signal.signal(number, self._stop)
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -135,9 +137,9 @@ class _Signals:
             signal.signal(number, handler)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self.came:  # impatience: the second one interrupts at once
-            raise KeyboardInterrupt
-        self.came = True
+        if self.came is not None:  # impatience: the second one interrupts at once
+            raise EndedError(number)
+        self.came = number
         self._device.request_stop()
 
 

@@ -1,4 +1,4 @@
-"""What a sweep found: `python -m toftrack.report multirun/DIR`.
+"""What a sweep found: `toftrack report multirun/DIR`.
 
 Gathers the overrides (.hydra/overrides.yaml) and the figures (summary.json) of every job below a
 folder into sweep.csv, a table, and sweep.png: the error against the cost of a frame, with the
@@ -258,7 +258,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; 0 also when jobs of the sweep failed, 1 when there is nothing to report."""
     parser = argparse.ArgumentParser(
-        prog="python -m toftrack.report", description="Gather the jobs of a sweep into one table."
+        prog="toftrack report", description="Gather the jobs of a sweep into one table."
     )
     parser.add_argument("folder", help="the sweep's folder, multirun/DATE/TIME")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""What `python train_pose_space.py` does: fit, report, write the model and its figures."""
+"""What `toftrack train` does: fit, report, write the model and its figures."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def train(config: DictConfig) -> float:
         json.dumps(_summary(kind, dims, data, rows), indent=1) + "\n", encoding="utf-8"
     )
     print("\n".join(f"  {folder / name}" for name in (model.name, *figures, "summary.json")))
-    print(f"use it: python track.py pose_space={kind} pose_space.file={model}")
+    print(f"use it: toftrack track pose_space={kind} pose_space.file={model}")
     return error
 
 

@@ -68,7 +68,7 @@ def train(config: DictConfig) -> float:
     )
     for name in (config.output, "images.png", "course.png", "summary.json"):
         print(f"  {folder / name}")
-    print(f"use it: python track.py relocation.weights={path}")
+    print(f"use it: toftrack track relocation.weights={path}")
     return float(last["votes_mm"])
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Self
 
@@ -16,8 +17,10 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, confidence_words, gesture_words, state_words
+from toftrack.output.files import write_whole
 from toftrack.views.base import TrackedFrame
 from toftrack.views.model_image import model_range_image
+from toftrack.views.video import VideoFile, unwritable, video_library
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
 FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
@@ -31,6 +34,7 @@ _TRUSTED = 0.5
 _NEAREST_GREY, _FARTHEST_GREY = 40, 215
 _SUBPIXEL_BITS = 3
 
+VIDEO, STRIP = "overlay.mp4", "overlay.png"
 _STRIP_TILES = 10
 _STRIP_COLUMNS = 5
 _STRIP_TILE_PX = 320
@@ -111,15 +115,15 @@ class VideoView:
         frames: how many panels are to come at most, or None where nobody knows.
 
     Raises:
-        ToftrackError: by `add` and `close`, when a file cannot be written.
+        ToftrackError: nothing encodes; by `add` and `close`, when a file cannot be written.
     """
 
     def __init__(self, folder: str | Path, fps: float, frames: int | None = None) -> None:
-        self.video_path = Path(folder) / "overlay.mp4"
-        self.strip_path = Path(folder) / "overlay.png"
-        # Two decimals: MPEG-4's clock cannot count in the odd fractions of measured rates.
-        self._fps = min(max(round(float(fps), 2), 1.0), 120.0) if math.isfinite(fps) else 25.0
-        self._writer: cv2.VideoWriter | None = None
+        self.video_path = Path(folder) / VIDEO
+        self.strip_path = Path(folder) / STRIP
+        video_library()  # better missed now than at the first frame
+        self._fps = fps
+        self._video: VideoFile | None = None
         self._size = (0, 0)
         self._count = 0
         self._tiles: list[np.ndarray] = []
@@ -135,39 +139,43 @@ class VideoView:
 
     def add(self, panel: np.ndarray) -> None:
         """Append a (h, w, 3) uint8 BGR panel; the first one decides on the size of the video."""
-        if self._writer is None:
+        if self._video is None:
             self._size = (panel.shape[1] & ~1, panel.shape[0] & ~1)
-            self._writer = cv2.VideoWriter(
-                str(self.video_path), cv2.VideoWriter.fourcc(*"mp4v"), self._fps, self._size
-            )
-            if not self._writer.isOpened():
-                raise _unwritable(self.video_path)
+            self._video = VideoFile(self.video_path, self._fps, self._size)
         if panel.shape[1::-1] != self._size:
             panel = cv2.resize(panel, self._size, interpolation=cv2.INTER_AREA)
-        self._writer.write(np.ascontiguousarray(panel))
+        self._video.add(panel)
         if self._count % self._stride == 0:
             self._keep(panel)
         self._count += 1
 
     def close(self) -> None:
-        """Finish both files and check that the video can be read; nothing without a panel."""
-        if self._writer is None:
+        """Finish both files; nothing without a panel."""
+        if self._video is None:
             return
-        self._writer.release()
-        self._writer = None
-        reader = cv2.VideoCapture(str(self.video_path))
-        readable, _ = reader.read()
-        reader.release()
-        if not readable:
-            raise _unwritable(self.video_path)
-        if not cv2.imwrite(str(self.strip_path), filmstrip(self._tiles)):
-            raise _unwritable(self.strip_path)
+        video, self._video = self._video, None
+        try:
+            video.close()
+        finally:
+            self._write_strip()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception: object) -> None:
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
+        # What went wrong before is what matters, such as a disk that is full.
+        ended = kind is None or issubclass(kind, KeyboardInterrupt)
+        with nullcontext() if ended else suppress(ToftrackError):
+            self.close()
+
+    def _write_strip(self) -> None:
+        done, picture = cv2.imencode(".png", filmstrip(self._tiles))
+        if not done:
+            raise unwritable(self.strip_path)
+        try:
+            write_whole(self.strip_path, lambda stream: stream.write(picture.tobytes()))
+        except OSError as error:
+            raise unwritable(self.strip_path) from error
 
     def _keep(self, panel: np.ndarray) -> None:
         """Keep a tile; when they become too many, every other one goes and the stride doubles."""
@@ -292,9 +300,3 @@ def filmstrip(tiles: list[np.ndarray]) -> np.ndarray:
     framed += [np.full_like(framed[0], 255)] * (-count % columns)
     rows = [np.hstack(framed[i : i + columns]) for i in range(0, len(framed), columns)]
     return cv2.copyMakeBorder(np.vstack(rows), 0, gap, 0, gap, cv2.BORDER_CONSTANT, value=_WHITE)
-
-
-def _unwritable(path: Path) -> ToftrackError:
-    return ToftrackError(
-        f"'{path}' cannot be written; check the folder and the free space, or choose view=none"
-    )

@@ -1,0 +1,127 @@
+"""The command `toftrack`: its programs, its help, and recordings given by name."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.tracking import ROOT, configuration
+
+from toftrack.configuration.compose import devices_of_files, setting_names
+from toftrack.errors import ToftrackError
+from toftrack.programs import main as front
+from toftrack.programs.recording_argument import quoted, with_recording
+
+KNOWN = setting_names(), devices_of_files()
+ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')
+ODDER = ("1,2,3.npz", "$HOME.npz", "back\\slash\\'s", "ends\\", "#", "-")
+
+
+@pytest.mark.parametrize("words", [["--help"], ["track", "--help"], ["train", "device=x", "-h"]])
+def test_help_begins_with_what_it_does_and_three_examples_and_loads_little(words) -> None:
+    command = [sys.executable, "-X", "importtime", "-m", "toftrack", *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    what, empty, *examples = done.stdout.splitlines()[:5]
+    assert done.returncode == 0 and what.startswith("toftrack ") and not empty
+    assert all(line.startswith("  toftrack t") for line in examples)
+    for slow in ("torch", "hydra", "numpy", "cv2"):
+        assert f"| {slow}\n" not in done.stderr
+
+
+def test_long_help_names_every_group_and_choice() -> None:
+    text = front.long_help("track")
+    for path in (ROOT / "conf").glob("*/*.yaml"):
+        if path.parent.name != "data":
+            assert f"  {path.parent.name} " in text and path.stem in text
+    assert "  data " in front.long_help("train")
+
+
+def test_every_command_is_a_function_that_there_is() -> None:
+    for command in front._COMMANDS.values():
+        assert callable(getattr(importlib.import_module(command.module), command.function))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["trak"], "did you mean toftrack track?"),
+        (["hand.side=left"], "did you mean toftrack track hand.side=left?"),
+        (["gone.npz"], "did you mean toftrack track gone.npz?"),
+        (["xyz"], "give one of track, train"),
+    ],
+)
+def test_a_command_that_there_is_not_is_told(words, told, capsys) -> None:
+    assert front.main(words) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("error: there is no command") and told in err and err.count("\n") == 1
+
+
+def test_a_program_s_status_and_errors_are_those_of_the_command(capsys, tmp_path) -> None:
+    assert front.main(["report", str(tmp_path)]) == 1
+    assert front.main(["convert", str(tmp_path / "gone.npz"), str(tmp_path / "x.srs")]) == 1
+    assert "gone.npz" in capsys.readouterr().err.splitlines()[-1]
+    assert front.main(["figures", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("usage: toftrack figures ")
+
+
+@pytest.mark.parametrize("name", [*ODD, *ODDER])
+def test_any_name_arrives_as_it_is(name: str, tmp_path, monkeypatch) -> None:
+    config = configuration("device=replay", f"device.path={quoted(name)}")
+    assert config.device.path == name
+    monkeypatch.chdir(tmp_path)
+    Path(name).touch()
+    assert with_recording([name, "seed=1"], *KNOWN) == [
+        "device=replay",
+        f"device.path={quoted(name)}",
+        "seed=1",
+    ]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["hand.side=left", "seed=1"],
+        ["~device.repeat", "+new.key=1", "++device.x=2", "hydra/launcher=joblib"],
+        ["--config-dir", "my_conf", "device@other=raw", "--cfg", "job"],
+        ["-m", "seed=1,2"],
+        ["hand.sied=left", "hnad.side=left"],
+    ],
+)
+def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my_conf").mkdir()
+    Path("seed=1").mkdir()  # as sweeps name their folders
+    assert with_recording(words, *KNOWN) == words
+
+
+def test_a_device_that_plays_files_may_be_chosen_beside_the_name() -> None:
+    words = ["device=folder", "device.unit_m=0.0001"]
+    assert with_recording([*words, "a b"], *KNOWN) == ["device.path='a b'", *words]
+
+
+def test_a_name_that_begins_with_a_tilde_is_not_somebody_s_home(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert with_recording(["~x"], *KNOWN) == ["~x"]
+    Path("~x").touch()
+    assert with_recording(["~x"], *KNOWN)[1] == "device.path='./~x'"
+
+
+def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missing() -> None:
+    for name in ("gone.npz", "gone [2]=x.npz"):
+        assert with_recording([name], *KNOWN)[1] == f"device.path={quoted(name)}"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["a.npz", "b.npz"], "two recordings, 'a.npz' and 'b.npz'"),
+        (["${x}.npz"], "rename the file"),
+        (["a.npz", "device=sr3000"], "device=sr3000 and the recording 'a.npz'"),
+    ],
+)
+def test_what_cannot_be_one_recording_is_told(words: list[str], told: str) -> None:
+    with pytest.raises(ToftrackError, match=told):
+        with_recording(words, *KNOWN)

@@ -1,0 +1,100 @@
+"""What was probably meant by a setting, a group or a choice that does not exist."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator, Sequence
+
+from hydra.errors import MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+_ALIKE = 0.6
+"""How much of a name must be right, 0..1."""
+_MOST = 12
+"""So many names are listed at most."""
+
+
+def nearest(word: str, names: Sequence[str]) -> str | None:
+    """The name that is most like a word; None where none is."""
+    found = difflib.get_close_matches(word, names, n=1, cutoff=_ALIKE)
+    return found[0] if found else None
+
+
+def better_sentence(chain: Sequence[BaseException]) -> str | None:
+    """One sentence for an override that means nothing; None for every other error.
+
+    chain: the error and its causes, the error first.
+    """
+    for error in chain:
+        if isinstance(error, OverrideParseException):
+            return _of_syntax(error)
+        if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+            return _of_choice(error.missing_cfg_file, error.options or ())
+    return _of_key(chain)
+
+
+def _of_syntax(error: OverrideParseException) -> str:
+    key, separator, value = error.override.partition("=")
+    text = f"'{error.override}' cannot be read as a setting"
+    if not separator:
+        return f"{text}; settings are given as KEY=VALUE, as in hand.side=left"
+    if key == "device.path":
+        return f"{text}; give the recording by its name alone: toftrack track '{value}'"
+    return (
+        f"{text}; where a value has blanks, commas, brackets or other signs, put it in two pairs of"
+        f""" quotes: '{key}="..."'"""
+    )
+
+
+def _of_choice(missing: str, options: Sequence[str]) -> str | None:
+    group, _, word = missing.rpartition("/")
+    if not group or not options:
+        return None
+    likely = nearest(word, options)
+    hint = f"did you mean {group}={likely}? The choices are" if likely else "give one of"
+    return f"there is no {group}={word}; {hint} {', '.join(options)}"
+
+
+def _of_key(chain: Sequence[BaseException]) -> str | None:
+    told = re.match(r"Could not override '([^']+)'", str(chain[0]))
+    for error in chain:
+        parent = getattr(error, "parent_node", None)
+        if told and isinstance(error, OmegaConfBaseException) and isinstance(parent, DictConfig):
+            return _unknown_key(told[1], parent)
+    return None
+
+
+def _unknown_key(key: str, parent: DictConfig) -> str:
+    root = parent._get_root()
+    assert isinstance(root, DictConfig)
+    keys = [name for name in _keys(root) if not name.startswith("hydra.") or key[:5] == "hydra"]
+    last = key.rpartition(".")[2]
+    same = [name for name in keys if name.rpartition(".")[2] == last]
+    likely = nearest(key, [name for name in keys if not key.startswith(f"{name}.")]) or (
+        same[0] if same else None
+    )
+    text = f"there is no setting {key}"
+    if key == "device.path":
+        return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
+    if likely is not None:
+        return f"{text}; did you mean {likely}?"
+    inside = OmegaConf.select(root, key.rpartition(".")[0]) if "." in key else root
+    some = [str(name) for name in inside if name not in ("_target_", "hydra")]
+    if len(some) > _MOST:
+        some = [*some[:_MOST], "..."]
+    where = key.rpartition(".")[0] or "the configuration"
+    return f"{text}; {where} has {', '.join(some)}"
+
+
+def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:
+    """Every group and setting of a configuration, dotted."""
+    for name in map(str, config):
+        if name == "_target_":
+            continue
+        yield f"{prefix}{name}"
+        if not OmegaConf.is_missing(config, name):
+            node = config._get_node(name)
+            if isinstance(node, DictConfig) and not node._is_none():
+                yield from _keys(node, f"{prefix}{name}.")

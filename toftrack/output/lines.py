@@ -1,0 +1,98 @@
+"""Estimates as lines of track.jsonl, and what each field is in the arrays of track.npz.
+
+Both follow from the fields of Estimate: a new one is in the files by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+
+_KINDS: dict[type, type] = {
+    bool: np.bool_,
+    int: np.int64,
+    float: np.float32,
+    str: np.str_,
+    np.ndarray: np.float32,
+}
+_EXACT = {"timestamp_s": np.float64}
+_HINTS = get_type_hints(Estimate)
+KINDS: dict[str, type] = {
+    field.name: _EXACT.get(field.name, _KINDS[_HINTS[field.name]]) for field in fields(Estimate)
+}
+"""Of what type each field is in track.npz; arrays have their shape behind the frames' axis."""
+
+_FIRST = (
+    "index",
+    "timestamp_s",
+    "state_name",
+    "lost",
+    "confidence",
+    "outside_rad",
+    "side",
+    "side_probability",
+    "score",
+)
+LINE_FIELDS = (*_FIRST, *(name for name in KINDS if name not in _FIRST))
+"""What a line of track.jsonl says, fields of Estimate, in their order."""
+
+
+def json_line(estimate: Estimate, names: Sequence[str] = LINE_FIELDS) -> str:
+    """An estimate as one line of strict JSON, without newline; NaN becomes null.
+
+    names: which of LINE_FIELDS, in this order.
+    """
+    content = {name: strict(getattr(estimate, name)) for name in names}
+    return json.dumps(content, allow_nan=False, separators=(",", ":"))
+
+
+def read_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The lines of a track.jsonl as dicts; one at the end that was not finished is left out.
+
+    Raises ToftrackError when another one is damaged, OSError when the file cannot be read.
+    """
+    with open(path, "rb") as stream:
+        for number, line in enumerate(stream, 1):
+            if not line.endswith(b"\n"):
+                return  # the run was killed, or the machine went down, while it was written
+            try:
+                content = json.loads(line)
+                if not isinstance(content, dict):
+                    raise ValueError("it is no object")
+            except ValueError as error:
+                if not stream.read(1):
+                    return  # the same, where the file system had given the line its room already
+                raise damaged(path, number, error) from None
+            yield content
+
+
+def damaged(path: Path, number: int, error: object) -> ToftrackError:
+    """What is said about a line that cannot be read."""
+    return ToftrackError(
+        f"line {number} of '{path}' is not a line of a run ({error}); take it out of the file, then"
+        " try again"
+    )
+
+
+def strict(value: Any) -> Any:
+    """`value` without what JSON cannot say: arrays become lists, NaN and infinity None."""
+    if isinstance(value, dict):
+        return {str(key): strict(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [strict(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return strict(value.tolist())
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,157 @@
+"""A run's frames as records on the disk: track.jsonl becomes track.npz with little memory.
+
+The lines are read once into a nameless file of records of one size; then each field's column is
+copied from there into the archive, piece by piece. Some 25 bytes a frame are held meanwhile.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, BinaryIO, Self
+
+import numpy as np
+
+from toftrack.estimate import no_estimate
+from toftrack.output.lines import KINDS, damaged, read_lines
+
+_PIECE = 256
+"""Records that are in memory at a time; a line's numbers take some 10 kB as Python objects."""
+
+
+class Records:
+    """The frames of a track.jsonl, for a `with`; each field is a column.
+
+    Args:
+        lines: the file, which is read at once.
+        latent_size: of the columns of a file without lines.
+
+    Raises:
+        ToftrackError: a line is damaged.
+        OSError: the lines cannot be read, or the records not be kept beside them.
+    """
+
+    def __init__(self, lines: Path, latent_size: int = 4) -> None:
+        self._words: dict[str, int] = {}
+        self._file: IO[bytes] = tempfile.TemporaryFile(dir=lines.parent)  # noqa: SIM115
+        self.count = 0
+        try:
+            empty = vars(no_estimate(0, 0.0, "", latent_size, 0.0))
+            self._kind = _record_kind(empty)
+            read = read_lines(lines)
+            while piece := list(itertools.islice(read, _PIECE)):
+                if not self.count:
+                    self._kind = _record_kind(piece[0])
+                try:
+                    self._file.write(self._records(piece).tobytes())
+                except (KeyError, TypeError, ValueError) as error:
+                    last = self.count + len(piece)
+                    raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
+                self.count += len(piece)
+            self._file.flush()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns."""
+        return self._kind.names or ()
+
+    def column(self, name: str, rows: np.ndarray | None = None) -> np.ndarray:
+        """A whole column, or its rows (not decreasing); texts as texts."""
+        rows = np.arange(self.count) if rows is None else rows
+        kind = self.kind(name)
+        pieces = [piece for piece in self.pieces(name, rows)]
+        shape = self._kind[name].shape
+        return np.concatenate(pieces) if pieces else np.zeros((0, *shape), kind)
+
+    def pieces(self, name: str, rows: np.ndarray) -> Iterator[np.ndarray]:
+        """Some rows (not decreasing) of a column, in pieces."""
+        kind = self.kind(name)
+        words = np.array(list(self._words), kind) if kind.kind == "U" else None
+        for begin in range(0, len(rows), _PIECE):
+            some = rows[begin : begin + _PIECE]
+            values = self._read(int(some[0]), int(some[-1]) + 1)[name][some - some[0]]
+            yield values.astype(kind) if words is None else words[values]
+
+    def kind(self, name: str) -> np.dtype:
+        """Of a column's values."""
+        if KINDS[name] is not np.str_:
+            return self._kind[name].base
+        # Of all texts, since a longer one costs nothing once the archive is compressed.
+        return np.dtype(f"<U{max(map(len, self._words), default=1) or 1}")
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Of one frame's values."""
+        return self._kind[name].shape
+
+    def _read(self, begin: int, end: int) -> np.ndarray:
+        self._file.seek(begin * self._kind.itemsize)
+        return np.frombuffer(self._file.read((end - begin) * self._kind.itemsize), self._kind)
+
+    def _records(self, lines: list[dict[str, Any]]) -> np.ndarray:
+        records = np.zeros(len(lines), self._kind)
+        for name in self.names:
+            values = [line[name] for line in lines]
+            if KINDS[name] is np.str_:
+                values = [self._words.setdefault(str(word), len(self._words)) for word in values]
+            records[name] = np.array(values, self._kind[name].base).reshape(
+                len(lines), *self._kind[name].shape
+            )
+        return records
+
+
+def _record_kind(line: dict[str, Any]) -> np.dtype:
+    """Texts are numbers of words; fields of another version are left out."""
+    return np.dtype(
+        [
+            (name, np.int32 if kind is np.str_ else kind, np.shape(line[name]))
+            for name, kind in KINDS.items()
+            if name in line
+        ]
+    )
+
+
+def write_archive(
+    stream: BinaryIO,
+    records: Records,
+    rows: np.ndarray,
+    changed: dict[str, np.ndarray],
+    small: dict[str, np.ndarray],
+) -> None:
+    """Write the `.npz` of some rows of all columns, as `np.savez_compressed` would.
+
+    rows: not decreasing.  changed: arrays in place of columns.  small: further arrays.
+    """
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in records.names:
+            if name in changed:
+                continue
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                header = {
+                    "descr": np.lib.format.dtype_to_descr(records.kind(name)),
+                    "fortran_order": False,
+                    "shape": (len(rows), *records.shape(name)),
+                }
+                np.lib.format.write_array_header_1_0(member, header)
+                for piece in records.pieces(name, rows):
+                    member.write(piece.tobytes())
+        for name, array in (changed | small).items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)

@@ -1,0 +1,144 @@
+"""The command `toftrack`: which program does what. Only the one that is asked for is loaded."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import toftrack
+
+
+@dataclass(frozen=True)
+class _Command:
+    module: str
+    about: str
+    function: str = "main"
+
+
+_COMMANDS = {
+    "track": _Command("toftrack.programs.applications", "follow a hand", "track"),
+    "train": _Command("toftrack.programs.applications", "learn a space of poses", "train"),
+    "record": _Command("toftrack.programs.record", "record a camera"),
+    "convert": _Command("toftrack.programs.convert", "convert a recording"),
+    "calibrate": _Command("toftrack.programs.calibrate", "calibrate a camera with a chequerboard"),
+    "evaluate": _Command("toftrack.programs.evaluate", "measure against a public data set"),
+    "gesture": _Command("toftrack.programs.gesture", "make gestures of your own"),
+    "figures": _Command("toftrack.programs.figures", "draw pictures of a finished run"),
+    "report": _Command("toftrack.programs.report", "gather the jobs of a sweep"),
+    "benchmark": _Command("toftrack.benchmark.scoring", "measure the speed"),
+    "recover": _Command("toftrack.programs.recover", "finish the files of a run that was killed"),
+}
+_HELP = ("-h", "--help")
+
+_OVERVIEW = """toftrack follows a human hand in the depth images of a camera or a recording.
+
+  toftrack track                              the recording that comes with it
+  toftrack track FILE hand.side=left          a recording of your own, of a left hand
+  toftrack track device=realsense view=browser    a camera, live in the browser
+
+commands (toftrack COMMAND --help says more):
+{commands}"""
+
+_TRACK = """toftrack track follows a hand and writes joints, state and gesture of every frame.
+
+  toftrack track                              the recording that comes with it
+  toftrack track FILE hand.side=left          a recording of your own, of a left hand
+  toftrack track device=realsense view=browser    a camera, live in the browser
+
+FILE is .npz, .srs or a folder of 16-bit PNG images. The results go into outputs/DATE/TIME/, or
+where hydra.run.dir=DIR says; Ctrl-C ends a run and keeps what was done. Everything else are
+settings: KEY=VALUE, or GROUP=CHOICE of
+
+{groups}
+
+  toftrack track --cfg job                    all settings, composed
+  toftrack track -m seed=1,2,3 view=none      a sweep: one run after another
+  toftrack track --hydra-help                 further options
+
+The settings stand in {folder}, each with its unit and effect."""
+
+_TRAIN = """toftrack train learns the space of hand poses that the tracker searches.
+
+  toftrack train                              from the poses of the paper
+  toftrack train pose_space=lle pose_space.dims=5     of another kind and size
+  toftrack train data=leap data.path=FILE     from recorded joint positions
+
+The model goes into the folder that is named at the end, or where hydra.run.dir=DIR says; use it
+with toftrack track pose_space=KIND pose_space.file=FILE. Settings are KEY=VALUE, or GROUP=CHOICE of
+
+{groups}
+
+  toftrack train --cfg job                    all settings, composed
+  toftrack train --hydra-help                 further options
+
+The settings stand in {folder}, each with its unit and effect."""
+
+_LONG_HELP = {"track": _TRACK, "train": _TRAIN}
+_GROUPS_OF_TRAINING = ("data", "pose_space")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line, by default this process's; returns the exit status."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if not given or given[0] in (*_HELP, "help"):
+        print(overview())
+        return 0
+    if given[0] == "--version":
+        print(f"toftrack {toftrack.__version__}")
+        return 0
+    name, rest = given[0], given[1:]
+    if name not in _COMMANDS:
+        print(f"error: {_unknown(name)}", file=sys.stderr)
+        return 1
+    if name in _LONG_HELP and any(word in _HELP for word in rest):
+        print(long_help(name))
+        return 0
+    from toftrack.programs.command_line import run
+
+    return run(lambda: _program(name)(rest))
+
+
+def overview() -> str:
+    """What `toftrack --help` prints."""
+    width = max(map(len, _COMMANDS))
+    lines = [f"  {name:<{width}}  {command.about}" for name, command in _COMMANDS.items()]
+    return _OVERVIEW.format(commands="\n".join(lines))
+
+
+def long_help(name: str) -> str:
+    """What `toftrack track --help` prints."""
+    folder = _configuration_folder()
+    groups = []
+    for group in sorted(path for path in folder.iterdir() if path.is_dir()):
+        choices = sorted(path.stem for path in group.glob("*.yaml"))
+        if (group.name in _GROUPS_OF_TRAINING) if name == "train" else group.name != "data":
+            groups.append(f"  {group.name:<14}{', '.join(choices)}")
+    return _LONG_HELP[name].format(groups="\n".join(groups), folder=folder)
+
+
+def _configuration_folder() -> Path:
+    """As configuration.compose has it, which takes the time to load Hydra."""
+    inside = Path(toftrack.__file__).parent / "conf"
+    return inside if inside.is_dir() else inside.parent.parent / "conf"
+
+
+def _program(name: str) -> Callable[[Sequence[str]], object]:
+    command = _COMMANDS[name]
+    function: Callable[[Sequence[str]], object] = getattr(
+        importlib.import_module(command.module), command.function
+    )
+    return function
+
+
+def _unknown(word: str) -> str:
+    import difflib
+
+    names = ", ".join(_COMMANDS)
+    if "=" in word or Path(word).suffix or Path(word).exists():
+        return f"there is no command '{word}'; did you mean toftrack track {word}?"
+    if near := difflib.get_close_matches(word, _COMMANDS, n=1):
+        return f"there is no command '{word}'; did you mean toftrack {near[0]}?"
+    return f"there is no command '{word}'; give one of {names}"
