@@ -160,7 +160,7 @@ def test_a_bad_image_does_not_disturb_the_track() -> None:
     ("overrides", "words"),
     [
         (["nope=1"], "nope"),
-        (["device=telescope"], "device/telescope"),
+        (["device=telescope"], "device=telescope"),
         (["hand.side=both"], "hand.side=both is unknown"),
         (["hand.shape=gone.json"], "gone.json"),
         (["seed=[1"], "[1"),

@@ -190,7 +190,8 @@ def test_the_networks_say_the_length_that_a_track_begins_with() -> None:
     belief = _hand_told(first, None, said, model)
     assert model.hand("right", belief).shape.hand_length_m == pytest.approx(0.152, rel=1e-3)
     # A track goes on as it began, and a hand that is not fitted stays as it is.
-    assert _hand_told(first, track_at(0.0), said, model) is first.size
+    followed = _hand_told(first, track_at(0.0), said, model)
+    assert model.hand("right", followed) is model.hand("right", first.size)
     assert _hand_told(replace(first, size=None), None, said, replace(model, adapt=None)) is None
 
 

@@ -113,7 +113,7 @@ def test_the_range_image_shows_the_hand_where_it_was_seen(default: Run) -> None:
 
 def test_a_restart_forgets_the_hand_and_may_change_its_side() -> None:
     scene = first(8)
-    tracker = make_tracker(*QUICK)
+    tracker = make_tracker(*SEARCH)
     before = tracker.shape
     tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
     tracker.restart()
