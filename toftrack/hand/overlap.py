@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -33,36 +35,38 @@ def overlap_of_each(joints_m: Tensor, hand_length_m: float) -> Tensor:
     """The same for each finger with all others, (N, 21, 3) to (N, 5)."""
     pairs = pairs_overlap(joints_m, hand_length_m)
     of_finger = pairs.new_zeros(len(pairs), 5)
-    for column in (0, 1):
-        of_finger.index_add_(
-            1, torch.tensor([p[column] for p in _PAIRS], device=pairs.device), pairs
-        )
+    for fingers in _tables(pairs.device, pairs.dtype)[:2]:
+        of_finger.index_add_(1, fingers, pairs)
     return of_finger
 
 
 def pairs_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
     """The same for each of the ten pairs, (N, 21, 3) to (N, 10)."""
+    first, second, apart, crossing = _tables(joints_m.device, joints_m.dtype)
     fingers = joints_m[:, 1:].unflatten(1, (5, 4))
-    bones = (fingers[:, :, 1:] - fingers[:, :, :-1]).norm(dim=-1).sum(2)
-    chord = (fingers[:, :, 3] - fingers[:, :, 0]).norm(dim=-1)
-    straight = ((chord / bones - _BENT) / (_STRAIGHT - _BENT)).clamp(0, 1)
-    straight = torch.cat((torch.zeros_like(straight[:, :1]), straight[:, 1:]), 1)  # no thumb
+    steps = fingers[:, :, 1:] - fingers[:, :, :-1]
+    chord = steps.sum(2).norm(dim=-1)
+    straight = (chord / steps.norm(dim=-1).sum(2) - _BENT) / (_STRAIGHT - _BENT)
+    straight = straight.clamp(0, 1)
+    # The thumb crosses the others, straight or not.
+    either = torch.maximum(straight[:, first], straight[:, second]) * crossing
     ends = fingers[:, :, 1:]  # (N, 5, 3, 3)
     points = torch.cat((ends, (ends[:, :, 1:] + ends[:, :, :-1]) / 2), 2)  # (N, 5, 5, 3)
-    first, second = ([pair[i] for pair in _PAIRS] for i in (0, 1))
     gap = torch.cdist(points[:, first], points[:, second])  # (N, pairs, 5, 5)
-    radii = _radii_m(joints_m) * (hand_length_m / DEFAULT_HAND_LENGTH_M)
-    apart = radii[first][:, :, None] + radii[second][:, None]
-    either = torch.maximum(straight[:, first], straight[:, second])
-    # The thumb crosses the others, straight or not.
-    either = either * either.new_tensor([float(a > 0) for a, _ in _PAIRS])
-    share = _SQUEEZED + (1 - _SQUEEZED) * either
+    share = (_SQUEEZED + (1 - _SQUEEZED) * either) * (hand_length_m / DEFAULT_HAND_LENGTH_M)
     depth = (1 - gap / (apart * share[:, :, None, None])).clamp(min=0)
-    weight = 1 + (_STRICT - 1) * either
-    return weight * depth.amax(3).square().sum(2)
+    return (1 + (_STRICT - 1) * either) * depth.amax(3).square().sum(2)
 
 
-def _radii_m(like: Tensor) -> Tensor:
-    """(5, 5) of the points that are compared: middle joint, last joint, tip, two bones' middles."""
-    first, second, last = (like.new_tensor(BONE_RADII_MM) / 1e3).unbind(1)
-    return torch.stack(((first + second) / 2, (second + last) / 2, last, second, last), 1)
+@functools.cache
+def _tables(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of the pairs: their fingers (10,), (10,); how far apart the points of fingers that touch are
+    (10, 5, 5), metres of the mean adult; and whether none of them is the thumb (10,), 1 or 0.
+    """
+    first, second = torch.tensor(_PAIRS, device=device).unbind(1)
+    bones = torch.tensor(BONE_RADII_MM, device=device, dtype=dtype) / 1e3
+    proximal, middle, last = bones.unbind(1)
+    # Of the points that are compared: middle joint, last joint, tip, two bones' middles.
+    radii = torch.stack(((proximal + middle) / 2, (middle + last) / 2, last, middle, last), 1)
+    apart = radii[first][:, :, None] + radii[second][:, None]
+    return first, second, apart, (first > 0).to(dtype)
