@@ -15,9 +15,16 @@ import torch
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
-from toftrack.pose_space.data.pose_data import PoseData, mixed_data, spread_out, synthetic_data
+from toftrack.pose_space.data.natural_poses import natural_poses
+from toftrack.pose_space.data.pose_data import (
+    PoseData,
+    mixed_data,
+    natural_data,
+    spread_out,
+    synthetic_data,
+)
 from toftrack.pose_space.data.pose_files import file_data
-from toftrack.pose_space.files import fit_pose_space, load_pose_space
+from toftrack.pose_space.files import fit_pose_space, load_pose_space, make_pose_space
 from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
 from toftrack.pose_space.reach import nearest_latents
 from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
@@ -198,6 +205,36 @@ def test_a_mixture_keeps_clips_and_sources_apart(tmp_path: Path) -> None:
     assert [source["data"] for source in both.sources] == ["synthetic", "file"]
     with pytest.raises(ToftrackError, match="data.parts"):
         mixed_data({}, poses=None)
+
+
+def test_natural_poses_are_recorded_sampled_and_the_papers_always_the_same() -> None:
+    data = natural_data(60)
+    assert len(data) == 3 * 60
+    assert {source.get("part", source["data"]) for source in data.sources} == {
+        "synthetic",
+        "recorded",
+        "sampled",
+    }
+    assert torch.equal(data.angles_rad, natural_data(60).angles_rad)
+    limits = torch.tensor(ANGLE_LIMITS)
+    assert (data.angles_rad >= limits[:, 0] - 1e-4).all()
+    assert (data.angles_rad <= limits[:, 1] + 1e-4).all()
+    assert len(data.clips.unique()) > 3, "held out in parts"
+
+
+def test_a_space_of_natural_poses_describes_natural_poses_better() -> None:
+    poses = natural_poses()[::7].double()
+
+    def error(data: str) -> float:
+        space = make_pose_space("pca", 4, None, data).to("cpu", torch.float64)
+        return float((space.decode(space.encode(poses)) - poses).square().mean().sqrt())
+
+    assert error("natural") < 0.95 * error("synthetic")
+
+
+def test_a_space_of_unknown_poses_is_refused() -> None:
+    with pytest.raises(ToftrackError, match="pose_space.data=mine .* natural or synthetic"):
+        make_pose_space("pca", 4, None, "mine")
 
 
 def test_folds_hold_out_whole_clips_and_every_pose_once() -> None:

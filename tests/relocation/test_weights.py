@@ -15,7 +15,12 @@ from toftrack.api import build_tracker
 from toftrack.errors import ToftrackError
 from toftrack.relocation import weights as module
 from toftrack.relocation.network import Finder, PoseNet
-from toftrack.relocation.weights import DEFAULT_FILE, load_weights, save_weights
+from toftrack.relocation.weights import (
+    DEFAULT_FILE,
+    load_weights,
+    save_weights,
+    trained_weights,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -197,3 +202,14 @@ def test_without_networks_their_weights_are_not_read(
     assert build_tracker(configuration(*overrides)).model.relocaliser is None
     with pytest.raises(Exception, match="no file of the relocaliser's weights"):
         build_tracker(configuration())
+
+
+def test_training_goes_on_from_the_weights_of_a_file(
+    networks: tuple[nn.Module, nn.Module], file: Path
+) -> None:
+    going_on = PoseNet(4)
+    going_on.load_state_dict(trained_weights(file, "pose", 4))
+    for name, value in networks[0].state_dict().items():
+        torch.testing.assert_close(going_on.state_dict()[name], value)
+    with pytest.raises(ToftrackError, match="width of 8, and the width to train is 16"):
+        trained_weights(file, "finder", 16)

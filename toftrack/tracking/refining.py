@@ -9,7 +9,7 @@ from torch import Tensor
 
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.contest import Alternatives, rivals_of, scored, settled, with_other_fingers
+from toftrack.tracking.contest import rivals_of, scored, settled, with_other_fingers
 from toftrack.tracking.model import ObservedFrame
 from toftrack.tracking.relocating import candidates, landmarks_of
 from toftrack.tracking.signs import out_of_sight
@@ -77,19 +77,20 @@ def _onto_points(
     frame = replace(frame, glance=glance)
     landmarks = None if glance is None else landmarks_of(glance, frame.model)
 
-    def onto_points(starts: Tensor) -> Alternatives:
-        return scored(refiner(starts, starts[:, 6:], seen, cfg, landmarks), frame)
+    def onto_points(starts: Tensor) -> Tensor:
+        return refiner(starts, starts[:, 6:], seen, cfg, landmarks)
 
     # The pose of the last frame stands until another one is clearly better: what the image does
     # not decide, such as a hidden finger, must not flicker. A contender moves along with it.
-    known = [pose[:, 6:] for pose in (before,) if pose is not None]
-    starts = [*(torch.cat((state[:, :6], angles), 1) for angles in known), state]
+    starts = [state]
+    if before is not None:
+        starts.insert(0, torch.cat((state[:, :6], before[:, 6:]), 1))
     own = len(starts)
     if track.contender is not None:
         starts.append(torch.cat((state[:, :6], track.contender.pose[:, 6:]), 1))
     mine = len(starts)
     likely = state[:0] if glance is None else candidates(glance, frame, frame.model.rivals)
-    tried = onto_points(torch.cat((*starts, likely)))
+    tried = scored(onto_points(torch.cat((*starts, likely))), frame)
     first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[own - 1] else own - 1
     rows = torch.arange(len(tried.scores), device=state.device)
     found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[own:mine]), None
@@ -98,7 +99,7 @@ def _onto_points(
         others = others.and_(near)
     swapped = with_other_fingers(found, likely[:_EXCHANGED, 6:], frame, cfg, generator)
     if len(swapped):
-        others = others.and_(scored(swapped, frame)).and_(onto_points(swapped))
+        others = others.and_(scored(torch.cat((swapped, onto_points(swapped))), frame))
     pose, contender = settled(found, others, track, dt_s, frame)
     return Refined(pose, None, rival, contender)
 
