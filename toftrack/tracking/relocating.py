@@ -36,7 +36,7 @@ _IN_FRONT_M = 0.03
 """What is so much nearer than a hidden hand is what hides it."""
 _STEP_M, _SPEED_M_S = 0.04, 0.25
 """How far a hand has moved since it was last believed: at once, and a second."""
-_FORGOTTEN_S = 2.0
+_FORGOTTEN_S = 1.0
 _NEAREST_M = 0.15
 """A camera sees nothing nearer."""
 
