@@ -49,7 +49,9 @@ def commands() -> Iterator[tuple[str, ...]]:
     shell = re.findall(r"```bash\n(.*?)```", README, re.DOTALL)
     lines = [line for text in shell for line in text.splitlines()]
     plain = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
-    lines += [" ".join(code.split()) for code in re.findall(r"`((?:python|toftrack) [^`]+)`", plain)]
+    lines += [
+        " ".join(code.split()) for code in re.findall(r"`((?:python|toftrack) [^`]+)`", plain)
+    ]
     for line in lines:
         words = shlex.split(line, comments=True)
         while words:
