@@ -78,7 +78,8 @@ TRACK = [words for words in COMMANDS if words[:2] == ("python", "track.py")]
 TRAIN = [words for words in COMMANDS if words[:2] == ("python", "train_pose_space.py")]
 RELOCALISER = ("python", "-m", "toftrack.programs.train_relocaliser")
 """The one command of a module that takes overrides."""
-MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m") and words != RELOCALISER]
+OTHERS = (RELOCALISER, ("python", "-m", "venv", ".venv"))
+MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m") and words not in OTHERS]
 OF_HYDRA = ("-m", "--multirun")
 
 
