@@ -1,4 +1,4 @@
-"""What README.md shows works: its programs run, and its commands are commands that there are."""
+"""What README.md and docs/ show works: programs run, and commands are commands that there are."""
 
 from __future__ import annotations
 
@@ -28,29 +28,49 @@ from toftrack.api import make_device
 from toftrack.programs import convert
 from toftrack.recordings.npz import read_recording
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = {
+    path: path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+}
+README = "\n".join(PAGES.values())
+"""All pages in one."""
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 
 
 def block(name: str) -> str:
     """The code after `<!-- test: name -->`."""
     found = re.findall(rf"<!-- test: {name} -->\n```\w+\n(.*?)```", README, re.DOTALL)
-    assert len(found) == 1, f"README.md has {len(found)} blocks marked {name}"
+    assert len(found) == 1, f"the pages have {len(found)} blocks marked {name}"
     return found[0]
 
 
 def commands() -> Iterator[tuple[str, ...]]:
-    """Every command in a block for the shell or in running text that starts with python."""
+    """Every command in a block for the shell, or that starts so in running text."""
     shell = re.findall(r"```bash\n(.*?)```", README, re.DOTALL)
     lines = [line for text in shell for line in text.splitlines()]
     plain = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
-    lines += [" ".join(code.split()) for code in re.findall(r"`(python [^`]+)`", plain)]
+    lines += [
+        " ".join(code.split()) for code in re.findall(r"`((?:python|toftrack) [^`]+)`", plain)
+    ]
     for line in lines:
         words = shlex.split(line, comments=True)
         while words:
             end = next((i for i, word in enumerate(words) if word in ("&&", "|")), len(words))
-            yield tuple(words[:end])
+            yield as_python(words[:end])
             words = words[end + 1 :]
+
+
+def as_python(words: list[str]) -> tuple[str, ...]:
+    """`toftrack NAME ...` as the command of Python that does the same."""
+    if words[0] != "toftrack" or words[1].startswith("-"):
+        return tuple(words)
+    name, rest = words[1], words[2:]
+    if name == "track":
+        return ("python", "track.py", *(word for word in rest if word != "FILE"))
+    module = f"toftrack.{name}"
+    if importlib.util.find_spec(module) is None:
+        module = f"toftrack.programs.{name}"
+    return ("python", "-m", module, *rest)
 
 
 COMMANDS = sorted(set(commands()))
@@ -58,13 +78,14 @@ TRACK = [words for words in COMMANDS if words[:2] == ("python", "track.py")]
 TRAIN = [words for words in COMMANDS if words[:2] == ("python", "train_pose_space.py")]
 RELOCALISER = ("python", "-m", "toftrack.programs.train_relocaliser")
 """The one command of a module that takes overrides."""
-MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m") and words != RELOCALISER]
+OTHERS = (RELOCALISER, ("python", "-m", "venv", ".venv"))
+MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m") and words not in OTHERS]
 OF_HYDRA = ("-m", "--multirun")
 
 
 def overrides_of(words: tuple[str, ...]) -> list[str]:
     """The overrides; of a sweep those of its first job, and without launchers that are extras."""
-    given = [word for word in words[2:] if word not in OF_HYDRA]
+    given = [word for word in words[2:] if word not in OF_HYDRA and word not in ("--cfg", "job")]
     launchers = {plugin.__name__ for plugin in Plugins.instance().discover(Launcher)}
     parsed: list[Override] = OverridesParser.create().parse_overrides(given)
     kept = []
@@ -135,6 +156,10 @@ def test_a_command_of_a_module_parses(
         program(words[2]).main(list(words[3:]))
 
 
+def test_the_readme_is_short() -> None:
+    assert len(PAGES[ROOT / "README.md"].splitlines()) <= 200
+
+
 def test_every_extra_that_is_named_is_there() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for names in re.findall(r"\.\[([\w,-]+)\]", README):
@@ -142,8 +167,9 @@ def test_every_extra_that_is_named_is_there() -> None:
 
 
 def test_every_file_and_picture_that_is_linked_is_there() -> None:
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
-        assert target.startswith("http") or (ROOT / target).exists(), target
+    for page, text in PAGES.items():
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+            assert target.startswith("http") or (page.parent / target).exists(), (page, target)
     for target in re.findall(r"`((?:toftrack|conf|tests)/[\w/.]+\.\w+)`", README):
         assert (ROOT / target).exists(), target
 

@@ -1,4 +1,4 @@
-"""A camera of one's own: the README's code and configuration, as they stand there."""
+"""A camera of one's own: the code and configuration of docs/own_device.md, as they stand there."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from toftrack.errors import ToftrackError
 FRAMES = 12
 
 
-def from_readme(name: str) -> str:
-    """The block of code that follows the README's marker of that name."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def from_page(name: str) -> str:
+    """The block of code that follows the page's marker of that name."""
+    text = (ROOT / "docs" / "own_device.md").read_text(encoding="utf-8")
     blocks = re.findall(rf"<!-- test: {name} -->\n```\w+\n(.*?)```", text, re.DOTALL)
-    assert len(blocks) == 1, f"the README has {len(blocks)} blocks marked {name}"
+    assert len(blocks) == 1, f"the page has {len(blocks)} blocks marked {name}"
     return blocks[0]
 
 
 @pytest.fixture
 def workplace(tmp_path: Path) -> Path:
     """A user's folder: the device, its configuration, and images in the sample's words."""
-    (tmp_path / "my_device.py").write_text(from_readme("own-device"), encoding="utf-8")
+    (tmp_path / "my_device.py").write_text(from_page("own-device"), encoding="utf-8")
     conf = tmp_path / "my_conf" / "device"
     conf.mkdir(parents=True)
-    (conf / "raw.yaml").write_text(from_readme("own-device-configuration"), encoding="utf-8")
+    (conf / "raw.yaml").write_text(from_page("own-device-configuration"), encoding="utf-8")
     with open(tmp_path / "images.raw", "wb") as images:
         for frame in Sample(stop=FRAMES):
             words = np.rint(np.minimum(frame.depth, 65) * 1000).astype(np.uint16)
@@ -61,7 +61,7 @@ def track(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_the_readmes_camera_is_tracked(workplace: Path) -> None:
     sample = Sample(stop=FRAMES)
     K = sample.camera.K
-    assert len(from_readme("own-device").splitlines()) <= 35
+    assert len(from_page("own-device").splitlines()) <= 35
     done = track(workplace, "device.path=images.raw", f"device.focal_px={K[0, 0]}")
     assert done.returncode == 0, done.stderr
     with np.load(workplace / "out" / "track.npz") as result:

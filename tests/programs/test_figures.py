@@ -143,6 +143,16 @@ def test_five_figures_are_written_that_show_something(run: Path) -> None:
         assert min(picture.shape[:2]) > 250 and picture.std() > 10, path.name
 
 
+def test_the_papers_run_is_drawn_though_json_has_no_infinity(run: Path) -> None:
+    with np.load(run / "track.npz") as archive:
+        facts = json.loads(str(archive["metadata"]))
+    assert isinstance(facts["config"]["segmentation"]["reach_m"], float)
+    facts["config"]["segmentation"]["reach_m"] = None
+    change(run, metadata=lambda _: np.array(json.dumps(facts)))
+    assert (run / "run.json").is_file()
+    assert draw_figures(run)
+
+
 def test_the_recording_is_found_from_another_folder(
     run: Path, tracked: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -117,6 +118,10 @@ class Run:
         target = settings.pop("_target_", None)
         if target != f"{kind.__module__}.{kind.__qualname__}":
             raise ToftrackError(f"the run in '{self.folder}' has a {group} of its own: {target}")
+        # JSON has no word for infinity: a number that is null was one.
+        for field in fields(kind):
+            if field.type == "float" and settings.get(field.name, 0.0) is None:
+                settings[field.name] = math.inf
         try:
             return kind(**settings)
         except TypeError as error:

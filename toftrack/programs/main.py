@@ -58,7 +58,7 @@ settings: KEY=VALUE, or GROUP=CHOICE of
   toftrack track -m seed=1,2,3 view=none      a sweep: one run after another
   toftrack track --hydra-help                 further options
 
-The settings stand in {folder}, each with its unit and effect."""
+The settings stand in {folder}, each with what it does."""
 
 _TRAIN = """toftrack train learns the space of hand poses that the tracker searches.
 
@@ -74,7 +74,7 @@ with toftrack track pose_space=KIND pose_space.file=FILE. Settings are KEY=VALUE
   toftrack train --cfg job                    all settings, composed
   toftrack train --hydra-help                 further options
 
-The settings stand in {folder}, each with its unit and effect."""
+The settings stand in {folder}, each with what it does."""
 
 _LONG_HELP = {"track": _TRACK, "train": _TRAIN}
 _GROUPS_OF_TRAINING = ("data", "pose_space")

@@ -52,8 +52,8 @@ def filtered(
 
     ahead = displacement(track, dt_s, model.filter)
     particles = model.backend.motions.compose(track.particles, ahead[None])
-    # A hand that was nearly lost is looked for farther away.
-    width = 1.0 + track.bad_s / FRAME_S
+    # A hand that was nearly lost is looked for farther away, but not ever farther.
+    width = 1.0 + (track.bad_s / FRAME_S if model.lost.patience else 0.0)
     sigmas = width * particle_filter.widened(
         model.sigmas, dt_s / FRAME_S, ahead, model.filter.rest, model.filter.speed_gain
     )

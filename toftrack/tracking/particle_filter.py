@@ -1,9 +1,8 @@
 """Sequential importance resampling as pure functions on tensors (paper, section 2.3).
 
 A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector
-(3, rad) and d latent coordinates; compute/rigid.py says how it is moved. Weights are kept as
-logarithms until they are used. Every function that draws takes an explicit generator on the
-particles' device.
+(3, rad) and d latent coordinates; compute/rigid.py says how it is moved. Scores come as logarithms;
+weights sum to 1. Every function that draws takes an explicit generator on the particles' device.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from toftrack.tracking.following import (
     remembered,
 )
 from toftrack.tracking.joint_belief import joint_signs, propagated_sigma
-from toftrack.tracking.life_cycle import Belief, believe
+from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.refining import refined
 from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
@@ -170,7 +170,11 @@ def _without_hand(
     model: TrackerModel,
     spans: Spans,
 ) -> tuple[TrackerState, StepInfo, Estimate]:
-    """Nothing in the frame can be a hand: the last estimate stands, and is lost."""
+    """Nothing in the frame can be a hand: the last estimate stands, and is lost.
+
+    A track ends with it, but where a track is never given up: there it waits as it was.
+    """
+    waits = isinstance(model.lost, LostSettings) and not model.lost.patience
     index, timestamp_s, last = image.index, image.timestamp_s, state.last
     if last is None:
         estimate = no_estimate(index, timestamp_s, "lost", model.space.dims, math.nan)
@@ -180,7 +184,7 @@ def _without_hand(
     none = torch.zeros(0, 6 + model.space.dims, device=model.device)
     info = StepInfo(observation, none, none[:, 0], spans.seconds())
     return (
-        replace(state, track=None, gesture=gesture),
+        replace(state, track=state.track if waits else None, gesture=gesture),
         info,
         replace(estimate, side=state.side, side_probability=1.0, compute_s=spans.total()),
     )

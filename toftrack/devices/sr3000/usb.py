@@ -323,8 +323,8 @@ def _reason(error: usb.core.USBError) -> str:
 def _unopened(error: usb.core.USBError) -> ToftrackError:
     if error.errno in (errno.EACCES, errno.EPERM):
         return ToftrackError(
-            "the SR3000 was found, but this user may not open it: install the udev rule from the "
-            "README, then unplug the camera and plug it in again (or, to try, run as root)"
+            "the SR3000 was found, but this user may not open it: install the udev rule of "
+            "docs/sr3000.md, then unplug the camera and plug it in again (or, to try, run as root)"
         )
     if error.errno == errno.EBUSY:
         return ToftrackError(
