@@ -65,8 +65,11 @@ class CalibratedBelief:
         """That every joint is within 40 mm, from one frame."""
         return self.intercept + sum(w * getattr(signs, name) for name, w in self.weights.items())
 
-    def judge(self, track: Track, signs: Signs, dt_s: float) -> Belief:
-        """What is thought of an estimate, dt_s after the last, and whether its track goes on."""
+    def judge(self, track: Track, signs: Signs, dt_s: float, side: float = 1.0) -> Belief:
+        """What is thought of an estimate, dt_s after the last, and whether its track goes on.
+
+        side: probability that it is of the right side; of the other one every finger is wrong.
+        """
         now = self.log_odds(signs)
         before = track.log_odds
         kept = self.memory ** (dt_s / FRAME_S)
@@ -76,6 +79,7 @@ class CalibratedBelief:
         # What is hidden is waited for.
         patience = self.patience * (_WAITED if signs.hidden > _HIDDEN else 1)
         ends = patience > 0 and bad > 0 and lasted(bad, patience)
+        confidence *= side
         lost = confidence < (self.confidence if track.believed else self.believe)
         return Belief(not ends, _state_name(signs, lost), lost, bad, 0.0, confidence, smooth)
 

@@ -43,7 +43,7 @@ class HandsTracker:
         index: int | None = None,
         timestamp_s: float | None = None,
     ) -> tuple[Estimate, ...]:
-        """One frame, see Tracker.step; an estimate a slot. A slot without a hand is lost and NaN."""
+        """One frame, see Tracker.step; an estimate a slot. One without a hand is lost and NaN."""
         began = time.perf_counter()
         depth_m, k = checked_image(depth_m, k)
         index = self.states[0].next_index if index is None else index

@@ -27,6 +27,7 @@ from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
 from toftrack.tracking.search import LastSeen, Start
 from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit
+from toftrack.tracking.side_belief import SideFit
 from toftrack.tracking.size_fit import HandFit, SizeBelief
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
@@ -65,6 +66,7 @@ class TrackerModel:
     refinement: None leaves the filter's estimate as it is.
     fit: of the size alone, where there are no networks; None leaves the hand as it is.
     adapt: of the shape, by what the networks say; None likewise.
+    sides: how the side is found out, by the networks; None where it was told.
     gestures: None tells none.
     relocaliser: None searches for starts, and challenges no track.
     """
@@ -82,6 +84,7 @@ class TrackerModel:
     backend: Backend
     relocaliser: Relocaliser | None = None
     adapt: ShapeFit | None = None
+    sides: SideFit | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.lost, CalibratedBelief) and self.relocaliser is None:

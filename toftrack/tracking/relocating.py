@@ -21,6 +21,7 @@ from toftrack.tracking.following import displacement
 from toftrack.tracking.life_cycle import lasted
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.search import LastSeen
+from toftrack.tracking.side_belief import OTHER_SIDE
 from toftrack.tracking.state import Track, TrackerState
 
 _UNLIKELY = 0.03
@@ -56,6 +57,11 @@ def glanced(
     if track is None or track.doubted:
         likely = partial(_reachable, state.seen, track)
         best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
+        if best is None and track is None and state.sides is not None:
+            # A hand of the other side may be too unlike one of this to be found as such.
+            other = relocaliser.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
+            again = np.array([glance.centre_m.numpy() for glance in other[:1]]).reshape(-1, 3)
+            best = next(iter(relocaliser.glance(image.depth_m, image.k, again, side)), None)
         if track is None:
             return None, best
     elif _sure(track, relocaliser.settings, dt_s):
@@ -177,6 +183,13 @@ def known_scores(
 
 def begun(frame: ObservedFrame) -> Track:
     """A track that begins with the best of the networks' poses."""
+    return track_of(best_start(frame)[0], frame.model)
+
+
+def best_start(frame: ObservedFrame) -> tuple[Tensor, float]:
+    """The best (1, 27) of the networks' poses, as they are and brought onto the seen points, and
+    what is known of it, log scale.
+    """
     model, glance = frame.model, frame.glance
     assert model.relocaliser is not None and glance is not None
     states = candidates(glance, frame, model.relocaliser.settings.hypotheses)
@@ -185,7 +198,8 @@ def begun(frame: ObservedFrame) -> Track:
         better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, landmarks)
         states = torch.cat((states, better))
     scores = known_scores(states, frame.hand.refiner.joints(states), frame, coverage=1.0)
-    return track_of(states[scores.argmax()][None], model)
+    best = int(scores.argmax())
+    return states[best][None], float(scores[best])
 
 
 def track_of(pose: Tensor, model: TrackerModel) -> Track:

@@ -34,6 +34,8 @@ from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.refining import refined
 from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
 from toftrack.tracking.shape_fit import ShapeBelief
+from toftrack.tracking.side_belief import SideBelief, probability
+from toftrack.tracking.sides import sided
 from toftrack.tracking.signs import Signs, read_signs, scored
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.spans import Spans
@@ -49,7 +51,8 @@ def first_state(model: TrackerModel, seed: int) -> TrackerState:
         size = shape_fit.first_belief()
     elif model.fit is not None:
         size = size_fit.first_belief(model.fit)
-    return TrackerState(generator.get_state(), model.shape.side, size=size)
+    sides = None if model.sides is None else SideBelief()
+    return TrackerState(generator.get_state(), model.shape.side, sides, size=size)
 
 
 @small_operations()
@@ -65,6 +68,7 @@ def step(
     state = _at(state, image)
     with spans("relocaliser"):
         track, glance = glanced(state, dt_s, image, model)
+        state, track, glance = sided(state, track, glance, dt_s, image, model)
         state = replace(state, size=_hand_told(state, track, glance, model))
     hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
@@ -86,7 +90,8 @@ def step(
         track, pose, trend = challenged(track, outcome, dt_s, frame)
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
-    belief, signs = _believed(track, found, score, dt_s, frame)
+    side_probability = probability(state.sides, state.side)
+    belief, signs = _believed(track, found, score, side_probability, dt_s, frame)
     looked = frame.glance is not None
     unlooked_s = 0.0 if looked else track.unlooked_s + dt_s
     estimate = _estimate(image, found, score, belief, frame)
@@ -97,8 +102,12 @@ def step(
         model.gestures, state.gesture, estimate, model.space, dt_s / FRAME_S
     )
     size, refused = _sized(state, found, belief, frame, generator)
-    # The side is told, and never guessed.
-    estimate = replace(estimate, side=state.side, side_probability=1.0, compute_s=spans.total())
+    estimate = replace(
+        estimate,
+        side=state.side,
+        side_probability=side_probability,
+        compute_s=spans.total(),
+    )
     after = replace(
         state,
         generator=generator.get_state(),
@@ -119,7 +128,12 @@ def _worth_keeping(last: Estimate | None, estimate: Estimate) -> Estimate:
 
 
 def _believed(
-    track: Track, found: Found, score: float, dt_s: float, frame: ObservedFrame
+    track: Track,
+    found: Found,
+    score: float,
+    side_probability: float,
+    dt_s: float,
+    frame: ObservedFrame,
 ) -> tuple[Belief, Signs | None]:
     """What is thought of a frame's estimate, and by which signs."""
     settings, signs = frame.model.lost, track.signs
@@ -131,7 +145,7 @@ def _believed(
         signs = read_signs(joints, score, track.age_s, frame.glance, seen.depth_m, seen.k)
     if isinstance(settings, CalibratedBelief):
         assert signs is not None  # see TrackerModel
-        return settings.judge(track, signs, dt_s), signs
+        return settings.judge(track, signs, dt_s, side_probability), signs
     # A pose that nothing refined is one of the space.
     off_rad = 0.0 if frame.model.refinement is None else found.off_rad
     return believe(track, score, off_rad, dt_s, settings), signs
@@ -186,7 +200,12 @@ def _without_hand(
     return (
         replace(state, track=state.track if waits else None, gesture=gesture),
         info,
-        replace(estimate, side=state.side, side_probability=1.0, compute_s=spans.total()),
+        replace(
+            estimate,
+            side=state.side,
+            side_probability=probability(state.sides, state.side),
+            compute_s=spans.total(),
+        ),
     )
 
 
