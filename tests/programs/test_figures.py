@@ -27,7 +27,7 @@ from toftrack.render.segmentation import Expected
 from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify
 from toftrack.views.figures import chart
-from toftrack.views.model_image import model_range_image, parted, posed_hand
+from toftrack.render.model_image import model_range_image, parted, posed_hand
 
 NAMES = ("measurement", "filmstrip", "lost", "course", "latent")
 QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")

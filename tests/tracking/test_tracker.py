@@ -17,7 +17,7 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.search import RoughStart
 from toftrack.tracking.tracker import Tracker
-from toftrack.views.model_image import model_range_image
+from toftrack.render.model_image import model_range_image
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

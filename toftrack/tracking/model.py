@@ -24,6 +24,7 @@ from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.life_cycle import LostSettings
+from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
 from toftrack.tracking.search import LastSeen, Start
 from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit
@@ -169,6 +170,7 @@ class ObservedFrame:
     """A frame that may show a hand, and the hand looked for: the judge of hypotheses.
 
     glance: what the networks say of the hand.  seen: the hand as it was last believed.
+    other: another hand that is tracked as well.
     """
 
     observation: Observation
@@ -177,6 +179,7 @@ class ObservedFrame:
     model: TrackerModel
     glance: Glance | None = None
     seen: LastSeen | None = None
+    other: OtherHand | None = None
 
     @property
     def hidden(self) -> bool:
@@ -201,8 +204,9 @@ def observed(
     model: TrackerModel,
     glance: Glance | None = None,
     seen: LastSeen | None = None,
+    other: OtherHand | None = None,
 ) -> ObservedFrame:
     """A segmented frame on the model's device, which is not empty."""
     observation = observation.to(model.device)
     evidence = model.likelihood.evidence(observation)
-    return ObservedFrame(observation, evidence, hand, model, glance, seen)
+    return ObservedFrame(observation, evidence, hand, model, glance, seen, other)

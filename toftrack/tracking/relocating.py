@@ -20,6 +20,7 @@ from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
 from toftrack.tracking.life_cycle import lasted
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
+from toftrack.tracking.other_hand import OtherHand, touching
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.side_belief import OTHER_SIDE
 from toftrack.tracking.state import Track, TrackerState
@@ -31,6 +32,8 @@ _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
 how far an angle may go."""
 _FAR_SIGMAS = 3.0
 """Farther off, a joint is as wrong as it can be."""
+_IN_OTHER = 4.0
+"""What speaks against a hand that lies wholly in the other one, log scale."""
 _LEAST_WORD = float(np.log(0.001))
 """The least that the networks' word counts."""
 _IN_FRONT_M = 0.03
@@ -43,19 +46,23 @@ _NEAREST_M = 0.15
 
 
 def glanced(
-    state: TrackerState, dt_s: float, image: DepthImage, model: TrackerModel
+    state: TrackerState,
+    dt_s: float,
+    image: DepthImage,
+    model: TrackerModel,
+    other: OtherHand | None = None,
 ) -> tuple[Track | None, Glance | None]:
     """The track to go on with, and what the networks say of the hand: where it is, or at the best
     place of all; None where there are no networks, or no hand, or no need to look.
 
-    A track that is doubted gives way to a hand that is found elsewhere.
+    A track that is doubted gives way to a hand that is found elsewhere, not where the other one is.
     """
     relocaliser, track, side = model.relocaliser, state.track, state.side
     if relocaliser is None:
         return track, None
     best = None
     if track is None or track.doubted:
-        likely = partial(_reachable, state.seen, track)
+        likely = partial(_reachable, state.seen, track, other)
         best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
         if best is None and track is None and state.sides is not None:
             # A hand of the other side may be too unlike one of this to be found as such.
@@ -86,11 +93,15 @@ def _logit(probability: float) -> float:
     return float(np.log(probability / (1 - probability)))
 
 
-def _reachable(seen: LastSeen | None, track: Track | None, centre_m: np.ndarray) -> float:
+def _reachable(
+    seen: LastSeen | None, track: Track | None, other: OtherHand | None, centre_m: np.ndarray
+) -> float:
     """How likely a hand has come to a place from where it was last believed, log scale.
 
     Another hand, or the thing that hides the hand, is no place that it has jumped to.
     """
+    if other is not None and np.linalg.norm(other.centre_m - centre_m) < SAME_PLACE_M:
+        return -np.inf
     behind = None if track is None else track.expected
     if behind is not None and centre_m[2] < behind.nearest_m - _IN_FRONT_M:
         return -np.inf
@@ -148,10 +159,13 @@ def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
 def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
     """(N,) what speaks against joints (N, 21, 3) besides the image, beside log scores; at most 0.
 
-    Fingers that are in one another, and joints that are not where the networks' votes are.
+    Fingers that are in one another or in another hand, and joints that are not where the networks'
+    votes are.
     """
     model, glance = frame.model, frame.glance
     word = joints_m.new_zeros(len(joints_m))
+    if frame.other is not None:
+        word = word - _IN_OTHER * touching(joints_m, frame.other)
     if model.refinement is not None and model.refinement.overlap:
         length = frame.hand.shape.hand_length_m
         word = word - model.refinement.overlap * finger_overlap(joints_m, length)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from toftrack.checks import check_number
 
@@ -22,12 +22,13 @@ class SideFit:
     kept: float
     shoulder: float
     shoulder_most: float
+    partner: float
     sure: float
     unsure_s: float
     sure_s: float
 
     def __post_init__(self) -> None:
-        for name in ("weight", "largest", "most", "kept", "shoulder", "shoulder_most"):
+        for name in ("weight", "largest", "most", "kept", "shoulder", "shoulder_most", "partner"):
             check_number(f"hand.sides.{name}", getattr(self, name), 0)
         for name in ("unsure_s", "sure_s"):
             check_number(f"hand.sides.{name}", getattr(self, name), 0)
@@ -36,33 +37,45 @@ class SideFit:
 
 @dataclass(frozen=True)
 class SideBelief:
-    """Whose hand it is thought to be.
+    """Whose hand it is thought to be; all but the body's place are log odds of a right hand.
 
-    fits: how much better a right hand explains the image than a left one, summed over looks.
+    fits: by how much better a right hand explains the image than a left one, summed over looks.
+    shoulder: by where the body is.  partner: by which hand the other one is that is tracked.
     body_m: how far the body is to the image's right of the hand, on average.
     looks: how many there were.  unlooked_s: how long ago the last one was.
-    log_odds: that it is a right hand, by all this.
     """
 
     fits: float = 0.0
+    shoulder: float = 0.0
+    partner: float = 0.0
     body_m: float = 0.0
     looks: int = 0
     unlooked_s: float = 0.0
-    log_odds: float = 0.0
+
+    @property
+    def log_odds(self) -> float:
+        """That it is a right hand, by all this."""
+        return self.fits + self.shoulder + self.partner
 
     def looked(self, gain: float, body_m: float, fit: SideFit) -> SideBelief:
-        """After one more look: how much better a right hand is, and the body."""
+        """After one more look: how much better a right hand is, and where the body."""
         looks = self.looks + 1
         fits = self.fits + fit.weight * min(max(gain, -fit.largest), fit.largest)
         fits = min(max(fits, -fit.most), fit.most)
         body_m = self.body_m + (body_m - self.body_m) / min(looks, _BODY_LOOKS)
         shoulder = min(max(fit.shoulder * body_m, -fit.shoulder_most), fit.shoulder_most)
-        return SideBelief(fits, body_m, looks, 0.0, fits + shoulder)
+        return SideBelief(fits, shoulder, self.partner, body_m, looks)
 
     def left(self, fit: SideFit) -> SideBelief:
         """After the hand has left: the next one is likely, but not surely, the same."""
-        log_odds = min(max(self.log_odds, -fit.kept), fit.kept)
-        return SideBelief(log_odds, unlooked_s=self.unlooked_s, log_odds=log_odds)
+        before = self.fits + self.shoulder
+        kept = min(max(before, -fit.kept), fit.kept)
+        return SideBelief(kept, partner=self.partner, unlooked_s=self.unlooked_s)
+
+    def beside(self, other: SideBelief, fit: SideFit) -> SideBelief:
+        """The same where another hand is tracked: a person's two hands are not of one side."""
+        surely = math.tanh(0.5 * (other.fits + other.shoulder))
+        return replace(self, partner=-fit.partner * surely)
 
 
 def probability(belief: SideBelief | None, side: str) -> float:

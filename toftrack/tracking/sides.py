@@ -17,6 +17,7 @@ from toftrack.frames import DepthImage
 from toftrack.relocation.relocaliser import Glance
 from toftrack.tracking import shape_fit
 from toftrack.tracking.model import TrackerModel, observed
+from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.relocating import best_start, expected_of
 from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.side_belief import OTHER_SIDE, probability
@@ -38,6 +39,7 @@ def sided(
     dt_s: float,
     image: DepthImage,
     model: TrackerModel,
+    other_hand: OtherHand | None = None,
 ) -> tuple[TrackerState, Track | None, Glance | None]:
     """The state, the track and the look at the hand to go on with, after its side was judged.
 
@@ -57,8 +59,8 @@ def sided(
     side, other = state.side, OTHER_SIDE[state.side]
     centre = glance.centre_m.numpy()
     mirrored = model.relocaliser.glance(image.depth_m, image.k, centre[None], other)[0]
-    gain = _known(glance, side, state, track, image, model)
-    gain -= _known(mirrored, other, state, track, image, model)
+    gain = _known(glance, side, state, track, image, model, other_hand)
+    gain -= _known(mirrored, other, state, track, image, model, other_hand)
     gain = gain if side == "right" else -gain
     belief = belief.looked(gain, _body_m(image, centre), fit)
     if probability(belief, side) >= 0.5:
@@ -90,13 +92,15 @@ def _known(
     track: Track | None,
     image: DepthImage,
     model: TrackerModel,
+    other: OtherHand | None,
 ) -> float:
     """The best of what is known of a side's poses, log scale; as low as it counts for none."""
-    observation = model.segmentation(image.depth_m, image.k, expected_of(glance))
+    theirs = None if other is None else other.pixels
+    observation = model.segmentation(image.depth_m, image.k, expected_of(glance), theirs)
     if observation.empty:
         return -math.inf
     hand = model.hand(side, _size(glance, state.size, track, model))
-    return best_start(observed(observation, hand, model, glance))[1]
+    return best_start(observed(observation, hand, model, glance, other=other))[1]
 
 
 def _size(

@@ -31,6 +31,7 @@ from toftrack.tracking.following import (
 from toftrack.tracking.joint_belief import joint_signs, propagated_sigma
 from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
+from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.refining import refined
 from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
 from toftrack.tracking.shape_fit import ShapeBelief
@@ -57,29 +58,32 @@ def first_state(model: TrackerModel, seed: int) -> TrackerState:
 
 @small_operations()
 def step(
-    state: TrackerState, image: DepthImage, model: TrackerModel
+    state: TrackerState, image: DepthImage, model: TrackerModel, other: OtherHand | None = None
 ) -> tuple[TrackerState, StepInfo, Estimate]:
     """One frame: segment, start if there is no hand yet, filter, refine, judge, fit the size.
 
     A pure function: the state given stays as it is, and gives the same again.
+
+    other: another hand that is tracked as well; it is not taken for this one.
     """
     spans, generator = Spans(), resumed(state.generator, model.device)
     dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
-    state = _at(state, image)
+    state = at(state, image)
     with spans("relocaliser"):
-        track, glance = glanced(state, dt_s, image, model)
-        state, track, glance = sided(state, track, glance, dt_s, image, model)
+        track, glance = glanced(state, dt_s, image, model, other)
+        state, track, glance = sided(state, track, glance, dt_s, image, model, other)
         state = replace(state, size=_hand_told(state, track, glance, model))
     hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
         expected = expected_depths(track, dt_s, hand, model)
         if expected is None and glance is not None:
             expected = expected_of(glance)
-        observation = model.segmentation(image.depth_m, image.k, expected)
+        theirs = None if other is None else other.pixels
+        observation = model.segmentation(image.depth_m, image.k, expected, theirs)
         nowhere = model.relocaliser is not None and glance is None and track is None
         if observation.empty or nowhere:
             return _without_hand(state, image, observation, model, spans)
-        frame = observed(observation, hand, model, glance, state.seen)
+        frame = observed(observation, hand, model, glance, state.seen, other)
     with spans("start"):
         track = begin(track, state, dt_s, frame, generator)
     with spans("filter: rest"):
@@ -165,7 +169,7 @@ def _hand_told(
     return shape_fit.contradicted(belief, glance, fit, model.shape)
 
 
-def _at(state: TrackerState, image: DepthImage) -> TrackerState:
+def at(state: TrackerState, image: DepthImage) -> TrackerState:
     """The state as time goes on to an image."""
     before = state.timestamp_s
     passed = 0.0 if before is None else max(0.0, image.timestamp_s - before)

@@ -18,8 +18,8 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, confidence_words, gesture_words, state_words
 from toftrack.output.files import write_whole
+from toftrack.render.model_image import model_range_image
 from toftrack.views.base import TrackedFrame
-from toftrack.views.model_image import model_range_image
 from toftrack.views.video import VideoFile, unwritable, video_library
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
