@@ -28,7 +28,7 @@ from toftrack.tracking.other_hand import (
     surface_m,
     touching,
 )
-from toftrack.tracking.side_belief import OTHER_SIDE
+from toftrack.tracking.side_belief import OTHER_SIDE, SideBelief
 from toftrack.tracking.state import StepInfo, TrackerState
 from toftrack.tracking.step import at, first_state, step
 from toftrack.tracking.tracker import fitted_hand, restarted
@@ -37,6 +37,10 @@ _SOUGHT_S = 0.12
 """How often a further hand is looked for."""
 _BELIEVED = 20.0
 """A hand that was believed once comes before one that never was, log odds."""
+_TRIED_S, _AGAIN_S = 0.5, 0.5
+"""A second track is given up when it was not believed for so long, and looked for so much later."""
+_KNOWN = 0.5
+"""Log odds from which on a slot's side is known."""
 _ONE_M, _ONE = 0.045, 0.3
 """Two tracks are of one hand where their palms are so near, and so much of them is in each other
 ..."""
@@ -90,8 +94,14 @@ def step_hands(
     if one_s and (one_s > _ONE_S or not all(_believed(slot) for slot in slots)):
         worse = min(range(len(slots)), key=lambda slot: _sureness(slots[slot]))
         slots[worse], estimates[worse], one_s = replace(slots[worse], track=None), None, 0.0
-    if _in_the_other_slot(before, slots):
-        slots = [_given_back(slots[1], before[0]), slots[0]]
+    for slot, state_now in enumerate(slots):
+        track = state_now.track
+        alone = not _believed(slots[1 - slot])
+        if track is not None and not track.believed and not alone and track.age_s > _TRIED_S:
+            slots[slot], estimates[slot] = replace(state_now, track=None), None
+            unsought_s, sought = -_AGAIN_S, False
+    if _in_wrong_slot(before, slots):
+        slots = _exchanged(before, slots)
         infos.reverse()
         estimates.reverse()
     told = tuple(
@@ -121,6 +131,7 @@ def _sureness(slot: TrackerState) -> float:
 
 
 def _believed(slot: TrackerState) -> bool:
+    """Whether a slot has a hand, and not just a place that may be one."""
     return slot.track is not None and slot.track.believed
 
 
@@ -134,17 +145,20 @@ def _other_hand(
 ) -> OtherHand | None:
     """What a slot has to know of the other one's hand; only one that is believed takes pixels."""
     theirs, other = poses[1 - slot], slots[1 - slot]
-    if theirs is None or other.track is None or other.track.doubted or not other.track.believed:
+    if theirs is None or other.track is None:
         return None
-    height, width = depth_m.shape
     hand, own, mine = model.hand(other.side, other.size), slots[slot], poses[slot]
+    joints, centre = hand.refiner.joints(theirs)[0].cpu(), palm_centre_m(theirs)
+    if other.track.doubted or not other.track.believed:
+        return OtherHand(joints, centre, None)
+    height, width = depth_m.shape
     their_surface = surface_m(theirs, hand.shape, k, height, width)
     my_surface = None
     if mine is not None:
         shape = model.hand(own.side, own.size).shape
         my_surface = surface_m(mine, shape, k, height, width)
     pixels = explained(depth_m, their_surface, my_surface)
-    return OtherHand(hand.refiner.joints(theirs)[0].cpu(), palm_centre_m(theirs), pixels)
+    return OtherHand(joints, centre, pixels)
 
 
 def _beside(slots: list[TrackerState], slot: int, model: TrackerModel) -> TrackerState:
@@ -152,7 +166,8 @@ def _beside(slots: list[TrackerState], slot: int, model: TrackerModel) -> Tracke
     mine, theirs = slots[slot].sides, slots[1 - slot].sides
     if model.sides is None or mine is None or theirs is None:
         return slots[slot]
-    return replace(slots[slot], sides=mine.beside(theirs, model.sides))
+    known = theirs if _believed(slots[1 - slot]) else SideBelief()
+    return replace(slots[slot], sides=mine.beside(known, model.sides))
 
 
 def _one_hand(slots: list[TrackerState], model: TrackerModel) -> bool:
@@ -168,24 +183,41 @@ def _one_hand(slots: list[TrackerState], model: TrackerModel) -> bool:
         for slot, pose in zip(slots, poses, strict=True)
         if pose is not None
     ]
-    none = np.zeros((0, 0), bool)
-    return float(touching(joints[0], OtherHand(joints[1][0].cpu(), centres[1], none))) > _ONE
+    other = OtherHand(joints[1][0].cpu(), centres[1], None)
+    return float(touching(joints[0], other)) > _ONE
 
 
-def _in_the_other_slot(before: tuple[TrackerState, ...], slots: list[TrackerState]) -> bool:
-    """Whether a hand that began in the first slot is the one that left the second one.
+def _in_wrong_slot(before: tuple[TrackerState, ...], slots: list[TrackerState]) -> bool:
+    """Whether a hand that began where both slots were vacant belongs into the other one.
 
-    A slot keeps to a hand, also when both were away: whose it is tells which one came back.
+    A slot keeps to a hand, also when both were away: whose it is tells which one came back. One
+    that nobody knows comes into the first slot.
     """
-    began = before[0].track is None and slots[0].track is not None
-    known = before[1].sides is not None and before[1].sides.fits != 0
-    turned = slots[0].side != before[0].side and slots[0].side == before[1].side
-    return began and known and turned and slots[1].track is None
+    began = [slot.track is not None for slot in slots]
+    if any(slot.track is not None for slot in before) or sum(began) != 1:
+        return False
+    new = began.index(True)
+    known = [_known_side(slot) for slot in before]
+    side = slots[new].side
+    first = 0 if known[0] == side or known[1] != side else 1
+    return new != first
 
 
-def _given_back(vacant: TrackerState, first: TrackerState) -> TrackerState:
-    """The first slot's state as it was before a hand began in it, at the time of the vacant one."""
-    return replace(first, next_index=vacant.next_index, timestamp_s=vacant.timestamp_s)
+def _known_side(slot: TrackerState) -> str | None:
+    """Of the hand that a slot had; None where it had none, or nothing was said of its side."""
+    if slot.last is None:
+        return None
+    return slot.side if slot.sides is None or abs(slot.sides.log_odds) > _KNOWN else None
+
+
+def _exchanged(before: tuple[TrackerState, ...], slots: list[TrackerState]) -> list[TrackerState]:
+    """The new hand in the other slot; the one that it began in is as it was, at the time of now."""
+    new = [slot.track is not None for slot in slots].index(True)
+    now = slots[1 - new]
+    waiting = replace(before[new], next_index=now.next_index, timestamp_s=now.timestamp_s)
+    # What was learned of a hand's shape and gestures stays with the slot that the hand is in.
+    moved = replace(slots[new], size=now.size, gesture=now.gesture, last=now.last)
+    return [waiting, moved] if new == 0 else [moved, waiting]
 
 
 def _vacant(slot: TrackerState, image: DepthImage, model: TrackerModel) -> Estimate:

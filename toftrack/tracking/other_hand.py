@@ -26,12 +26,13 @@ class OtherHand:
     """What a hand's step knows of the other one.
 
     joints_m: (21, 3).  centre_m: (3,) middle of its palm.
-    pixels: (H, W) bool of the reduced image, those that it explains better.
+    pixels: (H, W) bool of the reduced image, those that it explains better; None where it is not
+        believed.
     """
 
     joints_m: Tensor
     centre_m: np.ndarray
-    pixels: np.ndarray
+    pixels: np.ndarray | None
 
 
 def surface_m(

@@ -164,7 +164,7 @@ def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
     """
     model, glance = frame.model, frame.glance
     word = joints_m.new_zeros(len(joints_m))
-    if frame.other is not None:
+    if frame.other is not None and frame.other.pixels is not None:
         word = word - _IN_OTHER * touching(joints_m, frame.other)
     if model.refinement is not None and model.refinement.overlap:
         length = frame.hand.shape.hand_length_m

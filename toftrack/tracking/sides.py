@@ -28,6 +28,8 @@ _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
 """Its least area that is seen, and rows of the image that it is looked for in."""
+_SWITCHED = 0.4
+"""The side is changed when it has become less probable than this, so that it does not flicker."""
 _LEAST_PRESENT = 0.5
 """Where a hand is less probable than this, nothing is said of its side."""
 
@@ -63,7 +65,7 @@ def sided(
     gain -= _known(mirrored, other, state, track, image, model, other_hand)
     gain = gain if side == "right" else -gain
     belief = belief.looked(gain, _body_m(image, centre), fit)
-    if probability(belief, side) >= 0.5:
+    if probability(belief, side) >= _SWITCHED:
         return replace(state, sides=belief), track, glance
     forgotten = None if state.size is None else shape_fit.first_belief()
     state = replace(state, side=other, sides=belief, size=forgotten, gesture=None, refused=0)

@@ -149,7 +149,8 @@ def _believed(
         signs = read_signs(joints, score, track.age_s, frame.glance, seen.depth_m, seen.k)
     if isinstance(settings, CalibratedBelief):
         assert signs is not None  # see TrackerModel
-        return settings.judge(track, signs, dt_s, side_probability), signs
+        second = frame.other is not None and frame.other.pixels is not None
+        return settings.judge(track, signs, dt_s, side_probability, second), signs
     # A pose that nothing refined is one of the space.
     off_rad = 0.0 if frame.model.refinement is None else found.off_rad
     return believe(track, score, off_rad, dt_s, settings), signs
