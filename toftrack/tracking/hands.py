@@ -41,6 +41,8 @@ _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track is given up when it was not believed for so long, and looked for so much later."""
 _KNOWN = 0.5
 """Log odds from which on a slot's side is known."""
+_IN_FRONT_M = 0.03
+"""What is so much nearer than a hand's wrist may hide the hand."""
 _ONE_M, _ONE = 0.045, 0.3
 """Two tracks are of one hand where their palms are so near, and so much of them is in each other
 ..."""
@@ -150,7 +152,7 @@ def _other_hand(
     hand, own, mine = model.hand(other.side, other.size), slots[slot], poses[slot]
     joints, centre = hand.refiner.joints(theirs)[0].cpu(), palm_centre_m(theirs)
     if other.track.doubted or not other.track.believed:
-        return OtherHand(joints, centre, None)
+        return OtherHand(joints, centre, other.track.believed)
     height, width = depth_m.shape
     their_surface = surface_m(theirs, hand.shape, k, height, width)
     my_surface = None
@@ -158,7 +160,8 @@ def _other_hand(
         shape = model.hand(own.side, own.size).shape
         my_surface = surface_m(mine, shape, k, height, width)
     pixels = explained(depth_m, their_surface, my_surface)
-    return OtherHand(joints, centre, pixels)
+    beside = None if mine is None else pixels & (depth_m > float(mine[0, 2]) - _IN_FRONT_M)
+    return OtherHand(joints, centre, True, pixels, beside)
 
 
 def _beside(slots: list[TrackerState], slot: int, model: TrackerModel) -> TrackerState:
@@ -183,7 +186,7 @@ def _one_hand(slots: list[TrackerState], model: TrackerModel) -> bool:
         for slot, pose in zip(slots, poses, strict=True)
         if pose is not None
     ]
-    other = OtherHand(joints[1][0].cpu(), centres[1], None)
+    other = OtherHand(joints[1][0].cpu(), centres[1], False)
     return float(touching(joints[0], other)) > _ONE
 
 

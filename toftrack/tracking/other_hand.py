@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.rigid import rotated_pivot
+from toftrack.frames import DepthImage
 from toftrack.hand.shape import HandShape
 from toftrack.render.model_image import model_range_image
 
@@ -17,6 +18,8 @@ _TOLERANCE_M = 0.02
 """A pixel that is so near to a hand's surface may be the hand's."""
 _EDGE_M = 0.06
 """Pixels on the outline of a hand mix it with what is behind, up to this."""
+_FAR_M = 5.0
+"""So far away is nothing for the networks."""
 _TOUCH_M = 0.018
 """Joints of two hands come no nearer to each other, as a rule: fingers are so thick."""
 
@@ -26,13 +29,18 @@ class OtherHand:
     """What a hand's step knows of the other one.
 
     joints_m: (21, 3).  centre_m: (3,) middle of its palm.
-    pixels: (H, W) bool of the reduced image, those that it explains better; None where it is not
-        believed.
+    believed: it is a hand, and not just a place that may be one.
+    pixels: (H, W) bool of the reduced image, those that it explains better; None where its last
+        estimate was not believed.
+    beside: (H, W) bool, those of them that cannot hide this hand; None where the networks need not
+        be spared them.
     """
 
     joints_m: Tensor
     centre_m: np.ndarray
-    pixels: np.ndarray | None
+    believed: bool
+    pixels: np.ndarray | None = None
+    beside: np.ndarray | None = None
 
 
 def surface_m(
@@ -70,3 +78,14 @@ def touching(joints_m: Tensor, other: OtherHand) -> Tensor:
     """(N,) how much of hands (N, 21, 3) lies in the other one, 0 .. 1."""
     near = torch.cdist(joints_m, other.joints_m.to(joints_m)[None].expand(len(joints_m), -1, -1))
     return (1 - near.amin(2) / _TOUCH_M).clamp(min=0).mean(1)
+
+
+def without(image: DepthImage, other: OtherHand | None) -> DepthImage:
+    """The image as the networks are to see it: with nothing where the other hand is, or they vote
+    for its fingers as well. What may hide a hand stays, for they know things that hide hands.
+    """
+    if other is None or other.beside is None:
+        return image
+    height, width = image.depth_m.shape
+    gone = cv2.resize(other.beside.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return replace(image, depth_m=np.where(gone > 0, np.float32(_FAR_M), image.depth_m))

@@ -31,7 +31,7 @@ from toftrack.tracking.following import (
 from toftrack.tracking.joint_belief import joint_signs, propagated_sigma
 from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
-from toftrack.tracking.other_hand import OtherHand
+from toftrack.tracking.other_hand import OtherHand, without
 from toftrack.tracking.refining import refined
 from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
 from toftrack.tracking.shape_fit import ShapeBelief
@@ -70,8 +70,9 @@ def step(
     dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
     state = at(state, image)
     with spans("relocaliser"):
-        track, glance = glanced(state, dt_s, image, model, other)
-        state, track, glance = sided(state, track, glance, dt_s, image, model, other)
+        alone = without(image, other)
+        track, glance = glanced(state, dt_s, alone, model, other)
+        state, track, glance = sided(state, track, glance, dt_s, alone, model, other)
         state = replace(state, size=_hand_told(state, track, glance, model))
     hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
@@ -149,7 +150,7 @@ def _believed(
         signs = read_signs(joints, score, track.age_s, frame.glance, seen.depth_m, seen.k)
     if isinstance(settings, CalibratedBelief):
         assert signs is not None  # see TrackerModel
-        second = frame.other is not None and frame.other.pixels is not None
+        second = frame.other is not None and frame.other.believed
         return settings.judge(track, signs, dt_s, side_probability, second), signs
     # A pose that nothing refined is one of the space.
     off_rad = 0.0 if frame.model.refinement is None else found.off_rad
