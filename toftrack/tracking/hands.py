@@ -101,7 +101,8 @@ def step_hands(
         alone = not _believed(slots[1 - slot])
         if track is not None and not track.believed and not alone and track.age_s > _TRIED_S:
             slots[slot], estimates[slot] = replace(state_now, track=None), None
-            unsought_s, sought = -_AGAIN_S, False
+            if _known_side(state_now) is None:
+                unsought_s, sought = -_AGAIN_S, False
     if _in_wrong_slot(before, slots):
         slots = _exchanged(before, slots)
         infos.reverse()
@@ -208,7 +209,7 @@ def _in_wrong_slot(before: tuple[TrackerState, ...], slots: list[TrackerState]) 
 
 def _known_side(slot: TrackerState) -> str | None:
     """Of the hand that a slot had; None where it had none, or nothing was said of its side."""
-    if slot.last is None:
+    if slot.last is None or slot.last.lost:
         return None
     return slot.side if slot.sides is None or abs(slot.sides.log_odds) > _KNOWN else None
 
