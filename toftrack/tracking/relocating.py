@@ -66,8 +66,8 @@ def glanced(
         best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
         if best is None and track is None and state.sides is not None:
             # A hand of the other side may be too unlike one of this to be found as such.
-            other = relocaliser.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
-            again = np.array([glance.centre_m.numpy() for glance in other[:1]]).reshape(-1, 3)
+            found = relocaliser.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
+            again = np.array([glance.centre_m.numpy() for glance in found[:1]]).reshape(-1, 3)
             best = next(iter(relocaliser.glance(image.depth_m, image.k, again, side)), None)
         if track is None:
             return None, best
