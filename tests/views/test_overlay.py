@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.moments import one_hand
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
@@ -45,7 +46,7 @@ def lost_hand() -> Estimate:
 
 def moment() -> TrackedFrame:
     frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
-    return TrackedFrame(frame, DEPTH, CAMERA, hand(), default_hand_shape(), None)
+    return one_hand(frame, DEPTH, CAMERA, hand(), default_hand_shape())
 
 
 def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -73,7 +74,7 @@ def test_panels_are_three_times_a_small_image_and_once_a_large() -> None:
 )
 def test_panel_sides_are_even(size: tuple[int, int], scale: float) -> None:
     camera = Camera(CAMERA.K, size[1], size[0])
-    panel = draw_panel(np.ones(size, np.float32), None, camera, lost_hand(), None, scale)
+    panel = draw_panel(np.ones(size, np.float32), None, camera, (lost_hand(),), (None,), scale)
     assert panel.dtype == np.uint8
     assert panel.shape[0] % 2 == panel.shape[1] % 4 == 0
     assert panel.shape[2] == 3
@@ -82,7 +83,7 @@ def test_panel_sides_are_even(size: tuple[int, int], scale: float) -> None:
 @pytest.mark.parametrize("amplitude", [AMPLITUDE, None])
 def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None) -> None:
     one = hand()
-    _, left, right = sides(draw_panel(DEPTH, amplitude, CAMERA, one, None, 3))
+    _, left, right = sides(draw_panel(DEPTH, amplitude, CAMERA, (one,), (None,), 3))
     for joint, colour in ((4, THUMB), (2, THUMB), (20, LITTLE), (18, LITTLE)):
         u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
         np.testing.assert_allclose(left[v, u], colour, atol=2)
@@ -93,7 +94,7 @@ def test_joints_that_are_not_trusted_are_hollow() -> None:
     confidence = np.full(21, 0.9, np.float32)
     confidence[4] = 0.3
     one = dataclasses.replace(hand(), joint_confidence=confidence)
-    _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))
+    _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
     for joint, colour in ((4, (0, 0, 0)), (20, LITTLE)):
         u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
         np.testing.assert_allclose(left[v, u], colour, atol=2)
@@ -104,7 +105,7 @@ def test_a_nearer_hand_has_thicker_bones() -> None:
     far, near = hand(), hand()
     near = dataclasses.replace(near, joints_m=near.joints_m * np.float32(0.5))
     shares = [
-        colour_share(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[1], THUMB)
+        colour_share(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[1], THUMB)
         for one in (far, near)
     ]
     assert shares[1] > 1.5 * shares[0]  # the same length in the image at half the distance
@@ -113,21 +114,21 @@ def test_a_nearer_hand_has_thicker_bones() -> None:
 def test_no_skeleton_without_an_estimate_or_behind_the_camera() -> None:
     behind = dataclasses.replace(hand(), joints_m=-hand().joints_m)
     for one in (dataclasses.replace(lost_hand(), lost=False), behind):
-        _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))
+        _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
         assert is_grey(left)
 
 
 def test_a_hand_far_outside_the_image_does_not_fail() -> None:
     away = hand().joints_m * np.float32(1) + np.array([1e6, 0, 0], np.float32)
     one = dataclasses.replace(hand(), joints_m=away)
-    assert is_grey(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[1])
+    assert is_grey(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[1])
 
 
 def test_range_image_is_darker_where_nearer_on_white() -> None:
     model = np.zeros((H, W), np.float32)
     model[40:80, 40:80], model[40:80, 100:140] = 0.4, 0.6
     model[0, 0], model[0, 1] = np.nan, np.inf
-    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, hand(), model, 3))
+    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(),), (model,), 3))
     near, far, background = right[180, 180, 0], right[180, 360, 0], right[400, 30, 0]
     assert near < far < background == 255
     assert right[1, 1, 0] == right[1, 4, 0] == 255
@@ -138,7 +139,7 @@ def test_range_image_is_darker_where_nearer_on_white() -> None:
 def test_lost_is_red_and_tracking_is_not() -> None:
     red = (40, 40, 220)
     for lost in (True, False):
-        panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, hand(lost), None, 3)
+        panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(lost),), (None,), 3)
         caption, left, right = sides(panel)
         assert (colour_share(caption, red) > 0.5) == lost
         assert (colour_share(left[:, :3], red) > 0.9) == lost
@@ -147,9 +148,9 @@ def test_lost_is_red_and_tracking_is_not() -> None:
 
 def test_caption_stays_in_the_left_half_and_changes_with_the_frame() -> None:
     one = dataclasses.replace(hand(), index=123456, state_name="initialising", gesture="pointing")
-    first = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[0]
+    first = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[0]
     second = sides(
-        draw_panel(DEPTH, AMPLITUDE, CAMERA, dataclasses.replace(one, index=654321), None, 3)
+        draw_panel(DEPTH, AMPLITUDE, CAMERA, (dataclasses.replace(one, index=654321),), (None,), 3)
     )[0]
     assert (first != second).any()
     assert len(np.unique(first[:, 3 * W :])) == 1
@@ -159,7 +160,7 @@ def test_caption_stays_in_the_left_half_and_changes_with_the_frame() -> None:
 def test_images_without_any_reading_are_black() -> None:
     for depth in (np.zeros((H, W), np.float32), np.full((H, W), np.nan, np.float32)):
         one = dataclasses.replace(lost_hand(), lost=False)
-        _, left, right = sides(draw_panel(depth, None, CAMERA, one, np.zeros((H, W)), 3))
+        _, left, right = sides(draw_panel(depth, None, CAMERA, (one,), (np.zeros((H, W)),), 3))
         assert (left == 0).all()
         assert (right == 255).all()
 
