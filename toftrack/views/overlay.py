@@ -34,8 +34,8 @@ _WHITE = (255, 255, 255)
 _FONT, _SMALL = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 CAPTION_PX = 36
 """Height of the caption above a panel's two sides."""
-_TINT = 0.55
-"""How much of its slot's colour the range image of one of two hands has."""
+_TINT = 0.5
+"""How much of its slot's colour is mixed into the range image of one of two hands."""
 _NEAREST_GREY, _FARTHEST_GREY = 40, 215
 
 VIDEO, STRIP = "overlay.mp4", "overlay.png"
@@ -224,9 +224,9 @@ def _model_picture(surfaces: Sequence[np.ndarray]) -> np.ndarray:
         return cv2.cvtColor(range_grey(surfaces[0]), cv2.COLOR_GRAY2BGR)
     stack = np.stack([np.where(np.isfinite(s) & (s > 0), s, np.inf) for s in surfaces])
     grey = range_grey(stack.min(0))
-    tints = 1 - _TINT * (1 - np.array(SLOT_RGB)[:, ::-1] / 255)
-    tint = np.where(grey[..., None] < 255, tints[stack.argmin(0)], 1.0)
-    return np.round(grey[..., None] * tint).astype(np.uint8)
+    tint = np.array(SLOT_RGB)[:, ::-1][stack.argmin(0)]
+    tint[grey == 255] = 255
+    return np.round((1 - _TINT) * grey[..., None] + _TINT * tint).astype(np.uint8)
 
 
 def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:

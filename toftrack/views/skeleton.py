@@ -42,14 +42,16 @@ def draw_hands(
         doubted = estimates[0].joint_confidence < _TRUSTED
         _draw_skeleton(picture, camera, estimates[0].joints_m, doubted, *scale, _BLACK)
         return
-    slots = [slot for slot, estimate in enumerate(estimates) if not is_vacant(estimate)]
-    slots.sort(key=lambda slot: -float(np.median(estimates[slot].joints_m[:, 2])))
-    for slot in slots:
-        one = estimates[slot]
-        doubted = (one.joint_confidence < _TRUSTED) | one.lost
-        wrist = _draw_skeleton(picture, camera, one.joints_m, doubted, *scale, SLOT_RGB[slot][::-1])
+    there = [pair for pair in enumerate(estimates) if not is_vacant(pair[1])]
+    there.sort(key=lambda pair: -float(np.median(pair[1].joints_m[:, 2])))
+    labels = []
+    for slot, one in there:
+        doubted, rim = (one.joint_confidence < _TRUSTED) | one.lost, SLOT_RGB[slot][::-1]
+        wrist = _draw_skeleton(picture, camera, one.joints_m, doubted, *scale, rim)
         if wrist is not None:
-            _draw_label(picture, side_words(one), wrist, SLOT_RGB[slot][::-1])
+            labels.append((side_words(one) or "?", wrist, rim))
+    for label in labels:  # last, because they are smaller than a hand
+        _draw_label(picture, *label)
 
 
 def side_words(estimate: Estimate) -> str:
@@ -65,13 +67,13 @@ def _draw_label(
 ) -> None:
     """Text in a box below a place, moved so that all of it is in the picture where it fits."""
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 3
-    (width, height), base = cv2.getTextSize(text or "?", font, _LABEL, 1)
+    (width, height), base = cv2.getTextSize(text, font, _LABEL, 1)
     x = int(np.clip(below[0] - width // 2, margin, max(margin, picture.shape[1] - width - margin)))
     lowest = picture.shape[0] - base - margin
     y = int(np.clip(below[1] + height + 2 * _LABEL_GAP_PX, height + margin, lowest))
     corners = (x - margin, y - height - margin), (x + width + margin, y + base)
     cv2.rectangle(picture, *corners, colour, -1)
-    cv2.putText(picture, text or "?", (x, y), font, _LABEL, _WHITE, 1, cv2.LINE_AA)
+    cv2.putText(picture, text, (x, y), font, _LABEL, _WHITE, 1, cv2.LINE_AA)
 
 
 def _draw_skeleton(
