@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -28,7 +29,7 @@ from helpers.browsing import (
     raw,
     shown_again_and_again,
 )
-from helpers.moments import with_hand
+from helpers.moments import two_hands, with_hand
 from helpers.settings import browser_view
 
 from toftrack.errors import ToftrackError
@@ -95,6 +96,22 @@ def test_a_frame_without_a_hand_is_shown_as_lost(view) -> None:
     view.show(with_hand(moment, estimate=no_estimate(7, 0.28, "lost", 4, 0.01), insight=None))
     facts, _ = next_picture(view, {})
     assert facts["lost"] and facts["index"] == 7 and facts["gesture_probability"] is None
+
+
+def test_two_hands_are_told_apart_from_the_frame(view) -> None:
+    moment = two_hands(moments()[1], lost=True, gesture="fist")
+    view.show(moment)
+    facts, _ = next_picture(view, {})
+    assert [(one["side"], one["lost"], one["there"]) for one in facts["hands"]] == [
+        *(("right", False, True), ("left", True, True)),
+    ]
+    assert facts["hands"][1]["gesture"] == "fist" and facts["hands"][0]["side_probability"] == 1
+    assert facts["lost"] is False and facts["index"] == moment.estimates[0].index
+    gone = no_estimate(7, 0.28, "searching", 4, 0.01)
+    first, second = moment.hands
+    view.show(replace(moment, hands=(replace(first, estimate=gone), second)))
+    facts, _ = next_picture(view, facts)
+    assert facts["lost"] and [one["there"] for one in facts["hands"]] == [False, True]
 
 
 def test_before_the_first_frame_and_after_the_last_the_page_is_told_so(monkeypatch) -> None:

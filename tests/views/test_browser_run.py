@@ -27,7 +27,7 @@ from helpers.browsing import (
     ours,
     shown_again_and_again,
 )
-from helpers.moments import with_hand
+from helpers.moments import two_hands, with_hand
 from helpers.settings import browser_view
 from helpers.tracking import ROOT, configuration
 
@@ -192,6 +192,20 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
     lost = no_estimate(9, 0.36, "lost", 4, 0.01)
     view.show(with_hand(moments()[0], estimate=lost, insight=None))
     eventually(lambda: text("state") == "LOST" and text("phase") == "lost: no hand found")
+
+    def of_slots(name: str) -> list[str]:
+        script = f"return [...document.querySelectorAll('.hand .{name}')].map(e => e.textContent)"
+        return chromium.execute_script(script)
+
+    view.show(two_hands(moments()[1], side_probability=0.83, gesture="ok", pinching=True))
+    eventually(lambda: of_slots("side") == ["right", "left 83 %"])
+    assert of_slots("state") == ["tracking", "tracking"] and of_slots("gesture")[1] == "ok"
+    assert of_slots("pinching") == ["", "pinching"]
+    assert not chromium.find_element("id", "state").is_displayed()
+    view.show(two_hands(moments()[1], lost=True))
+    eventually(lambda: of_slots("state") == ["tracking", "LOST"])
+    view.show(moments()[1])
+    eventually(lambda: of_slots("state") == [] and text("state") == "tracking")
     assert chromium.get_log("browser") == []
 
     view._picture.set_phase("over")

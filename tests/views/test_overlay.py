@@ -18,6 +18,7 @@ from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
 from toftrack.views.base import NoView, TrackedFrame
 from toftrack.views.overlay import VideoView, draw_panel, panel_scale
+from toftrack.views.skeleton import SLOT_RGB, side_words
 
 W, H = 176, 144
 CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), W, H)
@@ -61,6 +62,58 @@ def colour_share(picture: np.ndarray, bgr: tuple[int, int, int]) -> float:
 
 def is_grey(picture: np.ndarray) -> bool:
     return bool((picture.max(axis=-1) == picture.min(axis=-1)).all())
+
+
+def other_hand(**changes: object) -> Estimate:
+    """Another one, 10 cm to the left and 10 cm farther away, of a left hand that is nearly sure."""
+    one = hand()
+    joints = one.joints_m + np.array([-0.1, 0, 0.1], np.float32)
+    told = {"joints_m": joints, "state": np.zeros(27, np.float32), "side": "left"}
+    return dataclasses.replace(one, **told | {"side_probability": 0.83} | changes)
+
+
+def present(**changes: object) -> Estimate:
+    told = {"state": np.zeros(27, np.float32), "side": "right", "side_probability": 1.0}
+    return dataclasses.replace(hand(), **told | changes)
+
+
+def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    near, far = np.zeros((H, W)), np.zeros((H, W))
+    near[20:80, 100:150], far[20:80, 20:120] = 0.5, 0.6
+    return sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one, other), (near, far), 3))
+
+
+def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
+    alone = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (present(),), (None,), 3))[1]
+    caption, left, right = two(present(), other_hand())
+    assert colour_share(left, THUMB) > 1.3 * colour_share(alone, THUMB)
+    for rgb in SLOT_RGB:
+        assert colour_share(alone, rgb[::-1]) < 1e-4 < colour_share(left, rgb[::-1])
+        assert colour_share(caption, rgb[::-1]) > 1e-3
+    blue, orange = right[150, 330], right[150, 90]
+    assert int(blue[0]) > int(blue[2]) + 50, "the nearer hides the farther"
+    assert int(orange[2]) > int(orange[0]) + 50
+    assert (right[300, 300] == 255).all()
+
+
+def test_a_slot_without_a_hand_is_not_drawn_and_not_called_lost() -> None:
+    caption, left, _ = two(present(), lost_hand())
+    assert colour_share(left, SLOT_RGB[1][::-1]) == 0 < colour_share(left, SLOT_RGB[0][::-1])
+    assert colour_share(caption, (40, 40, 220)) == 0
+    assert colour_share(two(lost_hand(), lost_hand())[0], (40, 40, 220)) > 0.5
+
+
+def test_a_doubted_one_of_two_hands_is_hollow_and_neither_is_framed() -> None:
+    sure, doubted = (two(present(), other_hand(lost=lost)) for lost in (False, True))
+    assert colour_share(doubted[1], (0, 0, 0)) > colour_share(sure[1], (0, 0, 0))
+    assert colour_share(doubted[0], (40, 40, 220)) == 0
+
+
+def test_a_side_is_said_with_how_sure_it_is_unless_it_was_told() -> None:
+    assert [side_words(one) for one in (present(), other_hand(), lost_hand())] == [
+        *("right", "left 83 %", ""),
+    ]
+    assert side_words(other_hand(side_probability=0.999)) == "left 99 %"
 
 
 def test_panels_are_three_times_a_small_image_and_once_a_large() -> None:

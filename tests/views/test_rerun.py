@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.configured import f_measure
-from helpers.moments import one_hand, with_hand
+from helpers.moments import one_hand, two_hands, with_hand
 from helpers.tracking import CONF, configuration, make_tracker
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -187,6 +187,29 @@ def test_particles_lie_around_the_hand_brighter_with_weight(written: Path) -> No
         red = (colours[number] >> 24) & 255  # grows all along the colour map
         assert red[weights.argmax()] == red.max() and red[weights.argmin()] == red.min()
         assert len(set(red)) > 5
+
+
+def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> None:
+    """It goes after the first frame."""
+    both = two_hands(moments()[5])
+    nan = np.full(27, np.nan, np.float32)
+    gone = two_hands(dataclasses.replace(moments()[7]), lost=True)
+    vacant = dataclasses.replace(gone.estimates[1], state=nan)
+    gone = dataclasses.replace(
+        gone, hands=(gone.hands[0], dataclasses.replace(gone.hands[1], estimate=vacant))
+    )
+    with rerun_view.RerunView(tmp_path, 25.0, 2, likelihood=f_measure()) as view:
+        view.show(both)
+        view.show(gone)
+    path = tmp_path / "track.rrd"
+    joints = rows(path, "world/hand_2/joints", "Points3D:positions")
+    np.testing.assert_allclose(joints[5], both.estimates[1].joints_m, atol=1e-6)
+    assert list(joints) == [5]
+    labels = rows(path, "world/hand_2/label", "Points3D:labels")
+    assert {number: words.tolist() for number, words in labels.items()} == {5: ["left"]}
+    scores = rows(path, "plots/score/second", "Scalars:scalars")
+    assert scores[5][0] == pytest.approx(both.estimates[1].score)
+    assert sorted(rows(path, "world/hand/joints", "Points3D:positions")) == [5, 7]
 
 
 def test_the_configured_likelihood_is_the_one_that_classifies() -> None:
