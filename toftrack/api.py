@@ -115,6 +115,7 @@ def build_model(config: DictConfig) -> TrackerModel:
         backend=choose_backend(config.renderer, device),
         relocaliser=relocaliser,
         adapt=None if relocaliser is None else hand.adapt,
+        sides=hand.sides,
     )
 
 

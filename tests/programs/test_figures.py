@@ -23,12 +23,12 @@ from toftrack.output.run_folder import open_footage, read_run
 from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
+from toftrack.render.model_image import model_range_image, parted, posed_hand
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify
 from toftrack.views.figures import chart
-from toftrack.views.model_image import model_range_image, parted, posed_hand
 from toftrack.views.skeleton import SLOT_RGB
 
 NAMES = ("measurement", "filmstrip", "lost", "course", "latent")

@@ -32,6 +32,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import confidence_words, state_words
 from toftrack.frames import Truth
 from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
+from toftrack.render.model_image import model_range_image
 from toftrack.views.classified import classify
 from toftrack.views.figures.runs import (
     course_figure,
@@ -40,7 +41,6 @@ from toftrack.views.figures.runs import (
     lost_figure,
     measurement_figure,
 )
-from toftrack.views.model_image import model_range_image
 from toftrack.views.overlay import draw_panel, panel_scale
 
 _FILM_FRAMES = 10

@@ -24,8 +24,8 @@ from toftrack.estimate import (
     state_words,
 )
 from toftrack.output.files import write_whole
+from toftrack.render.model_image import model_range_image
 from toftrack.views.base import TrackedFrame
-from toftrack.views.model_image import model_range_image
 from toftrack.views.skeleton import SLOT_RGB, draw_hands, side_words
 from toftrack.views.video import VideoFile, unwritable, video_library
 

@@ -30,11 +30,11 @@ from toftrack.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
 from toftrack.render.likelihood import FMeasure
+from toftrack.render.model_image import cpu_surface, parted, posed_hand
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.state import StepInfo
 from toftrack.views.base import TrackedFrame, TrackedHand
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
-from toftrack.views.model_image import cpu_surface, parted, posed_hand
 from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB, side_words
 
 try:
