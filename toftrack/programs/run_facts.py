@@ -25,7 +25,10 @@ _APART_S = 1.0
 
 
 def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> dict[str, Any]:
-    """The metadata of run.json and track.npz, JSON-able; the hand's shape is the first slot's."""
+    """The metadata of run.json and track.npz, JSON-able.
+
+    The hand's shape is the first slot's at the start, its side 'auto' where none was told.
+    """
     camera, shape = device.camera, tracker.shapes[0]
     return {
         "toftrack": version("toftrack"),
@@ -38,7 +41,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
         "device": device.description,
         "pose_space": {"kind": tracker.space.kind, "dims": tracker.space.dims},
         "hand_shape": {
-            "side": shape.side,
+            "side": told_side(config, shape.side) or "auto",
             "fitted": tracker.model.fit is not None,
             "thickness": shape.thickness,
             "hand_length_m": shape.hand_length_m,
@@ -69,12 +72,12 @@ def opening(metadata: dict[str, Any], device: Device) -> str:
     about, shape, config = metadata["device"], metadata["hand_shape"], metadata["config"]
     source = about.get("recording") or about.get("device")
     count = "live" if device.frames is None else f"{device.frames} frames"
-    side = told_side(config, shape["side"])
+    side = shape["side"]
     length_mm = 1e3 * float(shape["hand_length_m"])
     fitted = "fitted from" if shape["fitted"] else "of"
     if config.get("hands", 1) > 1:
         what = "up to two hands, their lengths"
-    elif side is None:
+    elif side == "auto":
         what = "a hand of either side (hand.side=right or left to say which), its length"
     else:
         other = "left" if side == "right" else "right"

@@ -50,8 +50,9 @@ def draw_hands(
         wrist = _draw_skeleton(picture, camera, one.joints_m, doubted, *scale, rim)
         if wrist is not None:
             labels.append((side_words(one) or "?", wrist, rim))
+    above: tuple[int, int, int, int] | None = None
     for label in labels:  # last, because they are smaller than a hand
-        _draw_label(picture, *label)
+        above = _draw_label(picture, *label, above)
 
 
 def side_words(estimate: Estimate) -> str:
@@ -63,17 +64,30 @@ def side_words(estimate: Estimate) -> str:
 
 
 def _draw_label(
-    picture: np.ndarray, text: str, below: tuple[int, int], colour: tuple[int, ...]
-) -> None:
-    """Text in a box below a place, moved so that all of it is in the picture where it fits."""
+    picture: np.ndarray,
+    text: str,
+    below: tuple[int, int],
+    colour: tuple[int, ...],
+    beside: tuple[int, int, int, int] | None,
+) -> tuple[int, int, int, int]:
+    """Text in a box below a place, moved so that all of it is in the picture where it fits, and
+    does not cover another one.
+
+    beside: left, top, right and bottom of the other one; returns those of this one.
+    """
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 3
     (width, height), base = cv2.getTextSize(text, font, _LABEL, 1)
     x = int(np.clip(below[0] - width // 2, margin, max(margin, picture.shape[1] - width - margin)))
     lowest = picture.shape[0] - base - margin
     y = int(np.clip(below[1] + height + 2 * _LABEL_GAP_PX, height + margin, lowest))
-    corners = (x - margin, y - height - margin), (x + width + margin, y + base)
-    cv2.rectangle(picture, *corners, colour, -1)
+    left, top, right, bottom = x - margin, y - height - margin, x + width + margin, y + base
+    if beside is not None and left < beside[2] and right > beside[0]:
+        down = beside[3] + 1 - top if beside[1] <= bottom and top <= beside[3] else 0
+        fits = y + down <= lowest
+        y, top, bottom = (v + (down if fits else -down) for v in (y, top, bottom))
+    cv2.rectangle(picture, (left, top), (right, bottom), colour, -1)
     cv2.putText(picture, text, (x, y), font, _LABEL, _WHITE, 1, cv2.LINE_AA)
+    return left, top, right, bottom
 
 
 def _draw_skeleton(
