@@ -11,8 +11,6 @@ from torch import Tensor
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.frames import DepthImage
-from toftrack.hand.shape import HandShape
-from toftrack.render.model_image import model_range_image
 
 _TOLERANCE_M = 0.02
 """A pixel that is so near to a hand's surface may be the hand's."""
@@ -41,13 +39,6 @@ class OtherHand:
     believed: bool
     pixels: np.ndarray | None = None
     beside: np.ndarray | None = None
-
-
-def surface_m(
-    state: Tensor, shape: HandShape, k: np.ndarray, height: int, width: int
-) -> np.ndarray:
-    """(H, W) Z of a hand (1, 27), 0 = none."""
-    return model_range_image(state[0].cpu().numpy(), shape, k, height, width)
 
 
 def palm_centre_m(state: Tensor) -> np.ndarray:

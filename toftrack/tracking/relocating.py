@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -32,6 +33,8 @@ _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
 how far an angle may go."""
 _FAR_SIGMAS = 3.0
 """Farther off, a joint is as wrong as it can be."""
+_AS_WELL = 1.3
+"""Hands are seen about as well when their expected errors differ by less than this factor."""
 _IN_OTHER = 4.0
 """What speaks against a hand that lies wholly in the other one, log scale."""
 _LEAST_WORD = float(np.log(0.001))
@@ -63,12 +66,13 @@ def glanced(
     best = None
     if track is None or track.doubted:
         likely = partial(_reachable, state.seen, track, other)
-        best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
+        found = relocaliser.search(image.depth_m, image.k, side, likely)
+        best = _chosen(found) if state.sides is not None and state.seen is None else _first(found)
         if best is None and track is None and state.sides is not None:
             # A hand of the other side may be too unlike one of this to be found as such.
-            other = relocaliser.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
-            again = np.array([glance.centre_m.numpy() for glance in other[:1]]).reshape(-1, 3)
-            best = next(iter(relocaliser.glance(image.depth_m, image.k, again, side)), None)
+            found = relocaliser.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
+            again = np.array([glance.centre_m.numpy() for glance in found[:1]]).reshape(-1, 3)
+            best = _first(relocaliser.glance(image.depth_m, image.k, again, side))
         if track is None:
             return None, best
     elif _sure(track, relocaliser.settings, dt_s):
@@ -80,6 +84,22 @@ def glanced(
     if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
         return None, best
     return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
+
+
+def _first(found: Sequence[Glance]) -> Glance | None:
+    return next(iter(found), None)
+
+
+def _chosen(found: Sequence[Glance]) -> Glance | None:
+    """The nearest of those hands that are seen about as well as the best one.
+
+    Where nobody said which hand is meant, it is the one that is held out to the camera.
+    """
+    if not found:
+        return None
+    most = _AS_WELL * float(found[0].error_m[0])
+    alike = [glance for glance in found if float(glance.error_m[0]) < most]
+    return min(alike, key=lambda glance: float(glance.centre_m[2]), default=found[0])
 
 
 def _sure(track: Track, settings: RelocationSettings, dt_s: float) -> bool:

@@ -28,6 +28,8 @@ _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
 """Its least area that is seen, and rows of the image that it is looked for in."""
+_GONE_S = 1.0
+"""A hand that was believed so long ago may have made way for another one."""
 _SWITCHED = 0.4
 """The side is changed when it has become less probable than this, so that it does not flicker."""
 _LEAST_PRESENT = 0.5
@@ -50,7 +52,7 @@ def sided(
     fit, belief = model.sides, state.sides
     if fit is None or belief is None:
         return state, track, glance
-    if track is None and state.track is not None:
+    if track is None and (state.seen is None or state.seen.age_s > _GONE_S):
         belief = belief.left(fit)  # what comes may be the other hand
     belief = replace(belief, unlooked_s=belief.unlooked_s + dt_s)
     sure = max(probability(belief, side) for side in OTHER_SIDE) > fit.sure
