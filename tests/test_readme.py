@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -25,6 +26,8 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 
 from toftrack.api import make_device
+from toftrack.estimate import no_estimate
+from toftrack.output.lines import json_line
 from toftrack.programs import convert
 from toftrack.recordings.npz import read_recording
 
@@ -256,6 +259,18 @@ def test_the_client_of_datagrams_gets_every_frame(tmp_path: Path) -> None:
     finally:
         client.kill()
         client.communicate()
+
+
+def test_the_client_for_two_hands_prints_each_that_there_is(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = no_estimate(3, 0.12, "searching", 4, 0.01)
+    there = replace(none, lost=False, side="left", state=np.zeros(27), joints_m=np.ones((21, 3)))
+    lines = [json_line(both) for both in ((none, none), (none, there), (there, there))]
+    monkeypatch.setattr(sys, "stdin", lines)
+    exec(compile(block("hands-client"), "streams.md", "exec"), {})
+    printed = [line.split()[:3] for line in capsys.readouterr().out.splitlines()]
+    assert printed == [["3", slot, "left"] for slot in ("1", "0", "1")]
 
 
 def test_the_program_in_python_tracks(

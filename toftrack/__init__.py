@@ -8,6 +8,13 @@ For a program of one's own:
     estimate = tracker.step(depth_m, K)
     estimate.joints_m
 
+or, of two hands:
+
+    tracker = toftrack.make_hands_tracker("hands=2")
+    for estimate in tracker.step(depth_m, K):
+        if not estimate.lost:
+            estimate.side, estimate.joints_m
+
 The names in `__all__` are stable. Everything else is private and may change with any version.
 """
 
@@ -17,7 +24,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from toftrack.api import make_device, make_tracker
+    from toftrack.api import make_device, make_hands_tracker, make_tracker
     from toftrack.camera import Camera
     from toftrack.devices.base import BaseDevice
     from toftrack.errors import ToftrackError
@@ -25,6 +32,7 @@ if TYPE_CHECKING:
     from toftrack.frames import Frame
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.output.results import read_results
+    from toftrack.tracking.hands import HandsTracker
     from toftrack.tracking.tracker import Tracker
 
     __version__: str

@@ -47,7 +47,13 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
 def make_hands_tracker(*overrides: str, config_dir: str | Path | None = None) -> HandsTracker:
     """A tracker whose `step` gives a tuple of estimates, one for each slot of `hands=2` or 1.
 
-    Args and raises as make_tracker.
+        tracker = make_hands_tracker("hands=2")
+        first, second = tracker.step(depth_m, K)
+
+    A slot keeps to its hand; Estimate.side says whose it is. A slot without a hand is lost, and its
+    arrays are NaN.
+
+    Args and raises as make_tracker, but for hands=2.
     """
     config = configuration(*overrides, config_dir=config_dir)
     with one_sentence():

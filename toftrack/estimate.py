@@ -110,6 +110,11 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
     )
 
 
+def is_vacant(estimate: Estimate) -> bool:
+    """Whether there is no hand at all: nobody is followed, and there is no last or best guess."""
+    return not np.isfinite(estimate.state).all()
+
+
 def state_words(estimate: Estimate) -> str:
     """What goes on, for people: "tracking", "searching for the hand", "the hand is hidden"."""
     if estimate.lost and estimate.state_name == "tracking":

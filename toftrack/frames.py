@@ -45,6 +45,8 @@ class Truth:
     """(T, 21) bool."""
     first: int = 0
     """Number of the first row's frame; the other rows' follow."""
+    other: Truth | None = None
+    """Of the person's other hand, in the same frames; None where nothing is known of one."""
 
     def __len__(self) -> int:
         return len(self.joints_m)
@@ -71,6 +73,7 @@ class Truth:
             visible_fraction=cut(self.visible_fraction),
             joint_visible=cut(self.joint_visible),
             first=first,
+            other=None if self.other is None else self.other._taken(rows, first),
         )
 
 

@@ -59,7 +59,7 @@ def estimate(index: int, **changes: Any) -> Estimate:
 def write(folder: Path, estimates: list[Estimate], truth: Truth | None = None) -> ResultWriter:
     with ResultWriter(folder, {"seed": 1}, NAMES, truth) as writer:
         for one in estimates:
-            writer.append(one)
+            writer.append((one,))
     return writer
 
 
@@ -122,7 +122,7 @@ def test_read_results_gives_back_what_was_appended(tmp_path: Path) -> None:
 def test_each_line_is_on_disk_when_its_frame_is_done(tmp_path: Path) -> None:
     writer = ResultWriter(tmp_path, {}, NAMES, None)
     for i in range(3):
-        writer.append(estimate(i))
+        writer.append((estimate(i),))
         lines = (tmp_path / "track.jsonl").read_text().splitlines()
         assert [json.loads(line)["index"] for line in lines] == list(range(i + 1))
     assert not (tmp_path / "track.npz").exists()
@@ -196,8 +196,8 @@ def test_files_of_older_versions_are_results_as_well(tmp_path: Path) -> None:
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         with ResultWriter(tmp_path, {}, NAMES, None) as writer:
-            writer.append(estimate(0))
-            writer.append(estimate(1))
+            writer.append((estimate(0),))
+            writer.append((estimate(1),))
             raise KeyboardInterrupt
     assert read_results(tmp_path / "track.npz")["joints_m"].shape == (2, 21, 3)
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
@@ -253,12 +253,12 @@ def test_run_json_is_there_from_the_start(tmp_path: Path) -> None:
 
 def test_a_second_run_into_a_folder_is_refused_while_the_first_lives(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, {}, NAMES) as first:
-        first.append(estimate(0))
+        first.append((estimate(0),))
         with pytest.raises(ToftrackError, match="another run is writing.*hydra.run.dir"):
             ResultWriter(tmp_path, {}, NAMES)
         with pytest.raises(ToftrackError, match="another run is writing"):
             recover(tmp_path)
-        first.append(estimate(1))
+        first.append((estimate(1),))
     assert len(read_results(tmp_path / "track.npz")["lost"]) == 2
     with ResultWriter(tmp_path, {}, NAMES):
         assert not (tmp_path / "track.npz").exists(), "it would be that of the first run"
@@ -286,9 +286,9 @@ def test_a_disk_that_fills_keeps_what_was_whole(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="No space left.*the 3 frames.*make room.*recover"):
         with ResultWriter(tmp_path, {}, NAMES) as writer:
             for i in range(3):
-                writer.append(estimate(i))
+                writer.append((estimate(i),))
             writer._lines._file = FullDisk(writer._lines._file, 1000)
-            writer.append(estimate(3))
+            writer.append((estimate(3),))
     assert (tmp_path / "track.jsonl").read_text().count("\n") == 3
     assert len(read_results(tmp_path / "track.npz")["lost"]) == 3
 
@@ -312,7 +312,7 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
         tracemalloc.start()
         with ResultWriter(tmp_path / str(frames), {}, NAMES) as writer:
             for i in range(frames):
-                writer.append(dataclasses.replace(one, index=i))
+                writer.append((dataclasses.replace(one, index=i),))
         found = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return found
@@ -407,7 +407,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
 
 def test_a_result_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     writer = ResultWriter(tmp_path, {}, NAMES, None)
-    writer.append(estimate(0))
+    writer.append((estimate(0),))
     (tmp_path / "track.npz.part").mkdir()
     with pytest.raises(ToftrackError, match="cannot be written"):
         writer.close()

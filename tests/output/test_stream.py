@@ -85,8 +85,8 @@ def test_a_reader_of_standard_output_gets_every_line_as_in_track_jsonl() -> None
     sent = [estimate(i) for i in range(5)]
     with piped() as pipe, stdout_stream() as stream:
         for one in sent:
-            stream.send(one)
-            assert lines_of(pipe, ends_with(one.index)) == [json.loads(json_line(one))]
+            stream.send((one,))
+            assert lines_of(pipe, ends_with(one.index)) == [json.loads(json_line((one,)))]
 
 
 def test_nothing_else_gets_to_standard_output() -> None:
@@ -97,7 +97,7 @@ from toftrack.output.stream import StdoutStream
 with StdoutStream(None, 25) as stream:
     print("printed")
     os.system("echo from below")
-    stream.send(no_estimate(1, 0.0, 'lost', 4, 0.0))
+    stream.send((no_estimate(1, 0.0, 'lost', 4, 0.0),))
 print("after")
 """
     told = subprocess.run(
@@ -120,7 +120,7 @@ def test_a_reader_that_falls_behind_gets_the_newest_and_whole_lines(
         reader = threading.Thread(target=lambda: found.extend(lines_of(pipe, ends_with(299))))
         with stdout_stream(waiting=3) as stream:
             for i in range(300):
-                stream.send(estimate(i))
+                stream.send((estimate(i),))
             reader.start()
         reader.join(20)
     indices = [line["index"] for line in found]
@@ -136,7 +136,7 @@ def test_a_reader_that_never_reads_stops_nothing(
     caplog.set_level(logging.INFO)
     with piped(), stdout_stream(waiting=1) as stream:
         for i in range(300):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     words = caplog.text.split()
     sent, dropped = (int(words[words.index(word) - 1]) for word in ("estimates", "dropped"))
     assert sent + dropped == 300 and dropped > 100
@@ -148,9 +148,9 @@ def test_a_reader_that_goes_away_is_told_at_once() -> None:
     os.dup2(writing, 1)
     try:
         with pytest.raises(ReaderGoneError, match="Broken pipe"), stdout_stream() as stream:
-            stream.send(estimate(0))
+            stream.send((estimate(0),))
             os.close(reading)
-            stream.send(estimate(1))
+            stream.send((estimate(1),))
     finally:
         os.dup2(kept, 1)
         os.close(kept)
@@ -160,8 +160,8 @@ def test_a_reader_that_goes_away_is_told_at_once() -> None:
 def test_a_datagram_is_a_whole_line(receiver: socket.socket) -> None:
     with udp_stream(*receiver.getsockname()) as stream:
         for i in range(3):
-            stream.send(one := estimate(i))
-            assert receiver.recv(65535).decode() == json_line(one) + "\n"
+            stream.send(((one := estimate(i)),))
+            assert receiver.recv(65535).decode() == json_line((one,)) + "\n"
 
 
 def test_datagrams_that_nobody_wants_stop_nothing(caplog: pytest.LogCaptureFixture) -> None:
@@ -171,7 +171,7 @@ def test_datagrams_that_nobody_wants_stop_nothing(caplog: pytest.LogCaptureFixtu
         port = free.getsockname()[1]
     with udp_stream("127.0.0.1", port) as stream:
         for i in range(50):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     assert f"50 estimates sent to 127.0.0.1 port {port}, 0 dropped" in caplog.text
 
 
@@ -180,20 +180,20 @@ def test_datagrams_that_the_system_refuses_are_counted(caplog: pytest.LogCapture
     caplog.set_level(logging.INFO)
     with udp_stream("255.255.255.255", 5005) as stream:
         for i in range(3):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     assert "0 estimates sent" in caplog.text and "3 dropped (" in caplog.text
 
 
 def test_a_receiver_that_never_reads_stops_nothing(receiver: socket.socket) -> None:
     with udp_stream(*receiver.getsockname()) as stream:
         for i in range(1000):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     assert json.loads(receiver.recv(65535))["index"] == 0
 
 
 def test_only_the_wanted_fields_are_sent(receiver: socket.socket) -> None:
     with udp_stream(*receiver.getsockname(), fields=["lost", "joints_m", "index"]) as stream:
-        stream.send(estimate(7))
+        stream.send((estimate(7),))
     line = json.loads(receiver.recv(65535))
     assert list(line) == ["lost", "joints_m", "index"] and line["index"] == 7
 
@@ -205,9 +205,9 @@ def test_the_fields_that_the_configuration_advises_fit_into_one_ethernet_frame()
     # Numbers of as many digits as there are; only depth is never negative.
     joints = np.full((21, 3), -0.12345678, np.float32) * np.float32([1, 1, -1])
     wanted = ("index", "timestamp_s", "lost", "joints_m")
-    line = json_line(replace(found, joints_m=joints, timestamp_s=12345.678901), wanted)
+    line = json_line((replace(found, joints_m=joints, timestamp_s=12345.678901),), wanted)
     assert len(line) + 1 <= 1472
-    assert len(json_line(found)) < 6000, "and all fields are as long as it says"
+    assert len(json_line((found,))) < 6000, "and all fields are as long as it says"
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_a_bad_setting_is_one_clear_error(overrides: list[str], words: str) -> N
 def test_no_stream_takes_everything() -> None:
     with hydra.utils.instantiate(configuration().stream) as stream:
         assert isinstance(stream, NoStream)
-        stream.send(estimate(0))
+        stream.send((estimate(0),))
 
 
 def program(*arguments: str, folder: Path) -> subprocess.Popen[str]:

@@ -240,6 +240,25 @@ def test_a_recording_is_tracked_by_its_name_alone_and_a_killed_run_recovered(
     assert summary["metrics"]["trust"]["visible"] == 8 and summary["hand"]["side"] == "right"
 
 
+def test_two_hands_are_written_slot_by_slot(here, tmp_path: Path) -> None:
+    status, out, err = here("hands=2", "device.stop=3", "stream=stdout", "view=video", *QUICK)
+    assert status == 0, err
+    assert "up to two hands, their lengths fitted" in err and "a right hand" not in err
+    folder = tmp_path / "out"
+    result = read_results(folder / "track.npz")
+    assert result["joints_m"].shape == (3, 2, 21, 3) and result["index"].shape == (3,)
+    assert not result["lost"].all(1).any() and result["metadata"]["config"]["hands"] == 2
+    told = (folder / "track.jsonl").read_text()
+    first = json.loads(told.splitlines()[0])["hands"][0]
+    assert first["slot"] in (0, 1) and first["side"] in ("right", "left")
+    for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
+        assert HandShape.load(folder / name).side in ("right", "left"), slot
+    summary = json.loads((folder / "summary.json").read_text())
+    assert [slot["slot"] for slot in summary["slots"]] == [0, 1] and "hand" not in summary
+    assert summary["metrics"]["trust"]["visible"] == 3 and "ghost_pct" in summary["metrics"]
+    assert len(video_frames(folder / "overlay.mp4")) == 3
+
+
 def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
     sweep = ("-m", "seed=1,2", "hydra.sweep.dir=sweep", "device.stop=3", "view=none")
     status, out, err = call(*sweep, *QUICK, cwd=tmp_path)
@@ -334,6 +353,7 @@ def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here
         (["device=telescope"], "device=telescope"),
         (["experiment=other"], "experiment=other"),
         (["particles=3"], "particles"),
+        (["hands=3"], "hands=3 is not possible"),
     ],
 )
 def test_a_bad_setting_is_one_clear_sentence(here, overrides: list[str], words: str) -> None:

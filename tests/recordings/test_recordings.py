@@ -125,6 +125,18 @@ def test_write_then_read_is_the_same(tmp_path: Path, radial: bool, kind: type) -
     assert [p.name for p in tmp_path.glob("*.part")] == []
 
 
+def test_the_other_hands_truth_is_kept_and_cut_with_the_first_ones(tmp_path: Path) -> None:
+    joints, seen = np.full((T, 21, 3), 0.5, np.float32), np.array([False, True, True, False])
+    first = read_recording(save(tmp_path, joints2_m=joints, visible2=seen))
+    write_recording(tmp_path / "copy.npz", first)
+    for truth in (first.truth, read_recording(tmp_path / "copy.npz").truth):
+        np.testing.assert_array_equal(truth.other.joints_m, joints)
+        np.testing.assert_array_equal(truth[1:3].other.visible, [True, True])
+        np.testing.assert_array_equal(truth.of_frames(np.array([0, 3])).other.visible, [False] * 2)
+        assert truth.other.in_space.all() and truth.other.joint_visible is None
+    assert read_recording(save(tmp_path)).truth.other is None
+
+
 def test_writing_into_no_folder_is_told(tmp_path: Path) -> None:
     recording = read_recording(save(tmp_path))
     with pytest.raises(ToftrackError, match="cannot be written"):

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -28,6 +27,7 @@ from helpers.browsing import (
     ours,
     shown_again_and_again,
 )
+from helpers.moments import two_hands, with_hand
 from helpers.settings import browser_view
 from helpers.tracking import ROOT, configuration
 
@@ -170,7 +170,7 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
         number = int(text("index"))
         eventually(lambda: all(picture(name) != old for name, old in before.items()))
         eventually(lambda: int(text("index")) > number)
-        assert text("score") in {f"{moment.estimate.score:.2f}" for moment in moments()}
+        assert text("score") in {f"{moment.estimates[0].score:.2f}" for moment in moments()}
         assert text("ms").endswith(" ms") and text("gesture") != ""
 
         eventually(lambda: pressed() == ["Right hand"])
@@ -189,8 +189,23 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
             assert chromium.execute_script(over) <= 0
         left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
         assert right["y"] > left["y"] + left["height"] and left["width"] > 400
-    view.show(replace(moments()[0], estimate=no_estimate(9, 0.36, "lost", 4, 0.01), insight=None))
+    lost = no_estimate(9, 0.36, "lost", 4, 0.01)
+    view.show(with_hand(moments()[0], estimate=lost, insight=None))
     eventually(lambda: text("state") == "LOST" and text("phase") == "lost: no hand found")
+
+    def of_slots(name: str) -> list[str]:
+        script = f"return [...document.querySelectorAll('.hand .{name}')].map(e => e.textContent)"
+        return chromium.execute_script(script)
+
+    view.show(two_hands(moments()[1], side_probability=0.83, gesture="ok", pinching=True))
+    eventually(lambda: of_slots("side") == ["right", "left 83 %"])
+    assert of_slots("state") == ["tracking", "tracking"] and of_slots("gesture")[1] == "ok"
+    assert of_slots("pinching") == ["", "pinching"]
+    assert not chromium.find_element("id", "state").is_displayed()
+    view.show(two_hands(moments()[1], lost=True))
+    eventually(lambda: of_slots("state") == ["tracking", "LOST"])
+    view.show(moments()[1])
+    eventually(lambda: of_slots("state") == [] and text("state") == "tracking")
     assert chromium.get_log("browser") == []
 
     view._picture.set_phase("over")

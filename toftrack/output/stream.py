@@ -1,7 +1,7 @@
-"""Estimates for other programs, one after the other as they are made.
+"""Estimates for other programs, one frame's after the other's as they are made.
 
-Each is a line of JSON, the same as in track.jsonl. Sending never waits for who reads: the tracker
-keeps its pace, and what a reader is too slow for is dropped, counted, and told at the end.
+Each frame is a line of JSON, the same as in track.jsonl. Sending never waits for who reads: the
+tracker keeps its pace, and what a reader is too slow for is dropped, counted, and told at the end.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ class ReaderGoneError(Exception):
 class Stream(Protocol):
     """Where estimates are sent, within a `with`."""
 
-    def send(self, estimate: Estimate) -> None:
-        """Send one, without ever waiting for who reads it; ReaderGoneError when nobody does."""
+    def send(self, estimates: Sequence[Estimate]) -> None:
+        """Send a frame's, one a slot, without ever waiting for who reads it; ReaderGoneError when
+        nobody does.
+        """
 
     def __enter__(self) -> Self: ...
 
@@ -46,7 +48,7 @@ class Stream(Protocol):
 class NoStream:
     """Sends nothing."""
 
-    def send(self, estimate: Estimate) -> None:
+    def send(self, estimates: Sequence[Estimate]) -> None:
         """Do nothing."""
 
     def __enter__(self) -> Self:
@@ -92,10 +94,10 @@ class StdoutStream:
         self._descriptor = _claim_stdout()
         return self
 
-    def send(self, estimate: Estimate) -> None:
+    def send(self, estimates: Sequence[Estimate]) -> None:
         """Write the lines that wait and this one, as far as the reader has room for them."""
         self._dropped += len(self._lines) == self._lines.maxlen
-        self._lines.append((json_line(estimate, self._fields) + "\n").encode())
+        self._lines.append((json_line(estimates, self._fields) + "\n").encode())
         try:
             self._write(until=0.0)
         except OSError as error:
@@ -165,10 +167,10 @@ class UdpStream:
         self._socket.setblocking(False)
         return self
 
-    def send(self, estimate: Estimate) -> None:
+    def send(self, estimates: Sequence[Estimate]) -> None:
         """Send a datagram; one that the system does not take at once is dropped."""
         assert self._socket is not None, "send within `with`"
-        line = (json_line(estimate, self._fields) + "\n").encode()
+        line = (json_line(estimates, self._fields) + "\n").encode()
         try:
             self._socket.sendto(line, self._address)
         except OSError as error:  # its buffer is full, or there is no network just now

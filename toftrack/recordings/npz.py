@@ -11,6 +11,7 @@
 | `joints_m` | (T, 21, 3) float | no |
 | `visible`, `in_space` | (T,) bool | no: true |
 | `visible_fraction`, `joint_visible` | (T,) float, (T, 21) bool | no |
+| `joints2_m`, `visible2`, `in_space2`, ... | the same of the other hand | no |
 | `metadata` | text, a JSON object | no |
 
 Unknown keys are ignored.
@@ -23,7 +24,7 @@ import math
 import os
 import zipfile
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -100,8 +101,7 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     if recording.amplitude is not None:
         arrays["amplitude"] = recording.amplitude
     if recording.truth is not None:
-        truth = {name: getattr(recording.truth, name) for name in Truth.__dataclass_fields__}
-        arrays.update({name: value for name, value in truth.items() if value is not None})
+        arrays |= _truth_arrays(recording.truth)
     partial = path.with_name(path.name + ".part")
     try:
         with open(partial, "wb") as stream:
@@ -114,6 +114,20 @@ def write_recording(path: str | Path, recording: Recording) -> None:
         ) from error
 
 
+def _truth_arrays(truth: Truth) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {}
+    for keys, hand in ((_TRUTH_KEYS, truth), (_OTHER_KEYS, truth.other)):
+        values = {key: getattr(hand, name, None) for name, key in keys.items()}
+        arrays |= {key: value for key, value in values.items() if value is not None}
+    return arrays
+
+
+_TRUTH_KEYS = {
+    name: name for name in ("joints_m", "visible", "in_space", "visible_fraction", "joint_visible")
+}
+"""What fields of Truth are called in a file."""
+_OTHER_KEYS = {name: f"{name}2" for name in _TRUTH_KEYS} | {"joints_m": "joints2_m"}
+"""Those of the other hand."""
 _KEYS = (
     "depth_m",
     "radial_m",
@@ -122,11 +136,8 @@ _KEYS = (
     "fps",
     "timestamp_s",
     "distortion",
-    "joints_m",
-    "visible",
-    "in_space",
-    "visible_fraction",
-    "joint_visible",
+    *_TRUTH_KEYS.values(),
+    *_OTHER_KEYS.values(),
     "metadata",
 )
 
@@ -304,19 +315,27 @@ def _amplitude(arrays: dict[str, np.ndarray], shape: tuple[int, ...]) -> np.ndar
 
 
 def _truth(arrays: dict[str, np.ndarray], count: int) -> Truth | None:
-    if "joints_m" not in arrays:
-        return None
-    joints = _of_shape(arrays, "joints_m", (count, _JOINTS, 3)).astype(np.float32)
-    if not np.isfinite(joints).all():
-        raise ToftrackError("'joints_m' contains NaN or infinity; leave it out or repair it")
+    first = _truth_of_one(arrays, count, _TRUTH_KEYS)
+    return first and replace(first, other=_truth_of_one(arrays, count, _OTHER_KEYS))
 
-    def flags(key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+
+def _truth_of_one(arrays: dict[str, np.ndarray], count: int, keys: dict[str, str]) -> Truth | None:
+    """Of one hand.  keys: what the fields are called."""
+    if keys["joints_m"] not in arrays:
+        return None
+    joints = _of_shape(arrays, keys["joints_m"], (count, _JOINTS, 3)).astype(np.float32)
+    if not np.isfinite(joints).all():
+        name = keys["joints_m"]
+        raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
+
+    def flags(name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+        key = keys[name]
         return _of_shape(arrays, key, shape).astype(bool) if key in arrays else None
 
     visible, in_space = flags("visible", (count,)), flags("in_space", (count,))
     fraction = None
-    if "visible_fraction" in arrays:
-        fraction = _of_shape(arrays, "visible_fraction", (count,)).astype(np.float32)
+    if keys["visible_fraction"] in arrays:
+        fraction = _of_shape(arrays, keys["visible_fraction"], (count,)).astype(np.float32)
     return Truth(
         joints_m=joints,
         visible=np.ones(count, bool) if visible is None else visible,

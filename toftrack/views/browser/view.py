@@ -20,8 +20,8 @@ import cv2
 
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import state_words
-from toftrack.views.base import TrackedFrame
+from toftrack.estimate import is_vacant, state_words
+from toftrack.views.base import TrackedFrame, TrackedHand
 from toftrack.views.browser.server import BrowserServer, News
 from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
@@ -274,25 +274,40 @@ def _encode(tracked: TrackedFrame, quality: int) -> bytes:
 
 
 def _facts(tracked: TrackedFrame) -> dict[str, Any]:
-    """What the page writes beside the picture, JSON-able."""
-    estimate = tracked.estimate
+    """What the page writes beside the picture, JSON-able: of the frame and of a hand, or `hands`.
 
-    def number(value: float) -> float | None:
-        return round(float(value), 6) if math.isfinite(value) else None
+    Of two hands the frame is lost when neither can be used, and its state is the first slot's.
+    """
+    first = tracked.hands[0]
+    of_frame = {"index": int(first.estimate.index), "ms": _number(1e3 * first.estimate.compute_s)}
+    if len(tracked.hands) == 1:
+        return of_frame | _hand_facts(first) | {"side": first.shape.side}
+    return of_frame | {
+        "state": state_words(first.estimate),
+        "lost": all(estimate.lost for estimate in tracked.estimates),
+        "hands": [_hand_facts(hand) for hand in tracked.hands],
+    }
 
+
+def _hand_facts(hand: TrackedHand) -> dict[str, Any]:
+    estimate = hand.estimate
     return {
-        "index": int(estimate.index),
+        "there": not is_vacant(estimate),
         "state": state_words(estimate),
         "lost": bool(estimate.lost),
-        "score": number(estimate.score),
-        "confidence": number(estimate.confidence),
+        "score": _number(estimate.score),
+        "confidence": _number(estimate.confidence),
         "gesture": estimate.gesture,
-        "gesture_probability": number(estimate.gesture_probability),
-        "pinch": number(estimate.pinch),
+        "gesture_probability": _number(estimate.gesture_probability),
+        "pinch": _number(estimate.pinch),
         "pinching": bool(estimate.pinching),
-        "ms": number(1e3 * estimate.compute_s),
-        "side": tracked.shape.side,
+        "side": estimate.side,
+        "side_probability": _number(estimate.side_probability),
     }
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 6) if math.isfinite(value) else None
 
 
 def _rate(times_s: Sequence[float]) -> float | None:
