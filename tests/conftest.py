@@ -6,9 +6,14 @@ fails the run, so that no test falls asleep unnoticed.
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 from collections import Counter
+
+# Before torch is loaded: workers, and what they start, share the cores among them.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
