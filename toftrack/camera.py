@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import read_json
 
 _FORMAT = "toftrack-camera"
 _VERSION = 1
@@ -196,7 +197,7 @@ class Camera:
     def load(cls, path: str | Path) -> Camera:
         """Read a camera that `save` wrote. Raises ToftrackError for anything else."""
         try:
-            content = json.loads(Path(path).expanduser().read_text(encoding="utf-8"))
+            content = read_json(Path(path).expanduser())
         except OSError as error:
             raise ToftrackError(
                 f"the camera file '{path}' cannot be read ({error.strerror}); give the path of a "

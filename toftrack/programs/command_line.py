@@ -31,6 +31,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
+from toftrack.json_text import read_json
 from toftrack.programs import endings
 
 
@@ -161,7 +162,7 @@ def _note_error(folder: Path, text: str) -> None:
     # The sentence is on the terminal; a folder that cannot be written must not stop the sweep.
     with contextlib.suppress(OSError):
         try:
-            summary = json.loads(path.read_text(encoding="utf-8"))
+            summary = read_json(path)
         except (FileNotFoundError, ValueError):
             summary = {}
         path.write_text(json.dumps(summary | {"error": text}, indent=1) + "\n", encoding="utf-8")

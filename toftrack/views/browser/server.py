@@ -34,6 +34,7 @@ from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
 from toftrack.views.base import COMMANDS
 
 _log = logging.getLogger(__name__)
@@ -223,7 +224,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _command(self, body: bytes) -> None:
         try:
-            content = json.loads(body)
+            content = parse_json(body)
         except ValueError:
             content = None
         command = content.get("command") if isinstance(content, dict) else None
