@@ -66,7 +66,7 @@ def piped() -> Iterator[BinaryIO]:
 def lines_of(reading: BinaryIO, until: Callable[[bytes], bool]) -> list[dict]:
     content = b""
     while not until(content):
-        assert select.select((reading,), (), (), 20)[0], "nothing more comes"
+        assert select.select((reading,), (), (), 200)[0], "nothing more comes"
         content += reading.read(1 << 16)
     return [json.loads(line) for line in content.splitlines()]
 
@@ -259,8 +259,8 @@ def test_a_reader_that_has_enough_ends_the_tracking_and_its_results_are_kept(
     first: list[dict] = []
 
     def read_two(pipe: BinaryIO) -> None:
-        first.extend(lines_of(pipe, lambda content: content.count(b"\n") >= 2)[:2])
-        pipe.close()
+        with pipe:
+            first.extend(lines_of(pipe, lambda content: content.count(b"\n") >= 2)[:2])
 
     with piped() as pipe, ThreadPoolExecutor() as pool:
         reader = pool.submit(read_two, pipe)

@@ -30,8 +30,15 @@ import numpy as np
 from toftrack.archives import MOST_BYTES, Archive, PickledError
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import LARGEST_MEDIAN_M, Truth
+from toftrack.frames import (
+    LARGEST_MEDIAN_M,
+    SMALLEST_MEDIAN_M,
+    Truth,
+    median_reading,
+    wrong_unit,
+)
 from toftrack.json_text import parse_json
+from toftrack.recordings.doubts import check_layout, some_images
 from toftrack.recordings.streamed_images import Images, StreamedImages
 
 DEFAULT_FPS = 25.0
@@ -188,6 +195,7 @@ def _parse(arrays: dict[str, Any]) -> Recording:
     if "K" not in arrays:
         raise ToftrackError("the required key 'K' (3x3 camera matrix, pixels) is missing; add it")
     depth = _check_depth(arrays[depth_key], depth_key)
+    check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
     camera = Camera(arrays["K"], width, height, arrays.get("distortion", np.zeros(5)))
     timestamp_s, fps = _times(arrays, count)
@@ -209,38 +217,22 @@ def _check_depth(depth: Images, key: str) -> Images:
             f"'{key}' must have 3 dimensions (frames, rows, columns), but has {depth.ndim}, shape "
             f"{depth.shape}"
         )
-    if np.issubdtype(depth.dtype, np.integer):
-        raise ToftrackError(
-            f"'{key}' consists of whole numbers ({depth.dtype}), which looks like millimetres, but "
-            f"must be float metres; convert with {key} = depth.astype('float32') / 1000"
-        )
-    if not np.issubdtype(depth.dtype, np.floating):
+    whole = np.issubdtype(depth.dtype, np.integer)
+    if not whole and not np.issubdtype(depth.dtype, np.floating):
         raise ToftrackError(f"'{key}' must be float32 or float16 metres, but is {depth.dtype}")
     if len(depth) == 0:
         raise ToftrackError(f"'{key}' has zero frames; record at least one")
     if depth.size == 0:
         raise ToftrackError(f"the images of '{key}' are empty, shape {depth.shape}")
-    some = _some_images(depth)
-    readings = some[(some > 0) & (some < np.inf)]
-    median = float(np.median(readings.astype(np.float32))) if readings.size else 0.0
-    if median > LARGEST_MEDIAN_M:
-        raise ToftrackError(
-            f"the median of '{key}' is {median:.0f}, which is plainly millimetres, but it must be "
-            f"metres; convert with {key} = depth / 1000"
-        )
+    median = median_reading(some_images(depth))
+    if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
+        raise wrong_unit(f"'{key}'", median, str(depth.dtype) if whole else "")
     if isinstance(depth, StreamedImages) or depth.dtype.newbyteorder("=") in (
         np.float16,
         np.float32,
     ):
         return depth
     return depth.astype(np.float32)
-
-
-def _some_images(depth: Images) -> np.ndarray:
-    """(n, H, W) of it, to judge the whole by: all of a long one would only take longer."""
-    if isinstance(depth, StreamedImages):
-        return np.stack([depth[index] for index in range(min(4, len(depth)))])
-    return depth[np.unique(np.linspace(0, len(depth) - 1, 16).astype(int))]
 
 
 def _of_shape(arrays: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
