@@ -40,7 +40,7 @@ from toftrack.views.browser.view import BrowserView
 
 
 def test_frames_with_an_end_wait_for_a_visitor_but_not_for_ever(capsys, monkeypatch) -> None:
-    found = re.compile(r"live view: (http://127\.0\.0\.1:\d+/)")
+    found = re.compile(r"live view: (http://127\.0\.0\.1:\d+/)#")
     # Reading captured output empties it, and would lose what is written at that moment.
     told = io.StringIO()
     monkeypatch.setattr(sys, "stderr", told)
@@ -165,6 +165,11 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
 
     with shown_again_and_again(view) as taken:
         chromium.get(view.url)
+        eventually(lambda: text("phase") == "live")
+        assert "whole address" in text("told")
+        restart = chromium.find_element("xpath", "//button[text()='Start again']")
+        assert restart.get_property("disabled")
+        chromium.get(view.address)
         eventually(lambda: text("phase") == "live")
         eventually(lambda: text("fps") != "–")
         before = {name: picture(name) for name in ("image", "model")}
