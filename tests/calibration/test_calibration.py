@@ -85,6 +85,20 @@ def test_takes_the_depth_error_away(calibrated: tuple[Camera, Path]) -> None:
     assert np.sqrt((wiggle(true) ** 2).mean()) > 0.008
 
 
+def test_no_board_is_told_long_before_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(calibrate, "_HOPE_S", 0.0)
+    monkeypatch.setattr(calibration, "find_corners", lambda *_: None)
+    path = tmp_path / "none.npz"
+    images = np.full((6, 144, 176), 0.6, np.float32)
+    np.savez(path, depth_m=images, K=TRUE.K, amplitude=np.ones(images.shape, np.uint16))
+    with pytest.raises(ToftrackError, match="found in 0 frames"):
+        calibrate.main([str(path), "--board", "7x5", "--square", "0.03"])
+    told = capsys.readouterr().err
+    assert told.count("no 7x5 chequerboard seen so far, up to frame 0") == 1
+
+
 def test_report_tells_before_and_after(calibrated: tuple[Camera, Path]) -> None:
     camera, folder = calibrated
     facts = json.loads((folder / "report.json").read_text())

@@ -41,7 +41,8 @@ class _Program:
 
     running: bool = False
     tracebacks: bool = False
-    failed_jobs: list[str] = field(default_factory=list)
+    failed_jobs: set[Path] = field(default_factory=set)
+    """Their folders."""
 
 
 _program = _Program()
@@ -120,11 +121,16 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
                 raise
             _report(error)
             folder = Path(HydraConfig.get().runtime.output_dir)
-            _program.failed_jobs.append(str(folder))
+            note_failed_job(folder)
             _note_error(folder, sentence(error))
             return math.inf
 
     return guarded
+
+
+def note_failed_job(folder: Path) -> None:
+    """A job of the sweep failed, in this process or another: `run` will say how many did."""
+    _program.failed_jobs.add(folder.absolute())
 
 
 @contextlib.contextmanager
