@@ -61,7 +61,8 @@ def next_picture(view: BrowserView, facts: dict) -> tuple[dict, bytes]:
 
 def post(view: BrowserView, body: object, path: str = "command", **headers: str) -> int:
     """The status of a POST as the page sends it, but for the given headers."""
-    headers = {"Content-Type": "application/json"} | {
+    token = view.address.partition("#")[2]
+    headers = {"Content-Type": "application/json", "X-Token": token} | {
         name.replace("_", "-"): value for name, value in headers.items()
     }
     data = body if isinstance(body, bytes) else json.dumps(body).encode()

@@ -11,13 +11,17 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
 import hydra
 import numpy as np
 import pytest
+from helpers import programs
+from helpers.programs import QUICK
 from helpers.settings import stdout_stream, udp_stream
 from helpers.tracking import CONF, ROOT, configuration, run
 
@@ -28,7 +32,6 @@ from toftrack.output.lines import LINE_FIELDS, json_line
 from toftrack.output.results import read_results
 from toftrack.output.stream import NoStream, ReaderGoneError
 
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 NUMBERS = np.random.default_rng(0)
 
 
@@ -42,7 +45,7 @@ def estimate(index: int) -> Estimate:
 
 
 @contextmanager
-def piped() -> Iterator[int]:
+def piped() -> Iterator[BinaryIO]:
     """The reading end of a pipe that is this process's standard output meanwhile.
 
     No fixture: pytest's own capturing begins anew between a fixture and its test.
@@ -53,18 +56,18 @@ def piped() -> Iterator[int]:
     os.dup2(writing, 1)
     os.close(writing)
     try:
-        yield reading
+        with os.fdopen(reading, "rb", buffering=0) as pipe:
+            yield pipe
     finally:
         os.dup2(kept, 1)
         os.close(kept)
-        os.close(reading)
 
 
-def lines_of(reading: int, until: Callable[[bytes], bool]) -> list[dict]:
+def lines_of(reading: BinaryIO, until: Callable[[bytes], bool]) -> list[dict]:
     content = b""
     while not until(content):
-        assert select.select((reading,), (), (), 20)[0], "nothing more comes"
-        content += os.read(reading, 1 << 16)
+        assert select.select((reading,), (), (), 200)[0], "nothing more comes"
+        content += reading.read(1 << 16)
     return [json.loads(line) for line in content.splitlines()]
 
 
@@ -235,37 +238,35 @@ def test_no_stream_takes_everything() -> None:
         stream.send((estimate(0),))
 
 
-def program(*arguments: str, folder: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / "track.py"), "view=none", "hydra.run.dir=out", *arguments],
-        cwd=folder,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+GIVEN = ("stream=stdout", "view=none", "hydra.run.dir=out", *QUICK)
 
 
 def test_standard_output_is_the_stream_s_alone_and_the_table_goes_to_standard_error(
     tmp_path: Path,
 ) -> None:
-    process = program("stream=stdout", "device.stop=6", *QUICK, folder=tmp_path)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert out == (tmp_path / "out" / "track.jsonl").read_text()
-    assert tuple(json.loads(out.splitlines()[0])) == LINE_FIELDS
-    assert "joint error, mean" in err and "track.npz" in err
-    assert "stream: 6 estimates sent to standard output, 0 dropped" in err
+    command = [sys.executable, str(ROOT / "track.py"), *GIVEN, "device.stop=6"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == (tmp_path / "out" / "track.jsonl").read_text()
+    assert tuple(json.loads(done.stdout.splitlines()[0])) == LINE_FIELDS
+    assert "joint error, mean" in done.stderr and "track.npz" in done.stderr
+    assert "stream: 6 estimates sent to standard output, 0 dropped" in done.stderr
 
 
 def test_a_reader_that_has_enough_ends_the_tracking_and_its_results_are_kept(
     tmp_path: Path,
 ) -> None:
-    process = program("stream=stdout", *QUICK, folder=tmp_path)
-    first = [json.loads(process.stdout.readline()) for _ in range(2)]
-    process.stdout.close()
-    err = process.stderr.read()
-    assert process.wait(timeout=120) == 0, err
+    first: list[dict] = []
+
+    def read_two(pipe: BinaryIO) -> None:
+        with pipe:
+            first.extend(lines_of(pipe, lambda content: content.count(b"\n") >= 2)[:2])
+
+    with piped() as pipe, ThreadPoolExecutor() as pool:
+        reader = pool.submit(read_two, pipe)
+        status, _, err = programs.call(*GIVEN, folder=tmp_path)
+        reader.result()
+    assert status == 0, err
     assert "standard output takes no more lines (Broken pipe): tracking ends here" in err
     assert "Traceback" not in err and "error:" not in err
     lines = (tmp_path / "out" / "track.jsonl").read_text().splitlines()

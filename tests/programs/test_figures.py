@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +11,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import programs
 from helpers.configured import f_measure, nearest_surface
+from helpers.programs import QUICK
 from helpers.tracking import ROOT, make_tracker, sample
 
 from toftrack.errors import ToftrackError
@@ -32,7 +32,6 @@ from toftrack.views.figures import chart
 from toftrack.views.skeleton import SLOT_RGB
 
 NAMES = ("measurement", "filmstrip", "lost", "course", "latent")
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 FRAMES = 12
 
 
@@ -49,16 +48,9 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = len(arrays["depth_m"])
     short = {key: v[:FRAMES] if v.ndim and len(v) == rows else v for key, v in arrays.items()}
     np.savez(folder / "hand.npz", **short)
-    done = subprocess.run(
-        [
-            *(sys.executable, str(ROOT / "track.py"), "device=replay", "device.path=hand.npz"),
-            *("view=none", "hydra.run.dir=run", *QUICK),
-        ],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    given = ("device=replay", "device.path=hand.npz", "view=none", "hydra.run.dir=run")
+    status, _, err = programs.call(*given, *QUICK, folder=folder)
+    assert status == 0, err
     return folder / "run"
 
 

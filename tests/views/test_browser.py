@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
@@ -173,12 +174,27 @@ def test_commands_arrive_in_order_and_once(view) -> None:
         ({"command": "left"}, {"Origin": "null"}, 403),
         ({"command": "left"}, {"Host": "evil.example", "Origin": "http://evil.example"}, 403),
         ({"command": "left"}, {"path": "elsewhere"}, 404),
+        ({"command": "left"}, {"X_Token": ""}, 403),
+        ({"command": "left"}, {"X_Token": "guessed"}, 403),
     ],
 )
 def test_anything_but_a_command_from_its_own_page_is_refused(view, body, changes, status) -> None:
     assert post(view, body, **changes) == status
     assert view.commands() == []
     assert post(view, {"command": "left"}) == 204
+
+
+def test_nothing_but_the_printed_address_says_the_token(view, capsys) -> None:
+    token = view.address.removeprefix(f"{view.url}#")
+    assert len(token) >= 16
+    view.show(moments()[0])
+    facts, picture = next_picture(view, {})
+    _, page = get(view, "")
+    assert token not in json.dumps(facts)
+    assert token.encode() not in picture + page
+    with closing(made()) as other:
+        assert other.address in capsys.readouterr().err
+        assert not other.address.endswith(token)
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])

@@ -16,6 +16,7 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, is_vacant
+from toftrack.json_text import parse_json
 
 _KINDS: dict[type, type] = {
     bool: np.bool_,
@@ -89,7 +90,7 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
             if not line.endswith(b"\n"):
                 return  # the run was killed, or the machine went down, while it was written
             try:
-                content = json.loads(line)
+                content = parse_json(line)
                 if not isinstance(content, dict):
                     raise ValueError("it is no object")
             except ValueError as error:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import datetime
 import json
 import os
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -18,9 +17,11 @@ from typing import Any, Self
 
 import numpy as np
 
+from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
+from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, LineFile, write_whole
 from toftrack.output.lines import KINDS, json_line, strict
 from toftrack.output.records import Records, write_archive
@@ -204,12 +205,12 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path).expanduser()
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            known = (*_FROM_THE_START, *(name for name in KINDS if name in archive))
-            names = (*dict.fromkeys(known), "joint_names", "metadata")
-            content: dict[str, Any] = {name: archive[name] for name in names}
+        arrays = read_archive(path, {*_FROM_THE_START, *KINDS, "joint_names", "metadata"})
+        known = (*_FROM_THE_START, *(name for name in KINDS if name in arrays))
+        names = (*dict.fromkeys(known), "joint_names", "metadata")
+        content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
-        content["metadata"] = json.loads(content["metadata"].item())
+        content["metadata"] = parse_json(content["metadata"].item())
     except OSError as error:
         raise ToftrackError(
             f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
@@ -219,7 +220,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         raise ToftrackError(
             f"'{path}' is not a track.npz of this toftrack: {error.args[0]}; give the path of one"
         ) from None
-    except (ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise ToftrackError(
             f"'{path}' is not a track.npz, or it is damaged; give the path of one"
         ) from error
@@ -230,7 +231,7 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
     """The content of a folder's run.json; ToftrackError when there is none that can be used."""
     path = folder / "run.json"
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = read_json(path)
     except FileNotFoundError:
         raise ToftrackError(
             f"'{folder}' is not the output folder of a run: it has no run.json; give a folder that "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -18,6 +17,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
+from toftrack.json_text import parse_json, read_json
 from toftrack.output.lines import HAND_FIELDS
 from toftrack.output.results import read_results, read_run_facts
 from toftrack.output.summary import shape_file
@@ -202,7 +202,7 @@ def read_run(folder: str | Path) -> Run:
     else:  # of an older version
         frames, names = _lines(folder / "track.jsonl", rows)
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_json(folder / "summary.json")
     except (OSError, ValueError) as error:
         raise ToftrackError(
             f"'{folder / 'summary.json'}' cannot be read ({error}); run track.py again"
@@ -222,7 +222,7 @@ def found_again(path: str | Path, ran_in: str | None) -> Path:
 def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
     """Frame numbers and state names for the rows of track.npz, which also has dropped frames."""
     try:
-        told = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        told = [parse_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
         index = np.array([int(line["index"]) for line in told])
         names = [str(line["state_name"]) for line in told]
     except (OSError, ValueError, KeyError, TypeError) as error:

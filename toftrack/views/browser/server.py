@@ -6,13 +6,16 @@
 | `GET /moment?run=R&after=N` | waits until there is news after version N of run R: 200 with the \
 newest picture (JPEG), 204 when only the facts are new or nothing is; the facts are JSON in the \
 header `X-Moment` |
-| `POST /command` | `{"command": "restart"}`; 204 when it was taken |
+| `POST /command` | `{"command": "restart"}`, and the token in the header `X-Token`; 204 when it \
+was taken |
 
 Pictures are asked for one by one rather than pushed: who is slow gets the newest one and skips the
 others, and a browser's six connections to a server are enough for any number of tabs.
 
 The server answers only those who call it by an address or as localhost, so that no other web site
-can reach it under a name of its own, and takes commands only from its own page.
+can reach it under a name of its own, and takes commands only from its own page. They need a token
+that nothing but the printed address carries: other users of the machine may watch, no more. It
+stands after `#`, which a browser keeps to itself.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
 from toftrack.views.base import COMMANDS
 
 _log = logging.getLogger(__name__)
@@ -94,6 +98,8 @@ class BrowserServer:
             raise _refused(host, port, error) from error
         at, free = map(str, self._server.server_address[:2])
         self.url = f"http://[{at}]:{free}/" if ":" in at else f"http://{at}:{free}/"
+        self.token = self._server.token
+        """What commands must carry."""
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="browser-server", daemon=True
         )
@@ -119,6 +125,7 @@ class _Server(ThreadingHTTPServer):
         self.address_family = family
         self.source, self.host = source, host
         self.run = secrets.token_hex(4)
+        self.token = secrets.token_urlsafe(12)
         self.page = (resources.files("toftrack.views.browser") / "page.html").read_bytes()
         self._connections: dict[threading.Thread, socket.socket] = {}
         self._lock = threading.Lock()
@@ -196,6 +203,8 @@ class _Handler(BaseHTTPRequestHandler):
         origin = self.headers.get("Origin")
         if origin is not None and origin != f"http://{self.headers.get('Host')}":
             self._refuse(403, "commands are taken from this server's own page only")
+        elif not self._carries_the_token():
+            self._refuse(403, "commands need the whole address that the tracker printed")
         elif self.headers.get_content_type() != "application/json":
             # Only this type makes a browser ask first when another site wants to send something.
             self._refuse(415, "a command is sent as application/json")
@@ -223,7 +232,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _command(self, body: bytes) -> None:
         try:
-            content = json.loads(body)
+            content = parse_json(body)
         except ValueError:
             content = None
         command = content.get("command") if isinstance(content, dict) else None
@@ -241,6 +250,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(413, f"a command has a Content-Length of at most {_MOST_COMMAND_BYTES}")
             return None
         return self.rfile.read(int(text))
+
+    def _carries_the_token(self) -> bool:
+        given = self.headers.get("X-Token", "")
+        return secrets.compare_digest(given.encode(), self.server.token.encode())
 
     def _called_by_a_known_name(self) -> bool:
         name = urlsplit(f"//{self.headers.get('Host', '')}").hostname or ""

@@ -69,7 +69,7 @@ def browser_view(
     """
     _check(port, quality, most_fps, wait_s, linger_s)
     view = BrowserView(host, port, quality, most_fps, linger_s)
-    print(f"live view: {view.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    print(f"live view: {view.address} (Ctrl-C ends)", file=sys.stderr, flush=True)
     if frames is not None and wait_s > 0:
         print(f"waiting up to {wait_s:g} s for it to be opened", file=sys.stderr, flush=True)
         try:
@@ -94,6 +94,9 @@ class BrowserView:
             self._picture.close()
             raise
         self.url = self._server.url
+        """Where the page is; without its commands."""
+        self.address = f"{self.url}#{self._server.token}"
+        """Where it is with them."""
 
     def wait_for_visitor(self, timeout_s: float) -> bool:
         """Wait until somebody has opened the page; False when nobody did in time."""
