@@ -25,6 +25,7 @@ from toftrack.output.smoothing import OneEuro, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import endings
 from toftrack.programs.run_facts import ShapeFile, opening, run_metadata
+from toftrack.tracking.conventions import in_all_conventions
 from toftrack.tracking.tracker import Tracker
 from toftrack.views.base import TrackedFrame, View
 
@@ -119,6 +120,9 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
                 parts.watch.see(estimate, depth, tracker.insight)
                 smoothed, calm = smooth(smoothing, smoothed, estimate, shape)
+                if calm is not estimate:
+                    size_px = depth.shape[1], depth.shape[0]
+                    calm = in_all_conventions(calm, shape, device.camera.K, size_px)
                 if smoothing is not None and smoothing.results:
                     estimate = calm
                 results.append(estimate)
