@@ -51,8 +51,12 @@ def json_line(estimate: Estimate, names: Sequence[str] = LINE_FIELDS) -> str:
 
     names: which of LINE_FIELDS, in this order.
     """
-    content = {name: strict(getattr(estimate, name)) for name in names}
-    return json.dumps(content, allow_nan=False, separators=(",", ":"))
+    return json.dumps(line_content(estimate, names), allow_nan=False, separators=(",", ":"))
+
+
+def line_content(estimate: Estimate, names: Sequence[str] = LINE_FIELDS) -> dict[str, Any]:
+    """What a line says, as JSON has it."""
+    return {name: strict(getattr(estimate, name)) for name in names}
 
 
 def read_lines(path: Path) -> Iterator[dict[str, Any]]:

@@ -75,7 +75,7 @@ class StdoutStream:
     """
 
     def __init__(self, fields: Sequence[str] | None, waiting: int) -> None:
-        self._fields = _known(fields)
+        self._fields = known_fields(fields)
         if not isinstance(waiting, int) or waiting < 1:
             raise ToftrackError(f"stream.waiting={waiting!r} is no number of lines; give 1 or more")
         if not hasattr(select, "PIPE_BUF"):
@@ -112,7 +112,7 @@ class StdoutStream:
         os.dup2(self._descriptor, _STDOUT)
         os.close(self._descriptor)
         dropped = self._dropped + len(self._lines) + bool(self._rest)
-        _tell(self._sent, "to standard output", dropped, "the reader was too slow")
+        told(self._sent, "to standard output", dropped, "the reader was too slow")
 
     def _write(self, until: float) -> None:
         """Write what waits; give up when there is no room for more, at that time at the latest."""
@@ -143,7 +143,7 @@ class UdpStream:
     """
 
     def __init__(self, host: str, port: int, fields: Sequence[str] | None) -> None:
-        self._fields = _known(fields)
+        self._fields = known_fields(fields)
         if not isinstance(port, int) or not 1 <= port <= 65535:
             raise ToftrackError(f"stream.port={port!r} is no port; give a number from 1 to 65535")
         try:
@@ -168,24 +168,28 @@ class UdpStream:
     def send(self, estimate: Estimate) -> None:
         """Send a datagram; one that the system does not take at once is dropped."""
         assert self._socket is not None, "send within `with`"
-        line = (json_line(estimate, self._fields) + "\n").encode()
         try:
-            self._socket.sendto(line, self._address)
+            self._socket.sendto(self.datagram(estimate), self._address)
         except OSError as error:  # its buffer is full, or there is no network just now
             self._dropped += 1
             self._reason = error.strerror or str(error)
         else:
             self._sent += 1
 
+    def datagram(self, estimate: Estimate) -> bytes:
+        """What is sent."""
+        return (json_line(estimate, self._fields) + "\n").encode()
+
     def __exit__(self, *exception: Any) -> None:
         assert self._socket is not None
         self._socket.close()
         self._socket = None
         host, port = self._address[:2]
-        _tell(self._sent, f"to {host} port {port}", self._dropped, self._reason)
+        told(self._sent, f"to {host} port {port}", self._dropped, self._reason)
 
 
-def _known(fields: Sequence[str] | None) -> tuple[str, ...]:
+def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
+    """The fields that a setting names, of lines.LINE_FIELDS; ToftrackError for an unknown one."""
     if fields is None:
         return LINE_FIELDS
     names = (fields,) if isinstance(fields, str) else tuple(fields)
@@ -213,6 +217,7 @@ def _claim_stdout() -> int:
     return own
 
 
-def _tell(sent: int, where: str, dropped: int, reason: str) -> None:
+def told(sent: int, where: str, dropped: int, reason: str) -> None:
+    """Log how many estimates were sent at the end of a stream."""
     why = f" ({reason})" if dropped else ""
     _log.info("stream: %d estimates sent %s, %d dropped%s", sent, where, dropped, why)
