@@ -32,7 +32,7 @@ class Estimate:
     lost: bool
     """Not to be used: no hand, or a joint that is likely off by more than 40 mm."""
     joints_m: np.ndarray
-    """(21, 3) float32 metres, camera frame, in the order of the recordings, which is MediaPipe's."""
+    """(21, 3) float32 metres, camera frame, in the order of JOINT_NAMES, which is MediaPipe's."""
     state: np.ndarray
     """(27,) float32: translation (3, m), rotation vector (3, rad), joint angles (21, rad)."""
     latent: np.ndarray

@@ -49,6 +49,8 @@ _METACARPAL = np.array([0.374, 0.373, 0.336, 0.295])
 _INWARD = np.array([0.126 / 0.252, 1.0, 0.129 / 0.206, 0.223 / 0.402])
 """Distance of the metacarpal's base from the middle finger's ray, in that of its knuckle."""
 
+_NEIGHBOURHOOD_M = np.linspace(-0.008, 0.008, 5)
+"""Places along the bone at which the flesh about a joint is measured."""
 _WORLD = np.array([1.0, -1.0, -1.0])
 """The camera's axes in the world's: half a turn about x."""
 
@@ -177,9 +179,10 @@ def _hinges(ways: np.ndarray, bases: np.ndarray, state: np.ndarray) -> np.ndarra
 def openxr_rig(shape: HandShape) -> OpenXRRig:
     """What openxr_hand needs of a shape: milliseconds for a new one, kept for one that was met.
 
-    A joint's radius is half of the flesh's thickness there, through the joint from the nail's side
-    to the other, with straight fingers. A fingertip's joint lies so far inside the tip that a
-    sphere of its radius touches both the tip and the skin on either side.
+    A joint's radius is half of the flesh's thickness from the nail's side to the other, with
+    straight fingers, in the mean over the joint's neighbourhood, since ellipsoids leave a waist
+    where they meet. A fingertip's joint lies so far inside the tip that a sphere of its radius
+    touches both the tip and the skin on either side.
     """
     shape = shape.to("cpu", torch.float64)
     base = shape.base_m.numpy()
@@ -205,8 +208,11 @@ def openxr_rig(shape: HandShape) -> OpenXRRig:
     rig = rig._replace(radius_m=radius)
     joints = rest.joints_m.numpy()
     hand = openxr_hand(joints[0], np.zeros(27), rig)
-    up = Rotation.from_quat(hand.orientation).as_matrix()[:, :, 1]
-    thickness = _thickness(_WORLD * hand.position_m, _WORLD * up, flesh)
+    _, up, back = np.moveaxis(Rotation.from_quat(hand.orientation).as_matrix(), 2, 0)
+    points = hand.position_m + _NEIGHBOURHOOD_M[:, None, None] * back
+    ways = np.broadcast_to(_WORLD * up, points.shape)
+    thickness = _thickness((_WORLD * points).reshape(-1, 3), ways.reshape(-1, 3), flesh)
+    thickness = thickness.reshape(-1, 26).mean(0)
     return rig._replace(radius_m=np.where(radius > 0, radius, thickness / 2))
 
 

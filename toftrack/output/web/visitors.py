@@ -10,7 +10,7 @@ from toftrack.errors import ToftrackError
 
 
 def called_by_a_known_name(host_header: str, host: str) -> bool:
-    """Whether a request is addressed to this machine by an address, as localhost, or as it was told.
+    """Whether a request calls this machine by an address, as localhost, or as `host`.
 
     Else another web site could reach the server under a name of its own.
     """
