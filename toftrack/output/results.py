@@ -27,6 +27,7 @@ from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate
 from toftrack.output.files import LINES, LineFile, write_whole
 from toftrack.output.lines import KINDS, json_line, strict
+from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.records import Records, write_archive
 from toftrack.output.trust import Hand, trust
 
@@ -155,7 +156,7 @@ def finish(folder: Path, facts: dict[str, Any], truth: Truth | None) -> dict[str
         small = {
             "joint_names": np.array(facts["joint_names"], np.str_),
             "metadata": np.array(json.dumps(metadata)),
-        }
+        } | facts_for_readers(metadata)
         summary = _summarise(records, rows, len(held)) | _hand(folder, metadata)
         if truth is not None and len(rows):
             metrics = _metrics(records, rows, changed["index"], truth)

@@ -60,7 +60,7 @@ class StdoutStream:
 
     Whatever else this process prints, its libraries included, goes to standard error meanwhile.
 
-    A reader that falls behind fills the operating system's pipe first (64 KiB on Linux, about 13
+    A reader that falls behind fills the operating system's pipe first (64 KiB on Linux, about 7
     lines). Then `waiting` lines wait for the next call of `send`, and when there are more, the
     oldest of them is dropped, so that the reader gets the newest. If it still does not read at the
     end, its last line may be cut short.
