@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 from toftrack.errors import ToftrackError
 from toftrack.output.exports.bvh import bvh_of
@@ -44,12 +46,16 @@ def export(folder: Path, kind: str) -> list[Path]:
     contents = _contents(read_run(folder), kind)
     try:
         for name, content in contents.items():
-            write_whole(folder / name, lambda stream, content=content: stream.write(content))
+            write_whole(folder / name, partial(_write, content))
     except OSError as error:
         raise ToftrackError(
             f"'{folder}' cannot be written ({error.strerror or error}); copy it to where it can be"
         ) from error
     return [folder / name for name in contents]
+
+
+def _write(content: bytes, stream: BinaryIO) -> None:
+    stream.write(content)
 
 
 def _contents(run: Run, kind: str) -> dict[str, bytes]:
