@@ -11,6 +11,7 @@ from toftrack.hand.openxr import (
     OPENXR_JOINT_NAMES,
     OPENXR_PARENTS,
     OpenXRHand,
+    _quaternions,
     openxr_hand,
     openxr_rig,
 )
@@ -227,6 +228,16 @@ def test_a_radius_is_the_distance_to_the_hand_s_own_skin() -> None:
         through = [depth(middle + part * radius * up) for part in np.linspace(-3, 3, 601)]
         assert np.mean(np.array(through) < 1) * 6 / 2 == pytest.approx(1, abs=0.03)
         assert depth(middle - 0.9 * radius * back) < 1.1
+
+
+def test_quaternions_are_those_of_any_rotation() -> None:
+    turns = np.random.default_rng(0).normal(size=(200, 4))
+    # Half and quarter turns about the axes, and none.
+    turns = np.r_[turns, np.eye(4), np.eye(4) + np.eye(4)[3], np.eye(4) - np.eye(4)[3] + 1e-12]
+    rotations = Rotation.from_quat(turns).as_matrix()
+    found = _quaternions(rotations.reshape(-1, 9))
+    assert np.allclose(Rotation.from_quat(found).as_matrix(), rotations)
+    assert (found[:, 3] >= 0).all() and np.allclose(np.linalg.norm(found, axis=1), 1)
 
 
 def test_a_larger_hand_has_larger_radii() -> None:
