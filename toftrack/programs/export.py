@@ -62,7 +62,7 @@ def _contents(run: Run, kind: str) -> dict[str, bytes]:
     """What each file is to hold, by its name."""
     if kind == "csv":
         return {"hand.csv": csv_of(run.results).encode()}
-    motions = motions_of(run.results, run.shape)
+    motions = motions_of(run.results, (run.shape,))
     if kind == "glb":
         return {"hand.glb": glb_of(motions)}
     if len(motions) == 1:

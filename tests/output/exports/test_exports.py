@@ -92,7 +92,7 @@ class Gltf:
 
 def exported(estimates: list[Estimate], side: str) -> Gltf:
     pytest.importorskip("pygltflib", reason="pip install '.[export]'")
-    return Gltf(glb_of(motions_of(results_of(estimates), shape_of(side))))
+    return Gltf(glb_of(motions_of(results_of(estimates), (shape_of(side),))))
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
@@ -162,7 +162,7 @@ def test_each_of_several_hands_has_a_skeleton_of_its_own() -> None:
     both = {name: np.stack([hand[name] for hand in hands], 1) for name in NAMES if name != "index"}
     both |= {"timestamp_s": hands[0]["timestamp_s"], "index": hands[0]["index"]}
     both["joint_names"] = JOINT_NAMES
-    motions = motions_of(both, shape_of("right"))
+    motions = motions_of(both, (shape_of("right"), shape_of("right")))
     assert [motion.shape.side for motion in motions] == ["right", "left"]
     pytest.importorskip("pygltflib", reason="pip install '.[export]'")
     gltf = Gltf(glb_of(motions))
@@ -181,12 +181,12 @@ def test_each_of_several_hands_has_a_skeleton_of_its_own() -> None:
 
 def test_a_run_without_a_hand_is_told() -> None:
     with pytest.raises(ToftrackError, match="nothing to export"):
-        motions_of(results_of([lost_hand(0), lost_hand(1)]), shape_of("right"))
+        motions_of(results_of([lost_hand(0), lost_hand(1)]), (shape_of("right"),))
 
 
 def test_frames_whose_times_stand_still_are_laid_out_evenly() -> None:
     estimates = [replace(hand, timestamp_s=hand.index % 4 / 25) for hand in moving()]
-    (motion,) = motions_of(results_of(estimates), shape_of("right"))
+    (motion,) = motions_of(results_of(estimates), (shape_of("right"),))
     assert np.allclose(motion.time_s, np.arange(8) / 25)
 
 
@@ -225,7 +225,7 @@ def read_bvh(text: str) -> tuple[list[str], np.ndarray]:
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_a_bvh_puts_the_joints_where_they_were(side: str) -> None:
     estimates = moving(side)
-    (motion,) = motions_of(results_of(estimates), shape_of(side))
+    (motion,) = motions_of(results_of(estimates), (shape_of(side),))
     text = bvh_of(motion)
     names, found = read_bvh(text)
     letter = side[0].upper()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,11 +43,11 @@ class HandMotion:
         return f"{joint.title()}_{self.shape.side[0].upper()}"
 
 
-def motions_of(results: Mapping[str, Any], shape: HandShape) -> list[HandMotion]:
+def motions_of(results: Mapping[str, Any], shapes: Sequence[HandShape]) -> list[HandMotion]:
     """The hands of a run's results, those that were tracked at all.
 
     results: of a track.npz; arrays of several hands have a second axis.
-    shape: the run's hand.
+    shapes: the run's hands, one a slot.
 
     Raises ToftrackError when there is none.
     """
@@ -59,7 +59,7 @@ def motions_of(results: Mapping[str, Any], shape: HandShape) -> list[HandMotion]
         slots = range(arrays["lost"].shape[1])
         hands = [{name: array[:, slot] for name, array in arrays.items()} for slot in slots]
     time_s = _times(np.asarray(results["timestamp_s"], np.float64))
-    motions = (_motion(hand, shape, time_s) for hand in hands)
+    motions = (_motion(*one, time_s) for one in zip(hands, shapes, strict=True))
     found = [motion for motion in motions if motion is not None]
     if not found:
         raise ToftrackError(
