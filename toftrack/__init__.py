@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from toftrack.errors import ToftrackError
     from toftrack.estimate import Estimate
     from toftrack.frames import Frame
+    from toftrack.hand.openxr import OPENXR_JOINT_NAMES
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.output.results import read_results
     from toftrack.tracking.tracker import Tracker
@@ -37,6 +38,7 @@ _PLACES = {
     "Estimate": "toftrack.estimate",
     "Frame": "toftrack.frames",
     "JOINT_NAMES": "toftrack.hand.skeleton",
+    "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
     "ToftrackError": "toftrack.errors",
     "Tracker": "toftrack.tracking.tracker",
     "make_device": "toftrack.api",
@@ -51,6 +53,7 @@ __all__ = [
     "Estimate",
     "Frame",
     "JOINT_NAMES",
+    "OPENXR_JOINT_NAMES",
     "ToftrackError",
     "Tracker",
     "__version__",
