@@ -24,6 +24,7 @@ ALLOWED_SKIPS = (
     r"pyrealsense2",  # the error's own sentence names it
     r"rerun-sdk is not installed|of the extra rerun|this rerun-sdk reads files in another way",
     r"pip install '.\[browser-test\]'|needs chromium and chromedriver",
+    r"pip install '.\[(osc|web|export)\]'",
     r"there is no C compiler",
     r"needs /dev/full|needs /proc",
     r"a camera is plugged in",

@@ -20,6 +20,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from helpers.hands import hand_estimate, lost_hand
 from helpers.programs import QUICK
 from helpers.tracking import ROOT, configuration, run
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -30,7 +31,9 @@ from hydra.plugins.launcher import Launcher
 from toftrack.api import make_device
 from toftrack.devices.sample import Sample
 from toftrack.estimate import no_estimate
+from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import json_line
+from toftrack.output.results import ResultWriter
 from toftrack.programs import convert
 from toftrack.recordings.npz import read_recording
 
@@ -283,3 +286,14 @@ def test_the_program_in_python_tracks(
     exec(compile(few, "README.md", "exec"), {})
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == 4 and all(line.split()[0] != "lost" for line in printed)
+
+
+def test_results_are_read_without_this_package_as_it_is_shown(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with ResultWriter(tmp_path, {}, JOINT_NAMES) as results:
+        for estimate in (lost_hand(0), hand_estimate(1), hand_estimate(2)):
+            results.append(estimate)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block("npz"), "exports.md", "exec"), {})
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["1", "2"]

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from toftrack.errors import ToftrackError
     from toftrack.estimate import Estimate
     from toftrack.frames import Frame
+    from toftrack.hand.openxr import OPENXR_JOINT_NAMES
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.output.results import read_results
     from toftrack.tracking.hands import HandsTracker
@@ -45,6 +46,7 @@ _PLACES = {
     "Estimate": "toftrack.estimate",
     "Frame": "toftrack.frames",
     "JOINT_NAMES": "toftrack.hand.skeleton",
+    "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
     "ToftrackError": "toftrack.errors",
     "HandsTracker": "toftrack.tracking.hands",
     "Tracker": "toftrack.tracking.tracker",
@@ -62,6 +64,7 @@ __all__ = [
     "Frame",
     "HandsTracker",
     "JOINT_NAMES",
+    "OPENXR_JOINT_NAMES",
     "ToftrackError",
     "Tracker",
     "__version__",

@@ -48,7 +48,7 @@ _ABOVE_ZERO = frozenset(
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
     start.hypotheses start.islands start.memory_rad start.memory_s start.samples
-    stream.port stream.waiting
+    stream.waiting
     view.most_fps view.quality
     """.split()
 )

@@ -59,7 +59,9 @@ def json_line(estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS)
     return json.dumps(content, allow_nan=False, separators=(",", ":"))
 
 
-def line_content(estimates: Sequence[Estimate], names: Sequence[str]) -> dict[str, Any]:
+def line_content(
+    estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS
+) -> dict[str, Any]:
     """What a line says: of one slot its fields; of two the frame's, and `hands`, those that are
     there, each with its slot and its side.
     """

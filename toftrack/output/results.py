@@ -24,6 +24,7 @@ from toftrack.frames import Truth
 from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, LineFile, write_whole
 from toftrack.output.lines import KINDS, json_line, strict
+from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.records import Records, write_archive
 from toftrack.output.summary import run_metrics, summarise
 
@@ -156,7 +157,7 @@ def finish(folder: Path, facts: dict[str, Any], truth: Truth | None) -> dict[str
         small = {
             "joint_names": np.array(facts["joint_names"], np.str_),
             "metadata": np.array(json.dumps(metadata)),
-        }
+        } | facts_for_readers(metadata)
         summary = summarise(records, len(rows), len(held), folder, metadata)
         if truth is not None and len(rows):
             metrics = run_metrics(records, rows, changed["index"], truth)

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import hydra
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -27,6 +28,7 @@ from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import endings
 from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata, told_side
+from toftrack.tracking.conventions import in_all_conventions
 from toftrack.tracking.hands import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 
@@ -124,7 +126,11 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 parts.watch.see(estimates, depth, tracker.insights)
                 every = zip(smoothed, estimates, shapes, strict=True)
                 made = [smooth(smoothing, *one) for one in every]
-                smoothed, calm = tuple(one[0] for one in made), tuple(one[1] for one in made)
+                smoothed = tuple(one[0] for one in made)
+                calm = tuple(
+                    _in_all_conventions(one[1], found, shape, device.camera.K, depth)
+                    for one, found, shape in zip(made, estimates, shapes, strict=True)
+                )
                 if smoothing is not None and smoothing.results:
                     estimates = calm
                 results.append(estimates)
@@ -134,6 +140,15 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 view.show(TrackedFrame(frame, depth, device.camera, hands))
                 bar.update()
                 bar.set_postfix_str(_progress_words(estimates), refresh=False)
+
+
+def _in_all_conventions(
+    smoothed: Estimate, found: Estimate, shape: HandShape, k: np.ndarray, depth_m: np.ndarray
+) -> Estimate:
+    """What follows from the smoothed joints, too; nothing to do where nothing was smoothed."""
+    if smoothed is found:
+        return found
+    return in_all_conventions(smoothed, shape, k, (depth_m.shape[1], depth_m.shape[0]))
 
 
 def _of_estimate(shape: HandShape, estimate: Estimate) -> HandShape:

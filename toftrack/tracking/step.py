@@ -20,6 +20,7 @@ from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter, shape_fit, size_fit
 from toftrack.tracking.belief import CalibratedBelief
+from toftrack.tracking.conventions import in_all_conventions
 from toftrack.tracking.following import (
     Found,
     advanced,
@@ -113,6 +114,8 @@ def step(
         side_probability=side_probability,
         compute_s=spans.total(),
     )
+    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
+    estimate = in_all_conventions(estimate, hand.shape, image.k, size_px)
     after = replace(
         state,
         generator=generator.get_state(),

@@ -20,8 +20,6 @@ stands after `#`, which a browser keeps to itself.
 
 from __future__ import annotations
 
-import errno
-import ipaddress
 import json
 import logging
 import os
@@ -36,8 +34,8 @@ from importlib import resources
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
-from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
+from toftrack.output.web.visitors import called_by_a_known_name, refused
 from toftrack.views.base import COMMANDS
 
 _log = logging.getLogger(__name__)
@@ -95,7 +93,7 @@ class BrowserServer:
             family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
             self._server = _Server(source, host, family, address)
         except OSError as error:
-            raise _refused(host, port, error) from error
+            raise refused("view", host, port, error) from error
         at, free = map(str, self._server.server_address[:2])
         self.url = f"http://[{at}]:{free}/" if ":" in at else f"http://{at}:{free}/"
         self.token = self._server.token
@@ -256,8 +254,7 @@ class _Handler(BaseHTTPRequestHandler):
         return secrets.compare_digest(given.encode(), self.server.token.encode())
 
     def _called_by_a_known_name(self) -> bool:
-        name = urlsplit(f"//{self.headers.get('Host', '')}").hostname or ""
-        known = name in ("localhost", self.server.host.lower()) or _is_address(name)
+        known = called_by_a_known_name(self.headers.get("Host", ""), self.server.host)
         if not known:
             self._refuse(403, "this server answers to its address and to localhost only")
         return known
@@ -288,28 +285,3 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
-def _refused(host: str, port: int, error: OSError) -> ToftrackError:
-    if error.errno == errno.EADDRINUSE:
-        return ToftrackError(
-            f"port {port} of {host} is taken, perhaps by another tracker; end that one, or choose "
-            "another with view.port=PORT (0 = any free one)"
-        )
-    if error.errno == errno.EACCES:
-        return ToftrackError(
-            f"port {port} of {host} may not be used; choose one above 1023 with view.port=PORT "
-            "(0 = any free one)"
-        )
-    return ToftrackError(
-        f"the page cannot be served at view.host={host} ({error.strerror or error}); give an "
-        "address of this machine, or leave it at 127.0.0.1"
-    )
