@@ -64,7 +64,7 @@ def read(data: bytes) -> dict[str, list[Any]]:
 def sent(receiver: socket.socket, estimate: Estimate, **changes: Any) -> dict[str, list[Any]]:
     host, port = receiver.getsockname()
     with osc_stream(host=host, port=port, **changes) as stream:
-        stream.send(estimate)
+        stream.send((estimate,))
         return read(receiver.recv(65535))
 
 
@@ -111,7 +111,7 @@ def test_landmarks_and_the_joints_of_openxr_are_told_on_demand(receiver: socket.
 
 def test_each_of_several_hands_has_addresses_of_its_own() -> None:
     frame = ("index", "timestamp_s")
-    hands = [line_content(hand_estimate(5, side)) for side in ("right", "left")]
+    hands = [line_content((hand_estimate(5, side),)) for side in ("right", "left")]
     line = {name: hands[0][name] for name in frame} | {
         "hands": [
             {name: value for name, value in hand.items() if name not in frame} | {"slot": slot}

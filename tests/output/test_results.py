@@ -116,7 +116,7 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
 def test_a_reader_without_this_package_can_draw_the_hand_into_the_image(tmp_path: Path) -> None:
     camera = {"K": [[200.0, 0, 87.5], [0, 210.0, 71.5], [0, 0, 1]], "width": 176, "height": 144}
     with ResultWriter(tmp_path, {"camera": camera}, JOINT_NAMES) as writer:
-        writer.append(hand_estimate(3))
+        writer.append((hand_estimate(3),))
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
         run = dict(archive)
     assert all(word in str(run["readme"]) for word in ("Metres", "x right, y down", "u = K"))

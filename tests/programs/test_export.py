@@ -20,7 +20,7 @@ def run(tmp_path: Path) -> Path:
     with ResultWriter(folder, {"config": {}}, JOINT_NAMES) as results:
         default_hand_shape().save(folder / "hand_shape.json")
         for index in range(5):
-            results.append(hand_estimate(index))
+            results.append((hand_estimate(index),))
     return folder
 
 
@@ -43,7 +43,7 @@ def test_what_is_no_run_or_has_no_hand_is_told(run: Path, tmp_path: Path) -> Non
     with pytest.raises(ToftrackError, match="is not the output folder of a run"):
         export.main([str(tmp_path), "--to", "csv"])
     with ResultWriter(run, {}, JOINT_NAMES) as results:
-        results.append(lost_hand(0))
+        results.append((lost_hand(0),))
     with pytest.raises(ToftrackError, match="nothing to export"):
         export.main([str(run), "--to", "bvh"])
 

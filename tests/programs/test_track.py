@@ -124,7 +124,7 @@ def test_track_npz_is_as_promised(whole) -> None:
     assert metadata["device"]["device"] == "sample" and metadata["device"]["stop"] == 12
     assert metadata["pose_space"] == {"kind": "pca", "dims": 4}
     assert metadata["camera"]["width"] == 176 and metadata["camera"]["K"][0][0] == 200
-    assert metadata["hand_shape"]["side"] == "right"
+    assert metadata["hand_shape"]["side"] == "auto"
 
 
 def test_track_jsonl_says_the_same_a_line_a_frame(whole) -> None:

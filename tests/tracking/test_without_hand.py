@@ -89,6 +89,7 @@ def test_tiny_images_are_lost_and_no_error(shape: tuple[int, int]) -> None:
     tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
     k = scene.k.copy()
     k[:2, 2] = (shape[1] / 2, shape[0] / 2)
+    k[0, 0] = k[1, 1] = 2 * max(shape)
     for i in range(1, 4):
         tiny = np.full(shape, 0.5, np.float32)
         estimate = tracker.step(tiny, k, i, i / 25)

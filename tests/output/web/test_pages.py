@@ -62,7 +62,7 @@ def picture(browser: Any) -> np.ndarray:
 
 def settled(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
     def send() -> None:
-        stream.send(estimate)
+        stream.send((estimate,))
 
     told = f"window.drawn?.index === {estimate.index}"
     for _ in range(40):  # the view follows the hand smoothly
@@ -93,13 +93,13 @@ def test_several_hands_are_drawn(stream: Any, page: Any, monkeypatch: Any) -> No
     from toftrack.output.web import stream as module
 
     def both(estimate: Estimate, _: Any) -> str:
-        hands = [lines.line_content(hand_estimate(0, side)) for side in ("right", "left")]
+        hands = [lines.line_content((hand_estimate(0, side),)) for side in ("right", "left")]
         content = {"index": estimate.index, "timestamp_s": 0.0, "hands": hands}
         return lines.json.dumps(content)
 
     monkeypatch.setattr(module, "json_line", both)
     page.get(stream.url)
-    shown(page, "window.drawn?.hands === 2", lambda: stream.send(hand_estimate(9)))
+    shown(page, "window.drawn?.hands === 2", lambda: stream.send((hand_estimate(9),)))
 
 
 def pointing(index: int, x: float, y: float, **changes: Any) -> Estimate:
@@ -123,7 +123,7 @@ def test_the_cursor_follows_the_ray_and_a_pinch_presses(stream: Any, page: Any) 
         count += 1
         nowhere = {name: np.full(3, np.nan) for name in ("pointing_origin_m", "pointing_direction")}
         changes = {"pinching": True, **nowhere} if pinch else {}  # who pinches does not point
-        stream.send(pointing(count, x, y, **changes))
+        stream.send((pointing(count, x, y, **changes),))
 
     for hits in range(3):
         at = page.execute_script("return game.target")
@@ -154,7 +154,7 @@ def test_a_ray_away_from_the_screen_moves_no_cursor(stream: Any, page: Any) -> N
     page.get(f"{stream.url}point?seed=3")
     away = {"pointing_origin_m": np.array([0, 0, 0.5]), "pointing_direction": np.array([0, -1, 0])}
     estimate = replace(hand_estimate(1), gesture="pointing", **away)
-    shown(page, "game.index === 1", lambda: stream.send(estimate))
+    shown(page, "game.index === 1", lambda: stream.send((estimate,)))
     assert page.execute_script("return game.cursor") is None
     assert not page.find_element("id", "cursor").is_displayed()
 
@@ -162,7 +162,7 @@ def test_a_ray_away_from_the_screen_moves_no_cursor(stream: Any, page: Any) -> N
 def test_the_pages_say_when_the_tracker_has_gone(browser: Any, tmp_path: Path) -> None:
     with part("stream=websocket", "stream", port=0) as stream:
         browser.get(stream.url)
-        shown(browser, "window.drawn", lambda: stream.send(hand_estimate(1)))
+        shown(browser, "window.drawn", lambda: stream.send((hand_estimate(1),)))
     gone = "document.body.dataset.phase === 'broken'"
     shown(browser, gone, lambda: None)
     browser.get("data:,")

@@ -69,14 +69,14 @@ def test_every_client_gets_every_line_as_in_track_jsonl(stream: WebSocketStream)
     with listening(stream) as first, listening(stream) as second:
         for index in range(20):
             estimate = hand_estimate(index) if index % 3 else lost_hand(index)
-            stream.send(estimate)
+            stream.send((estimate,))
             for one in (first, second):
-                assert one.recv(PATIENCE_S) == json_line(estimate)
+                assert one.recv(PATIENCE_S) == json_line((estimate,))
 
 
 def test_only_the_wanted_fields_are_sent() -> None:
     with websocket_stream(fields=["index", "pinching"]) as stream, listening(stream) as one:
-        stream.send(hand_estimate(3))
+        stream.send((hand_estimate(3),))
         assert json.loads(one.recv(PATIENCE_S)) == {"index": 3, "pinching": False}
 
 
@@ -85,14 +85,14 @@ def test_a_client_that_leaves_disturbs_nobody(stream: WebSocketStream) -> None:
         with listening(stream) as leaves:
             leaves.socket.shutdown(socket.SHUT_RDWR)
             eventually(lambda: len(stream._clients) == 1)
-        stream.send(hand_estimate(1))
+        stream.send((hand_estimate(1),))
         assert json.loads(stays.recv(PATIENCE_S))["index"] == 1
 
 
 def test_what_a_client_sends_is_not_looked_at(stream: WebSocketStream) -> None:
     with listening(stream) as one:
         one.send("restart")
-        stream.send(hand_estimate(1))
+        stream.send((hand_estimate(1),))
         assert json.loads(one.recv(PATIENCE_S))["index"] == 1
 
 
@@ -112,7 +112,7 @@ def test_a_client_that_never_reads_stops_nothing_and_its_oldest_lines_go(
         )
         eventually(lambda: stream._clients)
         for index in range(1500):
-            stream.send(replace(estimate, index=index))
+            stream.send((replace(estimate, index=index),))
     words = caplog.text.split()
     sent, dropped = (int(words[words.index(word) - 1]) for word in ("estimates", "dropped"))
     assert sent + dropped >= 1499 and dropped > 100  # one may have been on its way
@@ -122,7 +122,7 @@ def test_nothing_is_made_while_nobody_listens(
     stream: WebSocketStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("toftrack.output.web.stream.json_line", lambda *_: pytest.fail("made"))
-    stream.send(hand_estimate(0))
+    stream.send((hand_estimate(0),))
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_its_own_pages_and_those_that_are_named_may_listen() -> None:
         own = f"http://{urlsplit(stream.url).netloc}"
         for origin in (own, "http://localhost:3000"):
             with listening(stream, Origin=origin) as one:
-                stream.send(hand_estimate(4))
+                stream.send((hand_estimate(4),))
                 assert json.loads(one.recv(PATIENCE_S))["index"] == 4
 
 
@@ -173,7 +173,7 @@ def test_the_last_lines_arrive_and_then_everything_ends() -> None:
         with websocket_stream() as stream:
             one = clients.enter_context(listening(stream))
             for index in range(10):
-                stream.send(hand_estimate(index))
+                stream.send((hand_estimate(index),))
         found = [json.loads(message)["index"] for message in one]
     assert found == list(range(10))
     assert not any(t.name == "websocket-server" for t in threading.enumerate())
