@@ -28,8 +28,10 @@ def one_hand(
 
 
 def two_hands(moment: TrackedFrame, shift_m: float = 0.15, **changes: Any) -> TrackedFrame:
-    """The moment with a second hand of the other side beside the first one, and with changes."""
-    first = moment.hands[0]
+    """The moment with a second hand of the other side beside the first one, and with changes; both
+    sides as if they were told.
+    """
+    first = with_hand(moment, estimate=replace(moment.estimates[0], side_probability=1.0)).hands[0]
     move = np.array([shift_m, 0, 0], np.float32)
     state = first.estimate.state.copy()
     state[:3] += move

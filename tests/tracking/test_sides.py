@@ -55,6 +55,16 @@ def test_a_wrong_side_is_changed_in_one_frame_and_the_fingers_with_it() -> None:
     assert errors_mm(estimates, scene)[changed] < 20.0, "the fingers are renamed in that frame"
 
 
+def test_a_side_that_is_told_at_a_restart_stays_told() -> None:
+    scene, tracker = first(4), make_tracker(*SMALL)
+    tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
+    tracker.restart("left")
+    for i in (1, 2):
+        estimate = tracker.step(scene.depth_m[i], scene.k, i, i / 25)
+        assert (estimate.side, estimate.side_probability) == ("left", 1.0)
+        tracker.restart()
+
+
 def test_without_networks_a_hand_is_taken_for_a_right_one_and_nobody_is_sure() -> None:
     quick = ("relocation=none", "lost=score", "start.hypotheses=600", "start.samples=128")
     estimate = follow(first(1), *quick)[0]

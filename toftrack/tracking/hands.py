@@ -162,12 +162,9 @@ class HandsTracker:
         """Forget the hands, see Tracker.restart; a side is the first one's."""
         first, *others = self.states
         first = restarted(first, self.model, side)
-        self.state = HandsState(
-            (
-                first,
-                *(restarted(state, self.model, OTHER_SIDE[first.side]) for state in others),
-            )
-        )
+        other = OTHER_SIDE[first.side]
+        others = [restarted(state, self.model, side and other) for state in others]
+        self.state = HandsState((first, *(replace(state, side=other) for state in others)))
         self.infos = (None,) * len(self.states)
 
     @property

@@ -109,10 +109,13 @@ def fitted_hand(state: TrackerState, model: TrackerModel) -> HandShape:
 
 def restarted(state: TrackerState, model: TrackerModel, side: str | None = None) -> TrackerState:
     """A state that has seen nothing, but for its random and frame numbers; of a side if one is
-    given.
+    given, which is told from then on.
 
     Raises ToftrackError for an unknown side.
     """
-    side = state.side if side is None else model.shape.of_side(side).side
-    first = replace(first_state(model, 0), side=side)
+    first = first_state(model, 0)
+    if side is not None:
+        first = replace(first, side=model.shape.of_side(side).side, sides=None)
+    elif state.sides is None:
+        first = replace(first, side=state.side, sides=None)
     return replace(first, generator=state.generator, next_index=state.next_index)
