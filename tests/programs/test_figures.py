@@ -28,7 +28,7 @@ from toftrack.render.reference import ReferenceScorer
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify
-from toftrack.views.figures import chart
+from toftrack.views.figures import chart, runs
 from toftrack.views.skeleton import SLOT_RGB
 
 NAMES = ("measurement", "filmstrip", "lost", "course", "latent")
@@ -174,6 +174,31 @@ def test_the_numbers_of_a_frame_stand_in_its_figure(
     mean = json.loads((run / "summary.json").read_text())["metrics"]["mean_mm"]
     assert any(f"mean joint error {mean:.1f} mm" in text for text in texts)
     assert "No frame was lost: the 4 frames of the lowest score" in texts
+
+
+def test_the_course_and_the_manifold_are_labelled_in_the_words_used_elsewhere(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts: list[str] = []
+    true_write = chart.write
+    monkeypatch.setattr(
+        chart,
+        "write",
+        lambda picture, text, *a, **k: (texts.append(text), true_write(picture, text, *a, **k)),
+    )
+    draw_figures(run, out=tmp_path / "out")
+    assert "pointing" in texts and "gun" not in texts
+    assert any("may lie beyond it" in text for text in texts)
+    course = texts[texts.index("frame") :]
+    assert [text for text in ("0", "2", "4", "6", "8", "10") if text not in course] == []
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "found"),
+    [(0, 99, list(range(0, 100, 10))), (50, 69, list(range(50, 69, 2))), (3, 5, [3, 4, 5])],
+)
+def test_frames_on_an_axis_have_round_numbers(first: int, last: int, found: list[int]) -> None:
+    assert runs._round_frames(first, last) == found
 
 
 def test_lost_frames_are_shown_and_shaded(run: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from helpers.tracking import ROOT, configuration
 from toftrack.configuration.compose import devices_of_files, setting_names
 from toftrack.errors import ToftrackError
 from toftrack.programs import main as front
+from toftrack.programs import record
 from toftrack.programs.recording_argument import quoted, with_recording
 
 KNOWN = setting_names(), devices_of_files()
@@ -125,3 +126,9 @@ def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missi
 def test_what_cannot_be_one_recording_is_told(words: list[str], told: str) -> None:
     with pytest.raises(ToftrackError, match=told):
         with_recording(words, *KNOWN)
+
+
+def test_only_what_must_be_given_is_called_required(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        record.main([])
+    assert capsys.readouterr().err.endswith("the following arguments are required: OUT.srs\n")

@@ -193,6 +193,12 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
                 "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
             )
             assert chromium.execute_script(over) <= 0
+            clipped = "return [...document.querySelectorAll('dd, #phase')].filter(shown => shown"
+            clipped += ".scrollWidth > shown.clientWidth + 1).map(shown => shown.textContent)"
+            assert chromium.execute_script(clipped) == []
+            cells, table = "[...document.querySelectorAll('dl > div')]", "querySelector('dl')"
+            rest = f"return document.{table}.getBoundingClientRect().right - {cells}.at(-1)"
+            assert chromium.execute_script(f"{rest}.getBoundingClientRect().right") < 3
         left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
         assert right["y"] > left["y"] + left["height"] and left["width"] > 400
     lost = no_estimate(9, 0.36, "lost", 4, 0.01)

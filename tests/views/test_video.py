@@ -42,8 +42,10 @@ video.play().catch(error => tell(String(error)));
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A video of ten frames a second, killed after 35 frames."""
-    path = tmp_path_factory.mktemp("video") / "overlay.mp4"
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    # In a folder whose name the locale cannot say, besides.
+    path = tmp_path_factory.mktemp("vidéo") / "overlay.mp4"
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    environment = os.environ | ascii_only | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     done = subprocess.run([sys.executable, "-c", KILLED, str(path)], env=environment)
     assert done.returncode == -signal.SIGKILL
     return path

@@ -112,7 +112,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("data_set", metavar="DATASET", help=", ".join(DATA_SETS))
     parser.add_argument("folder", metavar="FOLDER", help="where the data set lies")
     parser.add_argument(
-        "overrides", metavar="OVERRIDE", nargs="*", help="as for track.py, filter.particles=1000"
+        "overrides",
+        metavar="OVERRIDE",
+        nargs="*",
+        default=[],
+        help="as for track.py, filter.particles=1000",
     )
     parser.add_argument("--sequences", help="only those, by name, separated by commas: P0/1,P0/2")
     parser.add_argument("--frames", type=_count, help="only so many at the start of each sequence")

@@ -175,6 +175,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "words",
         nargs="*",
+        default=[],
         metavar="NAME RECORDING OVERRIDE",
         help="its name; the recording that shows it (or sample); as for track.py, hand.side=left",
     )

@@ -45,7 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--conf", default=configuration_folder(), help="folder of the configuration"
     )
-    parser.add_argument("overrides", nargs="*", metavar="device.KEY=VALUE", help="settings")
+    parser.add_argument(
+        "overrides", nargs="*", default=[], metavar="device.KEY=VALUE", help="settings"
+    )
     # Intermixed: options may stand between the settings.
     options = parser.parse_intermixed_args(arguments)
     if Path(options.out).suffix.lower() != ".srs":

@@ -18,6 +18,8 @@ from toftrack.views.overlay import range_grey
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 # Okabe and Ito's colours, which colour-blind people can tell apart; BGR.
 BASIC_BGR = {"palm": (178, 114, 0), "fist": (0, 94, 213), "gun": (115, 158, 0)}
+WORDS = {"gun": "pointing"}
+"""What pictures call a basic pose, where it is not its name in the training poses."""
 _NEAR_DEGREES = 15.0
 """A pose is coloured as the gesture that it is within this root mean square distance of."""
 _BETWEEN, _THUMB = (150, 150, 150), (167, 121, 204)
@@ -106,15 +108,31 @@ def manifold_figure(space: PoseSpace, size: int = 460) -> np.ndarray:
         ):
             colour = _BETWEEN if gesture is None else BASIC_BGR[gesture]
             cv2.circle(panel, (int(u), int(size - v)), 4, colour, -1, cv2.LINE_AA)
-        name = f"{j + 1} against {i + 1}"
-        cv2.putText(panel, name, (34, size - 10), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
+        _write_limits(panel, xy.min(0), xy.max(0), f"{j + 1} against {i + 1}")
         panels.append(panel)
     x = 34
     for name, colour in (*BASIC_BGR.items(), ("other", _BETWEEN)):
         cv2.circle(panels[0], (x, 16), 5, colour, -1, cv2.LINE_AA)
-        cv2.putText(panels[0], name, (x + 9, 21), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
+        word = WORDS.get(name, name)
+        cv2.putText(panels[0], word, (x + 9, 21), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
         x += 80
     return np.hstack(panels)
+
+
+def _write_limits(panel: np.ndarray, low: np.ndarray, high: np.ndarray, name: str) -> None:
+    """Both coordinates' values at the ends of a manifold's panel, and the panel's name between."""
+    bottom, right = panel.shape[0] - 10, panel.shape[1] - 30
+
+    def write(text: str, x: int, y: int, aligned: float = 0.0, size: float = 0.5) -> None:
+        width = cv2.getTextSize(text, _FONT, size, 1)[0][0]
+        at = (x - round(aligned * width), y)
+        cv2.putText(panel, text, at, _FONT, size, _TEXT, 1, cv2.LINE_AA)
+
+    write(name, panel.shape[1] // 2, bottom, 0.5)
+    write(f"{low[0]:.2g}", 30, bottom, size=0.42)
+    write(f"{high[0]:.2g}", right, bottom, 1.0, size=0.42)
+    write(f"{high[1]:.2g}", 34, 45, size=0.42)
+    write(f"{low[1]:.2g}", 34, panel.shape[0] - 36, size=0.42)
 
 
 def nearest_gestures(angles: Tensor) -> list[str | None]:

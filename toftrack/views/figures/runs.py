@@ -15,7 +15,7 @@ from toftrack.render.segmentation import Observation
 from toftrack.views.classified import CLASS_RGB, CLASSES, Classified
 from toftrack.views.figures import chart
 from toftrack.views.figures.chart import Axes
-from toftrack.views.figures.poses import BASIC_BGR, nearest_gestures
+from toftrack.views.figures.poses import BASIC_BGR, WORDS, nearest_gestures
 from toftrack.views.overlay import film_tile, filmstrip, range_grey
 
 _MARGIN_PX = 8
@@ -167,7 +167,7 @@ def course_figure(
     axes.shade(picture, time_s, lost, chart.SHADE)
     axes.draw(picture, "time, s", "score")
     axes.line(picture, time_s, score, chart.GREEN)
-    numbers = np.unique(np.linspace(0, len(frames) - 1, 11).round().astype(int))
+    numbers = np.searchsorted(frames, _round_frames(int(frames[0]), int(frames[-1])))
     _write_frames(picture, axes, time_s[numbers], frames[numbers])
     entries = [("lost, says the tracker", chart.SHADE)]
     if absent is not None:
@@ -185,6 +185,11 @@ def course_figure(
         else "The error is left out where the truth has no visible hand."
     )
     return chart.titled(picture, title, note)
+
+
+def _round_frames(first: int, last: int) -> list[int]:
+    """Frame numbers to be written on an axis: multiples of 1, 2 or 5 times a power of ten."""
+    return [round(tick) for tick in chart.ticks(first, last, 11) if tick == round(tick)]
 
 
 def _span(time_s: np.ndarray) -> tuple[float, float]:
@@ -233,13 +238,14 @@ def latent_figure(
     ]
     body = np.hstack([*panels, _time_bar(time_s, panels[0].shape[0])])
     foot = chart.canvas(44, body.shape[1])
-    entries = [(name, colour) for name, colour in BASIC_BGR.items()]
+    entries = [(WORDS.get(name, name), colour) for name, colour in BASIC_BGR.items()]
     chart.legend(foot, [*entries, ("other training poses", chart.GREY)], (30, 24))
     chart.legend(foot, [("estimates", chart.TEXT)], (body.shape[1] - 330, 24), _dot)
     chart.legend(foot, [("lost", chart.TEXT)], (body.shape[1] - 200, 24), _cross)
     about = (
         "Training poses (large dots) by their nearest gesture, and over them the way of the "
-        "estimates. The rectangle is the range of the training poses, to which the particles keep."
+        "estimates. The rectangle is the range of the training poses, to which the particles keep; "
+        "an estimate may lie beyond it, because the refinement is free of it."
     )
     return chart.titled(np.vstack([body, foot]), title, about + note)
 
