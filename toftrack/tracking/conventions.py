@@ -9,6 +9,7 @@ import numpy as np
 from toftrack.estimate import Estimate
 from toftrack.hand.landmarks import image_landmarks
 from toftrack.hand.openxr import openxr_hand, openxr_rig
+from toftrack.hand.openxr_numba import openxr_hand_compiled
 from toftrack.hand.shape import HandShape
 
 _DECIMALS = 6
@@ -22,7 +23,9 @@ def in_all_conventions(
 
     shape: the hand of the estimate.  k: (3, 3) intrinsics, pixels.  size_px: width, height.
     """
-    hand = openxr_hand(estimate.joints_m, estimate.state, openxr_rig(shape))
+    known = np.isfinite(estimate.joints_m).all() and np.isfinite(estimate.state).all()
+    place = openxr_hand_compiled if known else openxr_hand
+    hand = place(estimate.joints_m, estimate.state, openxr_rig(shape))
     return replace(
         estimate,
         landmarks=np.round(image_landmarks(estimate.joints_m, k, size_px), _DECIMALS),
