@@ -34,7 +34,10 @@ def encoding(message: Any, kind: str) -> str:
 
 def is_depth(words: str) -> bool:
     """An `encoding` is one of depth images."""
-    return words.startswith(("16UC1", "32FC1")) and (";" not in words or _lossless(words))
+    transport = words.partition(";")[2]
+    return words.startswith(("16UC1", "32FC1")) and (
+        not transport or "compressedDepth" in transport or _lossless(words)
+    )
 
 
 def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:

@@ -21,11 +21,11 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import LARGEST_MEDIAN_M
 from toftrack.recordings.bag_names import storage_of
+from toftrack.recordings.bare import MILLIMETRE, BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.ros_camera import CAMERA_INFO, camera_of
 from toftrack.recordings.ros_images import COMPRESSED, IMAGE, depth_image, encoding, is_depth
 
-_MILLIMETRE = 0.001
 _REPAIR = {
     ".bag": "rosbag reindex FILE repairs a bag that was cut off",
     ".mcap": "mcap recover FILE repairs one that was cut off",
@@ -115,7 +115,7 @@ def read_rosbag(
     path = Path(path).expanduser()
     if not path.exists():
         raise ToftrackError(f"there is no bag '{path}'; give the path of a recording")
-    unit_m = _MILLIMETRE if unit_m is None else unit_m
+    unit_m = BareFacts(unit_m=unit_m).unit_m or MILLIMETRE
     bag = _Bag(path)
     try:
         chosen = _choose(bag, topic)
