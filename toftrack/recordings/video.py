@@ -144,7 +144,7 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
     container = opened(path)
     try:
         own = kinect.tracks_of(container, path)
-        number = own.depth if own is not None else _grey_stream(container, path)
+        number = _grey_stream(container, path, None if own is None else own.depth)
         shape = container.streams[number].width, container.streams[number].height
         if camera_file is not None or own is None:
             camera = bare_camera(path, camera_file, bare, *shape)
@@ -178,9 +178,9 @@ def opened(path: Path) -> Any:
         ) from error
 
 
-def _grey_stream(container: Any, path: Path) -> int:
-    """The number of the only track of grey 16-bit images."""
-    videos = container.streams.video
+def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
+    """The number of the wanted, or the only track of grey 16-bit images."""
+    videos = [s for s in container.streams.video if wanted in (None, s.index)]
     kinds = [(s.index, s.codec_context.name, s.codec_context.pix_fmt) for s in videos]
     grey = [index for index, _, pixels in kinds if pixels in _GREY]
     if len(grey) == 1:
