@@ -176,7 +176,11 @@ def test_depth_that_was_recorded_twice_is_one_topic(tmp_path: Path) -> None:
         ),
         (
             [Message("/device_0/sensor_0/Depth_0/image/data", IMAGE, {}, recorded_ns(0))],
-            "RealSense.*device=realsense device.bag=",
+            "camera's own program.*device=realsense device.bag=",
+        ),
+        (
+            [Message("/cam/sensor_3/frameType_3", IMAGE, {}, recorded_ns(0))],
+            "camera's own program.*device=orbbec device.bag=",
         ),
     ],
 )

@@ -32,6 +32,8 @@ _REPAIR = {
     ".db3": "record or copy it again",
     "": "ros2 bag reindex FOLDER repairs one that was cut off",
 }
+_OF_CAMERAS = {"/device_0/sensor_": "realsense", "/cam/sensor_": "orbbec"}
+"""How topics begin in the bags that cameras' own programs write, and the devices that play them."""
 
 
 class RosBag:
@@ -155,8 +157,8 @@ class _Bag:
             types = importlib.import_module("rosbags.typesys")
         except ImportError as error:
             raise ToftrackError(
-                f"'{path}' is read by rosbags ({error}): pip install -e '.[ros]' (a recording of a "
-                "RealSense: device=realsense device.bag=FILE)"
+                f"'{path}' is read by rosbags ({error}): pip install -e '.[ros]' (recordings of "
+                "cameras' own programs: device=realsense or orbbec, device.bag=FILE)"
             ) from error
         self._is_one = path.suffix.lower() == ".bag" and path.is_file()
         # The messages that are read are the same in every release of ROS 2.
@@ -216,6 +218,12 @@ class _Bag:
 
 def _choose(bag: _Bag, wanted: str | None) -> _Topic:
     """The topic of depth images; ToftrackError, with those there are, where it is not clear."""
+    for start, device in _OF_CAMERAS.items():
+        if any(name.startswith(start) for name in bag.all_topics()):
+            raise ToftrackError(
+                f"'{bag.path}' is a recording of a camera's own program, which only that can read: "
+                f"play it with device={device} device.bag=FILE"
+            )
     images = list(_image_topics(bag))
     if wanted is not None:
         for topic in images:
@@ -224,11 +232,6 @@ def _choose(bag: _Bag, wanted: str | None) -> _Topic:
         raise ToftrackError(
             f"'{bag.path}' has no images of the topic {wanted}; its topics of images are "
             f"{_listed(images)}"
-        )
-    if any(name.startswith("/device_0/sensor_") for name in bag.all_topics()):
-        raise ToftrackError(
-            f"'{bag.path}' is a recording of a camera's own program, of RealSense's: play it with "
-            "device=realsense device.bag=FILE (others: convert it with the camera's program)"
         )
     depth = [topic for topic in images if is_depth(topic.encoding)]
     raw = {topic.base for topic in depth if topic.kind == IMAGE}
