@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,7 @@ from helpers.bags import (
     recording,
     write_bag,
 )
+from helpers.damage import damaged
 
 from toftrack.camera import Camera
 from toftrack.devices.replay import Replay
@@ -241,6 +243,19 @@ def test_bags_that_were_cut_off_are_told_or_used_so_far(
     else:  # a data base may be whole but for its last pages
         assert kind == "db3"
         assert 0 < len(list(device)) <= (40 if share > 0.99 else 39)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whatever_bytes_are_damaged_it_is_read_or_told(tmp_path: Path, kind: str) -> None:
+    path = write_bag(tmp_path, kind, recording(some_depth(), CAMERA))
+    path = path if path.is_file() else next(path.glob(f"*.{kind}"))
+    content = path.read_bytes()
+    for seed in range(24):
+        path.write_bytes(damaged(content, seed))
+        with contextlib.suppress(ToftrackError):
+            store = open_recording(path)
+            for number in range(len(store)):
+                store.image(number)
 
 
 def test_what_is_no_bag_is_told(tmp_path: Path) -> None:

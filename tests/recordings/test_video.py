@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.damage import damaged
 from helpers.videos import (
     RATIONAL,
     START_OFFSET_S,
@@ -137,6 +139,26 @@ def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_told(
     frames = list(Replay(path))
     assert len(frames) == len(store) == pytest.approx(share * 21, abs=1.01)
     np.testing.assert_allclose(frames[-1].depth, depth[len(frames) - 1] / 1000, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["kinect.mkv", "grey.mkv", "grey.avi", "stack.npy"])
+def test_whatever_bytes_are_damaged_it_is_read_or_told(
+    tmp_path: Path, images: tuple[np.ndarray, np.ndarray], name: str
+) -> None:
+    path = tmp_path / name
+    if name == "kinect.mkv":
+        write_kinect(path, images[0][:2], images[1][:2], ABOUT)
+    elif name == "stack.npy":
+        np.save(path, words() // 8)
+    else:
+        write_grey(path, words())
+    content = path.read_bytes()
+    for seed in range(24):
+        path.write_bytes(damaged(content, seed))
+        with contextlib.suppress(ToftrackError):
+            store = open_recording(path, bare=TOLD)
+            for number in range(len(store)):
+                store.image(number)
 
 
 def broken(change: Callable[[dict], Any]) -> dict:

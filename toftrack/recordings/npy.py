@@ -5,6 +5,7 @@ Whole numbers are steps of a millimetre, unless another unit is told; floats are
 
 from __future__ import annotations
 
+import tokenize
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def _mapped(path: Path) -> np.ndarray:
         raise ToftrackError(f"there is no file '{path}'; give the path of a recording") from None
     except OSError as error:
         raise ToftrackError(f"'{path}' cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError, TypeError, SyntaxError) as error:
+    except (ValueError, EOFError, TypeError, SyntaxError, tokenize.TokenError) as error:
         raise ToftrackError(
             f"'{path}' is no .npy of numbers, or was cut off ({error}); save the depth with "
             "numpy.save"

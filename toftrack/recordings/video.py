@@ -150,7 +150,9 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
             camera = bare_camera(path, camera_file, bare, *shape)
         else:
             camera = kinect.camera_of(container, path, *shape)
-        found = _scanned(container, path, [number] + ([] if own is None else own.infrared))
+        infrared = [] if own is None else own.infrared
+        grey = [index for index in infrared if _kind(container.streams[index])[1] in _GREY]
+        found = _scanned(container, path, [number, *grey])
     finally:
         container.close()
     depth, *others = (
@@ -170,7 +172,8 @@ def opened(path: Path) -> Any:
     import av  # takes a while, and most recordings are no videos
 
     try:
-        return av.open(str(path))
+        # A damaged text among the tags is no reason to refuse the images.
+        return av.open(str(path), metadata_errors="replace")
     except (av.FFmpegError, OSError) as error:
         raise ToftrackError(
             f"'{path}' cannot be read as a video ({_reason(error)}); it is damaged, cut off or of "
@@ -181,7 +184,7 @@ def opened(path: Path) -> Any:
 def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
     """The number of the wanted, or the only track of grey 16-bit images."""
     videos = [s for s in container.streams.video if wanted in (None, s.index)]
-    kinds = [(s.index, s.codec_context.name, s.codec_context.pix_fmt) for s in videos]
+    kinds = [(s.index, *_kind(s)) for s in videos]
     grey = [index for index, _, pixels in kinds if pixels in _GREY]
     if len(grey) == 1:
         return grey[0]
@@ -231,9 +234,15 @@ def _scanned(container: Any, path: Path, streams: list[int]) -> _Found:
     return _Found(times, tick_s, damage)
 
 
+def _kind(stream: Any) -> tuple[str, str | None]:
+    """The names of a track's codec and pixels."""
+    codec = stream.codec_context  # None where FFmpeg knows no decoder
+    return ("unknown", None) if codec is None else (codec.name, codec.pix_fmt)
+
+
 def _least(stream: Any) -> int:
     """The fewest bytes that an image of a track may have: all of them where none is compressed."""
-    raw = stream.codec_context.name == "rawvideo"
+    raw = _kind(stream)[0] == "rawvideo"
     return 2 * stream.width * stream.height if raw else 1
 
 
