@@ -23,7 +23,7 @@ from toftrack.recordings.srs import read_srs
 from toftrack.recordings.video import VIDEOS, read_video
 
 _BY_OPENNI = (
-    "extract its depth as 16-bit PNG images (OpenNI's own tools do), put a camera.json beside them "
+    "write its depth out as 16-bit PNG images by OpenNI, put a camera.json beside them "
     "(docs/formats.md) and give the folder"
 )
 _BY_POINTS = "points have lost the image that they came from; give the depth images themselves"
