@@ -6,12 +6,16 @@ fails the run, so that no test falls asleep unnoticed.
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 from collections import Counter
 
 import pytest
-import torch
+
+# Before torch is loaded: workers, and what they start, share the cores among them.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 ALLOWED_SKIPS = (
     r"slow; run with --slow",
@@ -22,6 +26,7 @@ ALLOWED_SKIPS = (
     r"rosbags is not installed",
     r"rerun-sdk is not installed|of the extra rerun|this rerun-sdk reads files in another way",
     r"pip install '.\[browser-test\]'|needs chromium and chromedriver",
+    r"pip install '.\[(osc|web|export)\]'",
     r"there is no C compiler",
     r"needs /dev/full|needs /proc",
     r"a camera is plugged in",
@@ -79,6 +84,8 @@ def _ctrl_c_interrupts():
 @pytest.fixture(scope="module")
 def one_thread():
     """Idle helpers of torch hold up small work on a busy machine."""
+    import torch
+
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

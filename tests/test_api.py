@@ -54,6 +54,16 @@ def test_every_stable_name_is_there_and_no_other() -> None:
         _ = toftrack.make_racket
 
 
+def test_a_tracker_of_two_hands_gives_an_estimate_a_slot() -> None:
+    scene, tracker = sample(), toftrack.make_hands_tracker("hands=2", *QUICK)
+    estimates = tracker.step(scene.depth_m[30], scene.k)
+    assert len(estimates) == len(tracker.shapes) == len(tracker.insights) == 2
+    assert not all(estimate.lost for estimate in estimates)
+    assert {estimate.index for estimate in estimates} == {0}
+    with pytest.raises(toftrack.ToftrackError, match="make_hands_tracker follows two"):
+        toftrack.make_tracker("hands=2")
+
+
 def test_every_field_of_an_estimate_has_a_name() -> None:
     """Names that other programs rely on: a change of them needs a new version."""
     assert {field.name for field in dataclasses.fields(toftrack.Estimate)} == {
@@ -62,6 +72,7 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
         *("pinch", "pinching"),
         *("pointing_origin_m", "pointing_direction", "confidence", "outside_rad"),
         *("side", "side_probability", "joint_sigma_m", "joint_confidence"),
+        *("landmarks", "openxr_position_m", "openxr_orientation", "openxr_radius_m"),
     }
 
 

@@ -252,3 +252,32 @@ def test_missing_and_unwritable_camera_files_are_told(tmp_path: Path) -> None:
         Camera.load(tmp_path / "nope.json")
     with pytest.raises(ToftrackError, match="cannot be written"):
         Camera(K, W, H).save(tmp_path / "nowhere" / "camera.json")
+
+
+PLAUSIBLE = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [((0, 0), 1e-300), ((1, 1), 1e300), ((0, 0), 900.0), ((0, 2), 5000.0), ((1, 2), -900.0)],
+)
+def test_a_matrix_that_no_camera_has_is_refused_with_one_that_is_plausible(place, value) -> None:
+    K = PLAUSIBLE.copy()
+    K[place] = value
+    with pytest.raises(ToftrackError, match=r"a plausible one is \[\[194, 0, 88\]"):
+        Camera(K, 176, 144)
+    with pytest.raises(ToftrackError, match="of 176x144 pixels"):
+        Camera(np.eye(3), 176, 144)
+
+
+@pytest.mark.parametrize(
+    ("K", "size"),
+    [
+        ([[212.0, 0, 256], [0, 212.0, 212]], (512, 424)),  # a wide fisheye
+        ([[600.0, 0, -250], [0, 600.0, 400]], (64, 64)),  # a part beside the whole image's middle
+        ([[1400.0, 0, 320], [0, 700.0, 120]], (640, 240)),  # every second row
+        ([[5000.0, 0, 320], [0, 5000.0, 240]], (640, 480)),  # a narrow view
+    ],
+)
+def test_unusual_cameras_are_plausible(K: list, size: tuple[int, int]) -> None:
+    assert Camera(np.array([*K, [0, 0, 1]]), *size).width == size[0]

@@ -13,12 +13,16 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 from helpers.bags import recording, write_bag
+from helpers.hands import hand_estimate, lost_hand
+from helpers.programs import QUICK
 from helpers.tracking import ROOT, configuration, run
 from helpers.videos import write_grey
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -28,6 +32,10 @@ from hydra.plugins.launcher import Launcher
 
 from toftrack.api import make_device
 from toftrack.devices.sample import Sample
+from toftrack.estimate import no_estimate
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output.lines import json_line
+from toftrack.output.results import ResultWriter
 from toftrack.programs import convert
 from toftrack.recordings.npz import read_recording
 
@@ -37,7 +45,6 @@ PAGES = {
 }
 README = "\n".join(PAGES.values())
 """All pages in one."""
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 
 
 def block(name: str) -> str:
@@ -224,18 +231,28 @@ def test_a_conversion_works_as_it_is_shown(
     assert len(read_recording(tmp_path / target)) == 4
 
 
-def start(*arguments: str, folder: Path, **pipes: object) -> subprocess.Popen[str]:
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
-    return subprocess.Popen(
-        [sys.executable, *arguments], cwd=folder, env=environment, text=True, **pipes
-    )
+@contextmanager
+def client(name: str, folder: Path, *changes: tuple[str, str]) -> Iterator[subprocess.Popen[str]]:
+    """The page's client of that name, with changes to its code, as a process."""
+    code = block(name)
+    for old, new in changes:
+        assert old in code
+        code = code.replace(old, new)
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=folder, env=environment, **pipes)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
 
 
-def track(stream: str, *overrides: str, folder: Path, **pipes: object) -> subprocess.Popen[str]:
+def send(stream: str, folder: Path, *overrides: str) -> None:
+    """Track six frames with the overrides of the page's command for a stream."""
     (words,) = (words for words in TRACK if f"stream={stream}" in words)
-    few = ("device.stop=6", "view=none", "hydra.run.dir=out")
-    program = str(ROOT / "track.py")
-    return start(program, *words[2:], *few, *QUICK, *overrides, folder=folder, **pipes)
+    given = [word for word in words[2:] if not word.startswith("device")]
+    run(folder, Sample(stop=6), *given, "view=none", *QUICK, *overrides)
 
 
 def read(printed: list[str]) -> list[int]:
@@ -245,37 +262,37 @@ def read(printed: list[str]) -> list[int]:
     return [int(row[0]) for row in rows]
 
 
-def test_the_client_of_standard_output_gets_every_frame(tmp_path: Path) -> None:
-    (tmp_path / "client.py").write_text(block("stdout-client"))
-    quiet = {"stderr": subprocess.DEVNULL}
-    sender = track("stdout", folder=tmp_path, stdout=subprocess.PIPE, **quiet)
-    client = start(
-        "client.py", folder=tmp_path, stdin=sender.stdout, stdout=subprocess.PIPE, **quiet
-    )
-    sender.stdout.close()
-    printed, _ = client.communicate(timeout=120)
+def test_the_client_of_standard_output_gets_every_frame(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    send("stdout", tmp_path)
+    with client("stdout-client", tmp_path) as process:
+        printed, _ = process.communicate(capfd.readouterr().out, timeout=60)
     assert read(printed.splitlines()) == list(range(6))
-    assert sender.wait(timeout=60) == 0
 
 
 def test_the_client_of_datagrams_gets_every_frame(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
-    code = block("udp-client")
-    assert "5005" in code and "5005" in " ".join(word for words in TRACK for word in words)
-    ready = code.replace("while True", 'print("ready", flush=True)\nwhile True')
-    (tmp_path / "client.py").write_text(ready.replace("5005", port))
-    client = start("client.py", folder=tmp_path, stdout=subprocess.PIPE)
-    try:
-        assert client.stdout.readline() == "ready\n"
-        quiet = {"stderr": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
-        sender = track("udp", f"stream.port={port}", folder=tmp_path, **quiet)
-        assert sender.wait(timeout=120) == 0
-        assert read([client.stdout.readline() for _ in range(6)]) == list(range(6))
-    finally:
-        client.kill()
-        client.communicate()
+    assert "5005" in " ".join(word for words in TRACK for word in words)
+    ready = ("while True", 'print("ready", flush=True)\nwhile True')
+    with client("udp-client", tmp_path, ready, ("5005", port)) as process:
+        assert process.stdout.readline() == "ready\n"
+        send("udp", tmp_path, f"stream.port={port}")
+        assert read([process.stdout.readline() for _ in range(6)]) == list(range(6))
+
+
+def test_the_client_for_two_hands_prints_each_that_there_is(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = no_estimate(3, 0.12, "searching", 4, 0.01)
+    there = replace(none, lost=False, side="left", state=np.zeros(27), joints_m=np.ones((21, 3)))
+    lines = [json_line(both) for both in ((none, none), (none, there), (there, there))]
+    monkeypatch.setattr(sys, "stdin", lines)
+    exec(compile(block("hands-client"), "streams.md", "exec"), {})
+    printed = [line.split()[:3] for line in capsys.readouterr().out.splitlines()]
+    assert printed == [["3", slot, "left"] for slot in ("1", "0", "1")]
 
 
 def test_the_program_in_python_tracks(
@@ -288,3 +305,14 @@ def test_the_program_in_python_tracks(
     exec(compile(few, "README.md", "exec"), {})
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == 4 and all(line.split()[0] != "lost" for line in printed)
+
+
+def test_results_are_read_without_this_package_as_it_is_shown(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with ResultWriter(tmp_path, {}, JOINT_NAMES) as results:
+        for estimate in (lost_hand(0), hand_estimate(1), hand_estimate(2)):
+            results.append(estimate)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block("npz"), "exports.md", "exec"), {})
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["1", "2"]

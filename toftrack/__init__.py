@@ -8,6 +8,13 @@ For a program of one's own:
     estimate = tracker.step(depth_m, K)
     estimate.joints_m
 
+or, of two hands:
+
+    tracker = toftrack.make_hands_tracker("hands=2")
+    for estimate in tracker.step(depth_m, K):
+        if not estimate.lost:
+            estimate.side, estimate.joints_m
+
 The names in `__all__` are stable. Everything else is private and may change with any version.
 """
 
@@ -17,14 +24,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from toftrack.api import make_device, make_tracker
+    from toftrack.api import make_device, make_hands_tracker, make_tracker
     from toftrack.camera import Camera
     from toftrack.devices.base import BaseDevice
     from toftrack.errors import ToftrackError
     from toftrack.estimate import Estimate
     from toftrack.frames import Frame
+    from toftrack.hand.openxr import OPENXR_JOINT_NAMES
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.output.results import read_results
+    from toftrack.tracking.hands import HandsTracker
     from toftrack.tracking.tracker import Tracker
 
     __version__: str
@@ -37,9 +46,12 @@ _PLACES = {
     "Estimate": "toftrack.estimate",
     "Frame": "toftrack.frames",
     "JOINT_NAMES": "toftrack.hand.skeleton",
+    "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
     "ToftrackError": "toftrack.errors",
+    "HandsTracker": "toftrack.tracking.hands",
     "Tracker": "toftrack.tracking.tracker",
     "make_device": "toftrack.api",
+    "make_hands_tracker": "toftrack.api",
     "make_tracker": "toftrack.api",
     "read_results": "toftrack.output.results",
 }
@@ -50,11 +62,14 @@ __all__ = [
     "Camera",
     "Estimate",
     "Frame",
+    "HandsTracker",
     "JOINT_NAMES",
+    "OPENXR_JOINT_NAMES",
     "ToftrackError",
     "Tracker",
     "__version__",
     "make_device",
+    "make_hands_tracker",
     "make_tracker",
     "read_results",
 ]

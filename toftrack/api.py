@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     import torch
 
     from toftrack.devices.base import Device
+    from toftrack.tracking.hands import HandsTracker
+    from toftrack.tracking.model import TrackerModel
     from toftrack.tracking.tracker import Tracker
 
 
 def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Tracker:
-    """A tracker as `python track.py` with these overrides has it: `tracker.step(depth_m, K)`.
+    """A tracker of one hand as `python track.py` with these overrides has it:
+    `tracker.step(depth_m, K)`.
 
     Any number of them may work in one process, each in a thread of its own; one tracker must not be
     used by two threads at once.
@@ -29,11 +32,32 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
         config_dir: a folder with your own config.yaml and its groups, instead of toftrack's.
 
     Raises:
-        ToftrackError: an override or a file that it names cannot be used.
+        ToftrackError: an override or a file that it names cannot be used, or hands=2 is asked for.
+    """
+    config = configuration(*overrides, config_dir=config_dir)
+    if config.get("hands", 1) != 1:
+        raise ToftrackError(
+            f"make_tracker follows one hand, but hands={config.hands} is given; "
+            "toftrack.make_hands_tracker follows two"
+        )
+    with one_sentence():
+        return build_tracker(config)
+
+
+def make_hands_tracker(*overrides: str, config_dir: str | Path | None = None) -> HandsTracker:
+    """A tracker whose `step` gives a tuple of estimates, one for each slot of `hands=2` or 1.
+
+        tracker = make_hands_tracker("hands=2")
+        first, second = tracker.step(depth_m, K)
+
+    A slot keeps to its hand; Estimate.side says whose it is. A slot without a hand is lost, and its
+    arrays are NaN.
+
+    Args and raises as make_tracker, but for hands=2.
     """
     config = configuration(*overrides, config_dir=config_dir)
     with one_sentence():
-        return build_tracker(config)
+        return build_hands_tracker(config)
 
 
 def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device:
@@ -55,16 +79,29 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
 
 
 def build_tracker(config: DictConfig) -> Tracker:
-    """The tracker of a configuration (conf/config.yaml composed)."""
+    """The tracker of one hand of a configuration (conf/config.yaml composed)."""
     # These take seconds: an override's error comes before.
+    from toftrack.tracking.tracker import Tracker
+
+    return Tracker(build_model(config), config.seed)
+
+
+def build_hands_tracker(config: DictConfig) -> HandsTracker:
+    """The tracker of as many hands as a configuration says."""
+    from toftrack.tracking.hands import HandsTracker
+
+    return HandsTracker(build_model(config), config.seed, config.get("hands", 1))
+
+
+def build_model(config: DictConfig) -> TrackerModel:
+    """The parts of a tracker of a configuration."""
     from toftrack.tracking.backend import choose_backend
     from toftrack.tracking.model import TrackerModel
-    from toftrack.tracking.tracker import Tracker
 
     device = compute_device(config.compute)
     hand = instantiate(config.hand)
     relocaliser = instantiate(config.relocation)
-    model = TrackerModel(
+    return TrackerModel(
         shape=hand.shape.to(device),
         space=instantiate(config.pose_space).to(device),
         segmentation=instantiate(config.segmentation),
@@ -78,8 +115,8 @@ def build_tracker(config: DictConfig) -> Tracker:
         backend=choose_backend(config.renderer, device),
         relocaliser=relocaliser,
         adapt=None if relocaliser is None else hand.adapt,
+        sides=hand.sides,
     )
-    return Tracker(model, config.seed)
 
 
 def compute_device(name: str) -> torch.device:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import read_json
 
 _FORMAT = "toftrack-camera"
 _VERSION = 1
@@ -24,6 +25,13 @@ _COUNTS = (4, 5, 8, 12, 14)
 _LENSES = ("opencv", "fisheye")
 # The iteration that undoes a lens: enough for the strong ones, and exact far below a pixel.
 _UNTIL = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+_SHORTEST, _LONGEST = 0.1, 50.0
+"""Focal lengths as multiples of the image's longer side: from an extreme wide angle to a small part
+of a narrow view."""
+_MOST_OBLONG = 2.5
+"""Pixels that were put together in one direction only."""
+_FARTHEST_ASIDE = 1.5
+"""How far the centre may lie beside the image's middle, in longer sides."""
 
 
 def _numbers(value: object, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -41,13 +49,32 @@ def _numbers(value: object, shape: tuple[int, ...], name: str) -> np.ndarray:
     return array
 
 
+def _check_plausible(K: np.ndarray, width: int, height: int) -> None:
+    """ToftrackError for a matrix that no depth camera with images of that size has."""
+    (fx, fy), (cx, cy), size = K[[0, 1], [0, 1]], K[:2, 2], max(width, height)
+    focal = all(_SHORTEST <= f / size <= _LONGEST for f in (fx, fy))
+    square = 1 / _MOST_OBLONG <= fx / fy <= _MOST_OBLONG
+    # Of a part of a larger image the centre may lie outside, but not far beside the view, too.
+    aside = abs(np.array([width / 2 - cx, height / 2 - cy]))
+    far = (aside > _FARTHEST_ASIDE * size) & (aside > (fx, fy))
+    if focal and square and not far.any():
+        return
+    usual = round(1.1 * size)
+    raise ToftrackError(
+        f"the camera matrix K cannot be that of images of {width}x{height} pixels (fx, fy {fx:g}, "
+        f"{fy:g}, centre {cx:g}, {cy:g}); a plausible one is [[{usual}, 0, {width / 2:g}], "
+        f"[0, {usual}, {height / 2:g}], [0, 0, 1]], in pixels"
+    )
+
+
 # Compared by identity: the fields are arrays, and the tables below are cached per object.
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A camera with one of OpenCV's two lens models and a correction of the measured depth.
 
     Raises ToftrackError when K is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with finite numbers and
-    positive focal lengths, or when a size or another coefficient makes no sense.
+    positive focal lengths, when no camera with images of that size has it, or when a size or
+    another coefficient makes no sense.
     """
 
     K: np.ndarray
@@ -79,6 +106,7 @@ class Camera:
             )
         if int(self.width) < 1 or int(self.height) < 1:
             raise ToftrackError(f"the image size {self.width}x{self.height} is not positive")
+        _check_plausible(K, int(self.width), int(self.height))
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
@@ -225,7 +253,7 @@ class Camera:
     def load(cls, path: str | Path) -> Camera:
         """Read a camera that `save` wrote. Raises ToftrackError for anything else."""
         try:
-            content = json.loads(Path(path).expanduser().read_text(encoding="utf-8"))
+            content = read_json(Path(path).expanduser())
         except OSError as error:
             raise ToftrackError(
                 f"the camera file '{path}' cannot be read ({error.strerror}); give the path of a "

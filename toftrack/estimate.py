@@ -32,7 +32,7 @@ class Estimate:
     lost: bool
     """Not to be used: no hand, or a joint that is likely off by more than 40 mm."""
     joints_m: np.ndarray
-    """(21, 3) float32 metres, camera frame, in the order of the recordings."""
+    """(21, 3) float32 metres, camera frame, in the order of JOINT_NAMES, which is MediaPipe's."""
     state: np.ndarray
     """(27,) float32: translation (3, m), rotation vector (3, rad), joint angles (21, rad)."""
     latent: np.ndarray
@@ -71,6 +71,15 @@ class Estimate:
     the thumb stretched away, else NaN."""
     pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 unit vector from there to the finger's tip, else NaN."""
+    landmarks: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan))
+    """(21, 3) the joints as MediaPipe's landmarks: x, y in parts of the image's width and height, z
+    the depth beyond the wrist's in parts of the width; see hand/landmarks.py."""
+    openxr_position_m: np.ndarray = field(default_factory=lambda: np.full((26, 3), np.nan))
+    """(26, 3) metres, the joints of XR_EXT_hand_tracking; x right, y up, -z forward."""
+    openxr_orientation: np.ndarray = field(default_factory=lambda: np.full((26, 4), np.nan))
+    """(26, 4) unit quaternions x y z w of these joints; see hand/openxr.py for their axes."""
+    openxr_radius_m: np.ndarray = field(default_factory=lambda: np.full(26, np.nan))
+    """(26,) metres from these joints to the skin."""
 
 
 def no_estimate(
@@ -108,6 +117,11 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         joint_confidence=np.zeros(21, np.float32),
         compute_s=compute_s,
     )
+
+
+def is_vacant(estimate: Estimate) -> bool:
+    """Whether there is no hand at all: nobody is followed, and there is no last or best guess."""
+    return not np.isfinite(estimate.state).all()
 
 
 def state_words(estimate: Estimate) -> str:

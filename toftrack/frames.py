@@ -11,7 +11,33 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
-LARGEST_MEDIAN_M = 20.0
+LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
+_MILLIMETRES = (100.0, 20_000.0)
+"""A median between these is one of millimetres."""
+
+
+def wrong_unit(what: str, median: float, kind: str = "") -> ToftrackError:
+    """What is said of depth whose readings' median is no distance in metres.
+
+    kind: of whole numbers, which are no metres whatever they are.
+    """
+    whole = f"{what} consists of whole numbers ({kind}), their median"
+    given = whole if kind else f"the median of {what}"
+    if _MILLIMETRES[0] <= median <= _MILLIMETRES[1]:
+        return ToftrackError(
+            f"{given} is {median:.0f}, which is plainly millimetres, but it must be float metres; "
+            "convert with depth.astype('float32') / 1000"
+        )
+    return ToftrackError(
+        f"{given} is {median:.4g}, neither metres nor millimetres of a hand before a camera; "
+        "find out in which unit it was recorded, and give float metres (0 = no reading)"
+    )
+
+
+def median_reading(depth: np.ndarray) -> float:
+    """The median of what is a reading, in the unit that it has; 0 where there is none."""
+    readings = depth[(depth > 0) & (depth < np.inf)]
+    return float(np.median(readings.astype(np.float32))) if readings.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +71,8 @@ class Truth:
     """(T, 21) bool."""
     first: int = 0
     """Number of the first row's frame; the other rows' follow."""
+    other: Truth | None = None
+    """Of the person's other hand, in the same frames; None where nothing is known of one."""
 
     def __len__(self) -> int:
         return len(self.joints_m)
@@ -71,6 +99,7 @@ class Truth:
             visible_fraction=cut(self.visible_fraction),
             joint_visible=cut(self.joint_visible),
             first=first,
+            other=None if self.other is None else self.other._taken(rows, first),
         )
 
 
@@ -113,10 +142,7 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
             f"{depth.shape}; give one frame at a time"
         )
     if np.issubdtype(depth.dtype, np.integer):
-        raise ToftrackError(
-            f"the depth image consists of whole numbers ({depth.dtype}), which looks like "
-            "millimetres, but must be float metres; give depth.astype('float32') / 1000"
-        )
+        raise wrong_unit("the depth image", median_reading(depth), str(depth.dtype))
     if not np.issubdtype(depth.dtype, np.floating):
         raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
     depth = np.ascontiguousarray(depth, np.float32)
@@ -125,10 +151,7 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
         farthest = depth.max()
     if farthest > LARGEST_MEDIAN_M:
-        median = float(np.median(depth[depth > 0]))
+        median = median_reading(depth)
         if median > LARGEST_MEDIAN_M:
-            raise ToftrackError(
-                f"the median of the depth image is {median:.0f}, which is plainly millimetres, but "
-                "it must be metres; give depth / 1000"
-            )
+            raise wrong_unit("the depth image", median)
     return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K

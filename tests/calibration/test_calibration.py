@@ -48,17 +48,25 @@ def calibrated(recording: Path) -> tuple[Camera, Path]:
     return Camera.load(out), report
 
 
+def parallel(width: int, **depth: object) -> Camera:
+    """A camera whose first row's rays hardly part: radial distance and Z are the same."""
+    return Camera(np.diag((1e5, 1e5, 1)), width, 2000, **depth)
+
+
+def rectified(camera: Camera, radial_m: np.ndarray) -> np.ndarray:
+    """(W,) of a first row (W,)."""
+    return camera.rectify(np.tile(radial_m.astype(np.float32), (2000, 1)), True)[0]
+
+
 def depth_error_m(camera: Camera) -> np.ndarray:
     """What is left of the depth error from 0.3 to 1.5 m."""
     true = np.linspace(0.3, 1.5, 500)
-    flat = Camera(
-        np.diag((1e9, 1e9, 1)),
+    flat = parallel(
         500,
-        1,
         depth_polynomial=camera.depth_polynomial,
         depth_polynomial_range_m=camera.depth_polynomial_range_m,
     )
-    return flat.rectify((true + wiggle(true))[None].astype(np.float32), True)[0] - true
+    return rectified(flat, true + wiggle(true)) - true
 
 
 def test_finds_the_lens_again(calibrated: tuple[Camera, Path]) -> None:
@@ -75,6 +83,20 @@ def test_takes_the_depth_error_away(calibrated: tuple[Camera, Path]) -> None:
     assert rms < 0.002
     true = np.linspace(0.3, 1.5, 500)
     assert np.sqrt((wiggle(true) ** 2).mean()) > 0.008
+
+
+def test_no_board_is_told_long_before_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(calibrate, "_HOPE_S", 0.0)
+    monkeypatch.setattr(calibration, "find_corners", lambda *_: None)
+    path = tmp_path / "none.npz"
+    images = np.full((6, 144, 176), 0.6, np.float32)
+    np.savez(path, depth_m=images, K=TRUE.K, amplitude=np.ones(images.shape, np.uint16))
+    with pytest.raises(ToftrackError, match="found in 0 frames"):
+        calibrate.main([str(path), "--board", "7x5", "--square", "0.03"])
+    told = capsys.readouterr().err
+    assert told.count("no 7x5 chequerboard seen so far, up to frame 0") == 1
 
 
 def test_report_tells_before_and_after(calibrated: tuple[Camera, Path]) -> None:
@@ -172,11 +194,9 @@ def test_the_polynomial_ignores_the_noise_of_single_pixels() -> None:
 
 
 def test_beyond_its_range_the_correction_stays_what_it_was() -> None:
-    camera = Camera(
-        np.diag((1e9, 1e9, 1)), 4, 1, depth_polynomial=(0, 0, 0, 1), depth_polynomial_range_m=(1, 2)
-    )
-    depth = camera.rectify(np.array([[0.5, 1.0, 2.0, 5.0]], np.float32), True)
-    np.testing.assert_allclose(depth, [[1.5, 2.0, 10.0, 13.0]], rtol=1e-6)
+    camera = parallel(4, depth_polynomial=(0, 0, 0, 1), depth_polynomial_range_m=(1, 2))
+    depth = rectified(camera, np.array([0.5, 1.0, 2.0, 5.0]))
+    np.testing.assert_allclose(depth, [1.5, 2.0, 10.0, 13.0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("image", [np.zeros((144, 176)), np.full((144, 176), 900)])

@@ -31,6 +31,11 @@ OPTIONS = sorted(
 OF_TRAINING = ("data",)
 """Groups of train_pose_space.py; the others are track.py's."""
 
+OF_EXTRAS = {
+    ("stream", "osc"): ("pythonosc", "osc"),
+    ("stream", "websocket"): ("websockets", "web"),
+}
+"""The package and the extra that an option needs."""
 # Without it the kernels' widths are cross-validated, which takes seconds.
 FASTER = {
     "isomap": ["pose_space.neighbours=8"],
@@ -77,6 +82,9 @@ def test_every_option_composes_and_can_be_made(
 ) -> None:
     if option == "rerun":
         pytest.importorskip("rerun", reason="of the extra rerun")
+    if (group, option) in OF_EXTRAS:
+        package, extra = OF_EXTRAS[group, option]
+        pytest.importorskip(package, reason=f"pip install '.[{extra}]'")
     # A camera like none, so that realsense.yaml needs neither its SDK nor a camera here.
     camera = fake_realsense.Camera("1", [fake_realsense.Profile("depth", "z16", (640, 480))], [])
     monkeypatch.setitem(sys.modules, "pyrealsense2", fake_realsense.Sdk(camera))

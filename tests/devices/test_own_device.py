@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import programs
 from helpers.tracking import ROOT
 from hydra.errors import HydraException
 from hydra.utils import instantiate
@@ -46,24 +47,21 @@ def workplace(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def track(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """`python track.py` as it is run in the user's folder."""
-    command = [sys.executable, str(ROOT / "track.py"), "--config-dir", "my_conf", "device=raw"]
-    return subprocess.run(
-        [*command, *arguments, "view=none", f"hydra.run.dir={folder / 'out'}"],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder)},
-        capture_output=True,
-        text=True,
-    )
+@pytest.fixture
+def track(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
+    """`python track.py` as it is run in the user's folder, with that in PYTHONPATH."""
+    monkeypatch.syspath_prepend(workplace)
+    monkeypatch.delitem(sys.modules, "my_device", raising=False)
+    given = ("--config-dir", "my_conf", "device=raw", "view=none", "hydra.run.dir=out")
+    return partial(programs.call, *given, folder=workplace)
 
 
-def test_the_readmes_camera_is_tracked(workplace: Path) -> None:
+def test_the_readmes_camera_is_tracked(workplace: Path, track: Callable) -> None:
     sample = Sample(stop=FRAMES)
     K = sample.camera.K
     assert len(from_page("own-device").splitlines()) <= 35
-    done = track(workplace, "device.path=images.raw", f"device.focal_px={K[0, 0]}")
-    assert done.returncode == 0, done.stderr
+    status, _, err = track("device.path=images.raw", f"device.focal_px={K[0, 0]}")
+    assert status == 0, err
     with np.load(workplace / "out" / "track.npz") as result:
         found = result["joints_m"]
         assert not result["lost"].any()
@@ -85,11 +83,11 @@ def test_its_own_error_is_told_in_one_sentence(
     assert sentence(caught.value) == "'nowhere.raw' cannot be opened: No such file or directory"
 
 
-def test_a_missing_argument_is_told(workplace: Path) -> None:
-    done = track(workplace)
-    assert done.returncode == 1
-    assert "device.path=" in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_a_missing_argument_is_told(track: Callable) -> None:
+    status, _, err = track()
+    assert status == 1
+    assert "device.path=" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

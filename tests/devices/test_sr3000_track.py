@@ -3,71 +3,55 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import programs
+from helpers.programs import QUICK, interrupted_when
 from helpers.settings import (
     sr3000,
     sr3000_emulator,
     usb_settings,
 )
 
-ROOT = Path(__file__).parents[2]
 EMULATED = ("device=sr3000", "device.transport=emulated", "view=none")
 
 
-def track(folder: Path, *overrides: str, **changes: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "track.py", *overrides, f"hydra.run.dir={folder}"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, **changes)
+def track(folder: Path, *overrides: str) -> tuple[int, str, str]:
+    return programs.call(*overrides, "hydra.run.dir=out", folder=folder)
 
 
 def test_without_a_camera_the_user_is_told_at_once(tmp_path: Path) -> None:
-    done = track(tmp_path, "device=sr3000", "device.usb.ids=[dead:0001,dead:0002]")
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: no SR3000")
-    assert done.stderr.count("\n") == 1
+    status, _, err = track(tmp_path, "device=sr3000", "device.usb.ids=[dead:0001,dead:0002]")
+    assert status == 1
+    assert err.startswith("error: no SR3000")
+    assert err.count("\n") == 1
     for words in ("dead:0001, dead:0002", "libmesasr", "emulated"):
-        assert words in done.stderr
+        assert words in err
 
 
 def test_tracks_through_faults_and_an_unplugged_cable(tmp_path: Path) -> None:
     faults = "device.emulated.faults=[unplug_during@6,short@9,zeros@12,timeout@14]"
-    done = track(
-        tmp_path,
-        *EMULATED,
-        "device.keep=every",
-        faults,
-        "device.stop=24",
-        "device.usb.timeout_ms=99",
-    )
-    assert done.returncode == 0, done.stderr
-    with np.load(tmp_path / "track.npz") as result:
+    usual = ("device.keep=every", "device.stop=24", "device.usb.timeout_ms=99")
+    status, out, err = track(tmp_path, *EMULATED, faults, *usual, *QUICK)
+    assert status == 0, err
+    with np.load(tmp_path / "out" / "track.npz") as result:
         assert len(result["joints_m"]) == 24
         assert result["lost"][12]  # the frame without a reading
         assert not result["lost"][-3:].any()
-    assert "22 delivered" in done.stdout + done.stderr
+    assert "22 delivered" in out + err
 
 
 def test_ctrl_c_keeps_what_was_done(tmp_path: Path) -> None:
-    command = [sys.executable, "track.py", *EMULATED, "device.emulated.loop=true"]
-    process = subprocess.Popen(
-        [*command, f"hydra.run.dir={tmp_path}"], cwd=ROOT, stderr=subprocess.PIPE, text=True
-    )
-    lines, deadline = tmp_path / "track.jsonl", time.monotonic() + 200
-    while not (lines.exists() and lines.stat().st_size) and time.monotonic() < deadline:
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert "Traceback" not in errors
-    assert (tmp_path / "track.npz").exists()
+    lines = tmp_path / "out" / "track.jsonl"
+    with interrupted_when(lambda: lines.exists() and lines.stat().st_size):
+        status, _, err = track(tmp_path, *EMULATED, "device.emulated.loop=true", *QUICK)
+    assert status == 130
+    assert "interrupted" in err and "Traceback" not in err
+    assert (tmp_path / "out" / "track.npz").exists()
 
 
 def memory_mb() -> float:

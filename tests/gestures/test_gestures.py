@@ -304,8 +304,8 @@ def test_without_gestures_there_are_no_labels() -> None:
 def test_results_carry_the_gesture_and_the_ray(tmp_path: Path) -> None:
     _, told = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
     with ResultWriter(tmp_path, {}, ["joint"] * 21) as writer:
-        writer.append(told)
-        writer.append(no_estimate(1, 0.04, "lost", 4, 0.0))
+        writer.append((told,))
+        writer.append((no_estimate(1, 0.04, "lost", 4, 0.0),))
     found = read_results(tmp_path / "track.npz")
     assert found["gesture"].tolist() == ["pointing_thumb", ""]
     assert found["pinch"][0] == pytest.approx(told.pinch) and np.isnan(found["pinch"][1])

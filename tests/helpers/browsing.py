@@ -14,6 +14,7 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
+from helpers.moments import one_hand, with_hand
 from helpers.settings import browser_view
 from helpers.tracking import make_tracker
 
@@ -32,7 +33,7 @@ def moments() -> tuple[TrackedFrame, ...]:
     for frame in device:
         depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
         estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        kept.append(TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight))
+        kept.append(one_hand(frame, depth, device.camera, estimate, shape, tracker.insight))
     return kept[0], kept[-1]
 
 
@@ -60,7 +61,8 @@ def next_picture(view: BrowserView, facts: dict) -> tuple[dict, bytes]:
 
 def post(view: BrowserView, body: object, path: str = "command", **headers: str) -> int:
     """The status of a POST as the page sends it, but for the given headers."""
-    headers = {"Content-Type": "application/json"} | {
+    token = view.address.partition("#")[2]
+    headers = {"Content-Type": "application/json", "X-Token": token} | {
         name.replace("_", "-"): value for name, value in headers.items()
     }
     data = body if isinstance(body, bytes) else json.dumps(body).encode()
@@ -101,9 +103,10 @@ def shown_again_and_again(view: BrowserView) -> Iterator[list[str]]:
             taken.extend(view.commands())
             moment, count = moments()[count // 5 % 2], count + 1
             side = next((c for c in reversed(taken) if c != "restart"), "right")
-            shape = moment.shape.of_side(side) if side != moment.shape.side else moment.shape
-            estimate = replace(moment.estimate, index=count)
-            view.show(replace(moment, estimate=estimate, shape=shape))
+            hand = moment.hands[0]
+            shape = hand.shape.of_side(side) if side != hand.shape.side else hand.shape
+            estimate = replace(hand.estimate, index=count)
+            view.show(with_hand(moment, estimate=estimate, shape=shape))
             stop.wait(0.02)
 
     thread = threading.Thread(target=run)

@@ -18,6 +18,7 @@ from toftrack.render.segmentation import NearestSurface
 from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.search import RoughStart, SearchStart
+from toftrack.tracking.side_belief import SideFit
 
 
 @cache
@@ -72,3 +73,8 @@ def relocation_settings(**changes: Any) -> RelocationSettings:
     assert isinstance(config, dict)
     del config["_target_"], config["weights"]
     return replace(RelocationSettings(**config), **changes)
+
+
+def side_fit(**changes: Any) -> SideFit:
+    """hand.sides."""
+    return replace(_part("hand").sides, **changes)

@@ -88,10 +88,10 @@ def test_a_frames_facts_are_read_off_its_image() -> None:
     assert (seen.nearest_m, seen.farthest_m) == pytest.approx((0.54, 2.46), abs=0.02)
     assert (seen.hand_px, seen.other_side) == (0, None)
     watch = Watch(REACH_M)
-    watch.see(lost, np.zeros_like(depth), None)
-    watch.see(replace(lost, lost=False), depth, None)
-    assert (watch.facts.frames, watch.facts.lost, watch.advice("right")) == (2, 1, ())
-    watch.see(lost, np.zeros_like(depth), None)
+    watch.see((lost,), np.zeros_like(depth), (None,))
+    watch.see((replace(lost, lost=False),), depth, (None,))
+    assert (watch.facts[0].frames, watch.facts[0].lost, watch.advice("right")) == (2, 1, ())
+    watch.see((lost,), np.zeros_like(depth), (None,))
     assert "0 % of the pixels had readings." in watch.advice("right")[0]
 
 

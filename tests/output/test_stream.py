@@ -11,13 +11,18 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
 import hydra
 import numpy as np
 import pytest
+from helpers import programs
+from helpers.hands import hand_estimate
+from helpers.programs import QUICK
 from helpers.settings import stdout_stream, udp_stream
 from helpers.tracking import CONF, ROOT, configuration, run
 
@@ -28,7 +33,6 @@ from toftrack.output.lines import LINE_FIELDS, json_line
 from toftrack.output.results import read_results
 from toftrack.output.stream import NoStream, ReaderGoneError
 
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 NUMBERS = np.random.default_rng(0)
 
 
@@ -42,7 +46,7 @@ def estimate(index: int) -> Estimate:
 
 
 @contextmanager
-def piped() -> Iterator[int]:
+def piped() -> Iterator[BinaryIO]:
     """The reading end of a pipe that is this process's standard output meanwhile.
 
     No fixture: pytest's own capturing begins anew between a fixture and its test.
@@ -53,18 +57,18 @@ def piped() -> Iterator[int]:
     os.dup2(writing, 1)
     os.close(writing)
     try:
-        yield reading
+        with os.fdopen(reading, "rb", buffering=0) as pipe:
+            yield pipe
     finally:
         os.dup2(kept, 1)
         os.close(kept)
-        os.close(reading)
 
 
-def lines_of(reading: int, until: Callable[[bytes], bool]) -> list[dict]:
+def lines_of(reading: BinaryIO, until: Callable[[bytes], bool]) -> list[dict]:
     content = b""
     while not until(content):
-        assert select.select((reading,), (), (), 20)[0], "nothing more comes"
-        content += os.read(reading, 1 << 16)
+        assert select.select((reading,), (), (), 200)[0], "nothing more comes"
+        content += reading.read(1 << 16)
     return [json.loads(line) for line in content.splitlines()]
 
 
@@ -85,8 +89,8 @@ def test_a_reader_of_standard_output_gets_every_line_as_in_track_jsonl() -> None
     sent = [estimate(i) for i in range(5)]
     with piped() as pipe, stdout_stream() as stream:
         for one in sent:
-            stream.send(one)
-            assert lines_of(pipe, ends_with(one.index)) == [json.loads(json_line(one))]
+            stream.send((one,))
+            assert lines_of(pipe, ends_with(one.index)) == [json.loads(json_line((one,)))]
 
 
 def test_nothing_else_gets_to_standard_output() -> None:
@@ -97,7 +101,7 @@ from toftrack.output.stream import StdoutStream
 with StdoutStream(None, 25) as stream:
     print("printed")
     os.system("echo from below")
-    stream.send(no_estimate(1, 0.0, 'lost', 4, 0.0))
+    stream.send((no_estimate(1, 0.0, 'lost', 4, 0.0),))
 print("after")
 """
     told = subprocess.run(
@@ -120,7 +124,7 @@ def test_a_reader_that_falls_behind_gets_the_newest_and_whole_lines(
         reader = threading.Thread(target=lambda: found.extend(lines_of(pipe, ends_with(299))))
         with stdout_stream(waiting=3) as stream:
             for i in range(300):
-                stream.send(estimate(i))
+                stream.send((estimate(i),))
             reader.start()
         reader.join(20)
     indices = [line["index"] for line in found]
@@ -136,7 +140,7 @@ def test_a_reader_that_never_reads_stops_nothing(
     caplog.set_level(logging.INFO)
     with piped(), stdout_stream(waiting=1) as stream:
         for i in range(300):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     words = caplog.text.split()
     sent, dropped = (int(words[words.index(word) - 1]) for word in ("estimates", "dropped"))
     assert sent + dropped == 300 and dropped > 100
@@ -148,9 +152,9 @@ def test_a_reader_that_goes_away_is_told_at_once() -> None:
     os.dup2(writing, 1)
     try:
         with pytest.raises(ReaderGoneError, match="Broken pipe"), stdout_stream() as stream:
-            stream.send(estimate(0))
+            stream.send((estimate(0),))
             os.close(reading)
-            stream.send(estimate(1))
+            stream.send((estimate(1),))
     finally:
         os.dup2(kept, 1)
         os.close(kept)
@@ -160,8 +164,8 @@ def test_a_reader_that_goes_away_is_told_at_once() -> None:
 def test_a_datagram_is_a_whole_line(receiver: socket.socket) -> None:
     with udp_stream(*receiver.getsockname()) as stream:
         for i in range(3):
-            stream.send(one := estimate(i))
-            assert receiver.recv(65535).decode() == json_line(one) + "\n"
+            stream.send(((one := estimate(i)),))
+            assert receiver.recv(65535).decode() == json_line((one,)) + "\n"
 
 
 def test_datagrams_that_nobody_wants_stop_nothing(caplog: pytest.LogCaptureFixture) -> None:
@@ -171,7 +175,7 @@ def test_datagrams_that_nobody_wants_stop_nothing(caplog: pytest.LogCaptureFixtu
         port = free.getsockname()[1]
     with udp_stream("127.0.0.1", port) as stream:
         for i in range(50):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     assert f"50 estimates sent to 127.0.0.1 port {port}, 0 dropped" in caplog.text
 
 
@@ -180,20 +184,20 @@ def test_datagrams_that_the_system_refuses_are_counted(caplog: pytest.LogCapture
     caplog.set_level(logging.INFO)
     with udp_stream("255.255.255.255", 5005) as stream:
         for i in range(3):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     assert "0 estimates sent" in caplog.text and "3 dropped (" in caplog.text
 
 
 def test_a_receiver_that_never_reads_stops_nothing(receiver: socket.socket) -> None:
     with udp_stream(*receiver.getsockname()) as stream:
         for i in range(1000):
-            stream.send(estimate(i))
+            stream.send((estimate(i),))
     assert json.loads(receiver.recv(65535))["index"] == 0
 
 
 def test_only_the_wanted_fields_are_sent(receiver: socket.socket) -> None:
     with udp_stream(*receiver.getsockname(), fields=["lost", "joints_m", "index"]) as stream:
-        stream.send(estimate(7))
+        stream.send((estimate(7),))
     line = json.loads(receiver.recv(65535))
     assert list(line) == ["lost", "joints_m", "index"] and line["index"] == 7
 
@@ -205,9 +209,10 @@ def test_the_fields_that_the_configuration_advises_fit_into_one_ethernet_frame()
     # Numbers of as many digits as there are; only depth is never negative.
     joints = np.full((21, 3), -0.12345678, np.float32) * np.float32([1, 1, -1])
     wanted = ("index", "timestamp_s", "lost", "joints_m")
-    line = json_line(replace(found, joints_m=joints, timestamp_s=12345.678901), wanted)
+    line = json_line((replace(found, joints_m=joints, timestamp_s=12345.678901),), wanted)
     assert len(line) + 1 <= 1472
-    assert len(json_line(found)) < 6000, "and all fields are as long as it says"
+    whole = replace(hand_estimate(10000), covariance=found.covariance)
+    assert 6000 < len(json_line((whole,))) < 10000, "and all fields are as long as it says"
 
 
 @pytest.mark.parametrize(
@@ -232,40 +237,38 @@ def test_a_bad_setting_is_one_clear_error(overrides: list[str], words: str) -> N
 def test_no_stream_takes_everything() -> None:
     with hydra.utils.instantiate(configuration().stream) as stream:
         assert isinstance(stream, NoStream)
-        stream.send(estimate(0))
+        stream.send((estimate(0),))
 
 
-def program(*arguments: str, folder: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / "track.py"), "view=none", "hydra.run.dir=out", *arguments],
-        cwd=folder,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+GIVEN = ("stream=stdout", "view=none", "hydra.run.dir=out", *QUICK)
 
 
 def test_standard_output_is_the_stream_s_alone_and_the_table_goes_to_standard_error(
     tmp_path: Path,
 ) -> None:
-    process = program("stream=stdout", "device.stop=6", *QUICK, folder=tmp_path)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert out == (tmp_path / "out" / "track.jsonl").read_text()
-    assert tuple(json.loads(out.splitlines()[0])) == LINE_FIELDS
-    assert "joint error, mean" in err and "track.npz" in err
-    assert "stream: 6 estimates sent to standard output, 0 dropped" in err
+    command = [sys.executable, str(ROOT / "track.py"), *GIVEN, "device.stop=6"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == (tmp_path / "out" / "track.jsonl").read_text()
+    assert tuple(json.loads(done.stdout.splitlines()[0])) == LINE_FIELDS
+    assert "joint error, mean" in done.stderr and "track.npz" in done.stderr
+    assert "stream: 6 estimates sent to standard output, 0 dropped" in done.stderr
 
 
 def test_a_reader_that_has_enough_ends_the_tracking_and_its_results_are_kept(
     tmp_path: Path,
 ) -> None:
-    process = program("stream=stdout", *QUICK, folder=tmp_path)
-    first = [json.loads(process.stdout.readline()) for _ in range(2)]
-    process.stdout.close()
-    err = process.stderr.read()
-    assert process.wait(timeout=120) == 0, err
+    first: list[dict] = []
+
+    def read_two(pipe: BinaryIO) -> None:
+        with pipe:
+            first.extend(lines_of(pipe, lambda content: content.count(b"\n") >= 2)[:2])
+
+    with piped() as pipe, ThreadPoolExecutor() as pool:
+        reader = pool.submit(read_two, pipe)
+        status, _, err = programs.call(*GIVEN, folder=tmp_path)
+        reader.result()
+    assert status == 0, err
     assert "standard output takes no more lines (Broken pipe): tracking ends here" in err
     assert "Traceback" not in err and "error:" not in err
     lines = (tmp_path / "out" / "track.jsonl").read_text().splitlines()

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import programs
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
@@ -27,9 +26,9 @@ from toftrack.pose_space.data.pose_files import file_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, make_pose_space
 from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
 from toftrack.pose_space.reach import nearest_latents
+from toftrack.programs import train
 from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
 
-ROOT = Path(__file__).parents[2]
 LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
 
 
@@ -294,14 +293,18 @@ def test_figures_of_any_data_are_drawn(dims: int) -> None:
     assert corners_figure(space, size=60).std() > 0
 
 
-def test_the_command_trains_on_a_users_file_and_records_it(tmp_path: Path) -> None:
+def test_the_command_trains_on_a_users_file_and_records_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "_SILENT_S", 0)
     mine = write_csv(tmp_path / "mine.csv", random_angles(40).rad2deg().numpy())
     out = tmp_path / "out"
-    command = [sys.executable, "train_pose_space.py", "pose_space=lle", "pose_space.dims=2"]
-    command += ["data=file", f"data.path={mine}", "compare=[1]", f"hydra.run.dir={out}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert "40 training poses" in done.stdout and " deg," in done.stdout
+    given = ("pose_space=lle", "pose_space.dims=2", "data=file", f"data.path={mine}")
+    given += ("compare=[1]", "hydra.run.dir=out")
+    status, printed, err = programs.call(*given, folder=tmp_path, program="train_pose_space.py")
+    assert status == 0, err
+    assert "learning spaces for the table of errors" in err and "2/2" in err
+    assert "40 training poses" in printed and " deg," in printed
     assert load_pose_space(out / "pose_space.npz").dims == 2
     header = json.loads(str(np.load(out / "pose_space.npz")["header"]))
     assert header["sources"][0]["file"] == "mine.csv"

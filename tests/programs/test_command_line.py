@@ -13,11 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers.tracking import CONF
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
 import toftrack
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 from toftrack.programs.command_line import run
+from toftrack.programs.sweeps import FailedJobs
 
 
 @pytest.fixture(autouse=True)
@@ -175,6 +179,55 @@ def test_one_failing_job_does_not_stop_the_others(app: Path) -> None:
     assert summary(0) == {"error": "the reason, and what to do"}
     assert summary(1) == {"frames": 3, "error": "after three frames"}
     assert not (app / "sweep" / "3" / "summary.json").exists()
+
+
+LAUNCHER = """
+import os
+from hydra.core.config_store import ConfigStore
+from hydra.core.utils import JobReturn, JobStatus
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+
+class ForkingLauncher(BasicLauncher):
+    \"\"\"Every job in a process that keeps to itself what it knows.\"\"\"
+    def launch(self, job_overrides, initial_job_idx):
+        for number, overrides in enumerate(job_overrides, initial_job_idx):
+            child = os.fork()
+            if not child:
+                super().launch([overrides], number)
+                os._exit(0)
+            os.waitpid(child, 0)
+        done = JobReturn(status=JobStatus.COMPLETED)
+        done.return_value = 0.0
+        return [done] * len(job_overrides)
+
+ConfigStore.instance().store(
+    group="hydra/launcher",
+    name="forking",
+    node={"_target_": "hydra_plugins.forking.ForkingLauncher"},
+)
+"""
+
+
+def test_jobs_that_fail_in_other_processes_are_counted(app: Path) -> None:
+    """As the launchers joblib, submitit and ray run them, which are extras."""
+    (app / "hydra_plugins").mkdir()
+    (app / "hydra_plugins" / "forking.py").write_text(LAUNCHER)
+    with open(app / "conf" / "app.yaml", "a") as config:
+        called = "{failed_jobs: {_target_: toftrack.programs.sweeps.FailedJobs}}"
+        config.write(f"hydra: {{callbacks: {called}}}\n")
+    sweep = ("-m", "hydra/launcher=forking", "hydra.sweep.dir=sweep")
+    status, _, err = call(app, *sweep, "fail=clear,late,''")
+    assert status == 1 and err.splitlines()[-1] == "error: 2 of the jobs failed, see above"
+    # The folders of those that failed are there still.
+    status, _, err = call(app, *sweep, "seed=1", "hydra.sweep.subdir=other")
+    assert (status, err) == (0, "")
+
+
+def test_the_programs_count_jobs_that_failed_elsewhere() -> None:
+    for name in ("config", "train_pose_space", "train_relocaliser"):
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose(name, return_hydra_config=True)
+        assert isinstance(instantiate(config.hydra.callbacks.failed_jobs), FailedJobs)
 
 
 def test_a_sweep_of_good_jobs_exits_with_zero(app: Path) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,24 +11,27 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import programs
 from helpers.configured import f_measure, nearest_surface
+from helpers.programs import QUICK
 from helpers.tracking import ROOT, make_tracker, sample
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
+from toftrack.output.lines import HAND_FIELDS
 from toftrack.output.run_folder import open_footage, read_run
 from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
+from toftrack.render.model_image import model_range_image, parted, posed_hand
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify
 from toftrack.views.figures import chart
-from toftrack.views.model_image import model_range_image, parted, posed_hand
+from toftrack.views.skeleton import SLOT_RGB
 
 NAMES = ("measurement", "filmstrip", "lost", "course", "latent")
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 FRAMES = 12
 
 
@@ -47,16 +48,9 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = len(arrays["depth_m"])
     short = {key: v[:FRAMES] if v.ndim and len(v) == rows else v for key, v in arrays.items()}
     np.savez(folder / "hand.npz", **short)
-    done = subprocess.run(
-        [
-            *(sys.executable, str(ROOT / "track.py"), "device=replay", "device.path=hand.npz"),
-            *("view=none", "hydra.run.dir=run", *QUICK),
-        ],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    given = ("device=replay", "device.path=hand.npz", "view=none", "hydra.run.dir=run")
+    status, _, err = programs.call(*given, *QUICK, folder=folder)
+    assert status == 0, err
     return folder / "run"
 
 
@@ -205,6 +199,47 @@ def test_runs_of_older_versions_are_read_as_well(run: Path) -> None:
     assert (one.index, one.state_name, one.score) == (same.index, same.state_name, same.score)
     assert one.side == "right" and 0 <= one.confidence <= 1
     assert same.side == "" and np.isnan(same.confidence)
+
+
+def test_two_hands_have_figures_of_their_own_and_one_filmstrip(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second slot has a hand from frame 4 on, of which the recording knows nothing."""
+
+    def beside(values: np.ndarray) -> np.ndarray:
+        second = values.copy()
+        if second.dtype.kind in "fbU":
+            second[:4] = {"f": np.nan, "b": True, "U": ""}[second.dtype.kind]
+        return np.stack([values, second], 1)
+
+    with np.load(run / "track.npz") as archive:
+        change(run, **{name: beside for name in HAND_FIELDS if name in archive})
+    shutil.copy(run / "hand_shape.json", run / "hand_shape_2.json")
+    summary = json.loads((run / "summary.json").read_text())
+    summary["metrics"]["slot"] = 0
+    (run / "summary.json").write_text(json.dumps(summary))
+    titles, panels = [], []
+
+    def title(*values: object) -> np.ndarray:
+        titles.append(next(value for value in values if isinstance(value, str)))
+        return np.zeros((9, 9, 3), np.uint8)
+
+    for name in ("measurement_figure", "lost_figure", "course_figure", "latent_figure"):
+        monkeypatch.setattr(figures, name, title)
+    monkeypatch.setattr(
+        figures, "filmstrip_figure", lambda made, _: (panels.extend(made), made[0])[1]
+    )
+    written = [path.stem for path in draw_figures(run)]
+    assert written == [*NAMES, *(f"{name}_2" for name in NAMES if name != "filmstrip")]
+    assert [text.partition(".")[0] for text in titles] == [
+        *["Slot 0, right hand"] * 4,
+        *["Slot 1, right hand"] * 4,
+    ]
+    assert "mean joint error" in titles[2] and "mean joint error" not in titles[6]
+    orange = SLOT_RGB[1][::-1]
+    assert share(panels[-1], orange) > share(panels[0], orange) > 0, "it is in the captions"
+    one = read_run(run).slot(1)
+    assert np.isnan(one.estimate(3).score) and one.estimate(5).joints_m.shape == (21, 3)
 
 
 def test_without_truth_the_score_stands_alone(run: Path, tmp_path: Path) -> None:

@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import pickle
-import runpy
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers import programs
+from helpers.programs import QUICK
 from helpers.tracking import ROOT
-from hydra.core.singleton import Singleton
 
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
 from toftrack.estimate import STATES
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import read_results
-from toftrack.pose_space.files import fit_pose_space, save_pose_space
+from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
 from toftrack.programs.recover import recover
 
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
 K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])
 
 
@@ -54,32 +55,10 @@ def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
     )
 
 
-def call(*arguments: str, cwd: Path) -> tuple[int, str, str]:
-    process = start(*arguments, cwd=cwd)
-    out, err = process.communicate(timeout=300)
-    return process.returncode, out, err
-
-
 @pytest.fixture
-def here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Iterator[Callable[..., tuple[int, str, str]]]:
-    """`python track.py` within this process, which has loaded everything already."""
-    kept, root = Singleton.get_state(), logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["track.py", "hydra.run.dir=out", *arguments])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            runpy.run_path(str(ROOT / "track.py"), run_name="__main__")
-        return end.value.code, *capsys.readouterr()
-
-    yield run
-    Singleton.set_state(kept)
-    root.handlers[:], root.level = handlers, level
+def here(tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
+    """`python track.py` within this process, with `out` for its folder."""
+    return partial(programs.call, "hydra.run.dir=out", folder=tmp_path)
 
 
 def save(path: Path, drop: tuple[str, ...] = (), **changes: object) -> Path:
@@ -93,7 +72,7 @@ def save(path: Path, drop: tuple[str, ...] = (), **changes: object) -> Path:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str, str]:
     """The output folder, status, standard output and standard error of one ordinary run."""
     folder = tmp_path_factory.mktemp("whole")
-    told = call("device.stop=12", "hydra.run.dir=deep/er", *QUICK, cwd=folder)
+    told = programs.call("device.stop=12", "hydra.run.dir=deep/er", *QUICK, folder=folder)
     return folder / "deep" / "er", *told
 
 
@@ -130,7 +109,8 @@ def test_track_npz_is_as_promised(whole) -> None:
             assert archive[key].dtype == kind, key
         assert archive["gesture"].shape == (12,) and archive["gesture"].dtype.kind == "U"
         assert archive["joint_names"].tolist() == list(JOINT_NAMES)
-        assert (archive["side"] == "right").all() and (archive["side_probability"] == 1).all()
+        assert (archive["side"] == "right").all()
+        assert ((archive["side_probability"] > 0.5) & (archive["side_probability"] < 1)).all()
         sure = archive["confidence"]
         assert ((sure >= 0) & (sure <= 1)).all()
         assert (archive["outside_rad"] >= 0).all()
@@ -223,7 +203,7 @@ def test_a_recording_is_tracked_by_its_name_alone_and_a_killed_run_recovered(
     name = "Übung 'eins' [2]=a,b.npz"
     shutil.copy(ROOT / "toftrack" / "data" / "sample.npz", tmp_path / name)
     status, _, err = here(name, "device.start=10", "device.stop=18", "view=none", *QUICK)
-    assert status == 0 and f"tracking {name} (8 frames): a right hand" in err
+    assert status == 0 and f"tracking {name} (8 frames): a hand of either side" in err
     before = read_results(tmp_path / "out" / "track.npz")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert before["metadata"]["device"]["recording"] == name
@@ -240,9 +220,28 @@ def test_a_recording_is_tracked_by_its_name_alone_and_a_killed_run_recovered(
     assert summary["metrics"]["trust"]["visible"] == 8 and summary["hand"]["side"] == "right"
 
 
+def test_two_hands_are_written_slot_by_slot(here, tmp_path: Path) -> None:
+    status, out, err = here("hands=2", "device.stop=3", "stream=stdout", "view=video", *QUICK)
+    assert status == 0, err
+    assert "up to two hands, their lengths fitted" in err and "a right hand" not in err
+    folder = tmp_path / "out"
+    result = read_results(folder / "track.npz")
+    assert result["joints_m"].shape == (3, 2, 21, 3) and result["index"].shape == (3,)
+    assert not result["lost"].all(1).any() and result["metadata"]["config"]["hands"] == 2
+    told = (folder / "track.jsonl").read_text()
+    first = json.loads(told.splitlines()[0])["hands"][0]
+    assert first["slot"] in (0, 1) and first["side"] in ("right", "left")
+    for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
+        assert HandShape.load(folder / name).side in ("right", "left"), slot
+    summary = json.loads((folder / "summary.json").read_text())
+    assert [slot["slot"] for slot in summary["slots"]] == [0, 1] and "hand" not in summary
+    assert summary["metrics"]["trust"]["visible"] == 3 and "ghost_pct" in summary["metrics"]
+    assert len(video_frames(folder / "overlay.mp4")) == 3
+
+
 def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
     sweep = ("-m", "seed=1,2", "hydra.sweep.dir=sweep", "device.stop=3", "view=none")
-    status, out, err = call(*sweep, *QUICK, cwd=tmp_path)
+    status, out, err = programs.call(*sweep, *QUICK, folder=tmp_path)
     assert status == 0, err
     assert out.count("time a frame") == 2
     one, two = (read_results(tmp_path / "sweep" / n / "track.npz") for n in ("0", "1"))
@@ -251,8 +250,9 @@ def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
 
 
 def test_a_missing_recording_is_told_in_one_line_by_the_program_itself(tmp_path: Path) -> None:
-    status, out, err = call("device=replay", "device.path=gone.npz", cwd=tmp_path)
-    assert (status, out) == (1, "")
+    process = start("device=replay", "device.path=gone.npz", cwd=tmp_path)
+    out, err = process.communicate(timeout=300)
+    assert (process.returncode, out) == (1, "")
     assert err == "error: there is no file 'gone.npz'; give the path of a recording (.npz)\n"
 
 
@@ -273,25 +273,31 @@ MILLIMETRES = np.full((3, 30, 40), 600.0, np.float32)
     ],
 )
 def test_a_bad_recording_is_one_clear_sentence(
-    here, tmp_path, name: str, drop, changes: dict, words: str
+    tmp_path, name: str, drop, changes: dict, words: str
 ) -> None:
-    save(tmp_path / "bad.npz", drop, **changes)
+    path = save(tmp_path / "bad.npz", drop, **changes)
+    with pytest.raises(ToftrackError) as told:
+        Replay(path)
+    assert words in str(told.value) and "bad.npz" in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_bad_recording_ends_the_program_before_it_writes(here, tmp_path) -> None:
+    save(tmp_path / "bad.npz", ("depth_m",))
     status, out, err = here("device=replay", "device.path=bad.npz")
     assert (status, out) == (1, "")
-    assert err.startswith("error: ") and err.count("\n") == 1
-    assert words in err and "bad.npz" in err
+    assert err.startswith("error: ") and err.count("\n") == 1 and "bad.npz" in err
     assert not (tmp_path / "out" / "track.npz").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut off"])
-def test_what_is_no_archive_is_one_clear_sentence(here, tmp_path, content: bytes) -> None:
+def test_what_is_no_archive_is_one_clear_sentence(tmp_path, content: bytes) -> None:
     (tmp_path / "bad.npz").write_bytes(content)
-    status, out, err = here("device=replay", "device.path=bad.npz")
-    assert (status, out) == (1, "")
-    assert err.startswith("error: 'bad.npz' is not an .npz archive") and err.count("\n") == 1
+    with pytest.raises(ToftrackError, match="bad.npz' is not an .npz archive"):
+        Replay(tmp_path / "bad.npz")
 
 
-def test_a_pickle_by_itself_is_refused_and_not_loaded(here, tmp_path) -> None:
+def test_a_pickle_by_itself_is_refused_and_not_loaded(tmp_path) -> None:
     class Trap:
         def __reduce__(self) -> tuple:
             return Path.touch, (tmp_path / "sprung",)
@@ -299,24 +305,29 @@ def test_a_pickle_by_itself_is_refused_and_not_loaded(here, tmp_path) -> None:
     np.savez(tmp_path / "bad.npz", K=K, depth_m=np.array([Trap()], object))
     (tmp_path / "plain.npz").write_bytes(pickle.dumps(Trap()))
     for file in ("bad.npz", "plain.npz"):
-        status, _, err = here("device=replay", f"device.path={file}")
-        assert status == 1 and err.startswith("error: ") and err.count("\n") == 1
+        with pytest.raises(ToftrackError, match=file):
+            Replay(tmp_path / file)
     assert not (tmp_path / "sprung").exists()
 
 
 def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here, tmp_path) -> None:
-    save_pose_space(fit_pose_space("pca", 3), tmp_path / "small.npz")
-    status, _, err = here("pose_space.file=small.npz")
-    assert status == 1 and "3-dimensional" in err and "pose_space.dims=3" in err
-    with np.load(tmp_path / "small.npz") as archive:
+    def told(path: str | Path) -> str:
+        with pytest.raises(ToftrackError) as error:
+            load_pose_space(path)
+        return str(error.value)
+
+    small, newer = tmp_path / "small.npz", tmp_path / "newer.npz"
+    save_pose_space(fit_pose_space("pca", 3), small)
+    with np.load(small) as archive:
         arrays = dict(archive)
     arrays["header"] = np.array(str(arrays["header"]).replace('"version": 1', '"version": 99'))
-    np.savez(tmp_path / "newer.npz", **arrays)
-    status, _, err = here("pose_space.file=newer.npz")
-    assert status == 1 and "version 99" in err and err.count("\n") == 1
-    for path, words in (("gone.npz", "no pose-space file"), (__file__, "not a pose-space file")):
-        status, _, err = here(f"pose_space.file={path}")
-        assert status == 1 and words in err and err.count("\n") == 1
+    np.savez(newer, **arrays)
+    assert "version 99" in told(newer)
+    assert "no pose-space file" in told(tmp_path / "gone.npz")
+    assert "not a pose-space file" in told(__file__)
+    status, _, err = here("pose_space.file=small.npz")
+    assert status == 1 and "3-dimensional" in err and "pose_space.dims=3" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -334,6 +345,7 @@ def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here
         (["device=telescope"], "device=telescope"),
         (["experiment=other"], "experiment=other"),
         (["particles=3"], "particles"),
+        (["hands=3"], "hands=3 is not possible"),
     ],
 )
 def test_a_bad_setting_is_one_clear_sentence(here, overrides: list[str], words: str) -> None:

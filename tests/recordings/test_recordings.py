@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.recordings.npz import read_recording, write_recording
 
@@ -125,6 +126,18 @@ def test_write_then_read_is_the_same(tmp_path: Path, radial: bool, kind: type) -
     assert [p.name for p in tmp_path.glob("*.part")] == []
 
 
+def test_the_other_hands_truth_is_kept_and_cut_with_the_first_ones(tmp_path: Path) -> None:
+    joints, seen = np.full((T, 21, 3), 0.5, np.float32), np.array([False, True, True, False])
+    first = read_recording(save(tmp_path, joints2_m=joints, visible2=seen))
+    write_recording(tmp_path / "copy.npz", first)
+    for truth in (first.truth, read_recording(tmp_path / "copy.npz").truth):
+        np.testing.assert_array_equal(truth.other.joints_m, joints)
+        np.testing.assert_array_equal(truth[1:3].other.visible, [True, True])
+        np.testing.assert_array_equal(truth.of_frames(np.array([0, 3])).other.visible, [False] * 2)
+        assert truth.other.in_space.all() and truth.other.joint_visible is None
+    assert read_recording(save(tmp_path)).truth.other is None
+
+
 def test_writing_into_no_folder_is_told(tmp_path: Path) -> None:
     recording = read_recording(save(tmp_path))
     with pytest.raises(ToftrackError, match="cannot be written"):
@@ -216,6 +229,30 @@ def test_pickled_objects_are_refused(tmp_path: Path, key: str) -> None:
     assert not Canary.woken
 
 
+@pytest.mark.parametrize("told", ["", "timestamp_s"])
+def test_frames_that_are_counted_last_are_told(tmp_path: Path, told: str) -> None:
+    depth = np.full((48, 64, 20), 0.6, np.float32)
+    camera = np.array([[70.0, 0, 32], [0, 70.0, 24], [0, 0, 1]])
+    times = {"timestamp_s": np.arange(20.0)} if told else {}
+    path = tmp_path / "recording.npz"
+    np.savez(path, depth_m=depth, K=camera, **times)
+    assert "(rows, columns, frames)" in complaint(path)
+    if told:
+        return
+    # As many frames as rows, and a time for each: K alone does not decide.
+    np.savez(path, depth_m=depth, K=camera, timestamp_s=np.arange(48.0))
+    assert len(read_recording(path)) == 48
+
+
+@pytest.mark.parametrize(("level", "words"), [(0.0, "no pixel has a reading"), (0.6, "0.6 m")])
+def test_images_of_nothing_are_read_and_doubted(
+    tmp_path: Path, level: float, words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert len(list(Replay(save(tmp_path, depth_m=np.full((T, H, W), level, np.float32))))) == T
+    (message,) = caplog.messages
+    assert words in message and "recording.npz" in message
+
+
 @pytest.mark.parametrize("key", ["depth_m", "K"])
 def test_required_key_missing(tmp_path: Path, key: str) -> None:
     text = complaint(save(tmp_path, **{key: None}))
@@ -256,6 +293,18 @@ def test_bad_camera_matrix(tmp_path: Path, matrix: np.ndarray, words: str) -> No
     assert words in text
 
 
+@pytest.mark.parametrize(
+    ("unit", "kind"),
+    [(40, np.float32), (0.001, np.float32), (1e-6, np.float32), (30, np.uint16), (4e4, np.uint16)],
+)
+def test_a_unit_that_is_neither_metres_nor_millimetres_is_doubted(
+    tmp_path: Path, unit: float, kind: type
+) -> None:
+    depth = np.clip(arrays()["depth_m"] * unit, 0, 65535).astype(kind)
+    text = complaint(save(tmp_path, depth_m=depth))
+    assert "neither metres nor millimetres" in text and "1000" not in text
+
+
 @pytest.mark.parametrize("kind", [np.uint16, np.int32, np.int64])
 def test_whole_numbers_look_like_millimetres(tmp_path: Path, kind: type) -> None:
     text = complaint(save(tmp_path, depth_m=np.full((T, H, W), 500, kind)))
@@ -269,7 +318,7 @@ def test_millimetres_are_told_with_the_conversion(tmp_path: Path, key: str) -> N
     depth[:, : H - 1] = 0  # mostly without a reading, which must not hide it
     text = complaint(save(tmp_path, **({"depth_m": None} | {key: depth})))
     assert "millimetres" in text
-    assert f"{key} = depth / 1000" in text
+    assert f"'{key}'" in text and "depth.astype('float32') / 1000" in text
 
 
 def test_a_recording_without_any_reading_is_valid(tmp_path: Path) -> None:

@@ -209,24 +209,18 @@ def test_wide_images():
         check(make_scorer(name, shape, CPU)(states, evidence), expected)
 
 
-def test_the_compiled_kernel_is_cached_and_announced(tmp_path):
-    """A first process compiles, with a message; a second one does not."""
+def test_the_compiled_kernel_is_cached():
+    """A second process compiles nothing."""
+    make_scorer("numba", default_hand_shape(), CPU)
     code = (
-        "import logging, time; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
-        "from toftrack.render.numba.scorer import NumbaScorer\n"
         "from toftrack.hand.shape import default_hand_shape\n"
-        "t = time.perf_counter(); NumbaScorer(default_hand_shape())\n"
-        "print('seconds', time.perf_counter() - t)"
+        "from toftrack.render.numba.scorer import NumbaScorer, score_hands\n"
+        "NumbaScorer(default_hand_shape())\n"
+        "found = score_hands.stats\n"
+        "assert sum(found.cache_hits.values()) == 1 and not found.cache_misses, found\n"
     )
-    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    runs = [
-        subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
-        for _ in range(2)
-    ]
-    seconds = [float(run.stdout.split()[-1]) for run in runs]
-    assert runs[0].stderr.count("compiling the numba kernel") == 1
-    assert "compiling" not in runs[1].stderr
-    assert seconds[1] < min(1.0, seconds[0] / 4)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 130), (70, 1), (9, 65)])
@@ -254,25 +248,26 @@ INTERPRETED = [
 ]
 
 
-@pytest.mark.parametrize(("height", "width", "radius_px", "side"), INTERPRETED)
-def test_triton_agrees_as_far_as_its_interpreter_goes(height, width, radius_px, side):
+def test_triton_agrees_as_far_as_its_interpreter_goes():
     """The CUDA kernels, interpreted on the CPU in a process of its own."""
     pytest.importorskip("triton", reason="triton is not installed")
     code = (
         "import torch, sys; sys.path.insert(0, 'tests/render')\n"
         "from test_scoring import *\n"
         "from toftrack.render.triton.scorer import TritonScorer\n"
-        f"size, side = ({height}, {width}), {side!r}\n"
-        "shape = default_hand_shape(side=side)\n"
-        f"evidence = random_evidence(shape, *size, {radius_px}, 0.4, 1)\n"
-        "states = random_states(6, (0.3, 0.5), 1)\n"
-        "states[:3, :3] = torch.tensor([0.0, 0.08, 0.4]); states[:3, 3:] *= 0.1\n"
-        "states[1, 0], states[2, 0] = -0.4 * size[1] / size[0] / 3, 0.4 * size[1] / size[0] / 3\n"
-        "states[4, 2] = -0.4\n"
-        "states[5, 7] = math.nan\n"
-        "found = TritonScorer(shape)(states, evidence)\n"
-        "assert all(field[5] == 0 for field in found)\n"
-        "check(Counts(*(f[:5] for f in found)), ReferenceScorer(shape)(states[:5], evidence))\n"
+        "for *size, radius_px, side in INTERPRETED:\n"
+        "    shape = default_hand_shape(side=side)\n"
+        "    evidence = random_evidence(shape, *size, radius_px, 0.4, 1)\n"
+        "    states = random_states(6, (0.3, 0.5), 1)\n"
+        "    states[:3, :3] = torch.tensor([0.0, 0.08, 0.4]); states[:3, 3:] *= 0.1\n"
+        "    aside = 0.4 * size[1] / size[0] / 3\n"
+        "    states[1, 0], states[2, 0] = -aside, aside\n"
+        "    states[4, 2] = -0.4\n"
+        "    states[5, 7] = math.nan\n"
+        "    found = TritonScorer(shape)(states, evidence)\n"
+        "    assert all(field[5] == 0 for field in found)\n"
+        "    expected = ReferenceScorer(shape)(states[:5], evidence)\n"
+        "    check(Counts(*(f[:5] for f in found)), expected)\n"
     )
     env = {**os.environ, "TRITON_INTERPRET": "1"}
     run = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)

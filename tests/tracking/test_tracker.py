@@ -14,10 +14,10 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.hand.skeleton import forward_kinematics
+from toftrack.render.model_image import model_range_image
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.search import RoughStart
 from toftrack.tracking.tracker import Tracker
-from toftrack.views.model_image import model_range_image
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
@@ -29,6 +30,7 @@ from helpers.browsing import (
     raw,
     shown_again_and_again,
 )
+from helpers.moments import two_hands, with_hand
 from helpers.settings import browser_view
 
 from toftrack.errors import ToftrackError
@@ -64,7 +66,7 @@ def test_the_picture_is_the_overlay_of_the_newest_frame(view) -> None:
     assert picture.shape == panel.shape
     assert np.abs(picture.astype(int) - panel).mean() < 3
     assert np.abs(picture.astype(int) - draw_tracked(first)[CAPTION_PX:]).mean() > 3
-    estimate = second.estimate
+    estimate = second.estimates[0]
     assert (facts["phase"], facts["index"]) == ("live", estimate.index)
     assert facts["score"] == pytest.approx(estimate.score, abs=1e-3)
     assert (facts["state"], facts["lost"]) == (state_words(estimate), estimate.lost)
@@ -92,9 +94,25 @@ def test_a_page_of_an_earlier_run_gets_this_runs_picture_at_once(view) -> None:
 
 def test_a_frame_without_a_hand_is_shown_as_lost(view) -> None:
     moment = moments()[0]
-    view.show(replace(moment, estimate=no_estimate(7, 0.28, "lost", 4, 0.01), insight=None))
+    view.show(with_hand(moment, estimate=no_estimate(7, 0.28, "lost", 4, 0.01), insight=None))
     facts, _ = next_picture(view, {})
     assert facts["lost"] and facts["index"] == 7 and facts["gesture_probability"] is None
+
+
+def test_two_hands_are_told_apart_from_the_frame(view) -> None:
+    moment = two_hands(moments()[1], lost=True, gesture="fist")
+    view.show(moment)
+    facts, _ = next_picture(view, {})
+    assert [(one["side"], one["lost"], one["there"]) for one in facts["hands"]] == [
+        *(("right", False, True), ("left", True, True)),
+    ]
+    assert facts["hands"][1]["gesture"] == "fist" and facts["hands"][0]["side_probability"] == 1
+    assert facts["lost"] is False and facts["index"] == moment.estimates[0].index
+    gone = no_estimate(7, 0.28, "searching", 4, 0.01)
+    first, second = moment.hands
+    view.show(replace(moment, hands=(replace(first, estimate=gone), second)))
+    facts, _ = next_picture(view, facts)
+    assert facts["lost"] and [one["there"] for one in facts["hands"]] == [False, True]
 
 
 def test_before_the_first_frame_and_after_the_last_the_page_is_told_so(monkeypatch) -> None:
@@ -156,12 +174,27 @@ def test_commands_arrive_in_order_and_once(view) -> None:
         ({"command": "left"}, {"Origin": "null"}, 403),
         ({"command": "left"}, {"Host": "evil.example", "Origin": "http://evil.example"}, 403),
         ({"command": "left"}, {"path": "elsewhere"}, 404),
+        ({"command": "left"}, {"X_Token": ""}, 403),
+        ({"command": "left"}, {"X_Token": "guessed"}, 403),
     ],
 )
 def test_anything_but_a_command_from_its_own_page_is_refused(view, body, changes, status) -> None:
     assert post(view, body, **changes) == status
     assert view.commands() == []
     assert post(view, {"command": "left"}) == 204
+
+
+def test_nothing_but_the_printed_address_says_the_token(view, capsys) -> None:
+    token = view.address.removeprefix(f"{view.url}#")
+    assert len(token) >= 16
+    view.show(moments()[0])
+    facts, picture = next_picture(view, {})
+    _, page = get(view, "")
+    assert token not in json.dumps(facts)
+    assert token.encode() not in picture + page
+    with closing(made()) as other:
+        assert other.address in capsys.readouterr().err
+        assert not other.address.endswith(token)
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
@@ -187,7 +220,9 @@ def test_what_is_not_there_is_refused(view, path: str, status: int) -> None:
 
 def test_nothing_is_drawn_while_nobody_watches(monkeypatch) -> None:
     drawn: list[int] = []
-    monkeypatch.setattr(browser, "_encode", lambda m, _: drawn.append(m.estimate.index) or b"jpeg")
+    monkeypatch.setattr(
+        browser, "_encode", lambda m, _: drawn.append(m.estimates[0].index) or b"jpeg"
+    )
     picture = LivePicture(80, 1000)
     try:
         for _ in range(20):
@@ -196,7 +231,7 @@ def test_nothing_is_drawn_while_nobody_watches(monkeypatch) -> None:
         assert drawn == []
         picture.put(moments()[1])
         assert picture.after(0, PATIENCE_S).jpeg == b"jpeg"
-        assert drawn == [moments()[1].estimate.index]  # the others were never drawn
+        assert drawn == [moments()[1].estimates[0].index]  # the others were never drawn
     finally:
         picture.close()
 

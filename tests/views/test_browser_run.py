@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import io
-import json
 import re
-import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -20,14 +16,18 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from helpers import programs
 from helpers.browsing import (
     PATIENCE_S,
     eventually,
     made,
     moments,
+    next_picture,
     ours,
     shown_again_and_again,
 )
+from helpers.moments import two_hands, with_hand
+from helpers.programs import QUICK, interrupted_when
 from helpers.settings import browser_view
 from helpers.tracking import ROOT, configuration
 
@@ -38,11 +38,9 @@ from toftrack.output.results import read_results
 from toftrack.views.browser import view as browser
 from toftrack.views.browser.view import BrowserView
 
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
-
 
 def test_frames_with_an_end_wait_for_a_visitor_but_not_for_ever(capsys, monkeypatch) -> None:
-    found = re.compile(r"live view: (http://127\.0\.0\.1:\d+/)")
+    found = re.compile(r"live view: (http://127\.0\.0\.1:\d+/)#")
     # Reading captured output empties it, and would lose what is written at that moment.
     told = io.StringIO()
     monkeypatch.setattr(sys, "stderr", told)
@@ -97,31 +95,34 @@ def test_a_repeated_recording_drops_what_comes_too_late_over_its_end(monkeypatch
     assert indices == [0, 3, 6, 9] and device.dropped == 6
 
 
-def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, str(ROOT / "track.py"), "view=browser", "view.port=0", *QUICK],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    # A busy machine may say before that it compiles.
-    told = iter(process.stderr.readline, "")
-    lines = (re.fullmatch(r"live view: (http://\S+) \(Ctrl-C ends\)\n", line) for line in told)
-    url = next(filter(None, lines))[1]
-    bodies, facts = [], {"version": 0, "run": ""}
-    while len(bodies) < 2:
-        path = f"{url}moment?run={facts['run']}&after={facts['version']}"
-        with urlopen(path, timeout=PATIENCE_S) as answer:
-            facts = json.loads(answer.headers["X-Moment"])
-            bodies += [answer.read()] if answer.status == 200 else []
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and "time a frame" in out, err
+def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path, monkeypatch) -> None:
+    views: list[BrowserView] = []
+    made_as_ever = BrowserView.__init__
+
+    def noted(view: BrowserView, *given: object, **settings: object) -> None:
+        made_as_ever(view, *given, **settings)
+        views.append(view)
+
+    monkeypatch.setattr(BrowserView, "__init__", noted)
+    bodies: list[bytes] = []
+
+    def watched() -> bool:
+        """Two different pictures were seen."""
+        if views and len(bodies) < 2:
+            facts: dict[str, object] = {}
+            for _ in range(2):
+                facts, body = next_picture(views[0], facts)
+                bodies.append(body)
+        return len(bodies) == 2
+
+    given = ("view=browser", "view.port=0", "hydra.run.dir=out", *QUICK)
+    with interrupted_when(watched):
+        status, out, err = programs.call(*given, folder=tmp_path)
+    assert status == 130 and "time a frame" in out, err
+    assert re.search(r"live view: http://\S+ \(Ctrl-C ends\)\n", err)
     assert "interrupted" in err and "Traceback" not in err
-    assert bodies[0] != bodies[1]
-    (results,) = tmp_path.glob("outputs/*/*/track.npz")
-    assert len(read_results(results)["joints_m"]) >= 2
+    assert bodies[0] != bodies[1] and ours() == []
+    assert len(read_results(tmp_path / "out" / "track.npz")["joints_m"]) >= 2
 
 
 def test_the_page_stays_after_the_last_frame_until_ctrl_c(monkeypatch, capsys) -> None:
@@ -165,12 +166,17 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
     with shown_again_and_again(view) as taken:
         chromium.get(view.url)
         eventually(lambda: text("phase") == "live")
+        assert "whole address" in text("told")
+        restart = chromium.find_element("xpath", "//button[text()='Start again']")
+        assert restart.get_property("disabled")
+        chromium.get(view.address)
+        eventually(lambda: text("phase") == "live")
         eventually(lambda: text("fps") != "–")
         before = {name: picture(name) for name in ("image", "model")}
         number = int(text("index"))
         eventually(lambda: all(picture(name) != old for name, old in before.items()))
         eventually(lambda: int(text("index")) > number)
-        assert text("score") in {f"{moment.estimate.score:.2f}" for moment in moments()}
+        assert text("score") in {f"{moment.estimates[0].score:.2f}" for moment in moments()}
         assert text("ms").endswith(" ms") and text("gesture") != ""
 
         eventually(lambda: pressed() == ["Right hand"])
@@ -189,8 +195,23 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
             assert chromium.execute_script(over) <= 0
         left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
         assert right["y"] > left["y"] + left["height"] and left["width"] > 400
-    view.show(replace(moments()[0], estimate=no_estimate(9, 0.36, "lost", 4, 0.01), insight=None))
+    lost = no_estimate(9, 0.36, "lost", 4, 0.01)
+    view.show(with_hand(moments()[0], estimate=lost, insight=None))
     eventually(lambda: text("state") == "LOST" and text("phase") == "lost: no hand found")
+
+    def of_slots(name: str) -> list[str]:
+        script = f"return [...document.querySelectorAll('.hand .{name}')].map(e => e.textContent)"
+        return chromium.execute_script(script)
+
+    view.show(two_hands(moments()[1], side_probability=0.83, gesture="ok", pinching=True))
+    eventually(lambda: of_slots("side") == ["right", "left 83 %"])
+    assert of_slots("state") == ["tracking", "tracking"] and of_slots("gesture")[1] == "ok"
+    assert of_slots("pinching") == ["", "pinching"]
+    assert not chromium.find_element("id", "state").is_displayed()
+    view.show(two_hands(moments()[1], lost=True))
+    eventually(lambda: of_slots("state") == ["tracking", "LOST"])
+    view.show(moments()[1])
+    eventually(lambda: of_slots("state") == [] and text("state") == "tracking")
     assert chromium.get_log("browser") == []
 
     view._picture.set_phase("over")

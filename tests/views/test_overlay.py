@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.moments import one_hand
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
@@ -17,6 +18,7 @@ from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
 from toftrack.views.base import NoView, TrackedFrame
 from toftrack.views.overlay import VideoView, draw_panel, panel_scale
+from toftrack.views.skeleton import SLOT_RGB, side_words
 
 W, H = 176, 144
 CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), W, H)
@@ -45,7 +47,7 @@ def lost_hand() -> Estimate:
 
 def moment() -> TrackedFrame:
     frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
-    return TrackedFrame(frame, DEPTH, CAMERA, hand(), default_hand_shape(), None)
+    return one_hand(frame, DEPTH, CAMERA, hand(), default_hand_shape())
 
 
 def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -62,6 +64,58 @@ def is_grey(picture: np.ndarray) -> bool:
     return bool((picture.max(axis=-1) == picture.min(axis=-1)).all())
 
 
+def other_hand(**changes: object) -> Estimate:
+    """Another one, 10 cm to the left and 10 cm farther away, of a left hand that is nearly sure."""
+    one = hand()
+    joints = one.joints_m + np.array([-0.1, 0, 0.1], np.float32)
+    told = {"joints_m": joints, "state": np.zeros(27, np.float32), "side": "left"}
+    return dataclasses.replace(one, **told | {"side_probability": 0.83} | changes)
+
+
+def present(**changes: object) -> Estimate:
+    told = {"state": np.zeros(27, np.float32), "side": "right", "side_probability": 1.0}
+    return dataclasses.replace(hand(), **told | changes)
+
+
+def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    near, far = np.zeros((H, W)), np.zeros((H, W))
+    near[20:80, 100:150], far[20:80, 20:120] = 0.5, 0.6
+    return sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one, other), (near, far), 3))
+
+
+def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
+    alone = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (present(),), (None,), 3))[1]
+    caption, left, right = two(present(), other_hand())
+    assert colour_share(left, THUMB) > 1.3 * colour_share(alone, THUMB)
+    for rgb in SLOT_RGB:
+        assert colour_share(alone, rgb[::-1]) < 1e-4 < colour_share(left, rgb[::-1])
+        assert colour_share(caption, rgb[::-1]) > 1e-3
+    blue, orange = right[150, 330], right[150, 90]
+    assert int(blue[0]) > int(blue[2]) + 50, "the nearer hides the farther"
+    assert int(orange[2]) > int(orange[0]) + 50
+    assert (right[300, 300] == 255).all()
+
+
+def test_a_slot_without_a_hand_is_not_drawn_and_not_called_lost() -> None:
+    caption, left, _ = two(present(), lost_hand())
+    assert colour_share(left, SLOT_RGB[1][::-1]) == 0 < colour_share(left, SLOT_RGB[0][::-1])
+    assert colour_share(caption, (40, 40, 220)) == 0
+    assert colour_share(two(lost_hand(), lost_hand())[0], (40, 40, 220)) > 0.5
+
+
+def test_a_doubted_one_of_two_hands_is_hollow_and_neither_is_framed() -> None:
+    sure, doubted = (two(present(), other_hand(lost=lost)) for lost in (False, True))
+    assert colour_share(doubted[1], (0, 0, 0)) > colour_share(sure[1], (0, 0, 0))
+    assert colour_share(doubted[0], (40, 40, 220)) == 0
+
+
+def test_a_side_is_said_with_how_sure_it_is_unless_it_was_told() -> None:
+    assert [side_words(one) for one in (present(), other_hand(), lost_hand())] == [
+        *("right", "left 83 %", ""),
+    ]
+    assert side_words(other_hand(side_probability=0.999)) == "left 99 %"
+
+
 def test_panels_are_three_times_a_small_image_and_once_a_large() -> None:
     assert panel_scale(176) == 3
     assert panel_scale(640) == 1
@@ -73,7 +127,7 @@ def test_panels_are_three_times_a_small_image_and_once_a_large() -> None:
 )
 def test_panel_sides_are_even(size: tuple[int, int], scale: float) -> None:
     camera = Camera(CAMERA.K, size[1], size[0])
-    panel = draw_panel(np.ones(size, np.float32), None, camera, lost_hand(), None, scale)
+    panel = draw_panel(np.ones(size, np.float32), None, camera, (lost_hand(),), (None,), scale)
     assert panel.dtype == np.uint8
     assert panel.shape[0] % 2 == panel.shape[1] % 4 == 0
     assert panel.shape[2] == 3
@@ -82,7 +136,7 @@ def test_panel_sides_are_even(size: tuple[int, int], scale: float) -> None:
 @pytest.mark.parametrize("amplitude", [AMPLITUDE, None])
 def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None) -> None:
     one = hand()
-    _, left, right = sides(draw_panel(DEPTH, amplitude, CAMERA, one, None, 3))
+    _, left, right = sides(draw_panel(DEPTH, amplitude, CAMERA, (one,), (None,), 3))
     for joint, colour in ((4, THUMB), (2, THUMB), (20, LITTLE), (18, LITTLE)):
         u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
         np.testing.assert_allclose(left[v, u], colour, atol=2)
@@ -93,7 +147,7 @@ def test_joints_that_are_not_trusted_are_hollow() -> None:
     confidence = np.full(21, 0.9, np.float32)
     confidence[4] = 0.3
     one = dataclasses.replace(hand(), joint_confidence=confidence)
-    _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))
+    _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
     for joint, colour in ((4, (0, 0, 0)), (20, LITTLE)):
         u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
         np.testing.assert_allclose(left[v, u], colour, atol=2)
@@ -104,7 +158,7 @@ def test_a_nearer_hand_has_thicker_bones() -> None:
     far, near = hand(), hand()
     near = dataclasses.replace(near, joints_m=near.joints_m * np.float32(0.5))
     shares = [
-        colour_share(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[1], THUMB)
+        colour_share(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[1], THUMB)
         for one in (far, near)
     ]
     assert shares[1] > 1.5 * shares[0]  # the same length in the image at half the distance
@@ -113,21 +167,21 @@ def test_a_nearer_hand_has_thicker_bones() -> None:
 def test_no_skeleton_without_an_estimate_or_behind_the_camera() -> None:
     behind = dataclasses.replace(hand(), joints_m=-hand().joints_m)
     for one in (dataclasses.replace(lost_hand(), lost=False), behind):
-        _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))
+        _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
         assert is_grey(left)
 
 
 def test_a_hand_far_outside_the_image_does_not_fail() -> None:
     away = hand().joints_m * np.float32(1) + np.array([1e6, 0, 0], np.float32)
     one = dataclasses.replace(hand(), joints_m=away)
-    assert is_grey(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[1])
+    assert is_grey(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[1])
 
 
 def test_range_image_is_darker_where_nearer_on_white() -> None:
     model = np.zeros((H, W), np.float32)
     model[40:80, 40:80], model[40:80, 100:140] = 0.4, 0.6
     model[0, 0], model[0, 1] = np.nan, np.inf
-    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, hand(), model, 3))
+    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(),), (model,), 3))
     near, far, background = right[180, 180, 0], right[180, 360, 0], right[400, 30, 0]
     assert near < far < background == 255
     assert right[1, 1, 0] == right[1, 4, 0] == 255
@@ -138,7 +192,7 @@ def test_range_image_is_darker_where_nearer_on_white() -> None:
 def test_lost_is_red_and_tracking_is_not() -> None:
     red = (40, 40, 220)
     for lost in (True, False):
-        panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, hand(lost), None, 3)
+        panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(lost),), (None,), 3)
         caption, left, right = sides(panel)
         assert (colour_share(caption, red) > 0.5) == lost
         assert (colour_share(left[:, :3], red) > 0.9) == lost
@@ -147,9 +201,9 @@ def test_lost_is_red_and_tracking_is_not() -> None:
 
 def test_caption_stays_in_the_left_half_and_changes_with_the_frame() -> None:
     one = dataclasses.replace(hand(), index=123456, state_name="initialising", gesture="pointing")
-    first = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, one, None, 3))[0]
+    first = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[0]
     second = sides(
-        draw_panel(DEPTH, AMPLITUDE, CAMERA, dataclasses.replace(one, index=654321), None, 3)
+        draw_panel(DEPTH, AMPLITUDE, CAMERA, (dataclasses.replace(one, index=654321),), (None,), 3)
     )[0]
     assert (first != second).any()
     assert len(np.unique(first[:, 3 * W :])) == 1
@@ -159,7 +213,7 @@ def test_caption_stays_in_the_left_half_and_changes_with_the_frame() -> None:
 def test_images_without_any_reading_are_black() -> None:
     for depth in (np.zeros((H, W), np.float32), np.full((H, W), np.nan, np.float32)):
         one = dataclasses.replace(lost_hand(), lost=False)
-        _, left, right = sides(draw_panel(depth, None, CAMERA, one, np.zeros((H, W)), 3))
+        _, left, right = sides(draw_panel(depth, None, CAMERA, (one,), (np.zeros((H, W)),), 3))
         assert (left == 0).all()
         assert (right == 255).all()
 

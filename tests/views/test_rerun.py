@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.configured import f_measure
+from helpers.moments import one_hand, two_hands, with_hand
 from helpers.tracking import CONF, configuration, make_tracker
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -65,16 +66,16 @@ def moments() -> tuple[TrackedFrame, ...]:
     for frame in device:
         depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
         estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        tracked.append(TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight))
-    last = tracked[-1]
+        tracked.append(one_hand(frame, depth, device.camera, estimate, shape, tracker.insight))
+    last = tracked[-1].estimates[0]
     nan = dataclasses.replace(
-        last.estimate, index=6, timestamp_s=0.24, state=np.full(27, np.nan, np.float32), lost=True
+        last, index=6, timestamp_s=0.24, state=np.full(27, np.nan, np.float32), lost=True
     )
-    gone = dataclasses.replace(last.estimate, index=7, timestamp_s=0.28, lost=True, score=0.0)
+    gone = dataclasses.replace(last, index=7, timestamp_s=0.28, lost=True, score=0.0)
     return (
         *tracked,
-        dataclasses.replace(last, estimate=nan),
-        dataclasses.replace(last, estimate=gone, insight=None),
+        with_hand(tracked[-1], estimate=nan),
+        with_hand(tracked[-1], estimate=gone, insight=None),
     )
 
 
@@ -122,7 +123,8 @@ def test_every_frames_estimate_can_be_read_back(written: Path) -> None:
     pinches = rows(written, "plots/pinch", "Scalars:scalars")
     times = rows(written, "plots/time", "Scalars:scalars")
     for moment in moments():
-        estimate, number = moment.estimate, moment.estimate.index
+        estimate = moment.estimates[0]
+        number = estimate.index
         told = [estimate.score, estimate.confidence, float(estimate.lost)]
         assert scores[number] == pytest.approx(told, nan_ok=True)
         assert pinches[number] == pytest.approx([estimate.pinch], nan_ok=True)
@@ -139,7 +141,7 @@ def test_ellipsoids_have_the_sizes_of_the_hand_on_either_side(rerun_view) -> Non
     from toftrack.hand.surface import hand_surface
     from toftrack.views.rerun.entities import ellipsoids
 
-    one = moments()[0]
+    one = moments()[0].hands[0]
     right, left = (ellipsoids(one.estimate, one.shape.of_side(side)) for side in ("right", "left"))
     sizes = [np.array(hand.half_sizes.as_arrow_array().to_pylist()) for hand in (right, left)]
     assert sizes[0].shape == (len(hand_surface(one.shape)), 3) and (sizes[0] > 0).all()
@@ -153,7 +155,7 @@ def test_depth_comes_back_in_metres_and_with_its_pinhole(written: Path) -> None:
     steps = rows(written, "world/camera/depth", "DepthImage:buffer")
     metre = rows(written, "world/camera/depth", "DepthImage:meter")
     for moment in moments():
-        number = moment.estimate.index
+        number = moment.estimates[0].index
         depth = steps[number].reshape(-1).astype(np.uint8).view(np.uint16) / metre[number]
         np.testing.assert_allclose(depth.reshape(144, 176), moment.depth_m, atol=1.1e-4)
     pinhole = rows(written, "world/camera", "Pinhole:image_from_camera")
@@ -164,7 +166,7 @@ def test_depth_comes_back_in_metres_and_with_its_pinhole(written: Path) -> None:
 def test_classified_pixels_are_those_of_the_figures(written: Path) -> None:
     labels = rows(written, "world/tracker/classified", "SegmentationImage:buffer")
     segments = rows(written, "world/tracker/segmentation", "SegmentationImage:buffer")
-    for moment in moments()[:FRAMES]:
+    for moment in (tracked.hands[0] for tracked in moments()[:FRAMES]):
         seen = moment.insight.observation
         pixels = classify(moment.estimate.state, moment.shape, seen, f_measure()).labels()
         np.testing.assert_array_equal(labels[moment.estimate.index].reshape(144, 176), pixels)
@@ -178,13 +180,36 @@ def test_particles_lie_around_the_hand_brighter_with_weight(written: Path) -> No
     places = rows(written, "world/hand/particles", "Points3D:positions")
     colours = rows(written, "world/hand/particles", "Points3D:colors")
     for moment in moments()[1:FRAMES]:
-        number = moment.estimate.index
-        weights = moment.insight.weights.numpy()
+        number = moment.estimates[0].index
+        weights = moment.hands[0].insight.weights.numpy()
         middle = weights @ places[number]
-        assert np.linalg.norm(middle - moment.estimate.joints_m.mean(0)) < 0.05
+        assert np.linalg.norm(middle - moment.estimates[0].joints_m.mean(0)) < 0.05
         red = (colours[number] >> 24) & 255  # grows all along the colour map
         assert red[weights.argmax()] == red.max() and red[weights.argmin()] == red.min()
         assert len(set(red)) > 5
+
+
+def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> None:
+    """It goes after the first frame."""
+    both = two_hands(moments()[5])
+    nan = np.full(27, np.nan, np.float32)
+    gone = two_hands(dataclasses.replace(moments()[7]), lost=True)
+    vacant = dataclasses.replace(gone.estimates[1], state=nan)
+    gone = dataclasses.replace(
+        gone, hands=(gone.hands[0], dataclasses.replace(gone.hands[1], estimate=vacant))
+    )
+    with rerun_view.RerunView(tmp_path, 25.0, 2, likelihood=f_measure()) as view:
+        view.show(both)
+        view.show(gone)
+    path = tmp_path / "track.rrd"
+    joints = rows(path, "world/hand_2/joints", "Points3D:positions")
+    np.testing.assert_allclose(joints[5], both.estimates[1].joints_m, atol=1e-6)
+    assert list(joints) == [5]
+    labels = rows(path, "world/hand_2/label", "Points3D:labels")
+    assert {number: words.tolist() for number, words in labels.items()} == {5: ["left"]}
+    scores = rows(path, "plots/score/second", "Scalars:scalars")
+    assert scores[5][0] == pytest.approx(both.estimates[1].score)
+    assert sorted(rows(path, "world/hand/joints", "Points3D:positions")) == [5, 7]
 
 
 def test_the_configured_likelihood_is_the_one_that_classifies() -> None:

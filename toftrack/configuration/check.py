@@ -33,6 +33,7 @@ _ABOVE_ZERO = frozenset(
     filter.exponent filter.exponent_growth filter.particles filter.passes filter.shrink
     gestures.flexion_rad gestures.off_rad gestures.other gestures.pinch.open gestures.split_rad
     gestures.thumb_rad gestures.tips_palms
+    hands
     hand.adapt.certain_poses hand.adapt.contradiction hand.adapt.length_sigma hand.adapt.memory
     hand.adapt.sure_m hand.adapt.votes
     hand.length_m hand.fit.beta hand.fit.exponent hand.fit.frames hand.fit.largest hand.fit.prior
@@ -47,10 +48,11 @@ _ABOVE_ZERO = frozenset(
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
     start.hypotheses start.islands start.memory_rad start.memory_s start.samples
-    stream.port stream.waiting
+    stream.waiting
     view.most_fps view.quality
     """.split()
 )
+_AT_MOST = {"hands": 2}
 _OPEN_ENDED = frozenset(
     {"lost.outside_rad", "segmentation.reach_m", "view.linger_s", "view.wait_s"}
 )
@@ -91,7 +93,9 @@ def check_value(key: str, value: object, usual: object) -> None:
         if value is None and key in _MAY_BE_NONE or value == math.inf and key in _OPEN_ENDED:
             return
         least = -math.inf if key.startswith(_LOG_ODDS) else 0
-        check_number(key, value, least, above=key in _ABOVE_ZERO, whole=isinstance(usual, int))
+        most = _AT_MOST.get(key, math.inf)
+        above, whole = key in _ABOVE_ZERO, isinstance(usual, int)
+        check_number(key, value, least, most, above=above, whole=whole)
     elif isinstance(usual, list) and not isinstance(value, list):
         raise ToftrackError(f"{key}={value} is not possible; give a list, as [{value}]")
 

@@ -16,6 +16,8 @@ from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
+from toftrack.recordings.doubts import doubts
+from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording
 
@@ -76,6 +78,8 @@ class Replay(BaseDevice):
         damage = getattr(store, "damage", None)
         if damage:
             _log.warning("%s: %s; its %d whole frames are used", path, damage, len(store))
+        if isinstance(store, Recording) and (doubt := doubts(store.depth)):
+            _log.warning("%s: %s", path, doubt)
         self._range = _checked_range(start, stop, len(self._recording), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         camera = store.camera

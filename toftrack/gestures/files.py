@@ -27,6 +27,7 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
+from toftrack.json_text import read_json
 
 _SLACK_DEGREES = 10.0
 _UNITS = ("degrees", "radians")
@@ -189,7 +190,7 @@ _Content = tuple[str | None, list[_Row]]
 
 
 def _read_json(path: Path) -> _Content:
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path)
     poses = content.get("poses") if isinstance(content, dict) else None
     if not isinstance(poses, list):
         raise ToftrackError(f"{path} has no list 'poses' of objects with 'name' and 'angles'")

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import read_json
 
 SIDES = ("right", "left")
 DEFAULT_HAND_LENGTH_M = 0.190
@@ -174,12 +175,12 @@ class HandShape:
     def load(path: str | Path) -> HandShape:
         """Read a shape written by `save`; ToftrackError when it is not one."""
         try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
+            content = read_json(path)
         except FileNotFoundError:
             raise ToftrackError(
                 f"no hand shape file at {path}; give hand.shape=default or the path of one"
             ) from None
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        except (OSError, ValueError) as error:
             raise ToftrackError(f"{path} is not a readable hand shape file: {error}") from None
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
@@ -198,7 +199,7 @@ class HandShape:
                 side=str(content["side"]),
                 fitted=None if fitted is None else Fitted.of(fitted),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise ToftrackError(f"{path} is a damaged hand shape file: {error!r}") from None
         sizes = (shape.base_m.shape, shape.base_frames.shape, shape.bone_lengths_m.shape)
         if sizes != ((5, 3), (5, 3, 3), (5, 3)) or shape.side not in SIDES:

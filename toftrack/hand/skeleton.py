@@ -28,7 +28,9 @@ JOINT_NAMES: tuple[str, ...] = (
     *(f"thumb_{joint}" for joint in ("cmc", "mcp", "ip", "tip")),
     *(f"{finger}_{joint}" for finger in FINGERS[1:] for joint in ("mcp", "pip", "dip", "tip")),
 )
-"""The 21 joints in the order of every file: wrist, then four for each finger."""
+"""The 21 joints in the order of every file: wrist, then four for each finger. MediaPipe's order."""
+JOINT_PARENTS: tuple[int, ...] = (-1, *(0 if j % 4 == 0 else j for j in range(20)))
+"""Which joint each one hangs on; -1 for the wrist."""
 
 ANGLE_NAMES: tuple[str, ...] = (
     "thumb_cmc_abduction",

@@ -6,12 +6,12 @@ The facts are gathered while tracking, from lost frames only, so that a good run
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from toftrack.estimate import STATES, Estimate
+from toftrack.estimate import STATES, Estimate, is_vacant
 from toftrack.tracking.state import StepInfo
 
 _LOOKED_AT_PX = 5000
@@ -137,33 +137,60 @@ def _other_side(insight: StepInfo | None) -> bool | None:
 
 
 class Watch:
-    """Gathers the facts of a run; reach_m: nothing beyond is a hand."""
+    """Gathers the facts of a run, of each slot apart.
 
-    def __init__(self, reach_m: float) -> None:
+    reach_m: nothing beyond is a hand.  facts: of the slots.
+    """
+
+    def __init__(self, reach_m: float, slots: int = 1) -> None:
         self.reach_m = reach_m
-        self.facts = RunFacts()
+        self.facts = (RunFacts(),) * slots
 
-    def see(self, estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None) -> None:
-        """Take one frame, see lost_frame."""
+    def see(
+        self,
+        estimates: Sequence[Estimate],
+        depth_m: np.ndarray,
+        insights: Sequence[StepInfo | None],
+    ) -> None:
+        """Take one frame, see lost_frame. A slot without a hand misses none where there is another,
+        and where there is no hand at all, the first slot misses it.
+        """
+        vacant = [is_vacant(estimate) for estimate in estimates]
+        missed = [slot > 0 or not all(vacant) for slot in range(len(estimates))]
+        self.facts = tuple(
+            facts if gone and idle else self._with(facts, estimate, depth_m, insight)
+            for facts, gone, idle, estimate, insight in zip(
+                self.facts, vacant, missed, estimates, insights, strict=True
+            )
+        )
+
+    def _with(
+        self, facts: RunFacts, estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None
+    ) -> RunFacts:
         if estimate.lost:
-            found = lost_frame(estimate, depth_m, insight, self.reach_m)
-            self.facts = self.facts.with_lost(found)
-        else:
-            self.facts = self.facts.tracked(_other_side(insight))
+            return facts.with_lost(lost_frame(estimate, depth_m, insight, self.reach_m))
+        return facts.tracked(_other_side(insight))
 
-    def advice(self, side: str) -> tuple[str, ...]:
-        """Of the function of that name."""
-        return advice(self.facts, side, self.reach_m)
+    def advice(self, side: str | None) -> tuple[str, ...]:
+        """Of the function of that name, for each slot."""
+        if len(self.facts) == 1:
+            return advice(self.facts[0], side, self.reach_m)
+        return tuple(
+            f"Slot {slot}: {sentence}"
+            for slot, facts in enumerate(self.facts)
+            for sentence in advice(facts, side, self.reach_m)
+        )
 
 
-def advice(facts: RunFacts, side: str, reach_m: float) -> tuple[str, ...]:
+def advice(facts: RunFacts, side: str | None, reach_m: float) -> tuple[str, ...]:
     """At most three sentences: what was seen and what to try; none for a run that went well.
 
-    side: of the hand that was looked for.  reach_m: segmentation.max_distance_m.
+    side: of the hand that was looked for; None where either was.
+    reach_m: segmentation.max_distance_m.
     """
     if facts.lost <= _MOST * facts.frames:
         # A hand of the wrong side may be followed all the same, facing the wrong way.
-        if facts.tracked_other_side > _MOST * facts.tracked_judged:
+        if side is not None and facts.tracked_other_side > _MOST * facts.tracked_judged:
             return (
                 f"In {facts.tracked_other_side} of {facts.frames} frames it looked like the other "
                 f"hand: {_if_it_is_the_other(side)}.",
@@ -183,7 +210,7 @@ def _seen(facts: RunFacts) -> str:
     )
 
 
-def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
+def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     """What to try, the most telling first."""
 
     def mostly(frames: int, of: int = facts.lost) -> bool:
@@ -207,7 +234,7 @@ def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
             f"Something was nearer than {_TOO_NEAR_M:g} m: keep the hand 0.3 to 1 m away, and the "
             "view to it free."
         )
-    if facts.judged and mostly(facts.other_side, facts.judged):
+    if side is not None and facts.judged and mostly(facts.other_side, facts.judged):
         found.append(f"It looked like the other hand: {_if_it_is_the_other(side)}.")
     if facts.with_hand and mostly(facts.small, facts.with_hand):
         found.append(
@@ -215,9 +242,10 @@ def _remedies(facts: RunFacts, side: str, reach_m: float) -> list[str]:
             "let the camera give larger images."
         )
     if not found:
+        which = "a bare hand" if side is None else f"a {side} hand (hand.side)"
         found.append(
-            f"If a hand was in view, look at overlay.png (view=video): it must be a {side} hand "
-            "(hand.side), upright and not mirrored (x right, y down), with nothing else nearer to "
+            f"If a hand was in view, look at overlay.png (view=video): it must be {which}, upright "
+            "and not mirrored (x right, y down), with nothing else nearer to "
             "the camera, and depth_m must have the order frames, rows, columns."
         )
     return found

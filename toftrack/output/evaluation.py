@@ -131,33 +131,54 @@ def metrics_table(summary: dict[str, Any]) -> str:
         ("mean score", _figure(summary["mean_score"], 3)),
     ]
     if hand := summary.get("hand"):
-        length = f"{_figure(hand['length_mm'], 0)} mm long{', fitted' if hand['fitted'] else ''}"
-        rows.append(("hand", f"{hand['side']}, {length}"))
+        rows.append(("hand", _hand_text(hand)))
+    for slot in summary.get("slots", ()):
+        about = f"{_hand_text(slot['hand'])}; " if "hand" in slot else ""
+        frames = f"in {slot['frames']} frames, {slot['lost_frames']} of them lost"
+        rows.append((f"slot {slot['slot']}", about + frames))
     metrics = summary.get("metrics")
     if metrics:
         if metrics.get("trust"):
             rows = _trust_rows(metrics["trust"]) + rows
-        rows.append(("joint error, mean", f"{_figure(metrics['mean_mm'])} mm"))
-        rows.append(("joint error, median", f"{_figure(metrics['median_mm'])} mm"))
-        rows.append(("fingertip error", f"{_figure(metrics['fingertip_mm'])} mm"))
-        rows.append(("wrist-aligned error", f"{_figure(metrics['wrist_aligned_mm'])} mm"))
-        for name, value in metrics.items():
-            if name.startswith("frames_max_below_"):
-                limit = name.removeprefix("frames_max_below_").removesuffix("mm_pct")
-                share = value if metrics["frames"] else None
-                rows.append((f"frames below {limit} mm", f"{_figure(share)} %"))
-        if metrics["missing_pct"]:
-            rows.append(("without estimate", f"{_figure(metrics['missing_pct'])} %"))
-        precision, recall = metrics.get("lost_precision"), metrics.get("lost_recall")
-        if precision is not None or recall is not None:
-            text = f"precision {_figure(precision, 2)}, recall {_figure(recall, 2)}"
-            rows.append(("lost frames", text))
-        rows += _region_rows(metrics.get("coverage"))
-        for event in metrics["reacquisition"]:
-            delay = "never" if event["delay"] is None else f"after {event['delay']} frames"
-            rows.append((f"{event['event']} at {event['frame']}", f"tracked {delay}"))
+        rows += _error_rows(metrics)
+        if metrics.get("ghost_pct") is not None:
+            rows.append(("another hand, where is none", f"{_figure(metrics['ghost_pct'])} %"))
+        if second := metrics.get("second"):
+            rows.append(("the other hand", f"in slot {second['slot']}"))
+            rows += _trust_rows(second["trust"]) + _error_rows(second)
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
+
+
+def _hand_text(hand: dict[str, Any]) -> str:
+    fitted = ", fitted" if hand["fitted"] else ""
+    return f"{hand['side']}, {_figure(hand['length_mm'], 0)} mm long{fitted}"
+
+
+def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What `evaluate` and `coverage` found: names and texts."""
+    rows = [
+        ("joint error, mean", f"{_figure(metrics['mean_mm'])} mm"),
+        ("joint error, median", f"{_figure(metrics['median_mm'])} mm"),
+        ("fingertip error", f"{_figure(metrics['fingertip_mm'])} mm"),
+        ("wrist-aligned error", f"{_figure(metrics['wrist_aligned_mm'])} mm"),
+    ]
+    for name, value in metrics.items():
+        if name.startswith("frames_max_below_"):
+            limit = name.removeprefix("frames_max_below_").removesuffix("mm_pct")
+            share = value if metrics["frames"] else None
+            rows.append((f"frames below {limit} mm", f"{_figure(share)} %"))
+    if metrics["missing_pct"]:
+        rows.append(("without estimate", f"{_figure(metrics['missing_pct'])} %"))
+    precision, recall = metrics.get("lost_precision"), metrics.get("lost_recall")
+    if precision is not None or recall is not None:
+        text = f"precision {_figure(precision, 2)}, recall {_figure(recall, 2)}"
+        rows.append(("lost frames", text))
+    rows += _region_rows(metrics.get("coverage"))
+    for event in metrics["reacquisition"]:
+        delay = "never" if event["delay"] is None else f"after {event['delay']} frames"
+        rows.append((f"{event['event']} at {event['frame']}", f"tracked {delay}"))
+    return rows
 
 
 def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:

@@ -15,7 +15,8 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.estimate import Estimate, is_vacant
+from toftrack.json_text import parse_json
 
 _KINDS: dict[type, type] = {
     bool: np.bool_,
@@ -44,15 +45,41 @@ _FIRST = (
 )
 LINE_FIELDS = (*_FIRST, *(name for name in KINDS if name not in _FIRST))
 """What a line of track.jsonl says, fields of Estimate, in their order."""
+FRAME_FIELDS = ("index", "timestamp_s", "compute_s")
+"""What is said of a frame, not of each hand in it."""
+HAND_FIELDS = tuple(name for name in LINE_FIELDS if name not in FRAME_FIELDS)
 
 
-def json_line(estimate: Estimate, names: Sequence[str] = LINE_FIELDS) -> str:
-    """An estimate as one line of strict JSON, without newline; NaN becomes null.
+def json_line(estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS) -> str:
+    """A frame's estimates, one a slot, as one line of strict JSON, without newline.
 
     names: which of LINE_FIELDS, in this order.
     """
-    content = {name: strict(getattr(estimate, name)) for name in names}
+    content = line_content(estimates, names)
     return json.dumps(content, allow_nan=False, separators=(",", ":"))
+
+
+def line_content(
+    estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS
+) -> dict[str, Any]:
+    """What a line says: of one slot its fields; of two the frame's, and `hands`, those that are
+    there, each with its slot and its side.
+    """
+    if len(estimates) == 1:
+        return hand_content(estimates[0], names)
+    of_frame = hand_content(estimates[0], [name for name in names if name in FRAME_FIELDS])
+    of_hand = ["side", *(name for name in names if name in HAND_FIELDS and name != "side")]
+    hands = [
+        {"slot": slot} | hand_content(estimate, of_hand)
+        for slot, estimate in enumerate(estimates)
+        if not is_vacant(estimate)
+    ]
+    return of_frame | {"hands": hands}
+
+
+def hand_content(estimate: Estimate, names: Sequence[str]) -> dict[str, Any]:
+    """Fields of one hand's estimate as strict JSON has them; NaN becomes None."""
+    return {name: strict(getattr(estimate, name)) for name in names}
 
 
 def read_lines(path: Path) -> Iterator[dict[str, Any]]:
@@ -65,7 +92,7 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
             if not line.endswith(b"\n"):
                 return  # the run was killed, or the machine went down, while it was written
             try:
-                content = json.loads(line)
+                content = parse_json(line)
                 if not isinstance(content, dict):
                     raise ValueError("it is no object")
             except ValueError as error:

@@ -2,6 +2,9 @@
 
 The lines are read once into a nameless file of records of one size; then each field's column is
 copied from there into the archive, piece by piece. Some 25 bytes a frame are held meanwhile.
+
+Of two hands every field that speaks of a hand, not of the frame, has an axis of slots behind that
+of the frames. A slot without a hand is lost, its numbers are NaN, its texts empty.
 """
 
 from __future__ import annotations
@@ -17,8 +20,10 @@ from typing import IO, Any, BinaryIO, Self
 import numpy as np
 
 from toftrack.estimate import no_estimate
-from toftrack.output.lines import KINDS, damaged, read_lines
+from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, KINDS, damaged, read_lines, strict
 
+SLOTS = 2
+"""Of lines with `hands`."""
 _PIECE = 256
 """Records that are in memory at a time; a line's numbers take some 10 kB as Python objects."""
 
@@ -26,29 +31,39 @@ _PIECE = 256
 class Records:
     """The frames of a track.jsonl, for a `with`; each field is a column.
 
+    slots: 2 where the lines are of two hands, else 1.
+
     Args:
         lines: the file, which is read at once.
-        latent_size: of the columns of a file without lines.
+        latent_size: of the columns of a file without a hand.
+        slots: of a file without lines.
 
     Raises:
         ToftrackError: a line is damaged.
         OSError: the lines cannot be read, or the records not be kept beside them.
     """
 
-    def __init__(self, lines: Path, latent_size: int = 4) -> None:
+    def __init__(self, lines: Path, latent_size: int = 4, slots: int = 1) -> None:
         self._words: dict[str, int] = {}
         self._file: IO[bytes] = tempfile.TemporaryFile(dir=lines.parent)  # noqa: SIM115
         self.count = 0
         try:
-            empty = vars(no_estimate(0, 0.0, "", latent_size, 0.0))
-            self._kind = _record_kind(empty)
+            first = next(read_lines(lines), None)
+            self.slots = slots if first is None else SLOTS if "hands" in first else 1
+            empty = strict(vars(no_estimate(0, 0.0, "", latent_size, 0.0)))
+            if self.slots == 1:
+                self._kind = _record_kind(empty if first is None else first)
+            else:
+                # Which fields there are, any hand says.
+                hands = (hand for line in read_lines(lines) for hand in _hands(line))
+                self._vacant = _vacant(next(hands, empty))
+                frame = {name: empty[name] for name in FRAME_FIELDS}
+                self._kind = _record_kind(self._side_by_side(frame | {"hands": []}))
             read = read_lines(lines)
             while piece := list(itertools.islice(read, _PIECE)):
-                if not self.count:
-                    self._kind = _record_kind(piece[0])
                 try:
                     self._file.write(self._records(piece).tobytes())
-                except (KeyError, TypeError, ValueError) as error:
+                except (LookupError, TypeError, ValueError) as error:
                     last = self.count + len(piece)
                     raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
                 self.count += len(piece)
@@ -106,15 +121,49 @@ class Records:
         return np.frombuffer(self._file.read((end - begin) * self._kind.itemsize), self._kind)
 
     def _records(self, lines: list[dict[str, Any]]) -> np.ndarray:
+        if self.slots > 1:
+            lines = [self._side_by_side(line) for line in lines]
         records = np.zeros(len(lines), self._kind)
         for name in self.names:
             values = [line[name] for line in lines]
             if KINDS[name] is np.str_:
-                values = [self._words.setdefault(str(word), len(self._words)) for word in values]
+                values = [self._number(word) for word in values]
             records[name] = np.array(values, self._kind[name].base).reshape(
                 len(lines), *self._kind[name].shape
             )
         return records
+
+    def _number(self, words: Any) -> Any:
+        """Of a word, or of those in a list."""
+        if isinstance(words, list):
+            return [self._number(word) for word in words]
+        return self._words.setdefault(str(words), len(self._words))
+
+    def _side_by_side(self, line: dict[str, Any]) -> dict[str, Any]:
+        """A line of several hands whose fields are lists with a value for each slot."""
+        slots = [self._vacant] * SLOTS
+        for hand in line["hands"]:
+            slots[hand["slot"]] = hand
+        frame = {name: line[name] for name in FRAME_FIELDS}
+        return frame | {name: [hand[name] for hand in slots] for name in self._vacant}
+
+
+def _hands(line: dict[str, Any]) -> list[dict[str, Any]]:
+    """Those of a line that is of several; none of another one, which is told of later."""
+    hands = line.get("hands")
+    told = hands if isinstance(hands, list) else []
+    return [hand for hand in told if isinstance(hand, dict)]
+
+
+def _vacant(hand: dict[str, Any]) -> dict[str, Any]:
+    """What stands where a slot has no hand, with the fields and shapes of one that there is."""
+
+    def nothing(name: str) -> Any:
+        if KINDS[name] is np.bool_:
+            return name == "lost"
+        return "" if KINDS[name] is np.str_ else np.full(np.shape(hand[name]), np.nan).tolist()
+
+    return {name: nothing(name) for name in HAND_FIELDS if name in hand}
 
 
 def _record_kind(line: dict[str, Any]) -> np.dtype:

@@ -10,25 +10,23 @@ from __future__ import annotations
 import datetime
 import json
 import os
-import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
+from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
-from toftrack.hand.shape import HandShape
-from toftrack.output.coverage import coverage
-from toftrack.output.evaluation import evaluate
+from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, LineFile, write_whole
 from toftrack.output.lines import KINDS, json_line, strict
+from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.records import Records, write_archive
-from toftrack.output.trust import Hand, trust
+from toftrack.output.summary import run_metrics, summarise
 
 RUN_FORMAT = "toftrack-run"
 _VERSION = 1
@@ -104,10 +102,13 @@ class ResultWriter:
             raise _unwritable(self.folder, error) from error
         self._closed = False
 
-    def append(self, estimate: Estimate) -> None:
-        """Write a frame's line to disk. Raises ToftrackError if it cannot be written."""
+    def append(self, estimates: Sequence[Estimate]) -> None:
+        """Write the line of a frame, of which there is an estimate for each slot, to disk.
+
+        Raises ToftrackError if it cannot be written.
+        """
         try:
-            self._lines.append(json_line(estimate))
+            self._lines.append(json_line(estimates))
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         self.frames += 1
@@ -148,17 +149,18 @@ def finish(folder: Path, facts: dict[str, Any], truth: Truth | None) -> dict[str
     """
     metadata = facts["metadata"]
     latent_size = int((metadata.get("pose_space") or {}).get("dims", 4))
-    with Records(folder / LINES, latent_size) as records:
+    slots = int((metadata.get("config") or {}).get("hands", 1))
+    with Records(folder / LINES, latent_size, slots) as records:
         rows, changed, held = _every_frame(records)
         if held:
             metadata = metadata | {"held_frames": held}
         small = {
             "joint_names": np.array(facts["joint_names"], np.str_),
             "metadata": np.array(json.dumps(metadata)),
-        }
-        summary = _summarise(records, rows, len(held)) | _hand(folder, metadata)
+        } | facts_for_readers(metadata)
+        summary = summarise(records, len(rows), len(held), folder, metadata)
         if truth is not None and len(rows):
-            metrics = _metrics(records, rows, changed["index"], truth)
+            metrics = run_metrics(records, rows, changed["index"], truth)
             summary |= {"metrics": metrics} if metrics else {}
         write_whole(
             folder / "track.npz",
@@ -191,57 +193,11 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray], l
     return rows, changed, every[held].tolist()
 
 
-def _summarise(records: Records, rows: np.ndarray, dropped: int) -> dict[str, Any]:
-    """The summary without metrics."""
-    done = records.count
-    seconds = records.column("compute_s").astype(np.float64)
-    scores = records.column("score").astype(np.float64)
-    total = float(seconds.sum())
-    return {
-        "frames": len(rows),
-        "lost_frames": int(records.column("lost").sum()),
-        "dropped_frames": dropped,
-        "mean_ms": 1e3 * float(seconds.mean()) if done else None,
-        "median_ms": 1e3 * float(np.median(seconds)) if done else None,
-        "fps": done / total if total > 0 else None,
-        "mean_score": float(scores.mean()) if done else None,
-    }
-
-
-def _hand(folder: Path, metadata: dict[str, Any]) -> dict[str, Any]:
-    """The hand that was tracked, where its file is in the folder."""
-    try:
-        shape = HandShape.load(folder / "hand_shape.json")
-    except ToftrackError:
-        return {}
-    fitted = bool((metadata.get("hand_shape") or {}).get("fitted"))
-    return {"hand": {"side": shape.side, "length_mm": 1e3 * shape.hand_length_m, "fitted": fitted}}
-
-
-def _metrics(
-    records: Records, rows: np.ndarray, index: np.ndarray, truth: Truth
-) -> dict[str, Any] | None:
-    """The metrics over those frames whose numbers the truth has; None where it has none.
-
-    rows: records.  index: numbers of their frames.
-    """
-    true = index - truth.first
-    known = (true >= 0) & (true < len(truth))
-    if not known.any():
-        return None
-    found = truth.of_frames(index[known])
-    joints = records.column("joints_m", rows[known])
-    lost = records.column("lost", rows[known])
-    figures = trust(joints, lost, Hand(found.joints_m, found.visible))
-    metrics = {"trust": asdict(figures)} | evaluate(joints, lost, found)
-    if "joint_sigma_m" in records.names:
-        regions = coverage(joints, records.column("joint_sigma_m", rows[known]), found)
-        metrics["coverage"] = asdict(regions)
-    return metrics
-
-
 def read_results(path: str | Path) -> dict[str, Any]:
     """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
+
+    Of a run with `hands=2` all arrays but index, timestamp_s and compute_s have an axis of two
+    slots behind that of the frames.
 
     A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
     side, side_probability, the joints' regions and confidence, the pointing ray, the pinch).
@@ -250,12 +206,12 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path).expanduser()
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            known = (*_FROM_THE_START, *(name for name in KINDS if name in archive))
-            names = (*dict.fromkeys(known), "joint_names", "metadata")
-            content: dict[str, Any] = {name: archive[name] for name in names}
+        arrays = read_archive(path, {*_FROM_THE_START, *KINDS, "joint_names", "metadata"})
+        known = (*_FROM_THE_START, *(name for name in KINDS if name in arrays))
+        names = (*dict.fromkeys(known), "joint_names", "metadata")
+        content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
-        content["metadata"] = json.loads(content["metadata"].item())
+        content["metadata"] = parse_json(content["metadata"].item())
     except OSError as error:
         raise ToftrackError(
             f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
@@ -265,7 +221,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         raise ToftrackError(
             f"'{path}' is not a track.npz of this toftrack: {error.args[0]}; give the path of one"
         ) from None
-    except (ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise ToftrackError(
             f"'{path}' is not a track.npz, or it is damaged; give the path of one"
         ) from error
@@ -276,7 +232,7 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
     """The content of a folder's run.json; ToftrackError when there is none that can be used."""
     path = folder / "run.json"
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = read_json(path)
     except FileNotFoundError:
         raise ToftrackError(
             f"'{folder}' is not the output folder of a run: it has no run.json; give a folder that "

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,10 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
+from toftrack.json_text import parse_json, read_json
+from toftrack.output.lines import HAND_FIELDS
 from toftrack.output.results import read_results, read_run_facts
+from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.recordings.bare import BareFacts
@@ -38,8 +40,9 @@ _SAME_TIME_S = 0.002
 class Run:
     """A finished run: T frames, a row for each.
 
-    results: of `read_results`.  frames: (T,) numbers of the input frames.  state_names: (T,), of
-    a dropped frame that of the one before.  summary: of summary.json.
+    results: of `read_results`.  frames: (T,) numbers of the input frames.  summary: of
+    summary.json.  shapes: the hands at the end of the run, one a slot.
+    state_names: (T,), of a dropped frame that of the one before; of two slots that of the first.
     """
 
     folder: Path
@@ -47,8 +50,7 @@ class Run:
     frames: np.ndarray
     state_names: tuple[str, ...]
     summary: dict[str, Any]
-    shape: HandShape
-    """The hand at the end of the run."""
+    shapes: tuple[HandShape, ...]
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -58,8 +60,29 @@ class Run:
         """The run's configuration."""
         return self.results["metadata"].get("config") or {}
 
+    @property
+    def shape(self) -> HandShape:
+        """The hand at the end of the run, of two that of the first slot."""
+        return self.shapes[0]
+
+    def slot(self, number: int) -> Run:
+        """The run as if only one of its slots had been followed."""
+        if len(self.shapes) == 1:
+            return self
+        results = {
+            name: array[:, number] if name in HAND_FIELDS else array
+            for name, array in self.results.items()
+        }
+        names = tuple(results["state_name"].tolist())
+        shapes = self.shapes[number : number + 1]
+        return replace(self, results=results, state_names=names, shapes=shapes)
+
+    def estimates(self, row: int) -> tuple[Estimate, ...]:
+        """What the tracker said about one frame, one a slot."""
+        return tuple(self.slot(number).estimate(row) for number in range(len(self.shapes)))
+
     def estimate(self, row: int) -> Estimate:
-        """What the tracker said about one frame."""
+        """What the tracker said about one frame of a run with one slot, see `slot`."""
         results = self.results
         names = {f.name for f in fields(Estimate)} & results.keys()
         values = {name: results[name][row] for name in names}
@@ -83,9 +106,9 @@ class Run:
         if settings.get("file"):
             settings["file"] = str(self.found(settings["file"]))
         space = make_pose_space(**settings)
-        if space.dims != self.results["latent"].shape[1]:
+        if space.dims != self.results["latent"].shape[-1]:
             raise ToftrackError(
-                f"'{settings.get('file')}' is no more the {self.results['latent'].shape[1]}-"
+                f"'{settings.get('file')}' is no more the {self.results['latent'].shape[-1]}-"
                 "dimensional pose space of the run; put the old file back"
             )
         return space
@@ -173,17 +196,20 @@ def read_run(folder: str | Path) -> Run:
     rows = len(results["lost"])
     if not rows:
         raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to draw")
+    slots = 1 if results["lost"].ndim == 1 else results["lost"].shape[1]
     if {"index", "state_name"} <= results.keys():
-        frames, names = results["index"], tuple(results["state_name"].tolist())
+        of_first = results["state_name"] if slots == 1 else results["state_name"][:, 0]
+        frames, names = results["index"], tuple(of_first.tolist())
     else:  # of an older version
         frames, names = _lines(folder / "track.jsonl", rows)
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_json(folder / "summary.json")
     except (OSError, ValueError) as error:
         raise ToftrackError(
             f"'{folder / 'summary.json'}' cannot be read ({error}); run track.py again"
         ) from None
-    return Run(folder, results, frames, names, summary, HandShape.load(folder / "hand_shape.json"))
+    shapes = tuple(HandShape.load(folder / shape_file(slot)) for slot in range(slots))
+    return Run(folder, results, frames, names, summary, shapes)
 
 
 def found_again(path: str | Path, ran_in: str | None) -> Path:
@@ -197,7 +223,7 @@ def found_again(path: str | Path, ran_in: str | None) -> Path:
 def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
     """Frame numbers and state names for the rows of track.npz, which also has dropped frames."""
     try:
-        told = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        told = [parse_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
         index = np.array([int(line["index"]) for line in told])
         names = [str(line["state_name"]) for line in told]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -324,8 +350,8 @@ def _synthetic(device: dict[str, Any]) -> Recording:
 
 
 def observe(run: Run, footage: Footage, row: int) -> Observation:
-    """One frame segmented as the tracker did; where the hand was expected follows from the row
-    before instead of the tracker's prediction.
+    """One frame of a run with one slot segmented as the tracker did; where the hand was expected
+    follows from the row before instead of the tracker's prediction.
     """
     expected = None
     if row > 0 and not run.results["lost"][row - 1]:

@@ -1,7 +1,7 @@
-"""Estimates for other programs, one after the other as they are made.
+"""Estimates for other programs, one frame's after the other's as they are made.
 
-Each is a line of JSON, the same as in track.jsonl. Sending never waits for who reads: the tracker
-keeps its pace, and what a reader is too slow for is dropped, counted, and told at the end.
+Each frame is a line of JSON, the same as in track.jsonl. Sending never waits for who reads: the
+tracker keeps its pace, and what a reader is too slow for is dropped, counted, and told at the end.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ class ReaderGoneError(Exception):
 class Stream(Protocol):
     """Where estimates are sent, within a `with`."""
 
-    def send(self, estimate: Estimate) -> None:
-        """Send one, without ever waiting for who reads it; ReaderGoneError when nobody does."""
+    def send(self, estimates: Sequence[Estimate]) -> None:
+        """Send a frame's, one a slot, without ever waiting for who reads it; ReaderGoneError when
+        nobody does.
+        """
 
     def __enter__(self) -> Self: ...
 
@@ -46,7 +48,7 @@ class Stream(Protocol):
 class NoStream:
     """Sends nothing."""
 
-    def send(self, estimate: Estimate) -> None:
+    def send(self, estimates: Sequence[Estimate]) -> None:
         """Do nothing."""
 
     def __enter__(self) -> Self:
@@ -60,7 +62,7 @@ class StdoutStream:
 
     Whatever else this process prints, its libraries included, goes to standard error meanwhile.
 
-    A reader that falls behind fills the operating system's pipe first (64 KiB on Linux, about 13
+    A reader that falls behind fills the operating system's pipe first (64 KiB on Linux, about 7
     lines). Then `waiting` lines wait for the next call of `send`, and when there are more, the
     oldest of them is dropped, so that the reader gets the newest. If it still does not read at the
     end, its last line may be cut short.
@@ -75,7 +77,7 @@ class StdoutStream:
     """
 
     def __init__(self, fields: Sequence[str] | None, waiting: int) -> None:
-        self._fields = _known(fields)
+        self._fields = known_fields(fields)
         if not isinstance(waiting, int) or waiting < 1:
             raise ToftrackError(f"stream.waiting={waiting!r} is no number of lines; give 1 or more")
         if not hasattr(select, "PIPE_BUF"):
@@ -92,10 +94,10 @@ class StdoutStream:
         self._descriptor = _claim_stdout()
         return self
 
-    def send(self, estimate: Estimate) -> None:
+    def send(self, estimates: Sequence[Estimate]) -> None:
         """Write the lines that wait and this one, as far as the reader has room for them."""
         self._dropped += len(self._lines) == self._lines.maxlen
-        self._lines.append((json_line(estimate, self._fields) + "\n").encode())
+        self._lines.append((json_line(estimates, self._fields) + "\n").encode())
         try:
             self._write(until=0.0)
         except OSError as error:
@@ -112,7 +114,7 @@ class StdoutStream:
         os.dup2(self._descriptor, _STDOUT)
         os.close(self._descriptor)
         dropped = self._dropped + len(self._lines) + bool(self._rest)
-        _tell(self._sent, "to standard output", dropped, "the reader was too slow")
+        told(self._sent, "to standard output", dropped, "the reader was too slow")
 
     def _write(self, until: float) -> None:
         """Write what waits; give up when there is no room for more, at that time at the latest."""
@@ -143,7 +145,7 @@ class UdpStream:
     """
 
     def __init__(self, host: str, port: int, fields: Sequence[str] | None) -> None:
-        self._fields = _known(fields)
+        self._fields = known_fields(fields)
         if not isinstance(port, int) or not 1 <= port <= 65535:
             raise ToftrackError(f"stream.port={port!r} is no port; give a number from 1 to 65535")
         try:
@@ -165,27 +167,31 @@ class UdpStream:
         self._socket.setblocking(False)
         return self
 
-    def send(self, estimate: Estimate) -> None:
+    def send(self, estimates: Sequence[Estimate]) -> None:
         """Send a datagram; one that the system does not take at once is dropped."""
         assert self._socket is not None, "send within `with`"
-        line = (json_line(estimate, self._fields) + "\n").encode()
         try:
-            self._socket.sendto(line, self._address)
+            self._socket.sendto(self.datagram(estimates), self._address)
         except OSError as error:  # its buffer is full, or there is no network just now
             self._dropped += 1
             self._reason = error.strerror or str(error)
         else:
             self._sent += 1
 
+    def datagram(self, estimates: Sequence[Estimate]) -> bytes:
+        """What is sent."""
+        return (json_line(estimates, self._fields) + "\n").encode()
+
     def __exit__(self, *exception: Any) -> None:
         assert self._socket is not None
         self._socket.close()
         self._socket = None
         host, port = self._address[:2]
-        _tell(self._sent, f"to {host} port {port}", self._dropped, self._reason)
+        told(self._sent, f"to {host} port {port}", self._dropped, self._reason)
 
 
-def _known(fields: Sequence[str] | None) -> tuple[str, ...]:
+def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
+    """The fields that a setting names, of lines.LINE_FIELDS; ToftrackError for an unknown one."""
     if fields is None:
         return LINE_FIELDS
     names = (fields,) if isinstance(fields, str) else tuple(fields)
@@ -213,6 +219,7 @@ def _claim_stdout() -> int:
     return own
 
 
-def _tell(sent: int, where: str, dropped: int, reason: str) -> None:
+def told(sent: int, where: str, dropped: int, reason: str) -> None:
+    """Log how many estimates were sent at the end of a stream."""
     why = f" ({reason})" if dropped else ""
     _log.info("stream: %d estimates sent %s, %d dropped%s", sent, where, dropped, why)

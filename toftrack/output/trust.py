@@ -81,6 +81,8 @@ class TwoSlots:
     """None where the recording has one hand."""
     ghost_pct: float | None
     """Frames in which the slot without a hand says that it has one; None where both have theirs."""
+    slots: tuple[int, int]
+    """The first hand's and the other one."""
 
 
 @dataclass(frozen=True)
@@ -170,9 +172,9 @@ def trust_of_two(
         for slot, hand in zip(slots, hands, strict=False)
     ]
     if len(hands) == 2:
-        return TwoSlots(first=figures[0], second=figures[1], ghost_pct=None)
+        return TwoSlots(first=figures[0], second=figures[1], ghost_pct=None, slots=slots)
     there = ~lost[skip:, slots[1]]
-    return TwoSlots(figures[0], None, 100.0 * float(there.mean()) if there.size else 0.0)
+    return TwoSlots(figures[0], None, 100.0 * float(there.mean()) if there.size else 0.0, slots)
 
 
 def interval(shares: Sequence[float], draws: int = 2000, seed: int = 0) -> Share:

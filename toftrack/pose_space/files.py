@@ -17,9 +17,10 @@ import numpy as np
 import torch
 
 import toftrack.pose_space
+from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_NAMES
-from toftrack.pose_space.archives import read_archive
+from toftrack.json_text import parse_json
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
 
@@ -142,7 +143,7 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of this format and version."""
     try:
         content = read_archive(path)
-        header = json.loads(str(content.pop("header")))
+        header = parse_json(str(content.pop("header")))
     except FileNotFoundError:
         raise ToftrackError(f"no pose-space file at {path}; {_ADVICE}") from None
     except KeyError:

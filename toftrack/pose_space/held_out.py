@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -90,12 +90,25 @@ def clip_folds(clips: Tensor, folds: int = FOLDS) -> Iterator[tuple[Tensor, Tens
         yield (~out).nonzero()[:, 0], out.nonzero()[:, 0]
 
 
+def spaces_to_learn(data: PoseData) -> int:
+    """How many spaces a row of the table takes: one, and one for each fold."""
+    return 1 + sum(1 for _ in clip_folds(data.clips))
+
+
 def evaluate_space(
-    kind: str, dims: int, data: PoseData, settings: dict[str, Any] | None = None
+    kind: str,
+    dims: int,
+    data: PoseData,
+    settings: dict[str, Any] | None = None,
+    learned: Callable[[], object] = lambda: None,
 ) -> Row:
-    """Errors of one kind of space on its training poses and, fold by fold, on held-out clips."""
+    """Errors of one kind of space on its training poses and, fold by fold, on held-out clips.
+
+    learned: called after each of the `spaces_to_learn` that are learned for it.
+    """
     settings = settings or {}
     space = fit_pose_space(kind, dims, data, **settings)
+    learned()
     results: list[tuple[Tensor, Tensor]] = []
     reached: list[tuple[Tensor, Tensor]] = []
     for training, out in clip_folds(data.clips):
@@ -107,6 +120,7 @@ def evaluate_space(
         poses = data.angles_rad[out]
         results.append(reconstruction(fold, poses))
         reached.append(reconstruction(fold, poses, nearest_latents(fold, poses)))
+        learned()
     ratios = getattr(space, "explained_variance_ratio", None)
     clamped = None
     if isinstance(space, TensorSpace):

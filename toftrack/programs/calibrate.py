@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -30,6 +31,8 @@ from toftrack.views.figures.calibration import corner_sheet, error_plot
 
 _PICTURES = 12
 _LENS = "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tauX tauY".split()
+_HOPE_S = 4.0
+"""After so long without a board something is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +126,7 @@ def calibrate(
             f"{store.camera.width}x{store.camera.height}"
         )
     numbers = np.unique(np.linspace(0, len(store) - 1, frames).round().astype(int))
-    views = []
-    for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):
-        amplitude = store.image(number)[1]
-        assert amplitude is not None  # as was made sure of above
-        corners = calibration.find_corners(amplitude, board)
-        if corners is not None:
-            views.append(View(int(number), corners))
+    views = _views(store, board, numbers)
     fit = calibration.known_lens if keep_lens else calibration.fit_lens
     lens = fit(views, board, square_m, start)
     images = []
@@ -144,6 +141,27 @@ def calibrate(
         lens.camera, depth_polynomial=found.polynomial, depth_polynomial_range_m=found.range_m
     )
     return Calibration(camera, lens, found, pairs, [a for _, a in images], len(numbers))
+
+
+def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> list[View]:
+    """The frames of these numbers that show the board; says so soon where none does."""
+    views: list[View] = []
+    began, told = time.monotonic(), False
+    bar = tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5)
+    for number in bar:
+        amplitude = store.image(number)[1]
+        assert amplitude is not None  # it was made sure of that there are some
+        corners = calibration.find_corners(amplitude, board)
+        if corners is not None:
+            views.append(View(int(number), corners))
+        elif not views and not told and time.monotonic() - began > _HOPE_S:
+            told = True
+            bar.write(
+                f"no {board[0]}x{board[1]} chequerboard seen so far, up to frame {number}; it must "
+                "be wholly in view, and --board its inner corners, columns x rows (Ctrl-C ends)",
+                file=sys.stderr,
+            )
+    return views
 
 
 def report_text(result: Calibration, start: Camera) -> str:

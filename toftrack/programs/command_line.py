@@ -31,6 +31,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
+from toftrack.json_text import read_json
 from toftrack.programs import endings
 
 
@@ -40,7 +41,8 @@ class _Program:
 
     running: bool = False
     tracebacks: bool = False
-    failed_jobs: list[str] = field(default_factory=list)
+    failed_jobs: set[Path] = field(default_factory=set)
+    """Their folders."""
 
 
 _program = _Program()
@@ -119,11 +121,16 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
                 raise
             _report(error)
             folder = Path(HydraConfig.get().runtime.output_dir)
-            _program.failed_jobs.append(str(folder))
+            note_failed_job(folder)
             _note_error(folder, sentence(error))
             return math.inf
 
     return guarded
+
+
+def note_failed_job(folder: Path) -> None:
+    """A job of the sweep failed, in this process or another: `run` will say how many did."""
+    _program.failed_jobs.add(folder.absolute())
 
 
 @contextlib.contextmanager
@@ -161,7 +168,7 @@ def _note_error(folder: Path, text: str) -> None:
     # The sentence is on the terminal; a folder that cannot be written must not stop the sweep.
     with contextlib.suppress(OSError):
         try:
-            summary = json.loads(path.read_text(encoding="utf-8"))
+            summary = read_json(path)
         except (FileNotFoundError, ValueError):
             summary = {}
         path.write_text(json.dumps(summary | {"error": text}, indent=1) + "\n", encoding="utf-8")

@@ -11,7 +11,8 @@ Writes five PNG files into the run's folder, below `figures`:
 | `latent.png` | the way of the estimates over the training poses |
 
 The first three need the recording that the run tracked; of a run with a live camera there is none,
-and only the others are drawn.
+and only the others are drawn. Of a run with two hands those of the second slot are `measurement_2`
+and so on; the filmstrip shows both.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +30,9 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import confidence_words, state_words
+from toftrack.frames import Truth
 from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
+from toftrack.render.model_image import model_range_image
 from toftrack.views.classified import classify
 from toftrack.views.figures.runs import (
     course_figure,
@@ -37,7 +41,6 @@ from toftrack.views.figures.runs import (
     lost_figure,
     measurement_figure,
 )
-from toftrack.views.model_image import model_range_image
 from toftrack.views.overlay import draw_panel, panel_scale
 
 _FILM_FRAMES = 10
@@ -86,7 +89,8 @@ def draw_figures(
     """
     run = read_run(folder)
     footage = open_footage(run, recording)
-    row = _typical_row(run) if frame is None else _row_of(run, frame)
+    if frame is not None:
+        _row_of(run, frame)
     figures: dict[str, Callable[[], np.ndarray]] = {}
     if footage is None:
         if recording is None and frame is not None:
@@ -96,12 +100,8 @@ def draw_figures(
             "without them are drawn",
             file=sys.stderr,
         )
-    else:
-        figures["measurement"] = lambda: _measurement(run, footage, row)
-        figures["filmstrip"] = lambda: _film(run, footage)
-        figures["lost"] = lambda: _lost(run, footage)
-    figures["course"] = lambda: _course(run, footage)
-    figures["latent"] = lambda: _latent(run)
+    for position, slot in enumerate(_slots(run)):
+        figures |= _of_slot(run, footage, slot, frame, with_film=position == 0)
     target = Path(out).expanduser() if out is not None else run.folder / "figures"
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -121,9 +121,47 @@ def draw_figures(
     return written
 
 
+def _slots(run: Run) -> list[int]:
+    """Those that had a hand; the first one where none had."""
+    every = range(len(run.shapes))
+    return [n for n in every if np.isfinite(run.slot(n).results["joints_m"]).any()] or [0]
+
+
+def _of_slot(
+    run: Run, footage: Footage | None, slot: int, frame: int | None, with_film: bool
+) -> dict[str, Callable[[], np.ndarray]]:
+    """The figures of one slot by their names, and of all, with_film, the filmstrip."""
+    one = run.slot(slot)
+    several = len(run.shapes) > 1
+    after = f"_{slot + 1}" if slot else ""
+    of = f"Slot {slot}, {one.shape.side} hand. " if several else ""
+    row = _typical_row(one) if frame is None else _row_of(run, frame)
+    figures: dict[str, Callable[[], np.ndarray]] = {}
+    if footage is not None:
+        figures[f"measurement{after}"] = lambda: _measurement(one, footage, row, of)
+        if with_film:
+            figures["filmstrip"] = lambda: _film(run, footage)
+        figures[f"lost{after}"] = lambda: _lost(run, one, footage, of)
+    truth, metrics = _truth(run, footage, slot)
+    figures[f"course{after}"] = lambda: _course(one, truth, metrics, of)
+    figures[f"latent{after}"] = lambda: _latent(one, of)
+    return figures
+
+
+def _truth(run: Run, footage: Footage | None, slot: int) -> tuple[Truth | None, dict[str, Any]]:
+    """Of the hand that a slot followed, and the metrics of that."""
+    truth = None if footage is None else footage.truth
+    metrics = run.summary.get("metrics") or {}
+    if metrics.get("slot", slot) == slot:
+        return truth, metrics
+    second = metrics.get("second") or {}
+    return (None, {}) if truth is None or not second else (truth.other, second)
+
+
 def _typical_row(run: Run) -> int:
     """The tracked frame (any, if all are lost) whose score is nearest to the median of them."""
     lost, score = run.results["lost"], run.results["score"]
+    score = np.nan_to_num(score)
     rows = np.flatnonzero(~lost) if not lost.all() else np.arange(len(run))
     return int(rows[np.abs(score[rows] - np.median(score[rows])).argmin()])
 
@@ -138,39 +176,43 @@ def _row_of(run: Run, frame: int) -> int:
 
 
 def _panel(run: Run, footage: Footage, row: int) -> np.ndarray:
-    estimate, camera = run.estimate(row), footage.camera
-    model = model_range_image(estimate.state, run.shape, camera.K, camera.height, camera.width)
+    estimates, camera = run.estimates(row), footage.camera
+    models = [
+        model_range_image(estimate.state, shape, camera.K, camera.height, camera.width)
+        for estimate, shape in zip(estimates, run.shapes, strict=True)
+    ]
     return draw_panel(
         footage.depth(row),
         footage.amplitude(row),
         camera,
-        estimate,
-        model,
+        estimates,
+        models,
         panel_scale(camera.width),
     )
 
 
-def _measurement(run: Run, footage: Footage, row: int) -> np.ndarray:
+def _measurement(run: Run, footage: Footage, row: int, of: str) -> np.ndarray:
     estimate = run.estimate(row)
     observation = observe(run, footage, row)
     pixels = classify(estimate.state, run.shape, observation, run.likelihood())
     state = f"LOST: {state_words(estimate)}" if estimate.lost else ""
     facts = (f"score {estimate.score:.2f}", confidence_words(estimate.confidence), state)
-    title = f"Frame {estimate.index}: " + ", ".join(filter(None, facts))
+    title = f"{of}Frame {estimate.index}: " + ", ".join(filter(None, facts))
     return measurement_figure(observation, pixels, title)
 
 
 def _film(run: Run, footage: Footage) -> np.ndarray:
     count = min(_FILM_FRAMES, len(run))
     rows = np.linspace(0, len(run) - 1, count).round().astype(int)
-    title = f"{count} of {len(run)} frames; lost in all: {int(run.results['lost'].sum())}"
+    title = f"{count} of {len(run)} frames; lost in all: {run.summary['lost_frames']}"
     if count == len(run):
         title = f"{count} frames"
     return filmstrip_figure([_panel(run, footage, row) for row in rows], title)
 
 
-def _lost(run: Run, footage: Footage) -> np.ndarray:
-    lost, score = run.results["lost"], run.results["score"]
+def _lost(run: Run, one: Run, footage: Footage, of: str) -> np.ndarray:
+    """Of one slot of a run; the frames show all of them."""
+    lost, score = one.results["lost"], np.nan_to_num(one.results["score"])
     if lost.any():
         # Of a time in which there was nothing to see, one frame is enough.
         nothing = lost & (score == 0)
@@ -183,8 +225,8 @@ def _lost(run: Run, footage: Footage) -> np.ndarray:
         rows = _lowest_rows(score)
         title = f"No frame was lost: the {len(rows)} frames of the lowest score"
     panels = [_panel(run, footage, row) for row in rows]
-    sure = run.results.get("confidence")
-    return lost_figure(panels, rows, _time(run), run.frames, score, lost, title, sure)
+    sure = one.results.get("confidence")
+    return lost_figure(panels, rows, _time(run), run.frames, score, lost, of + title, sure)
 
 
 def _lowest_rows(score: np.ndarray) -> list[int]:
@@ -197,8 +239,8 @@ def _lowest_rows(score: np.ndarray) -> list[int]:
     return sorted(rows)
 
 
-def _course(run: Run, footage: Footage | None) -> np.ndarray:
-    results, truth = run.results, None if footage is None else footage.truth
+def _course(run: Run, truth: Truth | None, metrics: dict[str, Any], of: str) -> np.ndarray:
+    results = run.results
     error, absent = None, None
     if truth is not None:
         error = 1e3 * np.linalg.norm(results["joints_m"] - truth.joints_m, axis=-1)
@@ -206,14 +248,15 @@ def _course(run: Run, footage: Footage | None) -> np.ndarray:
         absent = ~(truth.visible & truth.in_space)
     score = np.where(np.isfinite(results["score"]), results["score"], np.nan)
     title = f"Score of {len(run)} frames"
-    mean = (run.summary.get("metrics") or {}).get("mean_mm")
+    mean = metrics.get("mean_mm")
     if mean is not None:
-        title = f"{len(run)} frames: mean joint error {mean:.1f} mm, mean score {score.mean():.2f}"
+        height = float(score[np.isfinite(score)].mean())
+        title = f"{len(run)} frames: mean joint error {mean:.1f} mm, mean score {height:.2f}"
     lost, sure = results["lost"], results.get("confidence")
-    return course_figure(_time(run), run.frames, score, lost, title, error, absent, sure)
+    return course_figure(_time(run), run.frames, score, lost, of + title, error, absent, sure)
 
 
-def _latent(run: Run) -> np.ndarray:
+def _latent(run: Run, of: str) -> np.ndarray:
     space, results = run.pose_space(), run.results
     latent, note = results["latent"], ""
     with torch.inference_mode():
@@ -221,7 +264,8 @@ def _latent(run: Run) -> np.ndarray:
     span = (space.upper - space.lower).numpy()
     if np.nanmax(np.abs(now - latent) / span, initial=0.0) > _SAME_SPACE:
         latent, note = now, " The space has changed since the run; its poses are encoded anew."
-    title = f"Pose space ({space.kind}, {space.dims} coordinates): training poses and estimates"
+    about = f"({space.kind}, {space.dims} coordinates)"
+    title = f"{of}Pose space {about}: training poses and estimates"
     return latent_figure(space, latent, results["lost"], _time(run), title, note)
 
 

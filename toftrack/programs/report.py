@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import math
 import statistics
 import sys
@@ -21,6 +20,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import read_json
 
 FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
 """What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
@@ -89,7 +89,7 @@ def _read_run(path: Path, folder: Path) -> Run:
     except Exception as error:  # whatever a YAML reader may say about a damaged file
         return Run(name, {}, {}, f"its overrides cannot be read ({type(error).__name__})")
     try:
-        summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+        summary = read_json(path / "summary.json")
     except FileNotFoundError:
         return Run(name, overrides, {}, "it left no summary.json: it did not finish")
     except (OSError, ValueError) as error:

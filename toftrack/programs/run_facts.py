@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import platform
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,18 @@ from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.output.files import save_whole
-from toftrack.tracking.tracker import Tracker
+from toftrack.output.summary import shape_file
+from toftrack.tracking.hands import HandsTracker
 
 _APART_S = 1.0
 
 
-def run_metadata(config: DictConfig, device: Device, tracker: Tracker) -> dict[str, Any]:
-    """The metadata of run.json and track.npz, JSON-able."""
-    camera, shape = device.camera, tracker.shape
+def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> dict[str, Any]:
+    """The metadata of run.json and track.npz, JSON-able.
+
+    The hand's shape is the first slot's at the start, its side 'auto' where none was told.
+    """
+    camera, shape = device.camera, tracker.shapes[0]
     return {
         "toftrack": version("toftrack"),
         "torch": torch.__version__,
@@ -36,7 +41,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: Tracker) -> dict[s
         "device": device.description,
         "pose_space": {"kind": tracker.space.kind, "dims": tracker.space.dims},
         "hand_shape": {
-            "side": shape.side,
+            "side": told_side(config, shape.side) or "auto",
             "fitted": tracker.model.fit is not None,
             "thickness": shape.thickness,
             "hand_length_m": shape.hand_length_m,
@@ -54,38 +59,63 @@ def run_metadata(config: DictConfig, device: Device, tracker: Tracker) -> dict[s
     }
 
 
+def told_side(config: Mapping[str, Any], side: str) -> str | None:
+    """The side that was told; None where either hand may come, or both.
+
+    config: of the run.  side: of the hand that is looked for.
+    """
+    told = config.get("hands", 1) == 1 and (config.get("hand") or {}).get("side") != "auto"
+    return side if told else None
+
+
 def opening(metadata: dict[str, Any], device: Device) -> str:
-    """What is tracked, which side, which size: one line to begin with."""
-    about, side = metadata["device"], metadata["hand_shape"]["side"]
+    """What is tracked, how many hands, which side, which size: one line to begin with."""
+    about, shape, config = metadata["device"], metadata["hand_shape"], metadata["config"]
     source = about.get("recording") or about.get("device")
     count = "live" if device.frames is None else f"{device.frames} frames"
-    other = "left" if side == "right" else "right"
-    length_mm = 1e3 * float(metadata["hand_shape"]["hand_length_m"])
-    fitted = "fitted from" if metadata["hand_shape"]["fitted"] else "of"
-    return (
-        f"tracking {source} ({count}): a {side} hand (hand.side={other} for the other), its length "
-        f"{fitted} {length_mm:.0f} mm"
-    )
+    side = shape["side"]
+    length_mm = 1e3 * float(shape["hand_length_m"])
+    fitted = "fitted from" if shape["fitted"] else "of"
+    if config.get("hands", 1) > 1:
+        what = "up to two hands, their lengths"
+    elif side == "auto":
+        what = "a hand of either side (hand.side=right or left to say which), its length"
+    else:
+        other = "left" if side == "right" else "right"
+        what = f"a {side} hand (hand.side={other} for the other), its length"
+    return f"tracking {source} ({count}): {what} {fitted} {length_mm:.0f} mm"
 
 
-class ShapeFile:
-    """hand_shape.json of a run, which is there from the start on and follows what is fitted.
+class ShapeFiles:
+    """The hands' files of a run, hand_shape.json and of a second slot hand_shape_2.json.
 
-    Between the first and the last time it is a second old at most: it serves runs that are killed.
+    They are there from the start on and follow what is fitted. Between the first and the last time
+    they are a second old at most: they serve runs that are killed.
     """
 
-    def __init__(self, folder: Path, tracker: Tracker) -> None:
-        self._path = folder / "hand_shape.json"
+    def __init__(self, folder: Path, tracker: HandsTracker) -> None:
         self._tracker = tracker
-        self._saved: HandShape | None = None
-        self._saved_s = -math.inf
+        self._files = [_ShapeFile(folder / shape_file(i)) for i in range(len(tracker.states))]
 
     def save(self, last: bool = False) -> None:
-        """Write the present hand, where it is another than was written.
+        """Write the present hands, where they are others than were written.
 
         Raises ToftrackError when that is not possible; before the last time, it may be later.
         """
-        shape = self._tracker.fitted
+        for file, shape in zip(self._files, self._tracker.fitted, strict=True):
+            file.save(shape, last)
+
+
+class _ShapeFile:
+    """One of them."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._saved: HandShape | None = None
+        self._saved_s = -math.inf
+
+    def save(self, shape: HandShape, last: bool) -> None:
+        """See ShapeFiles."""
         now_s = time.monotonic()
         if shape is self._saved or not (last or now_s > self._saved_s + _APART_S):
             return

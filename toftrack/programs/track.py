@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import hydra
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from toftrack.api import build_tracker
+from toftrack.api import build_hands_tracker
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, confidence_words
+from toftrack.estimate import Estimate, confidence_words, is_vacant
+from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.advice import Watch
 from toftrack.output.evaluation import metrics_table
 from toftrack.output.results import ResultWriter
-from toftrack.output.smoothing import OneEuro, smooth
+from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import endings
-from toftrack.programs.run_facts import ShapeFile, opening, run_metadata
-from toftrack.tracking.tracker import Tracker
-from toftrack.views.base import TrackedFrame, View
+from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata, told_side
+from toftrack.tracking.conventions import in_all_conventions
+from toftrack.tracking.hands import HandsTracker
+from toftrack.views.base import TrackedFrame, TrackedHand, View
 
 
 def track(config: DictConfig, device: Device) -> float:
@@ -40,21 +44,22 @@ def track(config: DictConfig, device: Device) -> float:
 
 
 def _track(config: DictConfig, device: Device, stream: Stream) -> float:
-    tracker = build_tracker(config)
-    watch = Watch(float(config.segmentation.get("max_distance_m", math.inf)))
+    tracker = build_hands_tracker(config)
+    reach_m = float(config.segmentation.get("max_distance_m", math.inf))
+    watch = Watch(reach_m, len(tracker.states))
     try:
         return _run(config, device, tracker, stream, watch)
     finally:  # a live run that lost the hand ends by an interruption
-        for sentence in watch.advice(tracker.shape.side):
+        for sentence in watch.advice(told_side(config, tracker.shapes[0].side)):
             endings.say(f"note: {sentence}", sys.stderr)
 
 
 def _run(
-    config: DictConfig, device: Device, tracker: Tracker, stream: Stream, watch: Watch
+    config: DictConfig, device: Device, tracker: HandsTracker, stream: Stream, watch: Watch
 ) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     make = hydra.utils.instantiate
-    parts = _Parts(tracker, stream, make(config.smooth), watch, ShapeFile(folder, tracker))
+    parts = _Parts(tracker, stream, make(config.smooth), watch, ShapeFiles(folder, tracker))
     ended: KeyboardInterrupt | None = None
     with device:
         metadata = run_metadata(config, device, tracker)
@@ -77,18 +82,18 @@ def _run(
     if not summary.get("frames"):
         raise ToftrackError("the device delivered no frame; nothing was tracked")
     error = (summary.get("metrics") or {}).get("mean_mm")
-    return float(error) if error is not None else 1.0 - float(summary["mean_score"])
+    return float(error) if error is not None else 1.0 - float(summary["mean_score"] or 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
     """What the loop needs beside the device, the results and the view."""
 
-    tracker: Tracker
+    tracker: HandsTracker
     stream: Stream
     smoothing: OneEuro | None
     watch: Watch
-    shape: ShapeFile
+    shapes: ShapeFiles
 
 
 def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) -> None:
@@ -100,14 +105,14 @@ def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) ->
     finally:
         with endings.not_now():
             try:
-                parts.shape.save(last=True)
+                parts.shapes.save(last=True)
             finally:
                 results.close()
 
 
 def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> None:
     tracker, smoothing = parts.tracker, parts.smoothing
-    smoothed = None
+    smoothed: tuple[SmoothState | None, ...] = (None,) * len(tracker.states)
     progress = partial(tqdm, total=device.frames, unit=" frames", file=sys.stderr, mininterval=0.2)
     with progress() as bar:
         for frame in device:
@@ -115,25 +120,51 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 for command in view.commands():
                     tracker.restart(None if command == "restart" else command)
                 depth = device.camera.rectify(frame.depth, frame.radial)
-                shape = tracker.shape
-                estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-                parts.watch.see(estimate, depth, tracker.insight)
-                smoothed, calm = smooth(smoothing, smoothed, estimate, shape)
-                if smoothing is not None and smoothing.results:
-                    estimate = calm
-                results.append(estimate)
-                parts.shape.save()
-                parts.stream.send(calm)
-                view.show(
-                    TrackedFrame(frame, depth, device.camera, estimate, shape, tracker.insight)
+                before = tracker.shapes
+                estimates = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+                shapes = tuple(map(_of_estimate, before, estimates))
+                parts.watch.see(estimates, depth, tracker.insights)
+                every = zip(smoothed, estimates, shapes, strict=True)
+                made = [smooth(smoothing, *one) for one in every]
+                smoothed = tuple(one[0] for one in made)
+                calm = tuple(
+                    _in_all_conventions(one[1], found, shape, device.camera.K, depth)
+                    for one, found, shape in zip(made, estimates, shapes, strict=True)
                 )
+                if smoothing is not None and smoothing.results:
+                    estimates = calm
+                results.append(estimates)
+                parts.shapes.save()
+                parts.stream.send(calm)
+                hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
+                view.show(TrackedFrame(frame, depth, device.camera, hands))
                 bar.update()
-                bar.set_postfix_str(_progress_words(estimate), refresh=False)
+                bar.set_postfix_str(_progress_words(estimates), refresh=False)
 
 
-def _progress_words(estimate: Estimate) -> str:
-    facts = (f"score {estimate.score:.2f}", confidence_words(estimate.confidence))
-    return ", ".join(filter(None, (*facts, estimate.state_name)))
+def _in_all_conventions(
+    smoothed: Estimate, found: Estimate, shape: HandShape, k: np.ndarray, depth_m: np.ndarray
+) -> Estimate:
+    """What follows from the smoothed joints, too; nothing to do where nothing was smoothed."""
+    if smoothed is found:
+        return found
+    return in_all_conventions(smoothed, shape, k, (depth_m.shape[1], depth_m.shape[0]))
+
+
+def _of_estimate(shape: HandShape, estimate: Estimate) -> HandShape:
+    """The hand that a slot had, or, where it turned out to be the other one, that."""
+    return shape if estimate.side in ("", shape.side) else shape.of_side(estimate.side)
+
+
+def _progress_words(estimates: Sequence[Estimate]) -> str:
+    if len(estimates) == 1:
+        return f"score {estimates[0].score:.2f}, {_sure_words(estimates[0])}"
+    there = [estimate for estimate in estimates if not is_vacant(estimate)]
+    return " | ".join(f"{one.side} {_sure_words(one)}" for one in there) or "no hand"
+
+
+def _sure_words(estimate: Estimate) -> str:
+    return ", ".join(filter(None, (confidence_words(estimate.confidence), estimate.state_name)))
 
 
 def _told_files(folder: Path) -> str:

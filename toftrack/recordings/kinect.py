@@ -11,7 +11,6 @@ corner of the first pixel. A mode of the camera bins that sensor's pixels and cu
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
 
 _SENSOR_PX = 1024
 """Width and height of the depth sensor."""
@@ -88,12 +88,12 @@ def camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
             f"Kinect; {_ADVICE}"
         )
     try:
-        cameras = json.loads(text)["CalibrationInformation"]["Cameras"]
+        cameras = parse_json(text)["CalibrationInformation"]["Cameras"]
         depth = next(c for c in cameras if c["Purpose"] == "CALIBRATION_CameraPurposeDepth")
         lens, size = depth["Intrinsics"], (depth["SensorWidth"], depth["SensorHeight"])
         numbers = np.array(lens["ModelParameters"], np.float64)
         model = lens["ModelType"]
-    except (ValueError, KeyError, TypeError, StopIteration, RecursionError):
+    except (ValueError, KeyError, TypeError, StopIteration):
         raise ToftrackError(f"the {_CALIBRATION} in '{path}' is damaged; {_ADVICE}") from None
     if model != _MODEL or size != (_SENSOR_PX, _SENSOR_PX) or numbers.shape != (14,):
         raise ToftrackError(

@@ -11,6 +11,7 @@
 | `joints_m` | (T, 21, 3) float | no |
 | `visible`, `in_space` | (T,) bool | no: true |
 | `visible_fraction`, `joint_visible` | (T,) float, (T, 21) bool | no |
+| `joints2_m`, `visible2`, `in_space2`, ... | the same of the other hand | no |
 | `metadata` | text, a JSON object | no |
 
 Unknown keys are ignored.
@@ -19,31 +20,40 @@ Unknown keys are ignored.
 from __future__ import annotations
 
 import json
-import math
 import os
 import zipfile
-import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
+from toftrack.archives import MOST_BYTES, Archive, PickledError
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import LARGEST_MEDIAN_M, Truth
+from toftrack.frames import (
+    LARGEST_MEDIAN_M,
+    SMALLEST_MEDIAN_M,
+    Truth,
+    median_reading,
+    wrong_unit,
+)
+from toftrack.json_text import parse_json
+from toftrack.recordings.doubts import check_layout, some_images
+from toftrack.recordings.streamed_images import Images, StreamedImages
 
 DEFAULT_FPS = 25.0
+LOADED_BYTES = MOST_BYTES
+"""Longer recordings are not loaded: their images are read in turn."""
+_IMAGES = ("depth_m", "radial_m", "amplitude")
 _JOINTS = 21
-# Of zip's usual method; nothing shrinks to less than a 1032th.
-_MOST_COMPRESSION = 1032
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
     """What a camera saw, as it lies in the file: depth keeps the file's type."""
 
-    depth: np.ndarray
+    depth: Images
     """(T, H, W) float16 or float32 metres."""
     radial: bool
     """True: `depth` is the distance along each pixel's ray; False: Z along the optical axis."""
@@ -51,7 +61,7 @@ class Recording:
     timestamp_s: np.ndarray
     """(T,) float64, not decreasing."""
     fps: float
-    amplitude: np.ndarray | None = None
+    amplitude: Images | None = None
     """(T, H, W) uint16."""
     truth: Truth | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
@@ -65,7 +75,10 @@ class Recording:
         return self.depth[index].astype(np.float32), amplitude
 
     def close(self) -> None:
-        """Nothing to close: the file was read as a whole."""
+        """Close the file, if it is read in turn."""
+        for images in (self.depth, self.amplitude):
+            if isinstance(images, StreamedImages):
+                images.close()
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -100,8 +113,7 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     if recording.amplitude is not None:
         arrays["amplitude"] = recording.amplitude
     if recording.truth is not None:
-        truth = {name: getattr(recording.truth, name) for name in Truth.__dataclass_fields__}
-        arrays.update({name: value for name, value in truth.items() if value is not None})
+        arrays |= _truth_arrays(recording.truth)
     partial = path.with_name(path.name + ".part")
     try:
         with open(partial, "wb") as stream:
@@ -114,6 +126,20 @@ def write_recording(path: str | Path, recording: Recording) -> None:
         ) from error
 
 
+def _truth_arrays(truth: Truth) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {}
+    for keys, hand in ((_TRUTH_KEYS, truth), (_OTHER_KEYS, truth.other)):
+        values = {key: getattr(hand, name, None) for name, key in keys.items()}
+        arrays |= {key: value for key, value in values.items() if value is not None}
+    return arrays
+
+
+_TRUTH_KEYS = {
+    name: name for name in ("joints_m", "visible", "in_space", "visible_fraction", "joint_visible")
+}
+"""What fields of Truth are called in a file."""
+_OTHER_KEYS = {name: f"{name}2" for name in _TRUTH_KEYS} | {"joints_m": "joints2_m"}
+"""Those of the other hand."""
 _KEYS = (
     "depth_m",
     "radial_m",
@@ -122,97 +148,65 @@ _KEYS = (
     "fps",
     "timestamp_s",
     "distortion",
-    "joints_m",
-    "visible",
-    "in_space",
-    "visible_fraction",
-    "joint_visible",
+    *_TRUTH_KEYS.values(),
+    *_OTHER_KEYS.values(),
     "metadata",
 )
 
 
-def _read_members(path: Path) -> dict[str, np.ndarray]:
+def _read_members(path: Path) -> dict[str, Images]:
     """The known arrays of the archive; every way in which a file can be broken ends here."""
     if path.is_dir():
         raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.npz)")
     try:
-        if not zipfile.is_zipfile(path):
-            if not path.exists():
+        with open(path, "rb") as stream:
+            if not zipfile.is_zipfile(stream):
                 raise ToftrackError(
-                    f"there is no file '{path}'; give the path of a recording (.npz)"
+                    f"'{path}' is not an .npz archive, or it was cut off; give a recording as "
+                    "numpy.savez writes it"
                 )
-            with open(path, "rb") as stream:  # tells "unreadable" from "not an archive"
-                stream.read(1)
-            raise ToftrackError(
-                f"'{path}' is not an .npz archive, or it was cut off; give a recording as "
-                "numpy.savez writes it"
-            )
-        with zipfile.ZipFile(path) as archive:
-            return _read_archive(path, archive)
+            return _read_archive(path, Archive(stream))
+    except FileNotFoundError:
+        raise ToftrackError(
+            f"there is no file '{path}'; give the path of a recording (.npz)"
+        ) from None
     except OSError as error:
         raise ToftrackError(
             f"the recording '{path}' cannot be read ({error.strerror or error}); check the file "
             "and its permissions"
         ) from error
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
-        # RuntimeError covers encrypted members and unknown compressions (NotImplementedError).
+    except PickledError as error:
+        raise ToftrackError(
+            f"the recording '{path}' is refused: {error}, and they can run code; save plain arrays "
+            "and text only"
+        ) from None
+    except ValueError as error:
         raise ToftrackError(
             f"the recording '{path}' is damaged ({error}); copy or record it again"
         ) from error
 
 
-def _read_archive(path: Path, archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
-    members = [name for name in archive.namelist() if name.endswith(".npy")]
-    for name in members:
-        _check_size(archive, name)
-        # Also of unknown keys, before anything is used: a file that carries objects is not ours.
-        if _holds_objects(archive, name):
-            raise ToftrackError(
-                f"the recording '{path}' contains pickled objects in '{name[:-4]}', which are "
-                "refused because they can run code; save plain arrays and text only"
-            )
-    arrays = {}
-    for key in _KEYS:
-        if f"{key}.npy" in members:
-            with archive.open(f"{key}.npy") as stream:
-                arrays[key] = np.lib.format.read_array(stream, allow_pickle=False)
-    return arrays
+def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
+    # Of unknown keys, too, before anything is used: a file that carries objects is not ours.
+    headers = {name: archive.header(name, None) for name in archive.names}
+    images = {name for name in _IMAGES if name in headers}
+    if sum(headers[name].size for name in images) <= LOADED_BYTES:
+        images.clear()
+    return {
+        key: StreamedImages(path, key, headers[key]) if key in images else archive.read(key)
+        for key in _KEYS
+        if key in headers
+    }
 
 
-def _holds_objects(archive: zipfile.ZipFile, name: str) -> bool:
-    with archive.open(name) as stream:
-        return _header(stream)[1].hasobject
-
-
-def _check_size(archive: zipfile.ZipFile, name: str) -> None:
-    """ValueError where a damaged header claims more than there is: memory must not go after it."""
-    info = archive.getinfo(name)
-    with archive.open(name) as stream:
-        shape, kind = _header(stream)
-    if not kind.hasobject and math.prod(shape) * kind.itemsize > info.file_size:
-        raise ValueError(f"'{name[:-4]}' is smaller than its header says")
-    if info.file_size > _MOST_COMPRESSION * info.compress_size + 1024:
-        raise ValueError(f"'{name[:-4]}' cannot be as large as the archive says")
-
-
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    version = np.lib.format.read_magic(stream)
-    read_header = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, kind = read_header(stream)
-    return shape, kind
-
-
-def _parse(arrays: dict[str, np.ndarray]) -> Recording:
+def _parse(arrays: dict[str, Any]) -> Recording:
     depth_key = "depth_m" if "depth_m" in arrays else "radial_m"
     if depth_key not in arrays:
         raise ToftrackError("the required key 'depth_m' is missing; add it (or 'radial_m')")
     if "K" not in arrays:
         raise ToftrackError("the required key 'K' (3x3 camera matrix, pixels) is missing; add it")
     depth = _check_depth(arrays[depth_key], depth_key)
+    check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
     camera = Camera(arrays["K"], width, height, arrays.get("distortion", np.zeros(5)))
     timestamp_s, fps = _times(arrays, count)
@@ -228,38 +222,31 @@ def _parse(arrays: dict[str, np.ndarray]) -> Recording:
     )
 
 
-def _check_depth(depth: np.ndarray, key: str) -> np.ndarray:
+def _check_depth(depth: Images, key: str) -> Images:
     if depth.ndim != 3:
         raise ToftrackError(
             f"'{key}' must have 3 dimensions (frames, rows, columns), but has {depth.ndim}, shape "
             f"{depth.shape}"
         )
-    if np.issubdtype(depth.dtype, np.integer):
-        raise ToftrackError(
-            f"'{key}' consists of whole numbers ({depth.dtype}), which looks like millimetres, but "
-            f"must be float metres; convert with {key} = depth.astype('float32') / 1000"
-        )
-    if not np.issubdtype(depth.dtype, np.floating):
+    whole = np.issubdtype(depth.dtype, np.integer)
+    if not whole and not np.issubdtype(depth.dtype, np.floating):
         raise ToftrackError(f"'{key}' must be float32 or float16 metres, but is {depth.dtype}")
     if len(depth) == 0:
         raise ToftrackError(f"'{key}' has zero frames; record at least one")
     if depth.size == 0:
         raise ToftrackError(f"the images of '{key}' are empty, shape {depth.shape}")
-    # A median of a few frames decides; all of a long recording would only take longer.
-    some = depth[np.unique(np.linspace(0, len(depth) - 1, 16).astype(int))]
-    readings = some[(some > 0) & (some < np.inf)]
-    median = float(np.median(readings.astype(np.float32))) if readings.size else 0.0
-    if median > LARGEST_MEDIAN_M:
-        raise ToftrackError(
-            f"the median of '{key}' is {median:.0f}, which is plainly millimetres, but it must be "
-            f"metres; convert with {key} = depth / 1000"
-        )
-    if depth.dtype.newbyteorder("=") in (np.float16, np.float32):
+    median = median_reading(some_images(depth))
+    if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
+        raise wrong_unit(f"'{key}'", median, str(depth.dtype) if whole else "")
+    if isinstance(depth, StreamedImages) or depth.dtype.newbyteorder("=") in (
+        np.float16,
+        np.float32,
+    ):
         return depth
     return depth.astype(np.float32)
 
 
-def _of_shape(arrays: dict[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
+def _of_shape(arrays: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
     """A numeric or boolean array of the given shape."""
     array = arrays[key]
     if array.dtype.kind not in "biuf":
@@ -272,7 +259,7 @@ def _of_shape(arrays: dict[str, np.ndarray], key: str, shape: tuple[int, ...]) -
     return array
 
 
-def _times(arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray, float]:
+def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
     fps = None
     if "fps" in arrays:
         if arrays["fps"].size != 1 or arrays["fps"].dtype.kind not in "iuf":
@@ -292,7 +279,7 @@ def _times(arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray, float
     return timestamp_s, DEFAULT_FPS if fps is None else fps
 
 
-def _amplitude(arrays: dict[str, np.ndarray], shape: tuple[int, ...]) -> np.ndarray | None:
+def _amplitude(arrays: dict[str, Any], shape: tuple[int, ...]) -> Images | None:
     if "amplitude" not in arrays:
         return None
     amplitude = _of_shape(arrays, "amplitude", shape)
@@ -300,23 +287,35 @@ def _amplitude(arrays: dict[str, np.ndarray], shape: tuple[int, ...]) -> np.ndar
         raise ToftrackError(f"'amplitude' must be uint16, but is {amplitude.dtype}")
     if amplitude.dtype == np.uint16:
         return amplitude
+    if isinstance(amplitude, StreamedImages):
+        raise ToftrackError(
+            f"'amplitude' must be uint16 in a long recording, but is {amplitude.dtype}"
+        )
     return np.clip(amplitude, 0, np.iinfo(np.uint16).max).astype(np.uint16)
 
 
-def _truth(arrays: dict[str, np.ndarray], count: int) -> Truth | None:
-    if "joints_m" not in arrays:
-        return None
-    joints = _of_shape(arrays, "joints_m", (count, _JOINTS, 3)).astype(np.float32)
-    if not np.isfinite(joints).all():
-        raise ToftrackError("'joints_m' contains NaN or infinity; leave it out or repair it")
+def _truth(arrays: dict[str, Any], count: int) -> Truth | None:
+    first = _truth_of_one(arrays, count, _TRUTH_KEYS)
+    return first and replace(first, other=_truth_of_one(arrays, count, _OTHER_KEYS))
 
-    def flags(key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+
+def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> Truth | None:
+    """Of one hand.  keys: what the fields are called."""
+    if keys["joints_m"] not in arrays:
+        return None
+    joints = _of_shape(arrays, keys["joints_m"], (count, _JOINTS, 3)).astype(np.float32)
+    if not np.isfinite(joints).all():
+        name = keys["joints_m"]
+        raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
+
+    def flags(name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+        key = keys[name]
         return _of_shape(arrays, key, shape).astype(bool) if key in arrays else None
 
     visible, in_space = flags("visible", (count,)), flags("in_space", (count,))
     fraction = None
-    if "visible_fraction" in arrays:
-        fraction = _of_shape(arrays, "visible_fraction", (count,)).astype(np.float32)
+    if keys["visible_fraction"] in arrays:
+        fraction = _of_shape(arrays, keys["visible_fraction"], (count,)).astype(np.float32)
     return Truth(
         joints_m=joints,
         visible=np.ones(count, bool) if visible is None else visible,
@@ -326,16 +325,15 @@ def _truth(arrays: dict[str, np.ndarray], count: int) -> Truth | None:
     )
 
 
-def _metadata(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+def _metadata(arrays: dict[str, Any]) -> dict[str, Any]:
     if "metadata" not in arrays:
         return {}
-    array = arrays["metadata"]
+    array, why = arrays["metadata"], ""
     if array.size == 1 and array.dtype.kind in "US":
-        text = array.reshape(()).item()
         try:
-            metadata = json.loads(text)
-        except ValueError:
-            metadata = None
+            metadata = parse_json(array.reshape(()).item())
+        except ValueError as error:
+            metadata, why = None, f" ({error})"
         if isinstance(metadata, dict):
             return metadata
-    raise ToftrackError("'metadata' must be the text of one JSON object")
+    raise ToftrackError(f"'metadata' must be the text of one JSON object{why}")

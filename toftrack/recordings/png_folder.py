@@ -25,6 +25,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.json_text import read_json
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
 
@@ -235,14 +236,14 @@ class _Facts:
 
 def _camera_content(path: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise ToftrackError(
             f"the camera file '{path}' cannot be read ({error.strerror})"
         ) from error
-    except (ValueError, RecursionError):
+    except ValueError:
         raise ToftrackError(f"'{path}' is not a camera file: it is not JSON") from None
     if not isinstance(content, dict):
         raise ToftrackError(f"'{path}' is not a camera file")

@@ -11,6 +11,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
 from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.sr_frame import HEIGHT, WIDTH
 
@@ -54,11 +55,11 @@ def parse_facts(path: Path, text: bytes) -> SrsFacts:
     """
     damaged = ToftrackError(f"the TOFT object of the recording '{path}' is damaged")
     try:
-        content = json.loads(text)
+        content = parse_json(text)
         range_m, fps = content["range_m"], float(content["fps"])
         range_m = None if range_m is None else float(range_m)
         camera, metadata = content["camera"], content["metadata"]
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError):
         raise damaged from None
     for number in (fps, 1.0 if range_m is None else range_m):
         if not (np.isfinite(number) and number > 0):

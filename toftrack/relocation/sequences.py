@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import roma
 import torch
 from torch import Tensor
 
+from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.natural_poses import sample_poses
 from toftrack.relocation.images import random_scenes
@@ -108,10 +108,10 @@ def write_sequence(path: Path, sequence: Sequence) -> None:
 def read_sequence(path: Path) -> Sequence:
     """A sequence that was kept. Raises ToftrackError where the file holds none."""
     try:
-        with np.load(path, allow_pickle=False) as kept:
-            fields = (kept["depth"], kept["k"], kept["joints"], kept["visible"])
-            return Sequence(*fields, str(kept["side"]))
-    except (OSError, KeyError, ValueError, BadZipFile) as error:
+        kept = read_archive(path)
+        fields = (kept["depth"], kept["k"], kept["joints"], kept["visible"])
+        return Sequence(*fields, str(kept["side"]))
+    except (OSError, KeyError, ValueError) as error:
         raise ToftrackError(
             f"'{path}' holds no rendered sequence; give a folder that fit_belief wrote"
         ) from error

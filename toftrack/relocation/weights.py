@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.archives import read_archive
+from toftrack.json_text import parse_json
 from toftrack.relocation.network import Finder, PoseNet, Residual
 
 FORMAT = "toftrack-relocaliser"
@@ -92,12 +93,12 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         if path.stat().st_size > _LARGEST_BYTES:
             raise ToftrackError(f"{path} is too large for weights of the relocaliser; {_AGAIN}")
         arrays = read_archive(path)
-        metadata = json.loads(str(arrays.pop("metadata")))
+        metadata = parse_json(str(arrays.pop("metadata")))
     except FileNotFoundError:
         raise ToftrackError(
             f"there are no weights of the relocaliser at {path}; {_AGAIN}"
         ) from None
-    except (OSError, ValueError, KeyError, RecursionError) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise ToftrackError(
             f"{path} is no file of the relocaliser's weights ({error}); {_AGAIN}"
         ) from None

@@ -66,8 +66,11 @@ class FMeasure:
         low = (depth + self.tolerance_m).reciprocal_().masked_fill_(background, torch.inf)
         high = (depth - self.tolerance_m).clamp_(min=1e-3).reciprocal_()
         high.masked_fill_(background, -torch.inf)
-        # A model surface at an occluder is hidden, not false.
-        front = torch.zeros_like(depth).masked_fill_(observation.occluder, torch.inf)
+        # A model surface at an occluder is hidden, not false; at another hand only behind it.
+        front = torch.zeros_like(depth)
+        if observation.other is not None:
+            front = torch.where(observation.other & (depth > 0), depth.reciprocal(), front)
+        front = front.masked_fill_(observation.occluder, torch.inf)
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
         return Evidence(low, high, front, hand, observation.k, radius)
 

@@ -23,6 +23,8 @@ class Observation:
     occluder: (H, W) bool, surfaces in front of where the hand is expected: they hide it.
     k: (3, 3) intrinsics of this image, which may be a crop or a reduction of the camera's.
     nearest_m: depth of the nearest surface, `inf` when nothing is in range.
+    other: (H, W) bool, pixels of another hand that is tracked as well; None where there is none. It
+        hides what is behind it.
     """
 
     depth_m: Tensor
@@ -30,6 +32,7 @@ class Observation:
     occluder: Tensor
     k: Tensor
     nearest_m: float
+    other: Tensor | None = None
 
     @property
     def empty(self) -> bool:
@@ -44,6 +47,7 @@ class Observation:
             hand=self.hand.to(device),
             occluder=self.occluder.to(device),
             k=self.k.to(device),
+            other=None if self.other is None else self.other.to(device),
         )
 
 
@@ -93,16 +97,23 @@ class NearestSurface:
         check_number("segmentation.max_pixels", self.max_pixels, 1, whole=True)
 
     def __call__(
-        self, depth_m: np.ndarray, k: np.ndarray, expected: Expected | None = None
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        expected: Expected | None = None,
+        other: np.ndarray | None = None,
     ) -> Observation:
         """Segment one image; the Observation is on the CPU.
 
         depth_m: (H, W) float32 Z, 0 = no reading.  k: (3, 3).
         expected: where a tracked hand should be. What is nearer than that, and not the hand itself
             come nearer, is an occluder and not the nearest surface.
+        other: (H, W) bool of the reduced image, pixels of another hand.
         """
         depth_m, k = reduce_image(depth_m, k, self.max_pixels)
         valid = (depth_m > 0) & (depth_m <= self.max_distance_m)
+        if other is not None:
+            valid &= ~other
         if expected is not None and expected.centre_m is not None and self.reach_m < math.inf:
             valid &= _disc(valid.shape, k, expected.centre_m, self.reach_m)
         occluder = np.zeros_like(valid)
@@ -126,6 +137,7 @@ class NearestSurface:
             torch.from_numpy(occluder),
             torch.from_numpy(k.astype(np.float32)),
             nearest,
+            None if other is None else torch.from_numpy(other),
         )
 
     def _nearest(self, depth_m: np.ndarray, valid: np.ndarray, focal_area: float) -> float:

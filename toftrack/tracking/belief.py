@@ -29,7 +29,8 @@ class CalibratedBelief:
     """When an estimate is not to be used, and when its track is given up; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time.
+    believe: likewise, until a track was believed for the first time.  second: or while another hand
+        is believed.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
     probation: frames after a start during which the hand is not remembered as seen.
@@ -39,6 +40,7 @@ class CalibratedBelief:
 
     confidence: float
     believe: float
+    second: float
     give_up: float
     patience: int
     memory: float
@@ -48,7 +50,7 @@ class CalibratedBelief:
     joints: JointBelief
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "give_up"):
+        for name in ("confidence", "believe", "second", "give_up"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
         for name in ("patience", "probation"):
@@ -65,8 +67,14 @@ class CalibratedBelief:
         """That every joint is within 40 mm, from one frame."""
         return self.intercept + sum(w * getattr(signs, name) for name, w in self.weights.items())
 
-    def judge(self, track: Track, signs: Signs, dt_s: float) -> Belief:
-        """What is thought of an estimate, dt_s after the last, and whether its track goes on."""
+    def judge(
+        self, track: Track, signs: Signs, dt_s: float, side: float = 1.0, second: bool = False
+    ) -> Belief:
+        """What is thought of an estimate, dt_s after the last, and whether its track goes on.
+
+        side: probability that it is of the right side; of the other one every finger is wrong.
+        second: another hand is believed already.
+        """
         now = self.log_odds(signs)
         before = track.log_odds
         kept = self.memory ** (dt_s / FRAME_S)
@@ -76,7 +84,10 @@ class CalibratedBelief:
         # What is hidden is waited for.
         patience = self.patience * (_WAITED if signs.hidden > _HIDDEN else 1)
         ends = patience > 0 and bad > 0 and lasted(bad, patience)
-        lost = confidence < (self.confidence if track.believed else self.believe)
+        # Whether it is a hand at all does not depend on whose it is.
+        new = 0.0 if track.believed else self.second if second else self.believe
+        lost = confidence < new or side * confidence < self.confidence
+        confidence *= side
         return Belief(not ends, _state_name(signs, lost), lost, bad, 0.0, confidence, smooth)
 
 

@@ -56,6 +56,8 @@ def arm_sight(observation: Observation) -> ArmSight:
     """Prepare an image for `forearm_conflict`."""
     depth, k = observation.depth_m, observation.k
     background = ~(observation.hand | observation.occluder) & (depth > 0)
+    if observation.other is not None:
+        background &= ~observation.other
     gap = cv2.distanceTransform(
         background.cpu().numpy().view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5
     )

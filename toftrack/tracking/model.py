@@ -24,9 +24,11 @@ from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.life_cycle import LostSettings
+from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
 from toftrack.tracking.search import LastSeen, Start
 from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit
+from toftrack.tracking.side_belief import SideFit
 from toftrack.tracking.size_fit import HandFit, SizeBelief
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
@@ -65,6 +67,7 @@ class TrackerModel:
     refinement: None leaves the filter's estimate as it is.
     fit: of the size alone, where there are no networks; None leaves the hand as it is.
     adapt: of the shape, by what the networks say; None likewise.
+    sides: how the side is found out, by the networks; None where it was told.
     gestures: None tells none.
     relocaliser: None searches for starts, and challenges no track.
     """
@@ -82,6 +85,7 @@ class TrackerModel:
     backend: Backend
     relocaliser: Relocaliser | None = None
     adapt: ShapeFit | None = None
+    sides: SideFit | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.lost, CalibratedBelief) and self.relocaliser is None:
@@ -166,6 +170,7 @@ class ObservedFrame:
     """A frame that may show a hand, and the hand looked for: the judge of hypotheses.
 
     glance: what the networks say of the hand.  seen: the hand as it was last believed.
+    other: another hand that is tracked as well.
     """
 
     observation: Observation
@@ -174,6 +179,7 @@ class ObservedFrame:
     model: TrackerModel
     glance: Glance | None = None
     seen: LastSeen | None = None
+    other: OtherHand | None = None
 
     @property
     def hidden(self) -> bool:
@@ -198,8 +204,9 @@ def observed(
     model: TrackerModel,
     glance: Glance | None = None,
     seen: LastSeen | None = None,
+    other: OtherHand | None = None,
 ) -> ObservedFrame:
     """A segmented frame on the model's device, which is not empty."""
     observation = observation.to(model.device)
     evidence = model.likelihood.evidence(observation)
-    return ObservedFrame(observation, evidence, hand, model, glance, seen)
+    return ObservedFrame(observation, evidence, hand, model, glance, seen, other)

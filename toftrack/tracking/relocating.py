@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -20,7 +21,9 @@ from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
 from toftrack.tracking.life_cycle import lasted
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
+from toftrack.tracking.other_hand import OtherHand, touching
 from toftrack.tracking.search import LastSeen
+from toftrack.tracking.side_belief import OTHER_SIDE
 from toftrack.tracking.state import Track, TrackerState
 
 _UNLIKELY = 0.03
@@ -30,6 +33,10 @@ _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
 how far an angle may go."""
 _FAR_SIGMAS = 3.0
 """Farther off, a joint is as wrong as it can be."""
+_AS_WELL = 1.3
+"""Hands are seen about as well when their expected errors differ by less than this factor."""
+_IN_OTHER = 4.0
+"""What speaks against a hand that lies wholly in the other one, log scale."""
 _LEAST_WORD = float(np.log(0.001))
 """The least that the networks' word counts."""
 _IN_FRONT_M = 0.03
@@ -42,20 +49,30 @@ _NEAREST_M = 0.15
 
 
 def glanced(
-    state: TrackerState, dt_s: float, image: DepthImage, model: TrackerModel
+    state: TrackerState,
+    dt_s: float,
+    image: DepthImage,
+    model: TrackerModel,
+    other: OtherHand | None = None,
 ) -> tuple[Track | None, Glance | None]:
     """The track to go on with, and what the networks say of the hand: where it is, or at the best
     place of all; None where there are no networks, or no hand, or no need to look.
 
-    A track that is doubted gives way to a hand that is found elsewhere.
+    A track that is doubted gives way to a hand that is found elsewhere, not where the other one is.
     """
     relocaliser, track, side = model.relocaliser, state.track, state.side
     if relocaliser is None:
         return track, None
     best = None
     if track is None or track.doubted:
-        likely = partial(_reachable, state.seen, track)
-        best = next(iter(relocaliser.search(image.depth_m, image.k, side, likely)), None)
+        likely = partial(_reachable, state.seen, track, other)
+        found = relocaliser.search(image.depth_m, image.k, side, likely)
+        best = _chosen(found) if state.sides is not None and state.seen is None else _first(found)
+        if best is None and track is None and state.sides is not None:
+            # A hand of the other side may be too unlike one of this to be found as such.
+            found = relocaliser.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
+            again = np.array([glance.centre_m.numpy() for glance in found[:1]]).reshape(-1, 3)
+            best = _first(relocaliser.glance(image.depth_m, image.k, again, side))
         if track is None:
             return None, best
     elif _sure(track, relocaliser.settings, dt_s):
@@ -69,6 +86,22 @@ def glanced(
     return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
 
 
+def _first(found: Sequence[Glance]) -> Glance | None:
+    return next(iter(found), None)
+
+
+def _chosen(found: Sequence[Glance]) -> Glance | None:
+    """The nearest of those hands that are seen about as well as the best one.
+
+    Where nobody said which hand is meant, it is the one that is held out to the camera.
+    """
+    if not found:
+        return None
+    most = _AS_WELL * float(found[0].error_m[0])
+    alike = [glance for glance in found if float(glance.error_m[0]) < most]
+    return min(alike, key=lambda glance: float(glance.centre_m[2]), default=found[0])
+
+
 def _sure(track: Track, settings: RelocationSettings, dt_s: float) -> bool:
     """Whether a track is believed so much that the networks need not look in this frame."""
     believed = track.log_odds is not None and track.log_odds > _logit(settings.sure)
@@ -80,11 +113,15 @@ def _logit(probability: float) -> float:
     return float(np.log(probability / (1 - probability)))
 
 
-def _reachable(seen: LastSeen | None, track: Track | None, centre_m: np.ndarray) -> float:
+def _reachable(
+    seen: LastSeen | None, track: Track | None, other: OtherHand | None, centre_m: np.ndarray
+) -> float:
     """How likely a hand has come to a place from where it was last believed, log scale.
 
     Another hand, or the thing that hides the hand, is no place that it has jumped to.
     """
+    if other is not None and np.linalg.norm(other.centre_m - centre_m) < SAME_PLACE_M:
+        return -np.inf
     behind = None if track is None else track.expected
     if behind is not None and centre_m[2] < behind.nearest_m - _IN_FRONT_M:
         return -np.inf
@@ -142,10 +179,13 @@ def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
 def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
     """(N,) what speaks against joints (N, 21, 3) besides the image, beside log scores; at most 0.
 
-    Fingers that are in one another, and joints that are not where the networks' votes are.
+    Fingers that are in one another or in another hand, and joints that are not where the networks'
+    votes are.
     """
     model, glance = frame.model, frame.glance
     word = joints_m.new_zeros(len(joints_m))
+    if frame.other is not None and frame.other.pixels is not None:
+        word = word - _IN_OTHER * touching(joints_m, frame.other)
     if model.refinement is not None and model.refinement.overlap:
         length = frame.hand.shape.hand_length_m
         word = word - model.refinement.overlap * finger_overlap(joints_m, length)
@@ -177,6 +217,13 @@ def known_scores(
 
 def begun(frame: ObservedFrame) -> Track:
     """A track that begins with the best of the networks' poses."""
+    return track_of(best_start(frame)[0], frame.model)
+
+
+def best_start(frame: ObservedFrame) -> tuple[Tensor, float]:
+    """The best (1, 27) of the networks' poses, as they are and brought onto the seen points, and
+    what is known of it, log scale.
+    """
     model, glance = frame.model, frame.glance
     assert model.relocaliser is not None and glance is not None
     states = candidates(glance, frame, model.relocaliser.settings.hypotheses)
@@ -185,7 +232,8 @@ def begun(frame: ObservedFrame) -> Track:
         better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, landmarks)
         states = torch.cat((states, better))
     scores = known_scores(states, frame.hand.refiner.joints(states), frame, coverage=1.0)
-    return track_of(states[scores.argmax()][None], model)
+    best = int(scores.argmax())
+    return states[best][None], float(scores[best])
 
 
 def track_of(pose: Tensor, model: TrackerModel) -> Track:

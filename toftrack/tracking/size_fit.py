@@ -33,6 +33,7 @@ from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
 from toftrack.render.scoring import Evidence
 from toftrack.tracking.shape_fit import ShapeFit
+from toftrack.tracking.side_belief import SideFit
 
 _REACH = 3  # sizes tried on either side of the present one
 _TRIED = (1.0, 1.12, 0.9, 1.24, 0.8)  # sizes of starts, in turn
@@ -72,17 +73,24 @@ class Hand:
     """The hand of a configuration: a shape, and how it is fitted to the user (None: it is not).
 
     fit: of the size, where there are no networks.  adapt: of the shape, where there are.
+    sides: of the side; None where it is told.
     """
 
     shape: HandShape
     fit: HandFit | None
     adapt: ShapeFit | None
+    sides: SideFit | None
 
 
-def make_hand(shape: str, side: str, length_m: float, fit: HandFit, adapt: ShapeFit) -> Hand:
-    """See toftrack.hand.make_hand_shape; only shape="auto" is fitted."""
-    made = make_hand_shape(shape, side, length_m)
-    return Hand(made, fit, adapt) if shape == "auto" else Hand(made, None, None)
+def make_hand(
+    shape: str, side: str, length_m: float, fit: HandFit, adapt: ShapeFit, sides: SideFit
+) -> Hand:
+    """See toftrack.hand.make_hand_shape; only shape="auto" is fitted, and only side="auto" found
+    out: it begins as a right hand.
+    """
+    made = make_hand_shape(shape, "right" if side == "auto" else side, length_m)
+    found = sides if side == "auto" else None
+    return Hand(made, fit, adapt, found) if shape == "auto" else Hand(made, None, None, found)
 
 
 @dataclass(frozen=True)

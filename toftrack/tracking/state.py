@@ -14,6 +14,7 @@ from toftrack.gestures.recognition import GestureState
 from toftrack.render.segmentation import Expected, Observation
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.shape_fit import ShapeBelief
+from toftrack.tracking.side_belief import SideBelief
 from toftrack.tracking.signs import Signs
 from toftrack.tracking.size_fit import SizeBelief
 
@@ -78,6 +79,7 @@ class TrackerState:
 
     generator: the state of the random generator, as torch.Generator.get_state() gives it.
     side: "right" or "left", whose hand is followed.
+    sides: how sure that is; None where it was told.
     track: None while there is no hand to follow.
     seen: the last hand that was believed.
     size: what is believed of the hand's size, or of its whole shape; None where it is not fitted.
@@ -90,6 +92,7 @@ class TrackerState:
 
     generator: Tensor
     side: str
+    sides: SideBelief | None = None
     track: Track | None = None
     seen: LastSeen | None = None
     size: SizeBelief | ShapeBelief | None = None

@@ -20,6 +20,7 @@ from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter, shape_fit, size_fit
 from toftrack.tracking.belief import CalibratedBelief
+from toftrack.tracking.conventions import in_all_conventions
 from toftrack.tracking.following import (
     Found,
     advanced,
@@ -31,9 +32,12 @@ from toftrack.tracking.following import (
 from toftrack.tracking.joint_belief import joint_signs, propagated_sigma
 from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
+from toftrack.tracking.other_hand import OtherHand, without
 from toftrack.tracking.refining import refined
 from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
 from toftrack.tracking.shape_fit import ShapeBelief
+from toftrack.tracking.side_belief import SideBelief, probability
+from toftrack.tracking.sides import sided
 from toftrack.tracking.signs import Signs, read_signs, scored
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.spans import Spans
@@ -49,33 +53,39 @@ def first_state(model: TrackerModel, seed: int) -> TrackerState:
         size = shape_fit.first_belief()
     elif model.fit is not None:
         size = size_fit.first_belief(model.fit)
-    return TrackerState(generator.get_state(), model.shape.side, size=size)
+    sides = None if model.sides is None else SideBelief()
+    return TrackerState(generator.get_state(), model.shape.side, sides, size=size)
 
 
 @small_operations()
 def step(
-    state: TrackerState, image: DepthImage, model: TrackerModel
+    state: TrackerState, image: DepthImage, model: TrackerModel, other: OtherHand | None = None
 ) -> tuple[TrackerState, StepInfo, Estimate]:
     """One frame: segment, start if there is no hand yet, filter, refine, judge, fit the size.
 
     A pure function: the state given stays as it is, and gives the same again.
+
+    other: another hand that is tracked as well; it is not taken for this one.
     """
     spans, generator = Spans(), resumed(state.generator, model.device)
     dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
-    state = _at(state, image)
+    state = at(state, image)
     with spans("relocaliser"):
-        track, glance = glanced(state, dt_s, image, model)
+        alone = without(image, other)
+        track, glance = glanced(state, dt_s, alone, model, other)
+        state, track, glance = sided(state, track, glance, dt_s, alone, model, other)
         state = replace(state, size=_hand_told(state, track, glance, model))
     hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
         expected = expected_depths(track, dt_s, hand, model)
         if expected is None and glance is not None:
             expected = expected_of(glance)
-        observation = model.segmentation(image.depth_m, image.k, expected)
+        theirs = None if other is None else other.pixels
+        observation = model.segmentation(image.depth_m, image.k, expected, theirs)
         nowhere = model.relocaliser is not None and glance is None and track is None
         if observation.empty or nowhere:
             return _without_hand(state, image, observation, model, spans)
-        frame = observed(observation, hand, model, glance, state.seen)
+        frame = observed(observation, hand, model, glance, state.seen, other)
     with spans("start"):
         track = begin(track, state, dt_s, frame, generator)
     with spans("filter: rest"):
@@ -86,7 +96,8 @@ def step(
         track, pose, trend = challenged(track, outcome, dt_s, frame)
     score = frame.score(pose)
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
-    belief, signs = _believed(track, found, score, dt_s, frame)
+    side_probability = probability(state.sides, state.side)
+    belief, signs = _believed(track, found, score, side_probability, dt_s, frame)
     looked = frame.glance is not None
     unlooked_s = 0.0 if looked else track.unlooked_s + dt_s
     estimate = _estimate(image, found, score, belief, frame)
@@ -97,8 +108,14 @@ def step(
         model.gestures, state.gesture, estimate, model.space, dt_s / FRAME_S
     )
     size, refused = _sized(state, found, belief, frame, generator)
-    # The side is told, and never guessed.
-    estimate = replace(estimate, side=state.side, side_probability=1.0, compute_s=spans.total())
+    estimate = replace(
+        estimate,
+        side=state.side,
+        side_probability=side_probability,
+        compute_s=spans.total(),
+    )
+    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
+    estimate = in_all_conventions(estimate, hand.shape, image.k, size_px)
     after = replace(
         state,
         generator=generator.get_state(),
@@ -119,7 +136,12 @@ def _worth_keeping(last: Estimate | None, estimate: Estimate) -> Estimate:
 
 
 def _believed(
-    track: Track, found: Found, score: float, dt_s: float, frame: ObservedFrame
+    track: Track,
+    found: Found,
+    score: float,
+    side_probability: float,
+    dt_s: float,
+    frame: ObservedFrame,
 ) -> tuple[Belief, Signs | None]:
     """What is thought of a frame's estimate, and by which signs."""
     settings, signs = frame.model.lost, track.signs
@@ -131,7 +153,8 @@ def _believed(
         signs = read_signs(joints, score, track.age_s, frame.glance, seen.depth_m, seen.k)
     if isinstance(settings, CalibratedBelief):
         assert signs is not None  # see TrackerModel
-        return settings.judge(track, signs, dt_s), signs
+        second = frame.other is not None and frame.other.believed
+        return settings.judge(track, signs, dt_s, side_probability, second), signs
     # A pose that nothing refined is one of the space.
     off_rad = 0.0 if frame.model.refinement is None else found.off_rad
     return believe(track, score, off_rad, dt_s, settings), signs
@@ -151,7 +174,7 @@ def _hand_told(
     return shape_fit.contradicted(belief, glance, fit, model.shape)
 
 
-def _at(state: TrackerState, image: DepthImage) -> TrackerState:
+def at(state: TrackerState, image: DepthImage) -> TrackerState:
     """The state as time goes on to an image."""
     before = state.timestamp_s
     passed = 0.0 if before is None else max(0.0, image.timestamp_s - before)
@@ -186,7 +209,12 @@ def _without_hand(
     return (
         replace(state, track=state.track if waits else None, gesture=gesture),
         info,
-        replace(estimate, side=state.side, side_probability=1.0, compute_s=spans.total()),
+        replace(
+            estimate,
+            side=state.side,
+            side_probability=probability(state.sides, state.side),
+            compute_s=spans.total(),
+        ),
     )
 
 

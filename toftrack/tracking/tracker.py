@@ -60,10 +60,7 @@ class Tracker:
 
         Only random numbers and frame numbers go on. Raises ToftrackError for an unknown side.
         """
-        state = self.state
-        side = state.side if side is None else self.model.shape.of_side(side).side
-        first = replace(first_state(self.model, 0), side=side)
-        self.state = replace(first, generator=state.generator, next_index=state.next_index)
+        self.state = restarted(self.state, self.model, side)
         self.info = None
 
     @property
@@ -74,10 +71,7 @@ class Tracker:
     @property
     def fitted(self) -> HandShape:
         """The same hand, with how sure the fit is of it."""
-        belief, fit = self.state.size, self.model.adapt
-        if fit is None or not isinstance(belief, ShapeBelief):
-            return self.shape
-        return replace(self.shape, fitted=belief.summary(fit))
+        return fitted_hand(self.state, self.model)
 
     @property
     def scorer(self) -> Scorer:
@@ -103,3 +97,22 @@ class Tracker:
     def insight(self) -> StepInfo | None:
         """What the last step saw and believed; None where nothing could be a hand."""
         return None if self.info is None or self.info.observation.empty else self.info
+
+
+def fitted_hand(state: TrackerState, model: TrackerModel) -> HandShape:
+    """The hand of a state, with how sure the fit is of it."""
+    shape, belief, fit = model.hand(state.side, state.size).shape, state.size, model.adapt
+    if fit is None or not isinstance(belief, ShapeBelief):
+        return shape
+    return replace(shape, fitted=belief.summary(fit))
+
+
+def restarted(state: TrackerState, model: TrackerModel, side: str | None = None) -> TrackerState:
+    """A state that has seen nothing, but for its random and frame numbers; of a side if one is
+    given.
+
+    Raises ToftrackError for an unknown side.
+    """
+    side = state.side if side is None else model.shape.of_side(side).side
+    first = replace(first_state(model, 0), side=side)
+    return replace(first, generator=state.generator, next_index=state.next_index)

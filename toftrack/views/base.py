@@ -19,6 +19,17 @@ COMMANDS = ("restart", "right", "left")
 
 
 @dataclass(frozen=True, eq=False)
+class TrackedHand:
+    """What one slot of the tracker says of a frame; is_vacant(estimate) where it has no hand."""
+
+    estimate: Estimate
+    shape: HandShape
+    """The hand of the estimate."""
+    insight: StepInfo | None
+    """What the tracker saw and believed; None where there was nothing to track."""
+
+
+@dataclass(frozen=True, eq=False)
 class TrackedFrame:
     """One tracked frame. Nothing in it changes later, so a view may keep it for its own thread."""
 
@@ -27,11 +38,13 @@ class TrackedFrame:
     depth_m: np.ndarray
     """(H, W) float32 metres, rectified Z on the camera's undistorted grid, 0 = no reading."""
     camera: Camera
-    estimate: Estimate
-    shape: HandShape
-    """The hand of the estimate."""
-    insight: StepInfo | None
-    """What the tracker saw and believed; None where there was nothing to track."""
+    hands: tuple[TrackedHand, ...]
+    """One for each slot, of which there are one or two."""
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """Of the slots."""
+        return tuple(hand.estimate for hand in self.hands)
 
 
 class View(Protocol):

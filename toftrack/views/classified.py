@@ -10,9 +10,9 @@ import torch
 
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import FMeasure
+from toftrack.render.model_image import parted, posed_hand, range_image
 from toftrack.render.reference import classify_range_images
 from toftrack.render.segmentation import Observation
-from toftrack.views.model_image import parted, posed_hand, range_image
 
 CLASSES = ("nothing", "neighbourhood", "correct", "false", "missed")
 """Names of the labels of `Classified.labels`, in order."""

@@ -16,23 +16,27 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, confidence_words, gesture_words, state_words
+from toftrack.estimate import (
+    Estimate,
+    confidence_words,
+    gesture_words,
+    is_vacant,
+    state_words,
+)
 from toftrack.output.files import write_whole
+from toftrack.render.model_image import model_range_image
 from toftrack.views.base import TrackedFrame
-from toftrack.views.model_image import model_range_image
+from toftrack.views.skeleton import SLOT_RGB, draw_hands, side_words
 from toftrack.views.video import VideoFile, unwritable, video_library
 
-# The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
-FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
 _RED = (40, 40, 220)
 _WHITE = (255, 255, 255)
+_FONT, _SMALL = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 CAPTION_PX = 36
 """Height of the caption above a panel's two sides."""
-_BONE_M = 0.004
-_TRUSTED = 0.5
-"""Joints that are less likely within 40 mm are drawn hollow."""
+_TINT = 0.5
+"""How much of its slot's colour is mixed into the range image of one of two hands."""
 _NEAREST_GREY, _FARTHEST_GREY = 40, 215
-_SUBPIXEL_BITS = 3
 
 VIDEO, STRIP = "overlay.mp4", "overlay.png"
 _STRIP_TILES = 10
@@ -50,23 +54,24 @@ def draw_panel(
     depth_m: np.ndarray,
     amplitude: np.ndarray | None,
     camera: Camera,
-    estimate: Estimate,
-    model_depth: np.ndarray | None,
+    estimates: Sequence[Estimate],
+    models: Sequence[np.ndarray | None],
     scale: float,
 ) -> np.ndarray:
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
     Above both, a caption with frame number, score, confidence, state and gesture. A red caption and
-    frame mark an estimate that is lost. The skeleton is missing where the estimate is NaN; joints
-    that are more likely wrong than right are hollow.
+    frame mark an estimate that is lost, of two hands that both are. The skeleton is missing where
+    the estimate is NaN; see draw_hands for the rest.
 
     Args:
         depth_m: (H, W) metres, 0 = no reading; shown without amplitude, nearer is brighter.
         amplitude: (H, W), shown in grey; or None.
         camera: projects the joints.
-        estimate: of this frame.
-        model_depth: (H, W) metres of the estimate's surface, anything not positive and finite is
-            background; None leaves the right side empty. Nearer is darker, on white.
+        estimates: of this frame, one a slot.
+        models: of each, (H, W) metres of the estimate's surface, anything not positive and finite
+            is background; None leaves it out. Nearer is darker, on white; two hands are tinted with
+            their slots' colours.
         scale: panel pixels per image pixel.
 
     Returns:
@@ -78,31 +83,28 @@ def draw_panel(
     grey = _depth_grey(depth_m) if amplitude is None else _amplitude_grey(amplitude)
     smooth = cv2.INTER_NEAREST if amplitude is None else cv2.INTER_LINEAR
     left = cv2.cvtColor(cv2.resize(grey, size, interpolation=smooth), cv2.COLOR_GRAY2BGR)
-    # A comparison with NaN is false: what nothing is known of is drawn as ever.
-    doubted = estimate.joint_confidence < _TRUSTED
-    scales = size[0] / width, size[1] / height
-    _draw_skeleton(left, camera, estimate.joints_m, doubted, *scales)
-    model: np.ndarray = np.full((height, width), 255, np.uint8)
-    if model_depth is not None:
-        model = range_grey(model_depth)
+    draw_hands(left, camera, estimates, (size[0] / width, size[1] / height))
+    surfaces = [np.zeros((height, width)) if model is None else model for model in models]
     # Nearest, because mixing the hand with the background would draw a dark rim around it.
-    model = cv2.resize(model, size, interpolation=cv2.INTER_NEAREST)
-    right = cv2.cvtColor(model, cv2.COLOR_GRAY2BGR)
-    if estimate.lost:
+    right = cv2.resize(_model_picture(surfaces), size, interpolation=cv2.INTER_NEAREST)
+    if all(estimate.lost for estimate in estimates):
         for side in (left, right):
             thick = max(2, size[0] // 130)
             cv2.rectangle(side, (0, 0), (size[0] - 1, size[1] - 1), _RED, 2 * thick)
-    return np.vstack([_caption(estimate, size[0]), np.hstack([left, right])])
+    return np.vstack([_caption(estimates, size[0]), np.hstack([left, right])])
 
 
 def draw_tracked(tracked: TrackedFrame) -> np.ndarray:
     """The panel of a tracked frame, (h, w, 3); see draw_panel."""
     camera = tracked.camera
     height, width = tracked.depth_m.shape
-    model = model_range_image(tracked.estimate.state, tracked.shape, camera.K, height, width)
+    models = [
+        model_range_image(hand.estimate.state, hand.shape, camera.K, height, width)
+        for hand in tracked.hands
+    ]
     amplitude = camera.undistort_amplitude(tracked.frame.amplitude)
     return draw_panel(
-        tracked.depth_m, amplitude, camera, tracked.estimate, model, panel_scale(width)
+        tracked.depth_m, amplitude, camera, tracked.estimates, models, panel_scale(width)
     )
 
 
@@ -216,66 +218,61 @@ def range_grey(model_depth: np.ndarray) -> np.ndarray:
     return np.where(surface, grey, 255).astype(np.uint8)
 
 
-def _draw_skeleton(
-    picture: np.ndarray,
-    camera: Camera,
-    joints_m: np.ndarray,
-    doubted: np.ndarray,
-    scale_x: float,
-    scale_y: float,
-) -> None:
-    """Draw (21, 3) joints into the picture, in place, as wide as 4 mm would look there.
+def _model_picture(surfaces: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W, 3): the nearest of the surfaces, each (H, W) metres; of two in their colours."""
+    if len(surfaces) == 1:
+        return cv2.cvtColor(range_grey(surfaces[0]), cv2.COLOR_GRAY2BGR)
+    stack = np.stack([np.where(np.isfinite(s) & (s > 0), s, np.inf) for s in surfaces])
+    grey = range_grey(stack.min(0))
+    tint = np.array(SLOT_RGB)[:, ::-1][stack.argmin(0)]
+    tint[grey == 255] = 255
+    return np.round((1 - _TINT) * grey[..., None] + _TINT * tint).astype(np.uint8)
 
-    doubted: (21,) joints that are drawn as rings.
+
+def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
+    """A strip of text as wide as the panel, a line for each slot; the text fits into its left half,
+    for the filmstrip.
     """
-    joints_m = np.asarray(joints_m, np.float64)
-    if not np.isfinite(joints_m).all() or (joints_m[:, 2] <= 0).any():
-        return
-    pixels = (camera.project(joints_m) + 0.5) * (scale_x, scale_y) - 0.5
-    if np.abs(pixels).max() > 1e5:  # far outside, and more than the drawing's integers hold
-        return
-    points = [tuple(map(int, p)) for p in np.round(pixels * 2**_SUBPIXEL_BITS)]
-    width = camera.K[0, 0] * scale_x * _BONE_M / float(np.median(joints_m[:, 2]))
-    thick = int(np.clip(round(width), 1, max(1, picture.shape[1] // 40)))
-    # All of the dark outline first, or each finger's would cross the colour of the one before.
-    for outline in (2 * max(1, thick // 3), 0):
-        for finger, rgb in enumerate(FINGER_RGB):
-            colour = (0, 0, 0) if outline else rgb[::-1]
-            chain = (0, *range(4 * finger + 1, 4 * finger + 5))
-            for a, b in zip(chain[:-1], chain[1:], strict=True):
-                cv2.line(
-                    picture,
-                    points[a],
-                    points[b],
-                    colour,
-                    thick + outline,
-                    cv2.LINE_AA,
-                    _SUBPIXEL_BITS,
-                )
-            for joint in chain[1:]:
-                radius = (thick + outline // 2) * 2**_SUBPIXEL_BITS
-                cv2.circle(picture, points[joint], radius, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
-    for joint in np.flatnonzero(doubted[1:]) + 1:
-        hole = max(1, thick // 2) * 2**_SUBPIXEL_BITS
-        cv2.circle(picture, points[joint], hole, (0, 0, 0), -1, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _caption(estimate: Estimate, half_width: int) -> np.ndarray:
-    """A strip of text as wide as the panel; the text fits into its left half, for the filmstrip."""
-    colour = _RED if estimate.lost else (48, 48, 48)
+    colour = _RED if all(estimate.lost for estimate in estimates) else (48, 48, 48)
     strip = np.full((CAPTION_PX, 2 * half_width, 3), colour, np.uint8)
-    score = f"{estimate.score:.2f}" if math.isfinite(estimate.score) else "-"
-    facts = (f"frame {estimate.index}", f"score {score}", confidence_words(estimate.confidence))
-    state = ("LOST: " if estimate.lost else "") + state_words(estimate)
-    text = "   ".join(filter(None, (*facts, state, gesture_words(estimate))))
-    font, margin = cv2.FONT_HERSHEY_SIMPLEX, 8
-    size, room = 0.8, half_width - 2 * margin
-    # Step by step, because not every OpenCV's text grows in proportion.
-    while size > 0.2 and cv2.getTextSize(text, font, size, 2 if size > 0.5 else 1)[0][0] > room:
-        size -= 0.02
-    origin = (margin, CAPTION_PX - 11)
-    cv2.putText(strip, text, origin, font, size, _WHITE, 2 if size > 0.5 else 1, cv2.LINE_AA)
+    if len(estimates) == 1:
+        facts = (f"frame {estimates[0].index}", f"score {_score(estimates[0])}")
+        _write_line(strip, "   ".join((*facts, _words(estimates[0]))), 8, CAPTION_PX - 11, 0.8)
+        return strip
+    number = f"frame {estimates[0].index}"
+    (indent, _), _ = cv2.getTextSize(f"{number}  ", _FONT, _SMALL, 1)
+    for slot, estimate in enumerate(estimates):
+        base = CAPTION_PX // 2 * (slot + 1) - 5
+        if slot == 0:
+            _write_line(strip, number, 8, base, _SMALL)
+        mark = (8 + indent, base - 10), (18 + indent, base)
+        cv2.rectangle(strip, *mark, SLOT_RGB[slot][::-1], -1)
+        cv2.rectangle(strip, *mark, _WHITE, 1)
+        words = "   ".join(filter(None, (side_words(estimate), _words(estimate))))
+        text = "no hand" if is_vacant(estimate) else words
+        _write_line(strip, text, 26 + indent, base, _SMALL)
     return strip
+
+
+def _score(estimate: Estimate) -> str:
+    return f"{estimate.score:.2f}" if math.isfinite(estimate.score) else "-"
+
+
+def _words(estimate: Estimate) -> str:
+    """Confidence, state and gesture."""
+    state = ("LOST: " if estimate.lost else "") + state_words(estimate)
+    facts = (confidence_words(estimate.confidence), state, gesture_words(estimate))
+    return "   ".join(filter(None, facts))
+
+
+def _write_line(strip: np.ndarray, text: str, x: int, base: int, size: float) -> None:
+    """White text, in place, from x on, smaller where it does not fit into the strip's half."""
+    room = strip.shape[1] // 2 - x - 8
+    # Step by step, because not every OpenCV's text grows in proportion.
+    while size > 0.2 and cv2.getTextSize(text, _FONT, size, 2 if size > 0.5 else 1)[0][0] > room:
+        size -= 0.02
+    thick = 2 if size > 0.5 else 1
+    cv2.putText(strip, text, (x, base), _FONT, size, _WHITE, thick, cv2.LINE_AA)
 
 
 def film_tile(panel: np.ndarray) -> np.ndarray:

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
-from toftrack.pose_space.archives import read_archive
 from toftrack.pose_space.data.pose_data import PoseData, spread_out
 from toftrack.pose_space.inverse_kinematics import (
     fit_angles,

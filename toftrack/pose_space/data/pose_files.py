@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
-from toftrack.pose_space.archives import read_archive
 from toftrack.pose_space.data.pose_data import PoseData
 
 UNITS = ("degrees", "radians")

@@ -6,19 +6,20 @@
 | `GET /moment?run=R&after=N` | waits until there is news after version N of run R: 200 with the \
 newest picture (JPEG), 204 when only the facts are new or nothing is; the facts are JSON in the \
 header `X-Moment` |
-| `POST /command` | `{"command": "restart"}`; 204 when it was taken |
+| `POST /command` | `{"command": "restart"}`, and the token in the header `X-Token`; 204 when it \
+was taken |
 
 Pictures are asked for one by one rather than pushed: who is slow gets the newest one and skips the
 others, and a browser's six connections to a server are enough for any number of tabs.
 
 The server answers only those who call it by an address or as localhost, so that no other web site
-can reach it under a name of its own, and takes commands only from its own page.
+can reach it under a name of its own, and takes commands only from its own page. They need a token
+that nothing but the printed address carries: other users of the machine may watch, no more. It
+stands after `#`, which a browser keeps to itself.
 """
 
 from __future__ import annotations
 
-import errno
-import ipaddress
 import json
 import logging
 import os
@@ -33,7 +34,8 @@ from importlib import resources
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
-from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
+from toftrack.output.web.visitors import called_by_a_known_name, refused
 from toftrack.views.base import COMMANDS
 
 _log = logging.getLogger(__name__)
@@ -91,9 +93,11 @@ class BrowserServer:
             family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
             self._server = _Server(source, host, family, address)
         except OSError as error:
-            raise _refused(host, port, error) from error
+            raise refused("view", host, port, error) from error
         at, free = map(str, self._server.server_address[:2])
         self.url = f"http://[{at}]:{free}/" if ":" in at else f"http://{at}:{free}/"
+        self.token = self._server.token
+        """What commands must carry."""
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="browser-server", daemon=True
         )
@@ -119,6 +123,7 @@ class _Server(ThreadingHTTPServer):
         self.address_family = family
         self.source, self.host = source, host
         self.run = secrets.token_hex(4)
+        self.token = secrets.token_urlsafe(12)
         self.page = (resources.files("toftrack.views.browser") / "page.html").read_bytes()
         self._connections: dict[threading.Thread, socket.socket] = {}
         self._lock = threading.Lock()
@@ -196,6 +201,8 @@ class _Handler(BaseHTTPRequestHandler):
         origin = self.headers.get("Origin")
         if origin is not None and origin != f"http://{self.headers.get('Host')}":
             self._refuse(403, "commands are taken from this server's own page only")
+        elif not self._carries_the_token():
+            self._refuse(403, "commands need the whole address that the tracker printed")
         elif self.headers.get_content_type() != "application/json":
             # Only this type makes a browser ask first when another site wants to send something.
             self._refuse(415, "a command is sent as application/json")
@@ -223,7 +230,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _command(self, body: bytes) -> None:
         try:
-            content = json.loads(body)
+            content = parse_json(body)
         except ValueError:
             content = None
         command = content.get("command") if isinstance(content, dict) else None
@@ -242,9 +249,12 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         return self.rfile.read(int(text))
 
+    def _carries_the_token(self) -> bool:
+        given = self.headers.get("X-Token", "")
+        return secrets.compare_digest(given.encode(), self.server.token.encode())
+
     def _called_by_a_known_name(self) -> bool:
-        name = urlsplit(f"//{self.headers.get('Host', '')}").hostname or ""
-        known = name in ("localhost", self.server.host.lower()) or _is_address(name)
+        known = called_by_a_known_name(self.headers.get("Host", ""), self.server.host)
         if not known:
             self._refuse(403, "this server answers to its address and to localhost only")
         return known
@@ -275,28 +285,3 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
-def _refused(host: str, port: int, error: OSError) -> ToftrackError:
-    if error.errno == errno.EADDRINUSE:
-        return ToftrackError(
-            f"port {port} of {host} is taken, perhaps by another tracker; end that one, or choose "
-            "another with view.port=PORT (0 = any free one)"
-        )
-    if error.errno == errno.EACCES:
-        return ToftrackError(
-            f"port {port} of {host} may not be used; choose one above 1023 with view.port=PORT "
-            "(0 = any free one)"
-        )
-    return ToftrackError(
-        f"the page cannot be served at view.host={host} ({error.strerror or error}); give an "
-        "address of this machine, or leave it at 127.0.0.1"
-    )

@@ -20,8 +20,8 @@ import cv2
 
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import state_words
-from toftrack.views.base import TrackedFrame
+from toftrack.estimate import is_vacant, state_words
+from toftrack.views.base import TrackedFrame, TrackedHand
 from toftrack.views.browser.server import BrowserServer, News
 from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
@@ -69,7 +69,7 @@ def browser_view(
     """
     _check(port, quality, most_fps, wait_s, linger_s)
     view = BrowserView(host, port, quality, most_fps, linger_s)
-    print(f"live view: {view.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    print(f"live view: {view.address} (Ctrl-C ends)", file=sys.stderr, flush=True)
     if frames is not None and wait_s > 0:
         print(f"waiting up to {wait_s:g} s for it to be opened", file=sys.stderr, flush=True)
         try:
@@ -94,6 +94,9 @@ class BrowserView:
             self._picture.close()
             raise
         self.url = self._server.url
+        """Where the page is; without its commands."""
+        self.address = f"{self.url}#{self._server.token}"
+        """Where it is with them."""
 
     def wait_for_visitor(self, timeout_s: float) -> bool:
         """Wait until somebody has opened the page; False when nobody did in time."""
@@ -274,25 +277,40 @@ def _encode(tracked: TrackedFrame, quality: int) -> bytes:
 
 
 def _facts(tracked: TrackedFrame) -> dict[str, Any]:
-    """What the page writes beside the picture, JSON-able."""
-    estimate = tracked.estimate
+    """What the page writes beside the picture, JSON-able: of the frame and of a hand, or `hands`.
 
-    def number(value: float) -> float | None:
-        return round(float(value), 6) if math.isfinite(value) else None
+    Of two hands the frame is lost when neither can be used, and its state is the first slot's.
+    """
+    first = tracked.hands[0]
+    of_frame = {"index": int(first.estimate.index), "ms": _number(1e3 * first.estimate.compute_s)}
+    if len(tracked.hands) == 1:
+        return of_frame | _hand_facts(first) | {"side": first.shape.side}
+    return of_frame | {
+        "state": state_words(first.estimate),
+        "lost": all(estimate.lost for estimate in tracked.estimates),
+        "hands": [_hand_facts(hand) for hand in tracked.hands],
+    }
 
+
+def _hand_facts(hand: TrackedHand) -> dict[str, Any]:
+    estimate = hand.estimate
     return {
-        "index": int(estimate.index),
+        "there": not is_vacant(estimate),
         "state": state_words(estimate),
         "lost": bool(estimate.lost),
-        "score": number(estimate.score),
-        "confidence": number(estimate.confidence),
+        "score": _number(estimate.score),
+        "confidence": _number(estimate.confidence),
         "gesture": estimate.gesture,
-        "gesture_probability": number(estimate.gesture_probability),
-        "pinch": number(estimate.pinch),
+        "gesture_probability": _number(estimate.gesture_probability),
+        "pinch": _number(estimate.pinch),
         "pinching": bool(estimate.pinching),
-        "ms": number(1e3 * estimate.compute_s),
-        "side": tracked.shape.side,
+        "side": estimate.side,
+        "side_probability": _number(estimate.side_probability),
     }
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 6) if math.isfinite(value) else None
 
 
 def _rate(times_s: Sequence[float]) -> float | None:

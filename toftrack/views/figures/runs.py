@@ -272,7 +272,7 @@ def _latent_panel(
         spot = np.round(axes.place(point[i], point[j])).astype(int)
         cv2.circle(picture, spot, 6, pale, -1, cv2.LINE_AA)
         cv2.circle(picture, spot, 6, colour, 1, cv2.LINE_AA)
-    spots = np.round(axes.place(path[:, i], path[:, j]) * 8).astype(np.int32)
+    spots = np.round(np.nan_to_num(axes.place(path[:, i], path[:, j])) * 8).astype(np.int32)
     colours = _time_colours(time_s)
     for row in np.flatnonzero(finite):
         if row and finite[row - 1]:

@@ -10,6 +10,9 @@ Entities, on the timelines `frame` (its number) and `time` (seconds of the recor
 | `plots` | `score` (confidence, lost), `latent` coordinates, `pinch`, `time` (milliseconds) |
 | `log` | changes of state, gesture and pinching |
 
+Of two hands the second one's are `world/hand_2`, `world/tracker_2` and, in the same plots,
+`plots/score/second` and so on; `label` in each hand says whose it is.
+
 The world is the camera's frame: x right, y down, z forward, metres.
 """
 
@@ -23,16 +26,16 @@ import torch
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, gesture_words, state_words
+from toftrack.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS
 from toftrack.render.likelihood import FMeasure
+from toftrack.render.model_image import cpu_surface, parted, posed_hand
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.state import StepInfo
-from toftrack.views.base import TrackedFrame
+from toftrack.views.base import TrackedFrame, TrackedHand
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
-from toftrack.views.model_image import cpu_surface, parted, posed_hand
-from toftrack.views.overlay import FINGER_RGB
+from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB, side_words
 
 try:
     import rerun as rr
@@ -53,6 +56,8 @@ _SEGMENTS = (
     (1, "hand", (86, 180, 233)),
     (2, "occluder", (230, 159, 0)),
 )
+_SCORE_RGB = ((86, 180, 233), (0, 158, 115), _LOST_RGB)
+_SKELETONS = ("world/hand/skeleton", "world/hand_2/skeleton")
 _BONE_M, _JOINT_M, _PARTICLE_M = 0.003, 0.003, 0.0012
 
 
@@ -68,27 +73,48 @@ class Entities:
         self._stream = stream
         self._likelihood = likelihood
         self._pinholes: dict[str, tuple[bytes, int, int]] = {}
-        self._told: tuple[str, ...] = ()
-        self._latent_named = False
+        self._told: dict[int, tuple[str, ...]] = {}
+        self._named: set[int] = set()
+        """Slots whose plots have names."""
         self._log_constants()
 
     @small_operations()
     def log(self, tracked: TrackedFrame) -> None:
         """Log one frame."""
-        estimate = tracked.estimate
+        estimate = tracked.estimates[0]
         self._stream.set_time("frame", sequence=estimate.index)
         self._stream.set_time("time", duration=estimate.timestamp_s)
         self._log_images(tracked)
-        if tracked.insight is None:
-            for gone in ("world/tracker/segmentation", "world/tracker/classified"):
+        for slot, hand in enumerate(tracked.hands):
+            self._log_slot(hand, slot)
+            if len(tracked.hands) > 1:
+                self._log_label(hand.estimate, slot)
+        self._stream.log("plots/time", rr.Scalars([1e3 * estimate.compute_s]))
+
+    def _log_slot(self, hand: TrackedHand, slot: int) -> None:
+        of_hand, of_tracker = _of_slot("world/hand", slot), _of_slot("world/tracker", slot)
+        if hand.insight is None:
+            for gone in (f"{of_tracker}/segmentation", f"{of_tracker}/classified"):
                 self._stream.log(gone, rr.Clear(recursive=False))
-            self._stream.log("world/hand/particles", rr.Clear(recursive=False))
+            self._stream.log(f"{of_hand}/particles", rr.Clear(recursive=False))
         else:
-            self._log_observation(tracked, tracked.insight.observation)
-            self._log_particles(tracked.insight)
-        self._log_hand(tracked)
-        self._log_plots(estimate)
-        self._log_changes(estimate)
+            self._log_observation(of_tracker, hand, hand.insight.observation)
+            self._log_particles(of_hand, hand.insight)
+        self._log_hand(of_hand, hand)
+        self._log_plots(hand.estimate, slot)
+        self._log_changes(hand.estimate, slot)
+
+    def _log_label(self, estimate: Estimate, slot: int) -> None:
+        """Whose hand it is, beside its wrist."""
+        entity = f"{_of_slot('world/hand', slot)}/label"
+        if is_vacant(estimate):
+            self._stream.log(entity, rr.Clear(recursive=False))
+            return
+        words, colour = side_words(estimate) or "?", SLOT_RGB[slot]
+        label = rr.Points3D(
+            estimate.joints_m[:1], labels=[words], colors=[colour], radii=2 * _JOINT_M
+        )
+        self._stream.log(entity, label)
 
     def _log_constants(self) -> None:
         stream = self._stream
@@ -97,13 +123,6 @@ class Entities:
         classes = tuple(enumerate(CLASSES))
         context = rr.AnnotationContext([(n, name, CLASS_RGB[n]) for n, name in classes])
         stream.log("world/tracker/classified", context, static=True)
-        lines = rr.SeriesLines(
-            names=["score", "confidence", "lost"],
-            colors=[(86, 180, 233), (0, 158, 115), _LOST_RGB],
-        )
-        stream.log("plots/score", lines, static=True)
-        pinch = rr.SeriesLines(names=["pinch"], colors=[FINGER_RGB[1]])
-        stream.log("plots/pinch", pinch, static=True)
         stream.log("plots/time", rr.SeriesLines(names=["ms"], colors=[(0, 158, 115)]), static=True)
 
     def _log_pinhole(self, entity: str, k: np.ndarray, height: int, width: int) -> None:
@@ -137,19 +156,19 @@ class Entities:
         if amplitude is not None:
             self._stream.log("world/camera/amplitude", rr.Image(amplitude))
 
-    def _log_observation(self, tracked: TrackedFrame, observation: Observation) -> None:
+    def _log_observation(self, entity: str, tracked: TrackedHand, observation: Observation) -> None:
         """How each pixel of the tracker's own image counts."""
         observation = observation.to(torch.device("cpu"))
         hand, occluder = observation.hand.numpy(), observation.occluder.numpy()
-        self._log_pinhole("world/tracker", observation.k.numpy(), *hand.shape)
+        self._log_pinhole(entity, observation.k.numpy(), *hand.shape)
         segments = hand.astype(np.uint8)
         segments[occluder] = 2
-        self._stream.log("world/tracker/segmentation", rr.SegmentationImage(segments))
+        self._stream.log(f"{entity}/segmentation", rr.SegmentationImage(segments))
         pixels = classify(tracked.estimate.state, tracked.shape, observation, self._likelihood)
         labels = rr.SegmentationImage(pixels.labels())
-        self._stream.log("world/tracker/classified", labels)
+        self._stream.log(f"{entity}/classified", labels)
 
-    def _log_particles(self, insight: StepInfo) -> None:
+    def _log_particles(self, entity: str, insight: StepInfo) -> None:
         """The middles of the hands that the particles stand for, brighter with their weight."""
         particles = insight.particles.detach().cpu()
         middles = particles[:, :3] + rotated_pivot(particles[:, 3:6])
@@ -157,45 +176,66 @@ class Entities:
         shades = np.round(255 * weights / max(float(weights.max()), 1e-12)).astype(np.uint8)
         colours = cv2.applyColorMap(shades[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
         points = rr.Points3D(middles.numpy(), colors=colours, radii=_PARTICLE_M)
-        self._stream.log("world/hand/particles", points)
+        self._stream.log(f"{entity}/particles", points)
 
-    def _log_hand(self, tracked: TrackedFrame) -> None:
+    def _log_hand(self, entity: str, tracked: TrackedHand) -> None:
         estimate, log = tracked.estimate, self._stream.log
-        if not np.isfinite(estimate.state).all():
+        if is_vacant(estimate):
             for part in ("ellipsoids", "skeleton", "joints"):
-                log(f"world/hand/{part}", rr.Clear(recursive=False))
+                log(f"{entity}/{part}", rr.Clear(recursive=False))
             return
-        log("world/hand/ellipsoids", ellipsoids(estimate, tracked.shape))
+        log(f"{entity}/ellipsoids", ellipsoids(estimate, tracked.shape))
         joints = estimate.joints_m
         strips = [joints[[0, *range(4 * f + 1, 4 * f + 5)]] for f in range(len(FINGERS))]
         lines = rr.LineStrips3D(strips, colors=FINGER_RGB, radii=_BONE_M / 2)
-        log("world/hand/skeleton", lines)
+        log(f"{entity}/skeleton", lines)
         colours = [_PALM_RGB, *(rgb for rgb in FINGER_RGB for _ in range(4))]
-        log("world/hand/joints", rr.Points3D(joints, colors=colours, radii=_JOINT_M))
+        log(f"{entity}/joints", rr.Points3D(joints, colors=colours, radii=_JOINT_M))
 
-    def _log_plots(self, estimate: Estimate) -> None:
-        log = self._stream.log
-        values = [estimate.score, estimate.confidence, float(estimate.lost)]
-        log("plots/score", rr.Scalars(values))
-        if not self._latent_named:
-            self._latent_named = True
-            names = [f"coordinate {n}" for n in range(1, len(estimate.latent) + 1)]
-            colours = [FINGER_RGB[n % len(FINGER_RGB)] for n in range(len(names))]
-            lines = rr.SeriesLines(names=names, colors=colours)
-            log("plots/latent", lines, static=True)
-        log("plots/latent", rr.Scalars(estimate.latent))
-        log("plots/pinch", rr.Scalars([estimate.pinch]))
-        log("plots/time", rr.Scalars([1e3 * estimate.compute_s]))
+    def _log_plots(self, estimate: Estimate, slot: int) -> None:
+        values = {
+            "score": [estimate.score, estimate.confidence, float(estimate.lost)],
+            "latent": estimate.latent,
+            "pinch": [estimate.pinch],
+        }
+        if slot not in self._named:
+            self._named.add(slot)
+            self._name_plots(len(estimate.latent), slot)
+        for name, numbers in values.items():
+            self._stream.log(_plot(name, slot), rr.Scalars(numbers))
 
-    def _log_changes(self, estimate: Estimate) -> None:
+    def _name_plots(self, dims: int, slot: int) -> None:
+        second = ", second hand" if slot else ""
+        coordinates = [f"coordinate {n}" for n in range(1, dims + 1)]
+        for plot, names, colours in (
+            ("score", ["score", "confidence", "lost"], _SCORE_RGB),
+            ("latent", coordinates, [FINGER_RGB[n % len(FINGER_RGB)] for n in range(dims)]),
+            ("pinch", ["pinch"], [FINGER_RGB[1]]),
+        ):
+            # Paler, so that the first hand's lines are told from the second one's.
+            shown = [tuple((c + 255) // 2 for c in rgb) if slot else rgb for rgb in colours]
+            lines = rr.SeriesLines(names=[f"{name}{second}" for name in names], colors=shown)
+            self._stream.log(_plot(plot, slot), lines, static=True)
+
+    def _log_changes(self, estimate: Estimate, slot: int) -> None:
         now = (estimate.state_name, gesture_words(estimate), str(estimate.lost))
-        if now == self._told:
+        if now == self._told.get(slot):
             return
-        self._told = now
+        self._told[slot] = now
+        which = "second hand" if slot else ""
         lost = "lost" if estimate.lost else ""
-        text = ", ".join(filter(None, (lost, state_words(estimate), gesture_words(estimate))))
+        words = (which, lost, state_words(estimate), gesture_words(estimate))
+        text = ", ".join(filter(None, words))
         level = rr.TextLogLevel.WARN if estimate.lost else rr.TextLogLevel.INFO
         self._stream.log("log", rr.TextLog(text, level=level))
+
+
+def _of_slot(entity: str, slot: int) -> str:
+    return entity if slot == 0 else f"{entity}_{slot + 1}"
+
+
+def _plot(name: str, slot: int) -> str:
+    return f"plots/{name}" if slot == 0 else f"plots/{name}/second"
 
 
 def ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
@@ -222,7 +262,12 @@ def blueprint() -> rrb.Blueprint:
     """How the viewer opens: the scene in 3-D, the images beside it, and the plots below."""
     scene = rrb.Spatial3DView(
         origin="world",
-        contents=["+ world/**", "- world/camera/amplitude", "- world/tracker/**"],
+        contents=[
+            "+ world/**",
+            "- world/camera/amplitude",
+            "- world/tracker/**",
+            "- world/tracker_2/**",
+        ],
         name="hand, points and particles",
         eye_controls=rrb.EyeControls3D(
             position=(0.2, -0.1, 0.15), look_target=(0, 0, 0.5), eye_up=(0, -1, 0)
@@ -231,12 +276,12 @@ def blueprint() -> rrb.Blueprint:
     images = rrb.Tabs(
         rrb.Spatial2DView(
             origin="world/camera",
-            contents=["world/camera/amplitude", "world/hand/skeleton"],
+            contents=["world/camera/amplitude", *_SKELETONS],
             name="amplitude and skeleton",
         ),
         rrb.Spatial2DView(
             origin="world/camera",
-            contents=["world/camera/depth", "world/hand/skeleton"],
+            contents=["world/camera/depth", *_SKELETONS],
             name="depth",
         ),
     )

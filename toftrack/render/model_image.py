@@ -7,6 +7,7 @@ import functools
 import numpy as np
 import torch
 
+from toftrack.compute.compiling import entry_point
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
@@ -45,21 +46,46 @@ def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) 
     # One more pixel all around than the outline needs, which rounding could move.
     boxes = screen_boxes(conics, torch.from_numpy(k), height, width)[0].numpy()
     x = (np.arange(width, dtype=np.float32) - k[0, 2]) / k[0, 0]
-    y = ((np.arange(height, dtype=np.float32) - k[1, 2]) / k[1, 1])[:, None]
+    y = (np.arange(height, dtype=np.float32) - k[1, 2]) / k[1, 1]
     linear, quadratic = conics.linear[0].numpy(), conics.quadratic[0].numpy()
-    inverse = np.zeros((height, width), np.float32)
-    for (left, right, top, bottom), line, q in zip(boxes, linear, quadratic, strict=True):
+    image = np.zeros((height, width), np.float32)
+    _draw(linear, quadratic, boxes.astype(np.int64), x, y, image)
+    return image
+
+
+@entry_point(__file__)
+def _draw(
+    linear: np.ndarray,
+    quadratic: np.ndarray,
+    boxes: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    image: np.ndarray,
+) -> None:
+    """Z of the nearest of E ellipsoids, into an image of zeros.
+
+    linear: (E, 3) and quadratic: (E, 3, 3) of their inverse depths, see closed_form.
+    boxes: (E, 4) left, right, top, bottom.  x, y: slopes of the columns' and rows' rays.
+    """
+    height, width = image.shape
+    for e in range(len(boxes)):
+        left, right, top, bottom = boxes[e]
         if right <= left or bottom <= top:
             continue
-        rows, columns = slice(max(0, top - 1), bottom + 1), slice(max(0, left - 1), right + 1)
-        px, py = x[columns], y[rows]
-        square = (q[0, 0] * px + 2 * q[0, 2]) * px + (q[1, 1] * py + 2 * q[1, 2]) * py + q[2, 2]
-        square += 2 * q[0, 1] * px * py
-        hit = square >= 0
-        u = line[0] * px + line[1] * py + line[2] + np.sqrt(np.where(hit, square, 0))
-        part = inverse[rows, columns]
-        np.maximum(part, np.where(hit, u, 0), out=part)
-    return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+        line, q = linear[e], quadratic[e]
+        for row in range(max(0, top - 1), min(height, bottom + 1)):
+            py = y[row]
+            for column in range(max(0, left - 1), min(width, right + 1)):
+                px = x[column]
+                square = (q[0, 0] * px + 2 * q[0, 2]) * px + (q[1, 1] * py + 2 * q[1, 2]) * py
+                square += q[2, 2] + 2 * q[0, 1] * px * py
+                if square >= 0:
+                    u = line[0] * px + line[1] * py + line[2] + np.sqrt(square)
+                    image[row, column] = max(image[row, column], u)
+    for row in range(height):
+        for column in range(width):
+            if image[row, column] > 0:
+                image[row, column] = 1 / image[row, column]
 
 
 def model_range_image(

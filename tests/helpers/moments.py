@@ -1,0 +1,45 @@
+"""Tracked frames of one hand, as views get them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.estimate import Estimate
+from toftrack.frames import Frame
+from toftrack.hand.shape import HandShape
+from toftrack.tracking.state import StepInfo
+from toftrack.views.base import TrackedFrame, TrackedHand
+
+
+def one_hand(
+    frame: Frame,
+    depth_m: np.ndarray,
+    camera: Camera,
+    estimate: Estimate,
+    shape: HandShape,
+    insight: StepInfo | None = None,
+) -> TrackedFrame:
+    """A moment with one slot."""
+    return TrackedFrame(frame, depth_m, camera, (TrackedHand(estimate, shape, insight),))
+
+
+def two_hands(moment: TrackedFrame, shift_m: float = 0.15, **changes: Any) -> TrackedFrame:
+    """The moment with a second hand of the other side beside the first one, and with changes."""
+    first = moment.hands[0]
+    move = np.array([shift_m, 0, 0], np.float32)
+    state = first.estimate.state.copy()
+    state[:3] += move
+    side = "left" if first.shape.side == "right" else "right"
+    estimate = replace(
+        first.estimate, joints_m=first.estimate.joints_m + move, state=state, side=side, **changes
+    )
+    return replace(moment, hands=(first, TrackedHand(estimate, first.shape.of_side(side), None)))
+
+
+def with_hand(moment: TrackedFrame, **changes: Any) -> TrackedFrame:
+    """The moment with changes of its first hand, and no other one."""
+    return replace(moment, hands=(replace(moment.hands[0], **changes),))

@@ -1,0 +1,69 @@
+"""`python track.py` within the tests' process, which has loaded everything already."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import runpy
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+
+from helpers.tracking import ROOT
+from hydra.core.singleton import Singleton
+
+QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+"""Overrides for runs whose accuracy is of no matter."""
+
+
+@contextmanager
+def _as_a_process(folder: Path, *arguments: str) -> Iterator[None]:
+    """The folder, the arguments and the environment; and all that Hydra changes changes back."""
+    kept, root = Singleton.get_state(), logging.getLogger()
+    handlers, level, argv = list(root.handlers), root.level, sys.argv
+    raw = os.environ.pop("HYDRA_FULL_ERROR", None)
+    sys.argv = list(arguments)
+    try:
+        with chdir(folder):
+            yield
+    finally:
+        sys.argv = argv
+        if raw is not None:
+            os.environ["HYDRA_FULL_ERROR"] = raw
+        Singleton.set_state(kept)
+        root.handlers[:], root.level = handlers, level
+
+
+def call(*arguments: str, folder: Path, program: str = "track.py") -> tuple[int, str, str]:
+    """Status, standard output and standard error of a program that is run in a folder."""
+    out, err = io.StringIO(), io.StringIO()
+    with _as_a_process(folder, program, *arguments), redirect_stdout(out), redirect_stderr(err):
+        try:
+            runpy.run_path(str(ROOT / program), run_name="__main__")
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else 1
+    return status, out.getvalue(), err.getvalue()
+
+
+@contextmanager
+def interrupted_when(ready: Callable[[], object]) -> Iterator[None]:
+    """Ctrl-C comes as soon as `ready` says something true."""
+    over = threading.Event()
+
+    def press() -> None:
+        while not over.wait(0.01):
+            if ready():
+                os.kill(os.getpid(), signal.SIGINT)
+                return
+
+    thread = threading.Thread(target=press)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

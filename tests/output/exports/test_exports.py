@@ -1,0 +1,261 @@
+"""A run as glTF, BVH and CSV: read back with the formats' own rules, and compared with the run."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import struct
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.hands import hand_estimate, lost_hand
+from scipy.spatial.transform import Rotation
+
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.hand.openxr import OPENXR_JOINT_NAMES
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output.exports.bvh import bvh_of
+from toftrack.output.exports.glb import glb_of
+from toftrack.output.exports.mesh import hand_mesh
+from toftrack.output.exports.motion import motions_of
+from toftrack.output.exports.table import csv_of
+
+NAMES = ("index", "timestamp_s", "state_name", "lost", "side", "joints_m", "state", "gesture")
+MORE = ("confidence", "pinching", "pointing_origin_m", "pointing_direction", "openxr_position_m")
+
+
+def results_of(estimates: list[Estimate]) -> dict[str, Any]:
+    columns = {n: np.array([getattr(e, n) for e in estimates]) for n in NAMES + MORE}
+    return columns | {"joint_names": JOINT_NAMES}
+
+
+def moving(side: str = "right", lost: tuple[int, ...] = ()) -> list[Estimate]:
+    """Eight frames of a hand that moves and closes."""
+    hands = [hand_estimate(index, side, bent=0.2 * index) for index in range(8)]
+    return [replace(hand, lost=hand.index in lost) for hand in hands]
+
+
+def shape_of(side: str):
+    return default_hand_shape(side=side)
+
+
+class Gltf:
+    """A .glb, read by the rules of the format."""
+
+    def __init__(self, data: bytes) -> None:
+        magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+        assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+        self.document = json.loads(data[20 : 20 + size])
+        self._binary = data[28 + size :]
+        assert data[24 + size : 28 + size] == b"BIN\0"
+
+    def array(self, number: int) -> np.ndarray:
+        accessor = self.document["accessors"][number]
+        view = self.document["bufferViews"][accessor["bufferView"]]
+        kinds = {5121: np.uint8, 5125: np.uint32, 5126: np.float32}
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
+        start = view.get("byteOffset", 0)
+        data = self._binary[start : start + view["byteLength"]]
+        return np.frombuffer(data, kinds[accessor["componentType"]]).reshape(-1, width)
+
+    def channels(self) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, str]]:
+        """Times, values and interpolation of each animated property of a node."""
+        (animation,) = self.document["animations"]
+        found = {}
+        for channel in animation["channels"]:
+            sampler = animation["samplers"][channel["sampler"]]
+            node = self.document["nodes"][channel["target"]["node"]]["name"]
+            time, values = self.array(sampler["input"])[:, 0], self.array(sampler["output"])
+            found[node, channel["target"]["path"]] = time, values, sampler["interpolation"]
+        return found
+
+    def world(self, frame: int) -> dict[str, np.ndarray]:
+        """(4, 4) of every animated joint in a frame."""
+        nodes, channels = self.document["nodes"], self.channels()
+        parents = {child: i for i, node in enumerate(nodes) for child in node.get("children", ())}
+
+        def matrix(number: int) -> np.ndarray:
+            name, own = nodes[number]["name"], np.eye(4)
+            if (name, "rotation") in channels:
+                turn = channels[name, "rotation"][1][frame]
+                own[:3, :3] = Rotation.from_quat(turn).as_matrix()
+                own[:3, 3] = channels[name, "translation"][1][frame]
+            return matrix(parents[number]) @ own if number in parents else own
+
+        return {node["name"]: matrix(number) for number, node in enumerate(nodes)}
+
+
+def exported(estimates: list[Estimate], side: str) -> Gltf:
+    pytest.importorskip("pygltflib", reason="pip install '.[export]'")
+    return Gltf(glb_of(motions_of(results_of(estimates), (shape_of(side),))))
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_every_joint_is_a_node_with_a_key_a_frame_that_puts_it_where_it_was(side: str) -> None:
+    estimates = moving(side)
+    gltf = exported(estimates, side)
+    channels = gltf.channels()
+    letter = side[0].upper()
+    for name in OPENXR_JOINT_NAMES:
+        for path in ("translation", "rotation"):
+            time, values, steps = channels[f"{name.title()}_{letter}", path]
+            assert np.allclose(time, np.arange(8) / 25) and len(values) == 8 and steps == "LINEAR"
+    for frame in (0, 5):
+        world = gltf.world(frame)
+        places = np.stack([world[f"{n.title()}_{letter}"][:3, 3] for n in OPENXR_JOINT_NAMES])
+        assert np.allclose(places, estimates[frame].openxr_position_m, atol=2e-6)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_skin_follows_the_joints(side: str) -> None:
+    """Skinned by the rules of the format, the tip of the mesh is the tip of the finger."""
+    estimates = moving(side)
+    gltf = exported(estimates, side)
+    (skin,), (mesh,) = gltf.document["skins"], gltf.document["meshes"]
+    inverse = gltf.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    names = [gltf.document["nodes"][joint]["name"] for joint in skin["joints"]]
+    attributes = mesh["primitives"][0]["attributes"]
+    points, joint, weight = (
+        gltf.array(attributes[name]) for name in ("POSITION", "JOINTS_0", "WEIGHTS_0")
+    )
+    assert np.allclose(weight.sum(1), 1) and not weight[:, 1:].any()
+    for frame in (0, 6):
+        world = gltf.world(frame)
+        moves = np.stack([world[name] for name in names]) @ inverse
+        skinned = np.einsum("pab,pb->pa", moves[joint[:, 0]], np.c_[points, np.ones(len(points))])
+        for tip in (8, 12, 20):
+            there = estimates[frame].joints_m[tip] * [1, -1, -1]
+            nearest = np.linalg.norm(skinned[:, :3] - there, axis=1).min()
+            assert nearest < 0.003  # its axis is set towards the pad of the finger
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_mesh_is_closed_and_faces_outwards(side: str) -> None:
+    mesh = hand_mesh(shape_of(side))
+    corners = mesh.points_m[mesh.triangles]
+    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("fa,fa->f", outwards, mesh.normals[mesh.triangles].mean(1)) > 0).all()
+    edges = np.sort(mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    volume = np.einsum("fa,fa->f", corners[:, 0], outwards).sum() / 6
+    assert 2e-4 < volume < 9e-4  # m3, all ellipsoids by themselves
+
+
+def test_a_lost_hand_is_hidden_and_its_pose_held() -> None:
+    estimates = [lost_hand(0), *moving(lost=(3, 4))[1:]]
+    gltf = exported(estimates, "right")
+    _, scale, steps = gltf.channels()["Hand_R", "scale"]
+    assert steps == "STEP"
+    assert scale.tolist() == [[float(shown)] * 3 for shown in (0, 1, 1, 0, 0, 1, 1, 1)]
+    for frame, held in ((0, 1), (3, 2), (4, 2)):
+        for name, place in gltf.world(frame).items():
+            assert np.allclose(place, gltf.world(held)[name]), (frame, name)
+
+
+def test_each_of_several_hands_has_a_skeleton_of_its_own() -> None:
+    hands = [results_of(moving(side)) for side in ("right", "left")]
+    both = {name: np.stack([hand[name] for hand in hands], 1) for name in NAMES if name != "index"}
+    both |= {"timestamp_s": hands[0]["timestamp_s"], "index": hands[0]["index"]}
+    both["joint_names"] = JOINT_NAMES
+    motions = motions_of(both, (shape_of("right"), shape_of("right")))
+    assert [motion.shape.side for motion in motions] == ["right", "left"]
+    pytest.importorskip("pygltflib", reason="pip install '.[export]'")
+    gltf = Gltf(glb_of(motions))
+    assert len(gltf.document["skins"]) == 2
+    world = gltf.world(5)
+    for hand, letter in zip(hands, "RL", strict=True):
+        tip = hand["openxr_position_m"][5][OPENXR_JOINT_NAMES.index("index_tip")]
+        assert np.allclose(world[f"Index_Tip_{letter}"][:3, 3], tip, atol=2e-6)
+    rows = list(csv.DictReader(io.StringIO(csv_of(both))))
+    assert [(row["index"], row["slot"], row["side"]) for row in rows[:3]] == [
+        ("0", "0", "right"),
+        ("0", "1", "left"),
+        ("1", "0", "right"),
+    ]
+
+
+def test_a_run_without_a_hand_is_told() -> None:
+    with pytest.raises(ToftrackError, match="nothing to export"):
+        motions_of(results_of([lost_hand(0), lost_hand(1)]), (shape_of("right"),))
+
+
+def test_frames_whose_times_stand_still_are_laid_out_evenly() -> None:
+    estimates = [replace(hand, timestamp_s=hand.index % 4 / 25) for hand in moving()]
+    (motion,) = motions_of(results_of(estimates), (shape_of("right"),))
+    assert np.allclose(motion.time_s, np.arange(8) / 25)
+
+
+def read_bvh(text: str) -> tuple[list[str], np.ndarray]:
+    """Names of the joints as they begin, and places (T, joints, 3) of all as they end, in cm."""
+    hierarchy, _, motion = text.partition("MOTION\n")
+    frames = np.array([line.split() for line in motion.splitlines()[2:]], float)
+    names: list[str] = []
+    places, column, stack = [], 0, []
+    for line in hierarchy.splitlines()[1:]:
+        match line.split():
+            case ["ROOT" | "JOINT", name]:
+                names.append(name)
+            case ["End", "Site"]:
+                names.append(f"end of {names[-1]}")
+            case ["OFFSET", *offset]:
+                origin, turn = stack[-1] if stack else (np.zeros((len(frames), 3)), None)
+                shift = np.array(offset, float)
+                here = origin + (shift if turn is None else turn.apply(shift))
+                stack.append((here, turn))
+            case ["CHANNELS", count, *kinds]:
+                here, turn = stack[-1]
+                values = frames[:, column : column + int(count)]
+                column += int(count)
+                order = "".join(kind[0] for kind in kinds if kind.endswith("rotation"))
+                if int(count) == 6:
+                    here = here + values[:, :3]
+                own = Rotation.from_euler(order, values[:, -3:], degrees=True)
+                stack[-1] = here, own if turn is None else turn * own
+            case ["}"]:
+                places.append(stack.pop()[0])
+    assert column == frames.shape[1] and not stack
+    return names, np.stack(places, 1)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_bvh_puts_the_joints_where_they_were(side: str) -> None:
+    estimates = moving(side)
+    (motion,) = motions_of(results_of(estimates), (shape_of(side),))
+    text = bvh_of(motion)
+    names, found = read_bvh(text)
+    letter = side[0].upper()
+    assert "Frames: 8\nFrame Time: 0.040000\n" in text
+    assert len(names) == 25 and f"Ring_Distal_{letter}" in names
+    assert names[0] == f"Wrist_{letter}"
+    wrist = 100 * np.stack([e.openxr_position_m[1] for e in estimates])
+    assert np.allclose(found[:, -1], wrist, atol=0.001)  # the root ends last
+    for joint, name in enumerate(OPENXR_JOINT_NAMES):
+        if name == "palm":
+            continue
+        there = 100 * np.stack([e.openxr_position_m[joint] for e in estimates])
+        assert np.linalg.norm(found - there[:, None], axis=-1).min(1).max() < 0.01, name
+
+
+def test_a_csv_has_a_row_a_frame_and_a_column_a_number() -> None:
+    estimates = [lost_hand(0), *moving(lost=(2,))[1:]]
+    rows = list(csv.DictReader(io.StringIO(csv_of(results_of(estimates)))))
+    assert len(rows) == 8
+    assert rows[0]["wrist_x_m"] == "" and rows[0]["lost"] == "1" and rows[2]["lost"] == "1"
+    for row, estimate in zip(rows[1:], estimates[1:], strict=True):
+        assert (row["index"], row["side"]) == (str(estimate.index), "right")
+        assert float(row["timestamp_s"]) == pytest.approx(estimate.timestamp_s, abs=1e-6)
+        for number, name in enumerate(JOINT_NAMES):
+            place = [float(row[f"{name}_{axis}_m"]) for axis in "xyz"]
+            assert place == pytest.approx(estimate.joints_m[number].tolist(), abs=1e-5)
+        assert row["pointing_origin_x_m"] == ""
+
+
+def test_a_missing_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pygltflib", None)
+    with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[export\]'"):
+        glb_of([])

@@ -1,0 +1,139 @@
+"""`stream=osc`: the documented addresses, read by a reader of our own from the datagrams."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.hands import hand_estimate, lost_hand
+from helpers.settings import part
+
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.hand.openxr import OPENXR_JOINT_NAMES
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output.lines import line_content
+from toftrack.output.osc import PARTS, OscStream, messages
+
+pytest.importorskip("pythonosc", reason="pip install '.[osc]'")
+
+
+def osc_stream(**changes: Any) -> OscStream:
+    return part("stream=osc", "stream", **changes)
+
+
+@pytest.fixture
+def receiver() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.settimeout(20)
+        yield listening
+
+
+def text_at(data: bytes, at: int) -> tuple[str, int]:
+    end = data.index(b"\0", at)
+    return data[at:end].decode(), (end // 4 + 1) * 4
+
+
+def read(data: bytes) -> dict[str, list[Any]]:
+    """A bundle's messages by address, as the specification of OSC 1.0 has them."""
+    assert data[:8] == b"#bundle\0"
+    found, at = {}, 16
+    while at < len(data):
+        (size,) = struct.unpack_from(">i", data, at)
+        message, at = data[at + 4 : at + 4 + size], at + 4 + size
+        address, place = text_at(message, 0)
+        kinds, place = text_at(message, place)
+        found[address] = values = []
+        for kind in kinds[1:]:
+            if kind == "s":
+                text, place = text_at(message, place)
+                values.append(text)
+                continue
+            (value,) = struct.unpack_from({"i": ">i", "f": ">f", "d": ">d"}[kind], message, place)
+            values.append(value)
+            place += 8 if kind == "d" else 4
+    return found
+
+
+def sent(receiver: socket.socket, estimate: Estimate, **changes: Any) -> dict[str, list[Any]]:
+    host, port = receiver.getsockname()
+    with osc_stream(host=host, port=port, **changes) as stream:
+        stream.send(estimate)
+        return read(receiver.recv(65535))
+
+
+def test_a_tracked_hand_is_told_with_all_its_joints(receiver: socket.socket) -> None:
+    estimate = hand_estimate(7, "left", pinch=0.75, pinching=True)
+    found = sent(receiver, estimate)
+    assert found["/toftrack/frame"] == [7, 7 / 25]
+    assert found["/toftrack/left/tracked"] == [1]
+    assert found["/toftrack/left/confidence"] == pytest.approx([0.9])
+    assert found["/toftrack/left/gesture"] == ["palm", pytest.approx(0.8)]
+    assert found["/toftrack/left/pinch"] == [0.75, 1]
+    for name, place in zip(JOINT_NAMES, estimate.joints_m, strict=True):
+        assert found[f"/toftrack/left/joint/{name}"] == pytest.approx(place.tolist())
+    assert not any("pointing" in address or "openxr" in address for address in found)
+
+
+def test_the_pointing_ray_is_told_while_there_is_one(receiver: socket.socket) -> None:
+    ray = np.arange(6, dtype=np.float32)
+    estimate = replace(hand_estimate(0), pointing_origin_m=ray[:3], pointing_direction=ray[3:])
+    assert sent(receiver, estimate)["/toftrack/right/pointing"] == ray.tolist()
+
+
+def test_of_a_lost_hand_nothing_is_told_but_that(receiver: socket.socket) -> None:
+    assert sent(receiver, lost_hand(2)) == {
+        "/toftrack/frame": [2, 2 / 25],
+        "/toftrack/hand/tracked": [0],
+    }
+    gone = replace(hand_estimate(3), lost=True)
+    assert set(sent(receiver, gone)) == {"/toftrack/frame", "/toftrack/right/tracked"}
+
+
+def test_landmarks_and_the_joints_of_openxr_are_told_on_demand(receiver: socket.socket) -> None:
+    estimate = hand_estimate(0)
+    found = sent(receiver, estimate, parts=["landmarks", "openxr"])
+    tip = found["/toftrack/right/landmark/index_tip"]
+    assert tip == pytest.approx(estimate.landmarks[8].tolist(), abs=1e-6)
+    palm = [*estimate.openxr_position_m[0], *estimate.openxr_orientation[0]]
+    assert found["/toftrack/right/openxr/palm"] == pytest.approx(
+        [*palm, estimate.openxr_radius_m[0]], abs=1e-6
+    )
+    assert sum("/openxr/" in address for address in found) == len(OPENXR_JOINT_NAMES)
+    assert not any("/joint/" in address for address in found)
+
+
+def test_each_of_several_hands_has_addresses_of_its_own() -> None:
+    frame = ("index", "timestamp_s")
+    hands = [line_content(hand_estimate(5, side)) for side in ("right", "left")]
+    line = {name: hands[0][name] for name in frame} | {
+        "hands": [
+            {name: value for name, value in hand.items() if name not in frame} | {"slot": slot}
+            for slot, hand in enumerate(hands)
+        ]
+    }
+    found = dict(messages(line, PARTS))
+    assert list(found)[0] == "/toftrack/frame"
+    for side, hand in zip(("right", "left"), hands, strict=True):
+        assert found[f"/toftrack/{side}/tracked"] == [("i", 1)]
+        wrist = [value for _, value in found[f"/toftrack/{side}/joint/wrist"]]
+        assert wrist == hand["joints_m"][0]
+
+
+def test_a_bad_setting_is_one_clear_error() -> None:
+    with pytest.raises(ToftrackError, match="unknown part 'bones'; give some of joints"):
+        osc_stream(parts=["bones"])
+    with pytest.raises(ToftrackError, match="stream.port=0"):
+        osc_stream(port=0)
+
+
+def test_a_missing_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pythonosc", None)
+    with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[osc\]'"):
+        osc_stream()

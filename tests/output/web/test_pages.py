@@ -1,0 +1,170 @@
+"""The pages of `stream=websocket` in headless Chromium: the hand moves, the cursor follows."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.chromium import DRAWS_IN_3D, headless_chromium
+from helpers.hands import hand_estimate
+from helpers.settings import part
+
+from toftrack.estimate import Estimate
+
+pytest.importorskip("websockets", reason="pip install '.[web]'")
+PATIENCE_S = 30
+WIDTH_M = 0.5
+
+
+@pytest.fixture(scope="module")
+def stream() -> Iterator[Any]:
+    with part("stream=websocket", "stream", port=0) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with headless_chromium(tmp_path_factory.mktemp("profile"), *DRAWS_IN_3D) as driver:
+        yield driver
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """The browser, whose console must stay empty."""
+    yield browser
+    assert browser.get_log("browser") == []
+
+
+def shown(browser: Any, told: str, send: Callable[[], None]) -> Any:
+    """Send until the page says something true in JavaScript, which is returned."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        send()
+        if value := browser.execute_script(f"return {told}"):
+            return value
+        assert time.monotonic() < deadline, told
+        time.sleep(0.02)
+
+
+def picture(browser: Any) -> np.ndarray:
+    """(H, W) bool: where something is drawn, between the page's words."""
+    data = np.frombuffer(io.BytesIO(browser.get_screenshot_as_png()).read(), np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int)[60:-60]
+    return np.ptp(image, axis=2) > 25  # skin is coloured, the ground is not
+
+
+def settled(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
+    def send() -> None:
+        stream.send(estimate)
+
+    told = f"window.drawn?.index === {estimate.index}"
+    for _ in range(40):  # the view follows the hand smoothly
+        shown(browser, told, send)
+    # A frame that is asked for is drawn before this is answered.
+    browser.execute_async_script("requestAnimationFrame(() => setTimeout(arguments[0], 50))")
+    return picture(browser)
+
+
+def test_the_hand_is_drawn_bends_and_turns_grey_when_it_is_lost(stream: Any, page: Any) -> None:
+    page.get(stream.url)
+    open_hand = settled(page, stream, hand_estimate(1))
+    rows, columns = np.nonzero(open_hand)
+    assert open_hand.mean() > 0.03 and np.ptp(rows) > 250 and np.ptp(columns) > 150
+    assert "frame 1" in page.find_element("tag name", "header").text
+    assert page.execute_script("return document.body.dataset.phase") == "live"
+    fist = settled(page, stream, hand_estimate(2, bent=1.2))
+    assert np.ptp(np.nonzero(fist)[0]) < 0.8 * np.ptp(rows)
+    lost = settled(page, stream, replace(hand_estimate(3), lost=True))
+    assert lost.mean() < 0.01  # grey has no colour
+    assert "lost" in page.find_element("tag name", "header").text
+    left = settled(page, stream, hand_estimate(4, "left"))
+    assert left.mean() > 0.03
+
+
+def test_several_hands_are_drawn(stream: Any, page: Any, monkeypatch: Any) -> None:
+    from toftrack.output import lines
+    from toftrack.output.web import stream as module
+
+    def both(estimate: Estimate, _: Any) -> str:
+        hands = [lines.line_content(hand_estimate(0, side)) for side in ("right", "left")]
+        content = {"index": estimate.index, "timestamp_s": 0.0, "hands": hands}
+        return lines.json.dumps(content)
+
+    monkeypatch.setattr(module, "json_line", both)
+    page.get(stream.url)
+    shown(page, "window.drawn?.hands === 2", lambda: stream.send(hand_estimate(9)))
+
+
+def pointing(index: int, x: float, y: float, **changes: Any) -> Estimate:
+    """A hand that points at a place of the screen, in parts of its width from its upper left."""
+    origin = np.array([0.05, 0.1, 0.5])
+    # The camera sits in the middle of the upper edge, and its right is the person's left.
+    there = np.array([WIDTH_M * (0.5 - x), WIDTH_M * y, 0.0])
+    way = (there - origin) / np.linalg.norm(there - origin)
+    ray = {"pointing_origin_m": origin, "pointing_direction": way}
+    return replace(hand_estimate(index), gesture="pointing", **ray | changes)
+
+
+def test_the_cursor_follows_the_ray_and_a_pinch_presses(stream: Any, page: Any) -> None:
+    """Three targets are pointed at and pinched, one of them beside it first."""
+    page.get(f"{stream.url}point?seed=3&targets=3&width={WIDTH_M}")
+    wide = page.execute_script("return innerWidth")
+    count = 0
+
+    def aim(x: float, y: float, pinch: bool = False) -> None:
+        nonlocal count
+        count += 1
+        nowhere = {name: np.full(3, np.nan) for name in ("pointing_origin_m", "pointing_direction")}
+        changes = {"pinching": True, **nowhere} if pinch else {}  # who pinches does not point
+        stream.send(pointing(count, x, y, **changes))
+
+    for hits in range(3):
+        at = page.execute_script("return game.target")
+        x, y = at["x"] / wide, at["y"] / wide
+        for beside in (0.15,) if hits == 1 else ():
+            rest(page, lambda x=x + beside, y=y: aim(x, y))
+            shown(page, "game.misses === 1", lambda: aim(0, 0, pinch=True))
+            shown(page, "!pinching", lambda: aim(0, 0))
+        rest(page, lambda x=x, y=y: aim(x, y))
+        cursor = page.execute_script("return game.cursor")
+        assert cursor == pytest.approx([at["x"], at["y"]], abs=1.5)
+        shown(page, f"game.hits === {hits + 1}", lambda: aim(0, 0, pinch=True))
+        shown(page, "!pinching", lambda x=x, y=y: aim(x, y))
+    game = page.execute_script("return game")
+    assert game["over"] and game["misses"] == 1 and len(game["times"]) == 3
+    score = page.find_element("id", "score").text
+    assert score.startswith("done: 3 of 3 hit, 1 missed, ") and score.endswith("s a target")
+
+
+def rest(page: Any, aim: Callable[[], None]) -> None:
+    """Point at a place for longer than a press looks back."""
+    until = time.monotonic() + 0.5
+    while time.monotonic() < until:
+        shown(page, "game.cursor !== null", aim)
+
+
+def test_a_ray_away_from_the_screen_moves_no_cursor(stream: Any, page: Any) -> None:
+    page.get(f"{stream.url}point?seed=3")
+    away = {"pointing_origin_m": np.array([0, 0, 0.5]), "pointing_direction": np.array([0, -1, 0])}
+    estimate = replace(hand_estimate(1), gesture="pointing", **away)
+    shown(page, "game.index === 1", lambda: stream.send(estimate))
+    assert page.execute_script("return game.cursor") is None
+    assert not page.find_element("id", "cursor").is_displayed()
+
+
+def test_the_pages_say_when_the_tracker_has_gone(browser: Any, tmp_path: Path) -> None:
+    with part("stream=websocket", "stream", port=0) as stream:
+        browser.get(stream.url)
+        shown(browser, "window.drawn", lambda: stream.send(hand_estimate(1)))
+    gone = "document.body.dataset.phase === 'broken'"
+    shown(browser, gone, lambda: None)
+    browser.get("data:,")
+    told = browser.get_log("browser")  # by the browser itself, which the page cannot help
+    assert all("ERR_CONNECTION_REFUSED" in entry["message"] for entry in told)

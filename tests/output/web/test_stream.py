@@ -1,0 +1,204 @@
+"""`stream=websocket`: who gets the lines, who does not, and what must not hold up the tracker."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import logging
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from helpers.hands import hand_estimate, lost_hand
+from helpers.settings import part
+
+from toftrack.errors import ToftrackError
+from toftrack.output.lines import json_line
+from toftrack.output.web.stream import WebSocketStream
+
+pytest.importorskip("websockets", reason="pip install '.[web]'")
+client = pytest.importorskip("websockets.sync.client", reason="pip install '.[web]'")
+PATIENCE_S = 20
+
+
+def websocket_stream(**changes: Any) -> WebSocketStream:
+    return part("stream=websocket", "stream", **{"port": 0, **changes})
+
+
+@pytest.fixture
+def stream() -> Iterator[WebSocketStream]:
+    with websocket_stream() as opened:
+        yield opened
+
+
+def listening(stream: WebSocketStream, **headers: str) -> Any:
+    """A client that is no browser, or says that it is a page of some origin."""
+    url = f"ws{stream.url.removeprefix('http')}stream"
+    before = len(stream._clients)
+    opened = client.connect(url, additional_headers=headers, compression=None)
+    eventually(lambda: len(stream._clients) > before)
+    return opened
+
+
+def eventually(told: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not told():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def answer(stream: WebSocketStream, path: str, **headers: str) -> tuple[int, dict, str]:
+    url = urlsplit(stream.url)
+    connection = http.client.HTTPConnection(url.hostname, url.port, timeout=PATIENCE_S)
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request("GET", path, headers=headers)
+    got = connection.getresponse()
+    found = got.status, dict(got.headers), got.read().decode()
+    connection.close()
+    return found
+
+
+def test_every_client_gets_every_line_as_in_track_jsonl(stream: WebSocketStream) -> None:
+    with listening(stream) as first, listening(stream) as second:
+        for index in range(20):
+            estimate = hand_estimate(index) if index % 3 else lost_hand(index)
+            stream.send(estimate)
+            for one in (first, second):
+                assert one.recv(PATIENCE_S) == json_line(estimate)
+
+
+def test_only_the_wanted_fields_are_sent() -> None:
+    with websocket_stream(fields=["index", "pinching"]) as stream, listening(stream) as one:
+        stream.send(hand_estimate(3))
+        assert json.loads(one.recv(PATIENCE_S)) == {"index": 3, "pinching": False}
+
+
+def test_a_client_that_leaves_disturbs_nobody(stream: WebSocketStream) -> None:
+    with listening(stream) as stays:
+        with listening(stream) as leaves:
+            leaves.socket.shutdown(socket.SHUT_RDWR)
+            eventually(lambda: len(stream._clients) == 1)
+        stream.send(hand_estimate(1))
+        assert json.loads(stays.recv(PATIENCE_S))["index"] == 1
+
+
+def test_what_a_client_sends_is_not_looked_at(stream: WebSocketStream) -> None:
+    with listening(stream) as one:
+        one.send("restart")
+        stream.send(hand_estimate(1))
+        assert json.loads(one.recv(PATIENCE_S))["index"] == 1
+
+
+def test_a_client_that_never_reads_stops_nothing_and_its_oldest_lines_go(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    estimate = hand_estimate(0)
+    with socket.socket() as mute, websocket_stream(waiting=3) as stream:
+        url = urlsplit(stream.url)
+        mute.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        mute.connect((url.hostname, url.port))
+        mute.sendall(
+            f"GET /stream HTTP/1.1\r\nHost: {url.netloc}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+        )
+        eventually(lambda: stream._clients)
+        for index in range(1500):
+            stream.send(replace(estimate, index=index))
+    words = caplog.text.split()
+    sent, dropped = (int(words[words.index(word) - 1]) for word in ("estimates", "dropped"))
+    assert sent + dropped >= 1499 and dropped > 100  # one may have been on its way
+
+
+def test_nothing_is_made_while_nobody_listens(
+    stream: WebSocketStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("toftrack.output.web.stream.json_line", lambda *_: pytest.fail("made"))
+    stream.send(hand_estimate(0))
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "https://127.0.0.1"},
+        {"Host": "evil.example", "Origin": "http://evil.example"},
+        {"Host": "127.0.0.1.evil.example"},
+    ],
+)
+def test_pages_of_other_sites_may_not_listen(stream: WebSocketStream, headers: dict) -> None:
+    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade"}
+    status, _, told = answer(stream, "/stream", **headers, **upgrade)
+    assert status == 403 and not stream._clients
+    assert "stream.origins" in told or "localhost only" in told
+
+
+def test_its_own_pages_and_those_that_are_named_may_listen() -> None:
+    with websocket_stream(origins=["http://localhost:3000"]) as stream:
+        own = f"http://{urlsplit(stream.url).netloc}"
+        for origin in (own, "http://localhost:3000"):
+            with listening(stream, Origin=origin) as one:
+                stream.send(hand_estimate(4))
+                assert json.loads(one.recv(PATIENCE_S))["index"] == 4
+
+
+def test_the_pages_come_with_all_that_they_need(stream: WebSocketStream) -> None:
+    for path, words in (("/", "in 3-D"), ("/point?seed=1", "point and pinch")):
+        status, headers, page = answer(stream, path)
+        assert status == 200 and words in page
+        assert headers["Content-Type"].startswith("text/html")
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
+        assert set(re.findall(r"src=\"([^\"]+)\"", page)) == {"/feed.js"}
+        assert not re.search(r"https?://|@import|url\(", page)
+    assert answer(stream, "/feed.js")[1]["Content-Type"].startswith("text/javascript")
+
+
+def test_what_is_not_there_is_refused(stream: WebSocketStream) -> None:
+    assert answer(stream, "/other")[0] == 404
+    assert answer(stream, "/stream")[0] == 426
+    assert answer(stream, "/", Host="evil.example")[0] == 403
+
+
+def test_the_last_lines_arrive_and_then_everything_ends() -> None:
+    with ExitStack() as clients:
+        with websocket_stream() as stream:
+            one = clients.enter_context(listening(stream))
+            for index in range(10):
+                stream.send(hand_estimate(index))
+        found = [json.loads(message)["index"] for message in one]
+    assert found == list(range(10))
+    assert not any(t.name == "websocket-server" for t in threading.enumerate())
+
+
+def test_a_port_that_is_taken_is_told(stream: WebSocketStream) -> None:
+    port = urlsplit(stream.url).port
+    with pytest.raises(ToftrackError, match=f"port {port} of 127.0.0.1 is taken.*stream.port=PORT"):
+        websocket_stream(port=port).__enter__()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"port": -1}, "stream.port=-1"),
+        ({"waiting": 0}, "stream.waiting=0"),
+        ({"fields": ["bones"]}, "'bones'"),
+    ],
+)
+def test_a_bad_setting_is_one_clear_error(changes: dict, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        websocket_stream(**changes)
+
+
+def test_a_missing_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "websockets.asyncio.server", None)
+    with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[web\]'"):
+        websocket_stream()

@@ -1,0 +1,193 @@
+"""Archives of others: sizes are checked before and while they are read, and memory is bounded."""
+
+from __future__ import annotations
+
+import io
+import struct
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toftrack import archives
+from toftrack.archives import MOST_TEXT_BYTES, Archive, PickledError, read_archive
+
+METHODS = {
+    "stored": zipfile.ZIP_STORED,
+    "deflate": zipfile.ZIP_DEFLATED,
+    "bzip2": zipfile.ZIP_BZIP2,
+    "lzma": zipfile.ZIP_LZMA,
+}
+PACKED = {name: method for name, method in METHODS.items() if method}
+ZEROS = bytes(2**20)
+every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+every_packing = pytest.mark.parametrize("method", PACKED.values(), ids=PACKED)
+
+
+def npy(array: Any) -> bytes:
+    content = io.BytesIO()
+    np.lib.format.write_array(content, np.asanyarray(array))
+    return content.getvalue()
+
+
+def header(shape: tuple[int, ...], kind: str = "<f4") -> bytes:
+    content = io.BytesIO()
+    told = {"descr": kind, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(content, told)
+    return content.getvalue()
+
+
+def save(path: Path, content: dict[str, bytes | list[bytes]], method: int) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, pieces in content.items():
+            with archive.open(f"{name}.npy", "w") as stream:
+                for piece in [pieces] if isinstance(pieces, bytes) else pieces:
+                    stream.write(piece)
+    return path
+
+
+def told(path: Path) -> str:
+    """What is said, after little memory was used; tracemalloc sees what Python allocates."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError) as error:
+            read_archive(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+    finally:
+        tracemalloc.stop()
+    return str(error.value)
+
+
+@every_method
+def test_arrays_of_every_kind_are_read_as_numpy_does(tmp_path: Path, method: int) -> None:
+    rng = np.random.default_rng(0)
+    arrays = {
+        "depth": rng.normal(size=(30, 50, 60)).astype(np.float32),
+        "zeros": np.zeros((300, 70), np.uint16),
+        "turned": np.asfortranarray(rng.normal(size=(3, 4))),
+        "none": np.zeros((0, 3)),
+        "one": np.float64(25.0),
+        "text": np.array(["palm", "fist"]),
+        "flags": np.array([True, False]),
+    }
+    path = save(tmp_path / "a.npz", {key: npy(value) for key, value in arrays.items()}, method)
+    found = read_archive(path)
+    assert found.keys() == arrays.keys()
+    for key, value in arrays.items():
+        assert found[key].dtype == value.dtype
+        np.testing.assert_array_equal(found[key], value)
+    assert read_archive(path, {"one", "absent"}).keys() == {"one"}
+
+
+@every_packing
+def test_what_was_made_to_fill_memories_is_not_unpacked(tmp_path: Path, method: int) -> None:
+    shape = (128, 2**20 // 4)
+    path = save(tmp_path / "bomb.npz", {"a": [header(shape), *[ZEROS] * 128]}, method)
+    assert path.stat().st_size < 2**20
+    assert "'a': it would make 134 MB of" in told(path)
+
+
+@every_packing
+def test_more_than_the_directory_states_is_not_unpacked(tmp_path: Path, method: int) -> None:
+    """The stated size and the header agree, but much more comes."""
+    path = save(tmp_path / "bomb.npz", {"a": [header((1000,)), *[ZEROS] * 128]}, method)
+    forged = bytearray(path.read_bytes())
+    size = struct.pack("<I", len(header((1000,))) + 4000)
+    at = forged.index(b"PK\x01\x02")
+    forged[at + 24 : at + 28] = size
+    path.write_bytes(forged)
+    assert "'a' is damaged: its checksum is wrong" in told(path)
+
+
+@every_method
+def test_a_header_that_claims_too_much_is_not_believed(tmp_path: Path, method: int) -> None:
+    claims = {"more": header((2**40,)), "negative": header((-1, 4)), "less": header((1,)) + ZEROS}
+    for name, content in claims.items():
+        path = save(tmp_path / f"{name}.npz", {"a": content}, method)
+        assert "'a'" in told(path) and "length" in told(path)
+
+
+@every_packing
+def test_a_header_without_end_is_not_read(tmp_path: Path, method: int) -> None:
+    long = b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**27)
+    path = save(tmp_path / "a.npz", {"a": [long, *[b" " * 2**20] * 128]}, method)
+    assert "'a': its header is damaged" in told(path)
+
+
+def edited(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
+    return lambda content: content.replace(old, new.ljust(len(old)))
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (edited(b"'shape': (4, 5), }", b"'shape': (9**9**9,)}"), "'a'"),
+        (edited(b"{'descr': '<f8', 'fortran_order'", b"(" * 32), "'a'"),
+        (edited(b"'<f8'", b"'z9'"), "'a'"),
+        (edited(b"NUMPY\x01", b"NUMPY\x07"), "it is no array"),
+        (edited(b"NUMPY\x01", b"NUMB3\x01"), "it is no array"),
+        (lambda content: content[:60], "'a'"),
+    ],
+)
+def test_a_damaged_header_is_told(tmp_path: Path, edit: Callable, words: str) -> None:
+    content = edit(npy(np.ones((4, 5))))
+    assert words in told(save(tmp_path / "a.npz", {"a": content}, zipfile.ZIP_STORED))
+
+
+def test_objects_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", a=np.array([{"b": 1}], object))
+    with pytest.raises(PickledError, match="'a' holds pickled objects"):
+        read_archive(tmp_path / "a.npz")
+
+
+def test_a_text_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    length = MOST_TEXT_BYTES // 4 + 1
+    pieces = [header((), f"<U{length}"), *[ZEROS] * 16, bytes(4)]
+    path = save(tmp_path / "a.npz", {"a": pieces}, zipfile.ZIP_DEFLATED)
+    assert "'a': it is a text of 17 MB" in told(path)
+
+
+def test_an_array_beyond_the_cap_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archives, "MOST_BYTES", 1000)
+    path = save(tmp_path / "a.npz", {n: npy(np.ones(100)) for n in "ab"}, zipfile.ZIP_STORED)
+    assert "it is larger than" in told(path)
+    with open(path, "rb") as stream, pytest.raises(ValueError, match="at most"):
+        Archive(stream).read("a", 100)
+
+
+@pytest.mark.parametrize(("method", "words"), [(97, "unknown way"), (14, "lzma properties")])
+def test_an_unknown_compression_is_told(tmp_path: Path, method: int, words: str) -> None:
+    path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_STORED)
+    forged = bytearray(path.read_bytes())
+    for start, at in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
+        place = forged.index(start) + at
+        forged[place : place + 2] = struct.pack("<H", method)
+    path.write_bytes(forged)
+    assert words in told(path)
+
+
+@every_method
+def test_random_damage_never_ends_otherwise_than_with_a_value_error(
+    tmp_path: Path, method: int
+) -> None:
+    rng, path = np.random.default_rng(1), tmp_path / "a.npz"
+    content = {"a": npy(rng.integers(0, 9, (40, 50))), "b": npy(np.array("text"))}
+    whole = save(path, content, method).read_bytes()
+    refused = 0
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, len(whole), rng.integers(1, 6)):
+            damaged[at] = rng.integers(0, 256)
+        path.write_bytes(damaged[: rng.integers(len(whole) // 2, 2 * len(whole))])
+        try:
+            read_archive(path)
+        except ValueError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused > 75

@@ -1,0 +1,52 @@
+"""JSON of others: whatever Python makes of it, what cannot be meant is a ValueError."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from toftrack import json_text
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import HandShape
+from toftrack.json_text import parse_json, read_json
+
+HOSTILE = {
+    "lists": ("[" * 100_000, "nested too deeply"),
+    "objects": ('{"a":' * 100_000 + "1" + "}" * 100_000, "nested too deeply"),
+    "digits": ("9" * 400, "400 digits"),
+    "many digits": ("9" * 5000, "5000 digits"),
+    "cut off": ('{"a": ', "Expecting value"),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), HOSTILE.values(), ids=HOSTILE)
+def test_what_cannot_be_meant_is_a_value_error(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        parse_json(text)
+
+
+def test_usual_content_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "usual.json"
+    path.write_text('{"é": [1, -2.5e3, true, null, 123456789012345678]}', encoding="utf-8")
+    assert read_json(path) == {"é": [1, -2500.0, True, None, 123456789012345678]}
+
+
+def test_a_file_that_is_too_large_is_not_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(json_text, "MOST_BYTES", 2**20)
+    path = tmp_path / "large.json"
+    path.write_text("1" + " " * 2**20)
+    with pytest.raises(ValueError, match="larger than 1 MB"):
+        read_json(path)
+
+
+@pytest.mark.parametrize("text", [text for text, _ in HOSTILE.values()], ids=HOSTILE)
+@pytest.mark.parametrize("load", [Camera.load, HandShape.load])
+def test_files_of_it_are_told_in_one_sentence(load, text: str, tmp_path: Path) -> None:
+    path = tmp_path / "hostile.json"
+    path.write_text(text)
+    with pytest.raises(ToftrackError, match="hostile.json"):
+        load(path)

@@ -1,0 +1,135 @@
+"""Two hands at once: each in its slot, neither taken for the other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.configured import calibrated_belief
+from helpers.tracking import configuration, follow, sample
+from helpers.two_hands import TwoHands, beside_its_mirror
+
+from toftrack.api import build_hands_tracker
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.tracking.hands import HandsTracker
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SMALL = ("filter.particles=80", "refine.swaps=16")
+ROWS = range(14, 34)
+"""Frames of the sample with the hand to the left of the image's middle."""
+
+
+def tracker_of(*overrides: str) -> HandsTracker:
+    return build_hands_tracker(configuration(*SMALL, *overrides))
+
+
+def followed(scene: TwoHands, *overrides: str) -> list[tuple[Estimate, ...]]:
+    tracker = tracker_of("hands=2", *overrides)
+    return [tracker.step(depth, scene.k, i, i / 25) for i, depth in enumerate(scene.depth_m)]
+
+
+def errors_mm(told: list[tuple[Estimate, ...]], scene: TwoHands) -> np.ndarray:
+    """(T, 2) errors of the right hand and of the left one, in whichever slot; NaN where lost."""
+    errors = np.full((len(told), 2), np.nan)
+    for t, estimates in enumerate(told):
+        for estimate in estimates:
+            hand = ("right", "left").index(estimate.side) if estimate.side else 0
+            if not estimate.lost:
+                off = np.linalg.norm(estimate.joints_m - scene.joints_m[hand, t], axis=1)
+                errors[t, hand] = 1e3 * off.mean()
+    return errors
+
+
+@pytest.fixture(scope="module")
+def apart() -> TwoHands:
+    return beside_its_mirror(sample().cut(*ROWS), 30)
+
+
+@pytest.fixture(scope="module")
+def found(apart: TwoHands) -> list[tuple[Estimate, ...]]:
+    return followed(apart)
+
+
+def test_both_hands_are_followed(apart: TwoHands, found: list[tuple[Estimate, ...]]) -> None:
+    late = errors_mm(found, apart)[8:]
+    assert np.isfinite(late).mean(0).min() > 0.8, "neither is lost"
+    assert np.nanmedian(late) < 15.0
+
+
+def test_two_hands_are_of_different_sides(found: list[tuple[Estimate, ...]]) -> None:
+    assert sorted(estimate.side for estimate in found[-1]) == ["left", "right"]
+
+
+def test_a_hand_keeps_its_slot(apart: TwoHands, found: list[tuple[Estimate, ...]]) -> None:
+    places = np.array([[e.joints_m[0, 0] for e in estimates] for estimates in found[4:]])
+    order = np.sign(places[:, 0] - places[:, 1])
+    assert len(set(order[np.isfinite(order)])) == 1
+
+
+def test_a_slot_without_a_hand_is_lost_and_empty() -> None:
+    tracker, scene = tracker_of("hands=2"), sample()
+    for i in range(4):
+        first, second = tracker.step(scene.depth_m[i], scene.k, i, i / 25)
+    assert np.isfinite(first.joints_m).all()
+    assert second.lost and second.side == ""
+    assert np.isnan(second.joints_m).all() and np.isnan(second.state).all()
+    assert second.index == first.index and second.timestamp_s == first.timestamp_s
+
+
+def test_one_hand_is_not_seen_twice() -> None:
+    tracker, scene = tracker_of("hands=2"), sample()
+    told = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(0, 60, 3)]
+    assert sum(not estimates[1].lost for estimates in told) == 0
+
+
+def test_a_told_side_is_that_of_the_first_slot_and_the_other_one_is_of_the_other(
+    apart: TwoHands,
+) -> None:
+    tracker = tracker_of("hands=2", "hand.side=left")
+    for i in range(10):
+        first, second = tracker.step(apart.depth_m[i], apart.k, i, i / 25)
+        assert first.side in ("left", "") and second.side in ("right", "")
+    assert first.side == "left" and second.side == "right"
+    assert first.joints_m[0, 0] > second.joints_m[0, 0], "each on its own hand"
+
+
+def test_one_hand_of_the_tracker_of_hands_is_that_of_the_tracker_of_one() -> None:
+    scene = sample().cut(0, 1, 2)
+    tracker = tracker_of()
+    one = [tracker.step(depth, scene.k, i, i / 25)[0] for i, depth in enumerate(scene.depth_m)]
+    for mine, its in zip(one, follow(scene, *SMALL), strict=True):
+        np.testing.assert_array_equal(mine.joints_m, its.joints_m)
+        assert (mine.lost, mine.side, mine.confidence) == (its.lost, its.side, its.confidence)
+
+
+def test_the_same_frames_and_seed_give_the_same_hands(
+    apart: TwoHands, found: list[tuple[Estimate, ...]]
+) -> None:
+    tracker = tracker_of("hands=2")
+    for i in range(5):
+        again = tracker.step(apart.depth_m[i], apart.k, i, i / 25)
+        for one, two in zip(found[i], again, strict=True):
+            np.testing.assert_array_equal(one.joints_m, two.joints_m)
+
+
+def test_a_restart_forgets_both_hands(apart: TwoHands) -> None:
+    tracker = tracker_of("hands=2")
+    for i in range(3):
+        tracker.step(apart.depth_m[i], apart.k, i, i / 25)
+    tracker.restart("left")
+    assert [state.track for state in tracker.states] == [None, None]
+    assert [state.side for state in tracker.states] == ["left", "right"]
+    assert tracker.states[0].next_index == 3
+
+
+@pytest.mark.parametrize("hands", [0, 3, 1.5])
+def test_other_numbers_of_hands_are_refused(hands: float) -> None:
+    model = tracker_of().model
+    with pytest.raises(ToftrackError, match="hands"):
+        HandsTracker(model, 0, hands)  # type: ignore[arg-type]
+
+
+def test_the_second_hand_has_to_convince_more_than_the_first() -> None:
+    lost = calibrated_belief()
+    assert lost.second > lost.believe

@@ -1,0 +1,37 @@
+"""JSON that others wrote: what cannot be meant is a ValueError, whatever Python makes of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+MOST_BYTES = 2**26
+"""No file of JSON here comes near 64 MB."""
+_MOST_DIGITS = 30
+"""Of a whole number; more cannot become a float, or take for ever."""
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The content of a text; ValueError, a few words, for what is damaged or cannot be meant."""
+    try:
+        return json.loads(text, parse_int=_whole)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    except MemoryError:
+        raise ValueError("it needs more memory than there is") from None
+
+
+def read_json(path: str | Path) -> Any:
+    """The content of a file (UTF-8); OSError, or ValueError as parse_json."""
+    with open(path, "rb") as stream:
+        text = stream.read(MOST_BYTES + 1)
+    if len(text) > MOST_BYTES:
+        raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
+    return parse_json(text.decode("utf-8"))
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"a number has {len(digits)} digits")
+    return int(digits)

@@ -1,0 +1,187 @@
+"""Hands as binary glTF: skeletons that move, and a skin on each.
+
+Metres; x right, y up, z backward. A node for each of the 26 joints of OpenXR with a key in every
+frame for its place and its turn. In frames without the hand its skeleton is scaled to nothing,
+which is how glTF hides what is animated; its pose is held there.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
+from toftrack.output.exports.mesh import hand_mesh
+from toftrack.output.exports.motion import HandMotion, rest_joints
+
+_SKIN = [0.85, 0.6, 0.46, 1.0]
+_ROOT = OPENXR_JOINT_NAMES.index("wrist")
+
+
+def glb_of(motions: list[HandMotion]) -> bytes:
+    """The content of a .glb file. Raises ToftrackError when pygltflib is not installed."""
+    file = _File(_pygltflib())
+    for motion in motions:
+        _add_hand(file, motion)
+    return file.content()
+
+
+def _add_hand(file: _File, motion: HandMotion) -> None:
+    """Nodes, skin, mesh and animation of one hand."""
+    gltf = file.gltf
+    first = len(file.document.nodes) + 1  # of the joints, behind the node that holds them
+    holder = gltf.Node(name=motion.name("hand"), children=[first + _ROOT])
+    file.document.nodes.append(holder)
+    for joint, name in enumerate(OPENXR_JOINT_NAMES):
+        children = [first + child for child, at in enumerate(OPENXR_PARENTS) if at == joint]
+        node = gltf.Node(
+            name=motion.name(name),
+            translation=motion.offset_m[0, joint].tolist(),
+            rotation=motion.turn[0, joint].tolist(),
+        )
+        if children:
+            node.children = children
+        file.document.nodes.append(node)
+    skinned = gltf.Node(
+        name=motion.name("skin"), mesh=_mesh(file, motion), skin=_skin(file, motion, first)
+    )
+    file.document.nodes.append(skinned)
+    file.document.scenes[0].nodes += [first - 1, len(file.document.nodes) - 1]
+    _animate(file, motion, first)
+
+
+def _mesh(file: _File, motion: HandMotion) -> int:
+    """The number of the mesh."""
+    gltf, mesh = file.gltf, hand_mesh(motion.shape)
+    joints = np.zeros((len(mesh.joint), 4), np.uint8)
+    joints[:, 0] = mesh.joint
+    weights = np.zeros((len(mesh.joint), 4), np.float32)
+    weights[:, 0] = 1
+    attributes = gltf.Attributes(
+        POSITION=file.array(mesh.points_m, gltf.VEC3, gltf.ARRAY_BUFFER, limits=True),
+        NORMAL=file.array(mesh.normals, gltf.VEC3, gltf.ARRAY_BUFFER),
+        JOINTS_0=file.array(joints, gltf.VEC4, gltf.ARRAY_BUFFER),
+        WEIGHTS_0=file.array(weights, gltf.VEC4, gltf.ARRAY_BUFFER),
+    )
+    triangles = mesh.triangles.ravel().astype(np.uint32)
+    indices = file.array(triangles, gltf.SCALAR, gltf.ELEMENT_ARRAY_BUFFER)
+    primitive = gltf.Primitive(attributes=attributes, indices=indices, material=0)
+    file.document.meshes.append(gltf.Mesh(name=motion.name("skin"), primitives=[primitive]))
+    return len(file.document.meshes) - 1
+
+
+def _skin(file: _File, motion: HandMotion, first: int) -> int:
+    """The number of the skin; its joints are the nodes from `first` on."""
+    gltf = file.gltf
+    position, turned = rest_joints(motion.shape)
+    back = Rotation.from_quat(turned).inv()
+    inverse = np.zeros((26, 4, 4))
+    inverse[:, :3, :3] = back.as_matrix()
+    inverse[:, :3, 3] = -back.apply(position)
+    inverse[:, 3, 3] = 1
+    columns = inverse.swapaxes(1, 2).reshape(26, 16)
+    file.document.skins.append(
+        gltf.Skin(
+            name=motion.name("skin"),
+            inverseBindMatrices=file.array(columns, gltf.MAT4),
+            skeleton=first + _ROOT,
+            joints=list(range(first, first + 26)),
+        )
+    )
+    return len(file.document.skins) - 1
+
+
+def _animate(file: _File, motion: HandMotion, first: int) -> None:
+    gltf, animation = file.gltf, file.animation
+    time = file.array(motion.time_s, gltf.SCALAR, limits=True)
+
+    def add(node: int, path: str, values: np.ndarray, kind: str, steps: str) -> None:
+        sampler = gltf.AnimationSampler(
+            input=time, output=file.array(values, kind), interpolation=steps
+        )
+        animation.samplers.append(sampler)
+        target = gltf.AnimationChannelTarget(node=node, path=path)
+        animation.channels.append(
+            gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target)
+        )
+
+    shown = np.repeat(motion.tracked[:, None].astype(np.float32), 3, 1)
+    add(first - 1, "scale", shown, gltf.VEC3, "STEP")
+    for joint in range(26):
+        add(first + joint, "translation", motion.offset_m[:, joint], gltf.VEC3, "LINEAR")
+        add(first + joint, "rotation", motion.turn[:, joint], gltf.VEC4, "LINEAR")
+
+
+class _File:
+    """A document that grows, with all its arrays in one buffer.
+
+    gltf: the module pygltflib.
+    """
+
+    def __init__(self, gltf: ModuleType) -> None:
+        self.gltf: Any = gltf
+        self.animation = self.gltf.Animation(name="track", samplers=[], channels=[])
+        skin = self.gltf.PbrMetallicRoughness(
+            baseColorFactor=_SKIN, metallicFactor=0.0, roughnessFactor=0.7
+        )
+        self.document = self.gltf.GLTF2(
+            asset=self.gltf.Asset(version="2.0", generator=f"toftrack {version('toftrack')}"),
+            scene=0,
+            scenes=[self.gltf.Scene(nodes=[])],
+            materials=[self.gltf.Material(name="skin", pbrMetallicRoughness=skin)],
+            animations=[self.animation],
+        )
+        self._data = bytearray()
+
+    def array(
+        self, values: np.ndarray, kind: str, target: int | None = None, limits: bool = False
+    ) -> int:
+        """Append an array; returns the number of its accessor. Floating ones become float32.
+
+        limits: say the least and the largest of each column.
+        """
+        types = {"u1": self.gltf.UNSIGNED_BYTE, "u4": self.gltf.UNSIGNED_INT}
+        if values.dtype.kind == "f":
+            values = values.astype(np.float32)
+        component = types.get(values.dtype.str[1:], self.gltf.FLOAT)
+        data = np.ascontiguousarray(values).tobytes()
+        document, rows = self.document, values.reshape(len(values), -1)
+        document.bufferViews.append(
+            self.gltf.BufferView(
+                buffer=0, byteOffset=len(self._data), byteLength=len(data), target=target
+            )
+        )
+        self._data += data + bytes(-len(data) % 4)
+        document.accessors.append(
+            self.gltf.Accessor(
+                bufferView=len(document.bufferViews) - 1,
+                componentType=component,
+                count=len(values),
+                type=kind,
+                min=rows.min(0).tolist() if limits else None,
+                max=rows.max(0).tolist() if limits else None,
+            )
+        )
+        return len(document.accessors) - 1
+
+    def content(self) -> bytes:
+        """The whole file."""
+        self.document.buffers = [self.gltf.Buffer(byteLength=len(self._data))]
+        self.document.set_binary_blob(bytes(self._data))
+        return b"".join(self.document.save_to_bytes())
+
+
+def _pygltflib() -> ModuleType:
+    try:
+        import pygltflib
+    except ImportError:
+        raise ToftrackError(
+            "glb needs pygltflib, which is not installed: pip install 'toftrack[export]', in a "
+            "checkout pip install -e '.[export]'"
+        ) from None
+    return pygltflib

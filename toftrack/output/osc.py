@@ -1,0 +1,143 @@
+"""Estimates as Open Sound Control: a bundle of messages a frame, by UDP.
+
+| address | arguments |
+| --- | --- |
+| `/toftrack/frame` | i number of the frame, d its time in s; in every bundle |
+| `/toftrack/SIDE/tracked` | i 1, or 0 when the hand is lost: then nothing else comes of this hand |
+| `/toftrack/SIDE/confidence` | f 0 to 1 |
+| `/toftrack/SIDE/gesture` | s name, f probability |
+| `/toftrack/SIDE/pinch` | f 0 open to 1 touching, i 1 while pinching |
+| `/toftrack/SIDE/pointing` | fff origin, fff direction; only while it points |
+| `/toftrack/SIDE/joint/NAME` | fff metres, camera axes: x right, y down, z forward |
+| `/toftrack/SIDE/landmark/NAME` | fff image coordinates as MediaPipe's |
+| `/toftrack/SIDE/openxr/NAME` | fff metres, ffff x y z w, f radius: x right, y up, -z forward |
+
+SIDE is right or left; NAME one of the 21 joints (index_tip), for openxr one of its 26.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from types import ModuleType
+from typing import Any
+
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.hand.openxr import OPENXR_JOINT_NAMES
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output.hand_records import hands_of
+from toftrack.output.lines import line_content
+from toftrack.output.stream import UdpStream
+
+PARTS = ("joints", "landmarks", "openxr")
+"""What may be sent of a hand beside the rest."""
+_FIELDS = (
+    *("index", "timestamp_s", "lost", "confidence", "side", "gesture", "gesture_probability"),
+    *("pinch", "pinching", "pointing_origin_m", "pointing_direction"),
+)
+_FIELDS_OF = {
+    "joints": ("joints_m",),
+    "landmarks": ("landmarks",),
+    "openxr": ("openxr_position_m", "openxr_orientation", "openxr_radius_m"),
+}
+
+Message = tuple[str, list[tuple[str, Any]]]
+"""An address, and arguments each with their OSC type."""
+
+
+class OscStream(UdpStream):
+    """A bundle a frame to one address, whether anybody listens there or not.
+
+    Args:
+        host: address or name of the receiving machine.
+        port: 1 to 65535.
+        parts: some of PARTS.
+
+    Raises:
+        ToftrackError: python-osc is not installed, an unknown part, a host that cannot be found or
+            an impossible port.
+    """
+
+    def __init__(self, host: str, port: int, parts: Sequence[str]) -> None:
+        super().__init__(host, port, None)
+        self._parts = (parts,) if isinstance(parts, str) else tuple(parts)
+        if unknown := [part for part in self._parts if part not in PARTS]:
+            raise ToftrackError(
+                f"stream.parts names the unknown part {unknown[0]!r}; give some of "
+                f"{', '.join(PARTS)}"
+            )
+        self._bundles, self._messages = _python_osc()
+        more = (name for part in self._parts for name in _FIELDS_OF[part])
+        self._names = (*_FIELDS, *more)
+
+    def datagram(self, estimates: Sequence[Estimate]) -> bytes:
+        """The bundle, to be acted upon at once."""
+        bundle = self._bundles.OscBundleBuilder(self._bundles.IMMEDIATELY)
+        for address, arguments in messages(line_content(estimates, self._names), self._parts):
+            message = self._messages.OscMessageBuilder(address)
+            for kind, value in arguments:
+                message.add_arg(value, kind)
+            bundle.add_content(message.build())
+        content: bytes = bundle.build().dgram
+        return content
+
+
+def messages(line: dict[str, Any], parts: Sequence[str]) -> Iterator[Message]:
+    """What is said of a frame, in order.
+
+    line: as in track.jsonl, with the fields of one hand or with `hands`.
+    """
+    yield "/toftrack/frame", [("i", line["index"]), ("d", line["timestamp_s"])]
+    for hand in hands_of(line):
+        yield from _messages_of(hand, f"/toftrack/{hand['side'] or 'hand'}", parts)
+
+
+def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Iterator[Message]:
+    tracked = not hand["lost"]
+    yield f"{root}/tracked", [("i", int(tracked))]
+    if not tracked:
+        return
+    if hand["confidence"] is not None:
+        yield f"{root}/confidence", [("f", hand["confidence"])]
+    if hand["gesture"]:
+        probability = hand["gesture_probability"]
+        yield f"{root}/gesture", [("s", hand["gesture"]), ("f", probability)]
+        yield f"{root}/pinch", [("f", hand["pinch"]), ("i", int(hand["pinching"]))]
+    ray = [*hand["pointing_origin_m"], *hand["pointing_direction"]]
+    if _known(ray):
+        yield f"{root}/pointing", _floats(ray)
+    if "joints" in parts:
+        yield from _listed(f"{root}/joint", JOINT_NAMES, hand["joints_m"])
+    if "landmarks" in parts:
+        yield from _listed(f"{root}/landmark", JOINT_NAMES, hand["landmarks"])
+    if "openxr" in parts:
+        columns = (hand[name] for name in _FIELDS_OF["openxr"])
+        rows = [[*at, *turned, radius] for at, turned, radius in zip(*columns, strict=True)]
+        yield from _listed(f"{root}/openxr", OPENXR_JOINT_NAMES, rows)
+
+
+def _listed(root: str, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Iterator[Message]:
+    for name, row in zip(names, rows, strict=True):
+        if _known(row):
+            yield f"{root}/{name}", _floats(row)
+
+
+def _floats(values: Sequence[float]) -> list[tuple[str, Any]]:
+    return [("f", value) for value in values]
+
+
+def _known(values: Sequence[float | None]) -> bool:
+    return all(value is not None and math.isfinite(value) for value in values)
+
+
+def _python_osc() -> tuple[ModuleType, ModuleType]:
+    """Its builders of bundles and of messages."""
+    try:
+        from pythonosc import osc_bundle_builder, osc_message_builder
+    except ImportError:
+        raise ToftrackError(
+            "stream=osc needs python-osc, which is not installed: pip install 'toftrack[osc]', in "
+            "a checkout pip install -e '.[osc]'"
+        ) from None
+    return osc_bundle_builder, osc_message_builder

@@ -1,0 +1,43 @@
+"""Which jobs of a sweep failed, whatever ran them: other processes tell it by their folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from toftrack.json_text import read_json
+from toftrack.programs.command_line import note_failed_job
+
+
+class FailedJobs(Callback):
+    """Finds the jobs whose summary.json tells an error, which a launcher may run anywhere.
+
+    Looks for files that are new or were written anew: a sweep may have the folder of an older one.
+    """
+
+    def __init__(self) -> None:
+        self._before: dict[Path, int] = {}
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        self._before = {path: path.stat().st_mtime_ns for path in _summaries(config)}
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        for path in _summaries(config):
+            if path.stat().st_mtime_ns != self._before.get(path) and _tells_an_error(path):
+                note_failed_job(path.parent)
+
+
+def _summaries(config: DictConfig) -> list[Path]:
+    folder = Path(config.hydra.sweep.dir).absolute()
+    return sorted(folder.glob("**/summary.json"))
+
+
+def _tells_an_error(path: Path) -> bool:
+    try:
+        content = read_json(path)
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and "error" in content
