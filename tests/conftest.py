@@ -22,6 +22,8 @@ ALLOWED_SKIPS = (
     r"needs a CUDA device|there is no CUDA device|there is a CUDA device",
     r"triton is not installed",
     r"pyrealsense2",  # the error's own sentence names it
+    r"pyorbbecsdk2",
+    r"rosbags is not installed",
     r"rerun-sdk is not installed|of the extra rerun|this rerun-sdk reads files in another way",
     r"pip install '.\[browser-test\]'|needs chromium and chromedriver",
     r"pip install '.\[(osc|web|export)\]'",

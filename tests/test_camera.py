@@ -54,6 +54,58 @@ def test_distorted_rays_project_back_to_their_pixels() -> None:
     )
 
 
+RATIONAL = (0.5, -0.1, 2e-3, -1e-3, 0.01, 0.85, 0.02, -0.005)
+LENSES = {
+    4: (-0.15, 0.03, 2e-3, -1e-3),
+    5: (-0.15, 0.03, 2e-3, -1e-3, 0.005),
+    8: RATIONAL,
+    12: (*RATIONAL, 0.002, -0.001, 0.003, 0.001),
+    14: (*RATIONAL, 0.002, -0.001, 0.003, 0.001, 0.01, -0.02),
+}
+
+
+def seen(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Where the camera's own lens shows points (n, 3): OpenCV's forward projection, (n, 2)."""
+    zero, points = np.zeros(3), points.reshape(-1, 1, 3)
+    if camera.lens == "fisheye":
+        return cv2.fisheye.projectPoints(points, zero, zero, camera.K, camera.distortion)[0][:, 0]
+    return cv2.projectPoints(points, zero, zero, camera.K, camera.distortion)[0][:, 0]
+
+
+def some_lens(count: int) -> Camera:
+    """A wide lens: the image's corners lie 45 degrees off the axis."""
+    K = np.array([[115.0, 0, 88.5], [0, 118.0, 71], [0, 0, 1]])
+    if count:
+        return Camera(K, W, H, np.array(LENSES[count]))
+    return Camera(K, W, H, np.array((0.05, -0.02, 0.01, -0.004)), lens="fisheye")
+
+
+@pytest.mark.parametrize("count", [0, *LENSES])
+def test_every_lens_of_opencvs_is_undone(count: int) -> None:
+    camera = some_lens(count)
+    rays = camera.normalised_rays().reshape(-1, 2)
+    v, u = np.mgrid[:H, :W]
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    np.testing.assert_allclose(
+        seen(camera, np.column_stack([rays, np.ones(len(rays))])), pixels, atol=0.01
+    )
+    measured = plane_z(camera, camera.normalised_rays()).astype(np.float32)
+    pinhole = Camera(camera.K, W, H)
+    z = camera.rectify(measured, radial=False)
+    inside = z > 0
+    assert inside.mean() > 0.8
+    expected = plane_z(pinhole, pinhole.normalised_rays())
+    np.testing.assert_allclose(z[inside], expected[inside], atol=0.006)
+    far = np.abs(measured - expected)[inside].max()
+    assert far > 0.02, "without undoing the lens the plane would be elsewhere"
+
+
+def test_a_fisheye_of_zeros_is_still_one() -> None:
+    camera = Camera(some_lens(0).K, W, H, np.zeros(4), lens="fisheye")
+    angle = np.hypot(88.5 / 115, 71 / 118)
+    assert np.linalg.norm(camera.normalised_rays()[0, 0]) == pytest.approx(np.tan(angle), rel=1e-6)
+
+
 def test_no_reading_is_zero() -> None:
     camera = Camera(np.eye(3), 6, 1)
     depth = np.array([[0.5, np.nan, np.inf, -np.inf, -1.0, 0.0]], np.float32)
@@ -142,6 +194,15 @@ def test_image_of_another_size_is_told() -> None:
         Camera(K, W, H).rectify(np.ones((W, H), np.float32), False)
 
 
+@pytest.mark.parametrize("count", [0, *LENSES])
+def test_save_and_load_keep_the_lens(tmp_path: Path, count: int) -> None:
+    camera = some_lens(count)
+    camera.save(tmp_path / "camera.json")
+    loaded = Camera.load(tmp_path / "camera.json")
+    np.testing.assert_array_equal(loaded.distortion, camera.distortion)
+    assert loaded.lens == camera.lens
+
+
 def test_save_and_load_are_the_same_camera(tmp_path: Path) -> None:
     camera = Camera(K, W, H, DISTORTION, (0.01, -0.002))
     camera.save(tmp_path / "camera.json")
@@ -162,7 +223,9 @@ def test_save_and_load_are_the_same_camera(tmp_path: Path) -> None:
         ({"width": "wide"}, "whole number"),
         ({"height": 0}, "not positive"),
         ({"K": [[1, 0], [0, 1]]}, "3x3"),
-        ({"distortion": [0, 0]}, "5 numbers"),
+        ({"distortion": [0, 0]}, "4, 5, 8, 12, 14 numbers.*has 2"),
+        ({"distortion": [0] * 5, "lens": "fisheye"}, "4 numbers.*has 5"),
+        ({"lens": "mirror"}, "opencv or fisheye.*mirror"),
         ({"depth_polynomial": ["a"]}, "depth polynomial"),
     ],
 )

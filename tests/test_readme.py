@@ -20,9 +20,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from helpers.bags import recording, write_bag
 from helpers.hands import hand_estimate, lost_hand
 from helpers.programs import QUICK
 from helpers.tracking import ROOT, configuration, run
+from helpers.videos import write_grey
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
@@ -189,9 +191,13 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     whole = read_recording(ROOT / "toftrack" / "data" / "sample.npz")
     part = folder / "FILE.npz"
     np.savez(part, depth_m=whole.depth[:4], K=whole.camera.K, amplitude=whole.amplitude[:4])
-    for name in ("hand.srs", "FOLDER"):
+    for name in ("hand.srs", "FOLDER", "pictures"):
         convert.main([str(part), str(folder / name)])
-    return {name: folder / name for name in ("FILE.npz", "hand.srs", "FOLDER")}
+    (folder / "pictures" / "camera.json").rename(folder / "camera.json")
+    words = np.rint(1000 * whole.depth[:4].astype(np.float32)).astype(np.uint16)
+    np.save(folder / "depth.npy", words)
+    write_grey(folder / "depth.mkv", words)
+    return {path.name: path for path in folder.iterdir()}
 
 
 @pytest.mark.parametrize("name", ["FILE.npz", "hand.srs", "FOLDER"])
@@ -205,10 +211,23 @@ def test_a_recording_of_one_s_own_is_tracked_as_it_is_shown(
         assert (tmp_path / made).stat().st_size > 0
 
 
-def test_a_conversion_works_as_it_is_shown(recordings: dict[str, Path], tmp_path: Path) -> None:
-    (words,) = (words for words in MODULES if words[2] == "toftrack.convert")
-    source, target = words[3:]
-    convert.main([str(recordings[source]), str(tmp_path / target)])
+CONVERSIONS = [words[3:] for words in MODULES if words[2] == "toftrack.convert"]
+
+
+@pytest.mark.parametrize("words", CONVERSIONS, ids=" ".join)
+def test_a_conversion_works_as_it_is_shown(
+    words: tuple[str, ...], recordings: dict[str, Path], tmp_path: Path
+) -> None:
+    source, target, *options = words
+    if source == "BAG":
+        messages = recording(read_recording(recordings["FILE.npz"]).depth, Sample().camera)
+        for message in messages:
+            message.topic = message.topic.replace("image_raw", "image_rect_raw")
+        bag = write_bag(tmp_path, "bag", messages)
+    else:
+        bag = recordings[source]
+    given = [str(recordings.get(word, word)) for word in options]
+    convert.main([str(bag), str(tmp_path / target), *given])
     assert len(read_recording(tmp_path / target)) == 4
 
 

@@ -20,6 +20,11 @@ from toftrack.json_text import read_json
 
 _FORMAT = "toftrack-camera"
 _VERSION = 1
+_COUNTS = (4, 5, 8, 12, 14)
+"""How many coefficients OpenCV's lens model may have."""
+_LENSES = ("opencv", "fisheye")
+# The iteration that undoes a lens: enough for the strong ones, and exact far below a pixel.
+_UNTIL = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 _SHORTEST, _LONGEST = 0.1, 50.0
 """Focal lengths as multiples of the image's longer side: from an extreme wide angle to a small part
 of a narrow view."""
@@ -65,7 +70,7 @@ def _check_plausible(K: np.ndarray, width: int, height: int) -> None:
 # Compared by identity: the fields are arrays, and the tables below are cached per object.
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera with OpenCV's lens distortion and a correction of the measured depth.
+    """A camera with one of OpenCV's two lens models and a correction of the measured depth.
 
     Raises ToftrackError when K is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with finite numbers and
     positive focal lengths, when no camera with images of that size has it, or when a size or
@@ -77,12 +82,16 @@ class Camera:
     width: int
     height: int
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(5))
-    """(5,) float64, OpenCV's k1 k2 p1 p2 k3."""
+    """(4,), (5,), (8,), (12,) or (14,) float64: OpenCV's k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4,
+    tauX tauY; of a `fisheye` (4,), its k1 k2 k3 k4."""
     depth_polynomial: tuple[float, ...] = ()
     """c_0, c_1, ... of the correction: true = measured + sum_i c_i measured^i, radial metres."""
     depth_polynomial_range_m: tuple[float, ...] = ()
     """The nearest and the farthest measured distance that the polynomial was fitted to; beyond them
     the correction stays what it is there, as a polynomial runs wild outside. () = no limits."""
+    lens: str = "opencv"
+    """Which of OpenCV's models: `opencv` (Brown and Conrady's, its rational form, ...) or `fisheye`
+    (Kannala and Brandt's, which ROS calls equidistant)."""
 
     def __post_init__(self) -> None:
         K = _numbers(self.K, (3, 3), "the camera matrix K")
@@ -101,8 +110,7 @@ class Camera:
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
-        distortion = _numbers(self.distortion, (5,), "the lens distortion (k1 k2 p1 p2 k3)")
-        object.__setattr__(self, "distortion", distortion)
+        object.__setattr__(self, "distortion", self._checked_distortion())
         count = np.size(self.depth_polynomial)
         polynomial = _numbers(self.depth_polynomial, (count,), "the depth polynomial")
         object.__setattr__(self, "depth_polynomial", tuple(map(float, polynomial)))
@@ -112,9 +120,21 @@ class Camera:
                 raise ToftrackError("the depth polynomial's range must be nearest, then farthest")
             object.__setattr__(self, "depth_polynomial_range_m", tuple(map(float, limits)))
 
+    def _checked_distortion(self) -> np.ndarray:
+        if self.lens not in _LENSES:
+            raise ToftrackError(f"the lens must be {' or '.join(_LENSES)}, but is {self.lens!r}")
+        counts = _COUNTS if self.lens == "opencv" else (4,)
+        if np.size(self.distortion) not in counts:
+            raise ToftrackError(
+                f"the lens distortion must be {', '.join(map(str, counts))} numbers (OpenCV's k1 "
+                f"k2 p1 p2 k3 ...), but has {np.size(self.distortion)}"
+            )
+        return _numbers(self.distortion, (np.size(self.distortion),), "the lens distortion")
+
     @cached_property
     def _distorted(self) -> bool:
-        return bool(self.distortion.any())
+        # A fisheye without coefficients still maps angles, not tangents, to the image.
+        return self.lens == "fisheye" or bool(self.distortion.any())
 
     @cached_property
     def _rays(self) -> np.ndarray:
@@ -124,10 +144,17 @@ class Camera:
             rays = (np.stack([u, v], axis=-1) - centre) / focal
         else:
             pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-            rays = cv2.undistortPoints(pixels, self.K, self.distortion)
-            rays = rays.reshape(self.height, self.width, 2)
+            rays = self._undistorted_points(pixels).reshape(self.height, self.width, 2)
         rays.setflags(write=False)
         return rays
+
+    def _undistorted_points(self, pixels: np.ndarray) -> np.ndarray:
+        """(n, 1, 2) measured pixels to x and y at Z = 1."""
+        if self.lens == "fisheye":
+            return cv2.fisheye.undistortPoints(pixels, self.K, self.distortion, criteria=_UNTIL)
+        # OpenCV 5 has taken the function of 4 that can be told when to stop into the other one.
+        undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+        return undistort(pixels, self.K, self.distortion, R=None, P=None, criteria=_UNTIL)
 
     @cached_property
     def _ray_lengths(self) -> np.ndarray:
@@ -137,9 +164,9 @@ class Camera:
     @cached_property
     def _undistortion_maps(self) -> tuple[np.ndarray, np.ndarray]:
         size = (self.width, self.height)
-        return cv2.initUndistortRectifyMap(
-            self.K, self.distortion, None, self.K, size, cv2.CV_32FC1
-        )
+        fisheye = self.lens == "fisheye"
+        make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+        return make(self.K, self.distortion, np.eye(3), self.K, size, cv2.CV_32FC1)
 
     def normalised_rays(self) -> np.ndarray:
         """(H, W, 2) float64: x and y at Z = 1 of each pixel's ray, after undistortion; cached."""
@@ -218,6 +245,8 @@ class Camera:
         }
         if self.depth_polynomial_range_m:
             content["depth_polynomial_range_m"] = list(self.depth_polynomial_range_m)
+        if self.lens != "opencv":
+            content["lens"] = self.lens
         return content
 
     @classmethod
@@ -271,6 +300,7 @@ class Camera:
                 distortion=content.get("distortion", np.zeros(5)),
                 depth_polynomial=content.get("depth_polynomial", ()),
                 depth_polynomial_range_m=content.get("depth_polynomial_range_m", ()),
+                lens=content.get("lens", "opencv"),
             )
         except KeyError as error:
             raise ToftrackError(

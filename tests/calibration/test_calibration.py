@@ -157,6 +157,22 @@ def test_exact_corners_give_the_exact_lens_and_planes() -> None:
         assert np.abs(distance - radial)[on_board].max() < 0.002
 
 
+def test_a_lens_of_another_model_is_a_start_and_a_rational_one_can_be_kept() -> None:
+    rational = (0.5, -0.02, 1e-4, -1e-4, -0.003, 0.9, 0.08, -0.01)
+    starts = {"opencv": rational, "fisheye": (0.1, 0.0, 0.0, 0.0)}
+    views = exact_views(TRUE)
+    for model, coefficients in starts.items():
+        start = Camera(nominal_camera().K, 176, 144, np.array(coefficients), lens=model)
+        lens = calibration.fit_lens(views, BOARD, SQUARE_M, start)
+        np.testing.assert_allclose(lens.camera.K, TRUE.K, atol=0.01)
+    wide = Camera(TRUE.K, 176, 144, np.array(rational))
+    known = calibration.known_lens(exact_views(wide), BOARD, SQUARE_M, wide)
+    assert known.errors_px.max() < 1e-2
+    np.testing.assert_array_equal(known.camera.distortion, rational)
+    with pytest.raises(ToftrackError, match="fisheye lens cannot be kept.*--keep-lens"):
+        calibration.known_lens(views, BOARD, SQUARE_M, start)
+
+
 def test_a_view_that_does_not_fit_is_left_out() -> None:
     views = exact_views(TRUE)
     views[3] = View(3, views[3].corners_px + np.random.default_rng(0).normal(size=(35, 2)) * 4)

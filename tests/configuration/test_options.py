@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from helpers import fake_realsense
+from helpers import fake_orbbec, fake_realsense
+from helpers.bags import recording, write_bag
 from helpers.tracking import CONF, ROOT, configuration
 from omegaconf import DictConfig, OmegaConf
 
 from toftrack.api import build_tracker
+from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
@@ -86,7 +88,13 @@ def test_every_option_composes_and_can_be_made(
     # A camera like none, so that realsense.yaml needs neither its SDK nor a camera here.
     camera = fake_realsense.Camera("1", [fake_realsense.Profile("depth", "z16", (640, 480))], [])
     monkeypatch.setitem(sys.modules, "pyrealsense2", fake_realsense.Sdk(camera))
+    femto = fake_orbbec.Camera("1", {fake_orbbec.DEPTH: [fake_orbbec.Profile("y16")]})
+    monkeypatch.setitem(sys.modules, "pyorbbecsdk", fake_orbbec.Sdk(femto))
     given = given_for(tmp_path).get((group, option), []) + FASTER.get(option, [])
+    if option == "rosbag":
+        frames = [np.ones((6, 8), np.float32)]
+        bag = write_bag(tmp_path, "bag", recording(frames, Camera(np.diag((9.0, 9, 1)), 8, 6)))
+        given = [f"device.path={bag}"]
     config = composed(group, option, *given)
     part = config if group == "experiment" else config[group]
     missing = OmegaConf.missing_keys(part)

@@ -10,7 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.bags import DEPTH, recording, write_bag
 from helpers.tracking import ROOT
+from helpers.videos import write_grey
 
 from toftrack.camera import Camera
 from toftrack.devices.folder import Folder
@@ -18,10 +20,12 @@ from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.programs import command_line, convert, record
+from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import PngFolderWriter, read_png_folder
 from toftrack.recordings.srs import read_srs
 
+TOLD = BareFacts((30.0, 30.0, 16.0, 12.0))
 EMULATED = ("device.transport=emulated", "device.emulated.fps=500")
 
 
@@ -101,9 +105,56 @@ def test_convert_errors(srs: Path, tmp_path: Path) -> None:
         ((srs, tmp_path / "a.npz", tmp_path / "camera.json"), "8x6"),
         ((srs, tmp_path / "a.npz", None, 25), "25 MHz"),
         ((srs, tmp_path / "a", None, 20, 2.0), "--unit"),
+        (
+            (srs, tmp_path / "b", tmp_path / "camera.json", 20, None, False, None, TOLD),
+            "--camera and --intrinsics both",
+        ),
     ):
         with pytest.raises(ToftrackError, match=words):
             convert.convert(*arguments)
+
+
+@pytest.mark.parametrize("name", ["a.mkv", "a.npy", "pictures"])
+def test_bare_images_are_converted_when_their_lens_is_told(tmp_path: Path, name: str) -> None:
+    words = np.random.default_rng(0).integers(1, 5000, (3, 24, 32)).astype(np.uint16)
+    path = tmp_path / name
+    if name.endswith(".mkv"):
+        write_grey(path, words)
+    elif name.endswith(".npy"):
+        np.save(path, words)
+    else:
+        path.mkdir()
+        for number, image in enumerate(words):
+            cv2.imwrite(str(path / f"{number}.png"), image)
+    lens = ["--intrinsics", "30", "31", "15.5", "11.5"]
+    rest = ["--source-unit", "0.0005", "--fps", "12.5"]
+    convert.main([str(path), str(tmp_path / "out.npz"), *lens, *rest])
+    made = read_recording(tmp_path / "out.npz")
+    np.testing.assert_allclose(made.depth, words * 0.0005, rtol=1e-6)
+    np.testing.assert_array_equal(made.camera.K, [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]])
+    assert made.fps == pytest.approx(12.5)
+    with pytest.raises(ToftrackError, match="--intrinsics"):
+        convert.main([str(path), str(tmp_path / "other.npz")])
+
+
+def test_a_topic_of_a_bag_is_converted_with_its_lens(tmp_path: Path) -> None:
+    camera = Camera(np.diag((30.0, 31, 1)), 32, 24, np.array([0.1, 0, 0, 0, 0, 0.2, 0, 0]))
+    depth = np.full((3, 24, 32), 0.7, np.float32)
+    bag = write_bag(tmp_path, "mcap", recording(depth, camera))
+    convert.main([str(bag), str(tmp_path / "out.npz"), "--topic", DEPTH])
+    made = read_recording(tmp_path / "out.npz")
+    np.testing.assert_allclose(made.depth, depth)
+    np.testing.assert_array_equal(made.camera.distortion, camera.distortion)
+
+
+def test_a_fisheye_lens_is_not_lost_in_npz(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    camera = Camera(np.diag((30.0, 31, 1)), 32, 24, np.full(4, 0.1), lens="fisheye")
+    camera.save(tmp_path / "camera.json")
+    np.save(tmp_path / "a.npy", np.ones((2, 24, 32)))
+    convert.convert(tmp_path / "a.npy", tmp_path / "out.npz", tmp_path / "camera.json")
+    assert Camera.load(tmp_path / "out.camera.json").lens == "fisheye"
+    assert not read_recording(tmp_path / "out.npz").camera.distortion.any()
+    assert "a fisheye lens has no place in .npz" in capsys.readouterr().err
 
 
 def test_recordings_of_another_size_do_not_fit_the_camera(tmp_path: Path) -> None:

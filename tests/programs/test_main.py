@@ -81,6 +81,17 @@ def test_any_name_arrives_as_it_is(name: str, tmp_path, monkeypatch) -> None:
     ]
 
 
+@pytest.mark.parametrize("name", ["a.bag", "a.MCAP", "a.db3", "ros2", "cut", "~x.bag"])
+def test_a_ros_bag_is_known_by_its_name_or_its_folder(name: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder, file in (("ros2", "metadata.yaml"), ("cut", "cut_0.mcap"), ("other", "1.png")):
+        Path(folder).mkdir()
+        (Path(folder) / file).touch()
+    Path("~x.bag").touch()
+    assert with_recording([name, "device.topic=/a"], *KNOWN)[0] == "device=rosbag"
+    assert with_recording(["other"], *KNOWN)[0] == "device=replay"
+
+
 @pytest.mark.parametrize(
     "words",
     [

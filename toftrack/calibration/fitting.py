@@ -127,6 +127,8 @@ def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, gue
             f"least {_FEWEST_VIEWS} are needed; check --board (inner corners, columns x rows) and "
             "show the whole board, near and far, turned in all directions"
         )
+    # Coefficients of another model (rational, fisheye) mean something else, and are no start.
+    known = guess.distortion if guess.distortion.size == 5 else np.zeros(5)
     # More terms than two radial ones are not to be had from so few pixels; they only fit noise.
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     while True:
@@ -136,7 +138,7 @@ def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, gue
                 [view.corners_px.astype(np.float32) for view in views],
                 (guess.width, guess.height),
                 guess.K.copy(),
-                guess.distortion.copy(),
+                known.copy(),
                 flags=flags,
             )
         except cv2.error as error:
@@ -164,6 +166,10 @@ def known_lens(
         raise ToftrackError(
             f"the {board[0]}x{board[1]} chequerboard was found in {len(views)} frames, but at "
             f"least {_FEWEST_VIEWS} are needed; check --board (inner corners, columns x rows)"
+        )
+    if camera.lens == "fisheye":
+        raise ToftrackError(
+            "a fisheye lens cannot be kept; leave out --keep-lens, which fits another model to it"
         )
     points, rvecs, tvecs, errors = board_points(board, square_m), [], [], []
     for view in views:

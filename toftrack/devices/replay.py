@@ -31,11 +31,11 @@ class Replay(BaseDevice):
     indices and timestamps go on counting from one round to the next, as a camera's would; there is
     no last frame then, so `frames` is None, and so is `truth`, which has a row for each of them.
 
-    A `.npz` is loaded; a `.srs` and a folder of images are read frame by frame, so that long ones
-    need no more memory than short ones.
+    A `.npz` is loaded; everything else is read frame by frame, so that long ones need no more
+    memory than short ones.
 
     Args:
-        path: the recording: `.npz`, `.srs`, or a folder of 16-bit PNG images with a camera file.
+        path: the recording, of any kind that `open_recording` knows.
         start: first frame.
         stop: the frame after the last; None for all.
         realtime: at the recording's own pace: wait for each frame's time, and drop a frame when the

@@ -23,6 +23,7 @@ from toftrack.output.results import read_results, read_run_facts
 from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
+from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording, open_source
@@ -293,7 +294,8 @@ def open_tracked(
     camera_file = about.get("camera_file")
     modulation_mhz = device.get("modulation_mhz", DEFAULT_MODULATION_MHZ)
     camera_path = None if camera_file is None else found(camera_file)
-    return open_recording(path, camera_path, modulation_mhz), path
+    bare = BareFacts(unit_m=device.get("unit_m"), fps=device.get("fps"))
+    return open_recording(path, camera_path, modulation_mhz, device.get("topic"), bare), path
 
 
 def _rows(

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from toftrack.recordings.store import FrameStore, open_recording
 from toftrack.views.figures.calibration import corner_sheet, error_plot
 
 _PICTURES = 12
+_LENS = "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tauX tauY".split()
 _HOPE_S = 4.0
 """After so long without a board something is wrong."""
 
@@ -174,10 +176,10 @@ def report_text(result: Calibration, start: Camera) -> str:
     ]
     for name in ("fx", "fy", "cx", "cy"):
         lines.append(f"{name:<18}{before[name]:>10.2f} {after[name]:>10.2f} px")
-    for number, name in enumerate(("k1", "k2", "p1", "p2", "k3")):
-        lines.append(
-            f"{name:<18}{before['distortion'][number]:>10.4f} {after['distortion'][number]:>10.4f}"
-        )
+    # Lenses before and after may have numbers of coefficients of their own; the rest are zeros.
+    for name, old, new in zip_longest(_LENS, before["distortion"], after["distortion"]):
+        if old is not None or new is not None:
+            lines.append(f"{name:<18}{old or 0:>10.4f} {new or 0:>10.4f}")
     for key, name in (("board_rms_mm", "depth, boards"), ("pixel_rms_mm", "depth, pixels")):
         lines.append(f"{name:<18}{before[key]:>10.2f} {after[key]:>10.2f} mm rms")
     errors = ", ".join(f"{o}: {mm:.2f}" for o, mm in facts["validation_mm"].items())

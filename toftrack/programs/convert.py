@@ -1,7 +1,10 @@
 """Convert a recording: `toftrack convert IN OUT`.
 
 IN and OUT are each a `.srs` (the SR3000's stream), a `.npz` (toftrack's recording) or a folder of
-16-bit PNG images with a camera file; the kind follows from the name.
+16-bit PNG images with a camera file; the kind follows from the name. IN may also be a ROS bag
+(`.bag`, `.mcap`, `.db3`, a folder), an Azure Kinect's `.mkv`, a lossless grey video of 16 bits
+(FFV1), or a `.npy` stack (frames, rows, columns). Bare images do not say their lens: give
+`--intrinsics FX FY CX CY` (pixels) or `--camera FILE`.
 """
 
 from __future__ import annotations
@@ -17,9 +20,12 @@ from tqdm import tqdm
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.recordings.bare import NOTHING_TOLD, BareFacts
+from toftrack.recordings.npy import NpyStack
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.npz_stream import write_npz_streamed
 from toftrack.recordings.png_folder import PngFolder, PngFolderWriter
+from toftrack.recordings.rosbag import RosBag
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     REGISTERS,
@@ -30,6 +36,7 @@ from toftrack.recordings.sr_frame import (
 from toftrack.recordings.srs import SrsRecording, SrsWriter
 from toftrack.recordings.srs_facts import SrsFacts
 from toftrack.recordings.store import FrameStore, open_recording
+from toftrack.recordings.video import DepthVideo
 
 _MILLIMETRE = 0.001
 
@@ -48,7 +55,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--unit", type=float, help="metres of one step of the PNG images")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    parser.add_argument("--topic", help="of the depth images in a ROS bag that has several")
+    parser.add_argument(
+        "--intrinsics",
+        type=float,
+        nargs=4,
+        metavar=("FX", "FY", "CX", "CY"),
+        help="pixels: the lens of bare images (a video, .npy, PNG without camera.json)",
+    )
+    parser.add_argument(
+        "--source-unit", type=float, help="metres of one step of IN's whole numbers (0.001)"
+    )
+    parser.add_argument("--fps", type=float, help="frames a second of bare images (25)")
     options = parser.parse_args(arguments)
+    told = options.intrinsics
     count = convert(
         options.source,
         options.target,
@@ -56,6 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.modulation,
         options.unit,
         options.overwrite,
+        options.topic,
+        BareFacts(None if told is None else tuple(told), options.source_unit, options.fps),
     )
     print(f"{options.target}: {count} frames")
 
@@ -67,6 +89,8 @@ def convert(
     modulation_mhz: int = DEFAULT_MODULATION_MHZ,
     unit_m: float | None = None,
     overwrite: bool = False,
+    topic: str | None = None,
+    bare: BareFacts = NOTHING_TOLD,
 ) -> int:
     """Convert a recording, frame by frame; returns the number of frames.
 
@@ -91,7 +115,9 @@ def convert(
         )
     if target.exists() and Path(source).expanduser().resolve() == target.resolve():
         raise ToftrackError(f"'{target}' cannot be converted into itself; choose another name")
-    store = open_recording(source, camera_file, modulation_mhz)
+    if camera_file is not None and bare.intrinsics is not None:
+        raise ToftrackError("--camera and --intrinsics both tell the lens; leave one out")
+    store = open_recording(source, camera_file, modulation_mhz, topic, bare)
     try:
         if camera_file is not None:
             store = _with_camera(store, Camera.load(camera_file), camera_file)
@@ -113,10 +139,15 @@ def convert(
 
 def _to_npz(store: FrameStore, target: Path, bar: tqdm) -> None:
     camera = store.camera
-    if camera.depth_polynomial:
+    fisheye = camera.lens == "fisheye"
+    if camera.depth_polynomial or fisheye:
         beside = target.with_name(target.stem + ".camera.json")
         camera.save(beside)
-        _warn(f"the depth polynomial has no place in .npz; use camera.file={beside}")
+        what = "a fisheye lens" if fisheye else "the depth polynomial"
+        _warn(f"{what} has no place in .npz; use camera.file={beside}")
+    if fisheye:  # its coefficients would be taken for those of another model
+        plain = Camera(camera.K, camera.width, camera.height)
+        store = _with_camera(store, plain, beside)
     if isinstance(store, Recording):
         write_recording(target, store)
     else:
@@ -161,7 +192,7 @@ def _with_camera(store: FrameStore, camera: Camera, path: str | Path) -> FrameSt
         )
     if isinstance(store, Recording):
         return replace(store, camera=camera)
-    assert isinstance(store, PngFolder | SrsRecording)
+    assert isinstance(store, PngFolder | SrsRecording | RosBag | DepthVideo | NpyStack)
     store.camera = camera
     return store
 

@@ -49,9 +49,10 @@ _TRACK = """toftrack track follows a hand and writes joints, state and gesture o
   toftrack track FILE hand.side=left          a recording of your own, of a left hand
   toftrack track device=realsense view=browser    a camera, live in the browser
 
-FILE is .npz, .srs or a folder of 16-bit PNG images. The results go into outputs/DATE/TIME/, or
-where hydra.run.dir=DIR says; Ctrl-C ends a run and keeps what was done. Everything else are
-settings: KEY=VALUE, or GROUP=CHOICE of
+FILE is .npz, .srs, a folder of 16-bit PNG images, a ROS bag, an Azure Kinect's .mkv, or what
+docs/cameras.md names. The results go into outputs/DATE/TIME/, or where hydra.run.dir=DIR says;
+Ctrl-C ends a run and keeps what was done. Everything else are settings: KEY=VALUE, or
+GROUP=CHOICE of
 
 {groups}
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Sequence
 
 from toftrack.errors import ToftrackError
+from toftrack.recordings.bag_names import is_bag
 
 _WITH_VALUE = frozenset(
     "--config-path -cp --config-name -cn --config-dir -cd --cfg -c --package -p "
@@ -23,7 +24,8 @@ def with_recording(
 
     known: the first parts of keys, groups and settings: what begins with one and has a = is one,
     whatever files there are.
-    players: the devices that play a file; replay is taken where none is chosen.
+    players: the devices that play a file; where none is chosen, rosbag is taken for a ROS bag, and
+    replay for everything else.
 
     Raises ToftrackError for two recordings, or one beside a device that plays none.
     """
@@ -55,7 +57,8 @@ def with_recording(
         )
     # What the shell has left of a ~ is the file's own, where there is one.
     name = f"./{files[0]}" if files[0][0] == "~" and os.path.exists(files[0]) else files[0]
-    chosen = [] if device is not None else ["device=replay"]
+    usual = "device=rosbag" if is_bag(os.path.expanduser(name)) else "device=replay"
+    chosen = [] if device is not None else [usual]
     return [*chosen, f"device.path={quoted(name)}", *others]
 
 

@@ -52,6 +52,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
             "width": camera.width,
             "height": camera.height,
             "distortion": camera.distortion.tolist(),
+            "lens": camera.lens,
             "depth_polynomial": list(camera.depth_polynomial),
         },
         "config": OmegaConf.to_container(config, resolve=True),

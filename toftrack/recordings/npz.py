@@ -7,7 +7,7 @@
 | `amplitude` | (T, H, W) uint16 | no |
 | `fps` | scalar | no: from the time stamps, else 25 |
 | `timestamp_s` | (T,) float64 | no: from `fps` |
-| `distortion` | (5,) float, OpenCV's k1 k2 p1 p2 k3 | no: zeros |
+| `distortion` | (4, 5, 8, 12 or 14,) float, OpenCV's k1 k2 p1 p2 k3 ... | no: zeros |
 | `joints_m` | (T, 21, 3) float | no |
 | `visible`, `in_space` | (T,) bool | no: true |
 | `visible_fraction`, `joint_visible` | (T,) float, (T, 21) bool | no |

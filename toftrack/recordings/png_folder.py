@@ -26,6 +26,7 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
+from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
@@ -95,6 +96,7 @@ def read_png_folder(
     camera_file: str | Path | None = None,
     unit_m: float | None = None,
     fps: float | None = None,
+    intrinsics: tuple[float, float, float, float] | None = None,
 ) -> PngFolder:
     """Open a folder of depth images: names, sizes and kinds are checked, pixels stay on the disk.
 
@@ -103,6 +105,7 @@ def read_png_folder(
         camera_file: a camera file instead of the folder's `camera.json`.
         unit_m: metres of one step of the images; None = as `camera.json` says, else 0.001.
         fps: frames a second; None = as `camera.json` says, else 25.
+        intrinsics: fx, fy, cx, cy in pixels instead of the camera of `camera.json`.
 
     Raises:
         ToftrackError: there is no folder, image or camera, images differ in size, or one is not a
@@ -128,12 +131,14 @@ def read_png_folder(
     facts = _facts(folder / _CAMERA, content, unit_m, fps)
     if camera_file is not None:
         camera = Camera.load(camera_file)
+    elif told := BareFacts(intrinsics).camera(*_png_size(depth[0])):
+        camera = told
     elif content is not None:
         camera = Camera.from_dict(content, folder / _CAMERA)
     else:
         raise ToftrackError(
             f"the folder '{folder}' has no {_CAMERA}; put the camera's file there, or give another "
-            "with camera.file=FILE"
+            "with camera.file=FILE (toftrack convert: --camera FILE, or --intrinsics FX FY CX CY)"
         )
     for path in (*depth, *amplitude):
         size = _png_size(path)

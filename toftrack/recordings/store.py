@@ -1,4 +1,4 @@
-"""A recording of any kind behind one face: `.npz`, `.srs`, or a folder of PNG images."""
+"""A recording of any kind behind one face: `.npz`, `.srs`, a folder of images, a ROS bag, ..."""
 
 from __future__ import annotations
 
@@ -10,11 +10,37 @@ from typing import Any, Protocol
 import numpy as np
 
 from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
+from toftrack.recordings.bag_names import is_bag
+from toftrack.recordings.bare import NOTHING_TOLD, BareFacts
+from toftrack.recordings.npy import read_npy
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import read_png_folder
+from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.srs import read_srs
+from toftrack.recordings.video import VIDEOS, read_video
+
+_BY_OPENNI = (
+    "write its depth out as 16-bit PNG images by OpenNI, put a camera.json beside them "
+    "(docs/formats.md) and give the folder"
+)
+_BY_POINTS = "points have lost the image that they came from; give the depth images themselves"
+ELSEWHERE = {
+    ".oni": _BY_OPENNI,
+    ".xef": "export its depth frames as 16-bit PNG images or .npy, and convert those",
+    ".rrf": "export its depth frames as 16-bit PNG images or .npy, and convert those",
+    ".ply": _BY_POINTS,
+    ".pcd": _BY_POINTS,
+    ".png": "a recording is the folder that the images lie in; give that",
+    ".tif": "save the depth images as 16-bit PNG, numbered, and give their folder",
+    ".tiff": "save the depth images as 16-bit PNG, numbered, and give their folder",
+    ".h5": "save its depth as .npy (frames, rows, columns), and convert that",
+    ".hdf5": "save its depth as .npy (frames, rows, columns), and convert that",
+    ".raw": "say what it is: read it with numpy, save .npy (frames, rows, columns), convert that",
+}
+"""What to do with files of other kinds."""
 
 
 class FrameStore(Protocol):
@@ -55,24 +81,40 @@ def open_recording(
     path: str | Path,
     camera_file: str | Path | None = None,
     modulation_mhz: int = DEFAULT_MODULATION_MHZ,
+    topic: str | None = None,
+    bare: BareFacts = NOTHING_TOLD,
 ) -> FrameStore:
-    """Open a recording, whose kind follows from its name: a folder, `.srs`, else `.npz`.
+    """Open a recording, whose kind follows from its name.
 
     Only `.npz` is loaded as a whole; the others stay on the disk.
 
     Args:
-        path: the recording.
-        camera_file: serves a folder that has no camera file of its own.
+        path: `.npz`, `.srs`, a folder of PNG images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder
+            with metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`.
+        camera_file: serves what has no camera of its own.
         modulation_mhz: tells the range of a `.srs` that does not state it.
+        topic: of a ROS bag that has several of depth images.
+        bare: what is known of images that say nothing of themselves.
 
     Raises:
         ToftrackError: it cannot be used; one sentence that names it.
     """
     path = Path(path).expanduser()
+    suffix = path.suffix.lower()
+    if is_bag(path):
+        return read_rosbag(path, topic, camera_file, bare.unit_m)
+    if topic is not None:
+        raise ToftrackError(f"'{path}' is no ROS bag, and has no topic {topic}; leave it out")
     if path.is_dir():
-        return read_png_folder(path, camera_file)
-    if path.suffix.lower() == ".srs":
+        return read_png_folder(path, camera_file, bare.unit_m, bare.fps, bare.intrinsics)
+    if suffix == ".srs":
         return read_srs(path, modulation_mhz)
+    if suffix == ".npy":
+        return read_npy(path, camera_file, bare)
+    if suffix in VIDEOS:
+        return read_video(path, camera_file, bare)
+    if suffix in ELSEWHERE:
+        raise ToftrackError(f"'{path}' is not read: {ELSEWHERE[suffix]}")
     return read_recording(path)
 
 

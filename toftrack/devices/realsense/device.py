@@ -13,6 +13,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
+from toftrack.devices.live import FrameNumbers, check_live, recording_index_error, told
 from toftrack.devices.realsense import sdk
 from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
 from toftrack.errors import ToftrackError
@@ -20,7 +21,6 @@ from toftrack.frames import Frame
 
 _log = logging.getLogger(__name__)
 _SUFFIXES = (".bag", ".db3")
-_LONGEST_GAP_S = 60  # results have a row for each index, so that a wild number must not become one
 _SLICE_MS = 100  # of waiting, between looks at what else may have happened
 _BUSY = (
     "close other programs that use it, plug it in again, into a USB 3 port, and on Linux install "
@@ -81,7 +81,7 @@ class RealSense(BaseDevice):
         self._emulator: EmulatedCamera | None = None
         size = None
         if path is not None:
-            with sdk.told(f"'{bag}' is not a recording of a RealSense", "choose another file"):
+            with told(f"'{bag}' is not a recording of a RealSense", "choose another file"):
                 device, owner = rs.context().load_device(str(path)), f"'{bag}'"
         elif transport == "emulated":
             self._emulator = EmulatedCamera(rs, emulated)
@@ -89,7 +89,7 @@ class RealSense(BaseDevice):
         else:
             device = sdk.find_camera(rs, None if serial is None else str(serial))
             size, owner = (width, height, fps), "the camera"
-        with sdk.told(f"{owner} cannot be used", _BUSY if path is None else "choose another file"):
+        with told(f"{owner} cannot be used", _BUSY if path is None else "choose another file"):
             self._streams = sdk.choose_streams(rs, device, size, infrared, owner)
             if preset is not None:
                 sdk.set_preset(rs, self._streams.sensor, preset)
@@ -167,7 +167,7 @@ class RealSense(BaseDevice):
     def _open_camera(self, pipeline: Any, config: Any) -> None:
         # The frames are kept, so that waiting ones do not use up the few that the SDK has.
         queue = self._rs.frame_queue(self._capacity, True)
-        with sdk.told("the RealSense camera was found, but cannot be started", _BUSY):
+        with told("the RealSense camera was found, but cannot be started", _BUSY):
             pipeline.start(config, queue)
         emulator = self._emulator
         if emulator is not None:
@@ -178,7 +178,7 @@ class RealSense(BaseDevice):
 
     def _open_recording(self, pipeline: Any, config: Any) -> None:
         rs = self._rs
-        with sdk.told(f"'{self._path}' cannot be replayed", "choose another file"):
+        with told(f"'{self._path}' cannot be replayed", "choose another file"):
             playback = config.resolve(rs.pipeline_wrapper(pipeline)).get_device().as_playback()
             # Not at its own pace, the SDK waits for each frame to be taken.
             playback.set_real_time(self._realtime)
@@ -196,22 +196,19 @@ class RealSense(BaseDevice):
     def __iter__(self) -> Iterator[Frame]:
         self.open()
         self.dropped = 0
-        delivered, offset, index = 0, None, -1
+        numbers = FrameNumbers(self.fps, None if self._emulator is None else FIRST_NUMBER)
+        delivered, begun = 0, False
         try:
-            while self._stop is None or index + 1 < self._stop:
-                came = self._wait(begun=offset is not None)
+            while self._stop is None or numbers.index + 1 < self._stop:
+                came = self._wait(begun)
                 if came is None:
                     break
                 depth = came.get_depth_frame()
                 if not depth:
                     continue
-                number = depth.get_frame_number()
-                if offset is None:
-                    offset = number if self._emulator is None else FIRST_NUMBER
-                elif not 0 < number - offset - index <= _LONGEST_GAP_S * self.fps:
-                    offset = number - index - 1  # the camera counts anew
-                self.dropped += number - offset - index - 1
-                index = number - offset
+                begun = True
+                index = numbers.take(depth.get_frame_number())
+                self.dropped = numbers.dropped
                 if index < self._start:
                     continue
                 if self._stop is not None and index >= self._stop:
@@ -221,13 +218,8 @@ class RealSense(BaseDevice):
         finally:
             self.close()
             _log.info("realsense: frames: %d delivered, %d dropped", delivered, self.dropped)
-        if index < 0 and self._path is not None:
-            raise ToftrackError(f"'{self._path}' has no frame with depth; record it again")
         if not delivered and self._path is not None:
-            raise ToftrackError(
-                f"'{self._path}' has no frame from start={self._start} on, but {index + 1} before; "
-                "choose a smaller device.start"
-            )
+            raise recording_index_error(self._path, numbers.index, self._start)
 
     def _wait(self, begun: bool) -> Any | None:
         """The next set of frames, None at the end; ToftrackError when none comes."""
@@ -301,19 +293,7 @@ def _check(
             "device.bag is a recording of its own; leave out device.transport=emulated (whose "
             "recording is device.emulated.source)"
         )
-    numbers = isinstance(queue_frames, int) and isinstance(timeout_s, int | float)
-    sensible = numbers and queue_frames >= 2 and timeout_s > 0
-    if keep not in ("newest", "every") or not sensible:
-        raise ToftrackError(
-            "device=realsense needs keep=newest or every, queue_frames of at least 2 and timeout_s "
-            f"above 0, but they are {keep}, {queue_frames!r} and {timeout_s!r}"
-        )
-    whole = all(isinstance(number, int) for number in (start, stop) if number is not None)
-    if not whole or start < 0 or (stop is not None and stop <= start):
-        raise ToftrackError(
-            "device=realsense needs whole numbers 0 <= start < stop, but they are "
-            f"{start!r} and {stop!r}"
-        )
+    check_live("realsense", keep, queue_frames, start, stop, timeout_s)
 
 
 def _recording(path: str | Path) -> Path:

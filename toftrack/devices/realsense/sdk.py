@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import importlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
+from toftrack.devices.live import told
 from toftrack.errors import ToftrackError
 
 _WORST_FIT_PX = 0.5
@@ -50,16 +50,6 @@ def _preload_libusb() -> None:
     # The wheels of pyrealsense2 leave libusb to the system; a loaded one of that name serves, too.
     path = importlib.import_module("libusb_package").get_library_path()
     ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-
-
-@contextlib.contextmanager
-def told(what: str, remedy: str) -> Iterator[None]:
-    """Errors of the SDK become one sentence: what, the SDK's words, and what to do."""
-    try:
-        yield
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())
-        raise ToftrackError(f"{what} ({reason}); {remedy}") from error
 
 
 def find_camera(rs: ModuleType, serial: str | None) -> Any:

@@ -1,0 +1,217 @@
+"""Orbbec cameras through a stand-in for the SDK: what a camera does, and what goes wrong."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.fake_orbbec import DEPTH, IR, LEFT_IR, Image, Images, Profile, Sdk
+from helpers.fake_orbbec import Camera as FakeCamera
+from helpers.settings import orbbec
+from helpers.tracking import ROOT
+
+from toftrack.devices.base import Device
+from toftrack.errors import ToftrackError
+
+LENS = (0.1, -0.2, 0.05, 0.3, -0.04, 0.01, 0.001, -0.002)
+"""k1 to k6, p1, p2."""
+
+
+def a_camera(
+    serial: str = "0042", numbers: tuple[int, ...] = (), infrared: str | None = IR
+) -> FakeCamera:
+    profiles = {DEPTH: [Profile("y16"), Profile("y16", fps=15), Profile("y16", (16, 12))]}
+    profiles[DEPTH].append(Profile("rle", (99, 99)))
+    if infrared is not None:
+        profiles[infrared] = [Profile("y8", (16, 12)), Profile("y8")]
+    dtype = np.uint8
+    sets = [Images(Image(n, "depth"), infrared and Image(n, "ir", dtype)) for n in numbers]
+    return FakeCamera(serial, profiles, sets)
+
+
+@pytest.fixture
+def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sdk]:
+    def installed(*cameras: FakeCamera, **changes: Any) -> Sdk:
+        sdk = Sdk(*cameras, **changes)
+        monkeypatch.setitem(sys.modules, "pyorbbecsdk", sdk)
+        return sdk
+
+    return installed
+
+
+def test_frames_are_metres_infrared_and_seconds(plug: Callable[..., Sdk]) -> None:
+    camera = a_camera(numbers=(70, 71, 72))
+    plug(camera)
+    device = orbbec(keep="every", stop=3)
+    assert isinstance(device, Device)
+    frames = list(device)
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert frames[1].timestamp_s == pytest.approx(5.071)
+    assert frames[1].depth.dtype == np.float32
+    np.testing.assert_allclose(frames[1].depth, np.full((6, 8), 71 * 0.25e-3))
+    np.testing.assert_array_equal(frames[1].amplitude, np.full((6, 8), 71))
+    assert frames[1].amplitude.dtype == np.uint16 and not frames[1].radial
+    np.testing.assert_array_equal(device.camera.K, [[9, 0, 4], [0, 8, 3], [0, 0, 1]])
+    assert device.description["serial"] == "0042" and device.fps == 30
+    assert not camera.started, "the camera is stopped"
+
+
+@pytest.mark.parametrize("infrared", [LEFT_IR, None])
+def test_infrared_is_the_left_cameras_or_none(
+    plug: Callable[..., Sdk], infrared: str | None
+) -> None:
+    plug(a_camera(numbers=(1,), infrared=infrared))
+    frame = next(iter(orbbec(keep="every", stop=1)))
+    assert (frame.amplitude is None) == (infrared is None)
+    assert next(iter(orbbec(keep="every", stop=1, infrared=False))).amplitude is None
+
+
+def test_dropped_frames_leave_a_gap_and_a_camera_may_count_anew(plug: Callable[..., Sdk]) -> None:
+    camera = a_camera(numbers=(70, 71, 74, 3, 4, 9_000_000))
+    camera.sets.insert(2, Images(None))  # the infrared image came alone
+    plug(camera)
+    device = orbbec(keep="every", stop=8)
+    assert [frame.index for frame in device] == [0, 1, 4, 5, 6, 7]
+    assert device.dropped == 2
+    assert [frame.index for frame in orbbec(keep="every", start=4, stop=6)] == [4, 5]
+
+
+def test_the_newest_frame_wins(plug: Callable[..., Sdk]) -> None:
+    camera = a_camera(numbers=tuple(range(100)))
+    plug(camera)
+    device = orbbec(stop=100)
+    indices = []
+    for frame in device:
+        indices.append(frame.depth[0, 0] / np.float32(0.25e-3))
+        assert camera.begun.wait(10)  # all were sent while this one was being tracked
+    assert len(indices) <= 2 and round(float(indices[-1])) == 99
+
+
+def test_an_unplugged_camera_is_told_after_its_last_frame(plug: Callable[..., Sdk]) -> None:
+    camera = a_camera(numbers=(1, 2))
+    plug(camera)
+    indices = []
+    with pytest.raises(ToftrackError, match="was unplugged; plug it in"):
+        for frame in orbbec(keep="every"):
+            indices.append(frame.index)
+            camera.plugged = False
+    assert indices == [0, 1]
+
+
+def test_a_silent_camera_is_told(plug: Callable[..., Sdk]) -> None:
+    camera = a_camera(numbers=(1,))
+    plug(camera)
+    with pytest.raises(ToftrackError, match="no frame has come.*0.05 s"):
+        list(orbbec(timeout_s=0.05))
+    assert not camera.started
+
+
+def test_a_camera_that_cannot_be_started_is_told(plug: Callable[..., Sdk]) -> None:
+    plug(a_camera(), start_error="busy\nor so")
+    with pytest.raises(ToftrackError, match=r"cannot be started \(busy or so\); close other"):
+        list(orbbec())
+
+
+def test_leaving_stops_the_camera_and_iterating_again_starts_it_again(
+    plug: Callable[..., Sdk],
+) -> None:
+    camera = a_camera(numbers=(5, 6))
+    plug(camera)
+    device = orbbec(keep="every")
+    for _ in range(2):
+        for frame in device:
+            assert frame.index == 0 and len(camera.started) == 2
+            break
+        assert not camera.started
+    device.close()
+
+
+def test_frames_with_too_few_bytes_are_told(plug: Callable[..., Sdk]) -> None:
+    camera = a_camera()
+    camera.sets = [Images(Image(1, "depth", few=True))]
+    plug(camera)
+    with pytest.raises(ToftrackError, match="sent 5 bytes for 8x6 pixels"):
+        list(orbbec())
+
+
+def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Callable[..., Sdk]) -> None:
+    plug(a_camera("0042"), a_camera("CL77"))
+    with pytest.raises(ToftrackError, match="2 Orbbec cameras.*device.serial=.*0042, CL77"):
+        orbbec()
+    assert orbbec(serial=42).description["serial"] == "0042"
+    assert orbbec(serial="CL77").description["serial"] == "CL77"
+    with pytest.raises(ToftrackError, match="serial number 5; there is 0042, CL77"):
+        orbbec(serial=5)
+
+
+def test_no_camera_is_told_with_what_else_there_is(plug: Callable[..., Sdk]) -> None:
+    plug()
+    with pytest.raises(ToftrackError, match="no Orbbec camera.*udev.*device.bag"):
+        orbbec()
+
+
+def test_a_size_that_the_camera_lacks_is_told_with_those_it_has(plug: Callable[..., Sdk]) -> None:
+    plug(a_camera())
+    with pytest.raises(ToftrackError, match="width=641.*8x6 at 15, 8x6 at 30, 16x12 at 30"):
+        orbbec(width=641)
+    assert orbbec(fps=15).fps == 15
+    assert orbbec(width=16, height=12).camera.width == 16
+
+
+def test_a_camera_without_depth_is_told(plug: Callable[..., Sdk]) -> None:
+    plug(FakeCamera("1", {IR: [Profile("y8")]}))
+    with pytest.raises(ToftrackError, match="the camera has no depth images"):
+        orbbec()
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "brown_conrady_k6", None])
+def test_the_cameras_lens_becomes_opencvs(plug: Callable[..., Sdk], model: str | None) -> None:
+    plug(FakeCamera("1", {DEPTH: [Profile("y16", lens=LENS, model=model)]}))
+    k1, k2, k3, k4, k5, k6, p1, p2 = LENS
+    np.testing.assert_array_equal(orbbec().camera.distortion, (k1, k2, p1, p2, k3, k4, k5, k6))
+
+
+def test_other_lenses_are_a_fisheye_none_or_told(plug: Callable[..., Sdk]) -> None:
+    plug(FakeCamera("1", {DEPTH: [Profile("y16", lens=LENS, model="kannala_brandt4")]}))
+    camera = orbbec().camera
+    assert camera.lens == "fisheye"
+    np.testing.assert_array_equal(camera.distortion, LENS[:4])
+    plug(FakeCamera("1", {DEPTH: [Profile("y16", lens=LENS, model="none")]}))
+    assert not orbbec().camera.distortion.any()
+    plug(FakeCamera("1", {DEPTH: [Profile("y16", model="inverse_brown_conrady")]}))
+    assert not orbbec().camera.distortion.any()
+    plug(FakeCamera("1", {DEPTH: [Profile("y16", lens=LENS, model="inverse_brown_conrady")]}))
+    with pytest.raises(ToftrackError, match="inverse_brown_conrady.*camera.file=FILE"):
+        orbbec()
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"keep": "some"}, "keep=newest or every"),
+        ({"queue_frames": 1}, "queue_frames of at least 2"),
+        ({"timeout_s": 0}, "timeout_s above 0"),
+        ({"start": 3, "stop": 3}, "0 <= start < stop"),
+        ({"bag": "none.bag"}, "no file 'none.bag'"),
+    ],
+)
+def test_settings_that_make_no_sense_are_told(changes: dict[str, Any], told: str) -> None:
+    with pytest.raises(ToftrackError, match=told):
+        orbbec(**changes)
+
+
+def test_the_sdk_is_not_imported_until_it_is_used() -> None:
+    code = "import toftrack.devices.orbbec.device, sys; sys.exit('pyorbbecsdk' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+
+
+def test_a_missing_or_strange_sdk_is_told_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (None, ModuleType("pyorbbecsdk")):
+        monkeypatch.setitem(sys.modules, "pyorbbecsdk", module)
+        with pytest.raises(ToftrackError, match=r"pyorbbecsdk2.*-e '.\[orbbec\]'.*--no-deps"):
+            orbbec()

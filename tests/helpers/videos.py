@@ -1,0 +1,139 @@
+"""Videos of depth for the tests: an Azure Kinect's recording, and lossless grey ones."""
+
+from __future__ import annotations
+
+import json
+import struct
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+
+from toftrack.camera import Camera
+
+START_OFFSET_S = 0.5
+"""Of the camera's clock in `write_kinect`."""
+RATIONAL = (0.55, -0.02, 1e-3, -2e-3, -0.0027, 0.89, 0.086, -0.014)
+"""OpenCV's k1 k2 p1 p2 k3 k4 k5 k6, of the size that an Azure Kinect's have."""
+
+
+def calibration(K: np.ndarray, across: int, corner: tuple[int, int], lens: Any = RATIONAL) -> dict:
+    """calibration.json of a camera whose mode bins the sensor to `across` pixels and cuts there.
+
+    K: (3, 3) of the mode's images, (0, 0) at the first pixel's centre.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = lens
+    centre = (K[:2, 2] + 0.5 + corner) / across
+    parameters = [*centre, K[0, 0] / across, K[1, 1] / across]
+    parameters += [k1, k2, k3, k4, k5, k6, 0, 0, p2, p1]
+    camera = {
+        "Intrinsics": {
+            "ModelParameterCount": 14,
+            "ModelParameters": [float(number) for number in parameters],
+            "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
+        },
+        "Purpose": "CALIBRATION_CameraPurposeDepth",
+        "SensorWidth": 1024,
+        "SensorHeight": 1024,
+    }
+    colour = {"Purpose": "CALIBRATION_CameraPurposePhotoVideo"}
+    return {"CalibrationInformation": {"Cameras": [colour, camera]}}
+
+
+def seen_through(camera: Camera, depth: np.ndarray, pinhole: Camera) -> np.ndarray:
+    """The (H, W) depth of a pinhole camera as another lens in its place sees it.
+
+    Interpolated on surfaces; at edges, where the neighbours lie apart, the nearest pixel.
+    """
+    at = pinhole.project(
+        np.dstack((camera.normalised_rays(), np.ones((camera.height, camera.width))))
+    )
+    u, v = np.moveaxis(at.astype(np.float32), -1, 0)
+    nearest = cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderValue=0)
+    between = cv2.remap(depth, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    square = np.ones((3, 3), np.uint8)
+    apart = cv2.dilate(depth, square) - cv2.erode(depth, square)
+    edge = cv2.remap(apart, u, v, cv2.INTER_NEAREST, borderValue=1) > 0.02
+    return np.where(edge | (nearest == 0), nearest, between)
+
+
+def write_kinect(
+    path: Path,
+    depth_mm: np.ndarray,
+    infrared: np.ndarray | None = None,
+    about: dict | bytes | None = None,
+    fps: int = 25,
+    titles: tuple[str, str] = ("DEPTH", "IR"),
+) -> Path:
+    """(T, H, W) uint16 images as k4arecorder writes them; `about` becomes calibration.json."""
+    container = av.open(str(path), "w", options={"allow_raw_vfw": "1"})
+    container.metadata.update(
+        {
+            "title": "Azure Kinect",
+            "K4A_START_OFFSET_NS": str(round(START_OFFSET_S * 1e9)),
+            "K4A_DEVICE_SERIAL_NUMBER": "0042",
+        }
+    )
+    streams = [_grey(container, "rawvideo", "gray16be", depth_mm.shape, fps)]
+    if infrared is not None:
+        streams.append(_grey(container, "rawvideo", "gray16be", infrared.shape, fps))
+    for stream, title in zip(streams, titles, strict=False):
+        stream.metadata["title"] = title
+    if about is not None:
+        text = about if isinstance(about, bytes) else json.dumps(about).encode() + b"\0\0"
+        container.add_attachment("calibration.json", "application/octet-stream", text)
+    images = [depth_mm] if infrared is None else [depth_mm, infrared]
+    _encode(container, streams, images, fps)
+    # The muxer has forgotten which kind of raw images they are, and turns them upside down.
+    height, width = depth_mm.shape[1:]
+    wrong = struct.pack("<IiiHHI", 40, width, -height, 1, 16, 0)
+    right = struct.pack("<IiiHH4s", 40, width, height, 1, 16, b"b16g")
+    content = path.read_bytes()
+    assert content.count(wrong) == len(streams)
+    path.write_bytes(content.replace(wrong, right))
+    return path
+
+
+def write_grey(
+    path: Path, words: np.ndarray, codec: str = "ffv1", pixels: str = "gray16le", fps: int = 25
+) -> Path:
+    """(T, H, W) uint16 images as a lossless grey video."""
+    container = av.open(str(path), "w")
+    _encode(container, [_grey(container, codec, pixels, words.shape, fps)], [words], fps)
+    return path
+
+
+def write_colour(path: Path, count: int = 5) -> Path:
+    """A video as telephones make them."""
+    container = av.open(str(path), "w")
+    stream = container.add_stream("mpeg4", rate=25)
+    stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+    for _ in range(count):
+        frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), "rgb24")
+        container.mux(stream.encode(frame))
+    container.mux(stream.encode())
+    container.close()
+    return path
+
+
+def _grey(container: Any, codec: str, pixels: str, shape: tuple[int, ...], fps: int) -> Any:
+    stream = container.add_stream(codec, rate=fps)
+    stream.height, stream.width = shape[1:]
+    stream.pix_fmt = pixels
+    return stream
+
+
+def _encode(container: Any, streams: list[Any], images: list[np.ndarray], fps: int) -> None:
+    for number in range(len(images[0])):
+        for stream, all_images in zip(streams, images, strict=True):
+            if number < len(all_images):
+                image = np.ascontiguousarray(all_images[number])
+                frame = av.VideoFrame.from_ndarray(image, stream.pix_fmt)
+                frame.pts, frame.time_base = number, Fraction(1, fps)
+                container.mux(stream.encode(frame))
+    for stream in streams:
+        container.mux(stream.encode())
+    container.close()

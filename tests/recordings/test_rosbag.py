@@ -1,0 +1,405 @@
+"""ROS bags: every kind of bag, image and lens gives the frames that went in; bad ones are told."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.bags import (
+    CAMERA_INFO,
+    COMPRESSED,
+    DEPTH,
+    IMAGE,
+    INFO,
+    KINDS,
+    Message,
+    as_message,
+    camera_info,
+    compressed,
+    image,
+    recorded_ns,
+    recording,
+    write_bag,
+)
+from helpers.damage import damaged
+
+from toftrack.camera import Camera
+from toftrack.devices.replay import Replay
+from toftrack.devices.rosbag import Bag
+from toftrack.errors import ToftrackError
+from toftrack.recordings import ros_images
+from toftrack.recordings.bag_names import is_bag
+from toftrack.recordings.ros_camera import camera_of
+from toftrack.recordings.rosbag import read_rosbag
+from toftrack.recordings.store import open_recording
+
+CAMERA = Camera(np.array([[40.0, 0, 15.5], [0, 41.0, 11.5], [0, 0, 1]]), 32, 24)
+COLOUR = "/camera/color/image_raw"
+
+
+def some_depth(count: int = 6) -> np.ndarray:
+    """(count, 24, 32) float32 metres in whole millimetres, with holes."""
+    depth = np.random.default_rng(0).integers(300, 2000, (count, 24, 32)).astype(np.float32) / 1000
+    depth[:, :3] = 0
+    return depth
+
+
+def colour(number: int = 0) -> Message:
+    fields = image(np.zeros((24, 96)), "rgb8")
+    return Message(COLOUR, IMAGE, fields | {"width": 32}, recorded_ns(number))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "16UC1; compressedDepth"])
+def test_every_kind_of_bag_gives_the_frames_that_went_in(
+    tmp_path: Path, kind: str, encoding: str
+) -> None:
+    depth = some_depth()
+    path = write_bag(tmp_path, kind, [colour(), *recording(depth, CAMERA, encoding)])
+    device = Bag(path)
+    frames = list(device)
+    assert [frame.index for frame in frames] == list(range(6))
+    np.testing.assert_allclose([frame.depth for frame in frames], depth, atol=1e-6)
+    assert frames[0].depth.dtype == np.float32 and not frames[0].radial
+    taken = [(recorded_ns(n) - 7_000_000) / 1e9 for n in range(6)]
+    np.testing.assert_allclose([frame.timestamp_s for frame in frames], taken, atol=1e-6)
+    assert device.fps == pytest.approx(25)
+    np.testing.assert_array_equal(device.camera.K, CAMERA.K)
+    assert (device.camera.width, device.camera.height) == (32, 24)
+    assert "image_raw" in device.description["topic"]
+    assert is_bag(path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_come_in_any_order_and_from_the_middle(tmp_path: Path, kind: str) -> None:
+    depth = some_depth(9)
+    messages = recording(depth, CAMERA)
+    for message in messages[3:7]:
+        message.recorded_ns = messages[3].recorded_ns  # a recorder that was late
+    store = read_rosbag(write_bag(tmp_path, kind, messages))
+    for number in (4, 2, 3, 8, 0, 1):
+        np.testing.assert_allclose(store.image(number)[0], depth[number], atol=1e-6)
+    store.close()
+    np.testing.assert_allclose(store.image(5)[0], depth[5], atol=1e-6)
+    store.close()
+    frames = list(Replay(store.path, start=2, stop=4))
+    assert [frame.index for frame in frames] == [2, 3]
+
+
+def test_a_file_of_a_ros_2_bag_is_one_too_and_so_is_a_folder_without_metadata(
+    tmp_path: Path,
+) -> None:
+    depth = some_depth()
+    for kind in ("mcap", "db3"):
+        folder = write_bag(tmp_path, kind, recording(depth, CAMERA))
+        file = next(folder.glob(f"*.{kind}"))
+        assert len(open_recording(file)) == 6
+        (folder / "metadata.yaml").unlink()
+        assert is_bag(folder)
+        np.testing.assert_allclose(open_recording(folder).image(5)[0], depth[5], atol=1e-6)
+
+
+def test_images_without_time_stamps_have_the_times_of_recording(tmp_path: Path) -> None:
+    messages = recording(some_depth(), CAMERA)
+    for message in messages:
+        message.stamp_ns = 0
+    store = read_rosbag(write_bag(tmp_path, "bag", messages))
+    np.testing.assert_allclose(store.timestamp_s, [recorded_ns(n) / 1e9 for n in range(6)])
+
+
+def test_a_camera_info_that_comes_late_is_used_from_the_first_frame_on(tmp_path: Path) -> None:
+    store = read_rosbag(write_bag(tmp_path, "mcap", recording(some_depth(), CAMERA, info_at=5)))
+    assert len(store) == 6
+    np.testing.assert_array_equal(store.camera.K, CAMERA.K)
+
+
+def test_without_a_camera_info_a_camera_file_serves(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "bag", recording(some_depth(), CAMERA, info_at=99))
+    with pytest.raises(ToftrackError, match=f"no message of {INFO}.*camera.file=FILE"):
+        read_rosbag(path)
+    CAMERA.save(tmp_path / "camera.json")
+    assert Bag(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 40
+
+
+def test_a_camera_info_elsewhere_is_found_by_its_frame(tmp_path: Path) -> None:
+    messages = recording(some_depth(), CAMERA)
+    messages[0].topic = "/tf/depth/info"
+    other = Message("/other/camera_info", CAMERA_INFO, camera_info(CAMERA), recorded_ns(0))
+    other.frame_id = "colour"
+    path = write_bag(tmp_path, "bag", [*messages, other])
+    assert read_rosbag(path).camera.K[0, 0] == 40
+
+
+def test_two_topics_of_depth_are_listed_and_one_is_chosen(tmp_path: Path) -> None:
+    aligned = [
+        Message("/camera/aligned/image", IMAGE, image(frame / 2), recorded_ns(n))
+        for n, frame in enumerate(some_depth())
+    ]
+    info = Message("/camera/aligned/camera_info", CAMERA_INFO, camera_info(CAMERA), recorded_ns(0))
+    path = write_bag(tmp_path, "bag", [*recording(some_depth(), CAMERA), *aligned, info])
+    with pytest.raises(ToftrackError, match=rf"2 topics.*device.topic=.*/aligned/image.*{DEPTH}"):
+        Replay(path)
+    depth = next(iter(Bag(path, topic="camera/aligned/image"))).depth
+    np.testing.assert_allclose(depth, some_depth()[0] / 2, atol=0.0006)
+    with pytest.raises(ToftrackError, match="no images of the topic /nowhere"):
+        Bag(path, topic="/nowhere")
+
+
+def test_depth_that_was_recorded_twice_is_one_topic(tmp_path: Path) -> None:
+    twice = [
+        Message(f"{DEPTH}/compressedDepth", COMPRESSED, compressed(frame), recorded_ns(n))
+        for n, frame in enumerate(some_depth())
+    ]
+    path = write_bag(tmp_path, "bag", [*recording(some_depth(), CAMERA), *twice])
+    assert read_rosbag(path).metadata["topic"] == DEPTH
+    assert read_rosbag(path, f"{DEPTH}/compressedDepth").image(3)[0].shape == (24, 32)
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([colour()], rf"no depth images.*{COLOUR} \(rgb8\)"),
+        ([], "no depth images.*none"),
+        (
+            [
+                Message(
+                    "/depth/compressedDepth",
+                    COMPRESSED,
+                    {"format": "16UC1; jpeg compressed bgr8", "data": np.zeros(9, np.uint8)},
+                    recorded_ns(0),
+                )
+            ],
+            "no depth images.*jpeg",
+        ),
+        (
+            [Message("/device_0/sensor_0/Depth_0/image/data", IMAGE, {}, recorded_ns(0))],
+            "camera's own program.*device=realsense device.bag=",
+        ),
+        (
+            [Message("/cam/sensor_3/frameType_3", IMAGE, {}, recorded_ns(0))],
+            "camera's own program.*device=orbbec device.bag=",
+        ),
+    ],
+)
+def test_bags_without_depth_are_told(tmp_path: Path, messages: list[Message], words: str) -> None:
+    for message in messages:
+        if not message.fields:
+            message.fields = image(some_depth()[0], "mono16")
+    path = write_bag(tmp_path, "bag", messages)
+    with pytest.raises(ToftrackError, match=words):
+        read_rosbag(path)
+
+
+def test_colour_images_that_are_asked_for_as_depth_are_told(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", [colour(), *recording(some_depth(), CAMERA)])
+    CAMERA.save(tmp_path / "camera.json")
+    with pytest.raises(ToftrackError, match=f"image 0 of the topic {COLOUR}.*'rgb8', not 16UC1"):
+        Bag(path, topic=COLOUR, camera_file=tmp_path / "camera.json")
+
+
+def test_images_of_another_unit_and_another_size_are_told(tmp_path: Path) -> None:
+    depth = some_depth()
+    path = write_bag(tmp_path, "bag", recording(1000 * depth, CAMERA, "32FC1"))
+    with pytest.raises(ToftrackError, match="plainly another unit"):
+        read_rosbag(path)
+    messages = recording(depth, CAMERA)
+    messages[4].fields = image(depth[0, :, :16])
+    (tmp_path / "b").mkdir()
+    with pytest.raises(ToftrackError, match="frame 3 of.*16x24 pixels.*32x24"):
+        list(Bag(write_bag(tmp_path / "b", "bag", messages)))
+
+
+def test_a_unit_can_be_told(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "bag", recording(some_depth(), CAMERA))
+    depth = next(iter(Bag(path, unit_m=0.0001))).depth
+    np.testing.assert_allclose(depth, some_depth()[0] / 10, atol=1e-6)
+    with pytest.raises(ToftrackError, match="unit_m must be a positive number"):
+        Bag(path, unit_m=-1.0)
+
+
+def cut(path: Path, share: float) -> None:
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("kind", KINDS)
+def test_bags_that_were_cut_off_are_told_or_used_so_far(
+    tmp_path: Path, kind: str, share: float
+) -> None:
+    path = write_bag(tmp_path, kind, recording(some_depth(40), CAMERA))
+    file = path if path.is_file() else next(path.glob(f"*.{kind}"))
+    cut(file, share)
+    try:
+        device = Replay(path)
+    except ToftrackError as error:
+        assert str(path) in str(error)
+        assert "Traceback" not in str(error) and "\n" not in str(error)
+        assert any(word in str(error) for word in ("damaged", "no depth images"))
+    else:  # a data base may be whole but for its last pages
+        assert kind == "db3"
+        assert 0 < len(list(device)) <= (40 if share > 0.99 else 39)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whatever_bytes_are_damaged_it_is_read_or_told(tmp_path: Path, kind: str) -> None:
+    path = write_bag(tmp_path, kind, recording(some_depth(), CAMERA))
+    path = path if path.is_file() else next(path.glob(f"*.{kind}"))
+    content = path.read_bytes()
+    for seed in range(24):
+        path.write_bytes(damaged(content, seed))
+        with contextlib.suppress(ToftrackError):
+            store = open_recording(path)
+            for number in range(len(store)):
+                store.image(number)
+
+
+def test_what_is_no_bag_is_told(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    for name in ("a.bag", "a.mcap", "a.db3"):
+        (tmp_path / name).write_bytes(b"nonsense" * 40)
+        with pytest.raises(ToftrackError, match=f"{name}' cannot be read.*no bag"):
+            Replay(tmp_path / name)
+    with pytest.raises(ToftrackError, match="there is no bag"):
+        Bag(tmp_path / "none.bag")
+
+
+def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag1", None)
+    (tmp_path / "a.bag").write_bytes(b"")
+    with pytest.raises(ToftrackError, match=r"rosbags.*pip install -e '.\[ros\]'"):
+        Replay(tmp_path / "a.bag")
+
+
+def test_a_damaged_message_ends_the_recording_before_it(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "bag", recording(some_depth(), CAMERA))
+    content = path.read_bytes()
+    at = [i for i in range(len(content)) if content.startswith(b"16UC1", i)][4]
+    # The length of the text before it.
+    path.write_bytes(content[: at - 4] + b"\xff\xff\xff\x7f" + content[at:])
+    store = read_rosbag(path)
+    assert len(store) == 4 and "cannot be read" in (store.damage or "")
+    assert len(list(Replay(path))) == 4
+    shutil.rmtree(tmp_path)
+
+
+# Images and lenses, without a bag.
+
+
+def test_rows_may_be_padded_and_bytes_swapped() -> None:
+    depth = some_depth(1)[0]
+    for fields in (image(depth, pad=6), image(depth, big=True), image(depth, "32FC1", big=True)):
+        found = ros_images.depth_image(as_message(fields), IMAGE, 0.001)
+        np.testing.assert_allclose(found, depth, atol=1e-6)
+
+
+def test_no_reading_is_zero_in_every_encoding() -> None:
+    depth = some_depth(1)[0]
+    depth[0, :4] = (np.nan, np.inf, -1, 0)
+    found = ros_images.depth_image(as_message(image(depth, "32FC1")), IMAGE, 0.001)
+    assert (found[0, :4] == 0).all() and np.isfinite(found).all()
+
+
+def test_quantised_inverse_depth_is_exact_to_its_steps() -> None:
+    depth = some_depth(1)[0]
+    message = as_message(compressed(depth, "32FC1; compressedDepth png"))
+    found = ros_images.depth_image(message, COMPRESSED, 0.001)
+    # A step of 1 / z is 1 / 10100 m.
+    np.testing.assert_array_less(np.abs(found - depth), depth**2 / 10100 / 2 + 1e-5)
+    assert (found[:3] == 0).all()
+
+
+def test_a_plain_png_of_16_bits_is_depth_too() -> None:
+    depth = some_depth(1)[0]
+    fields = compressed(depth, "16UC1; png compressed ")
+    fields["data"] = fields["data"][12:]
+    found = ros_images.depth_image(as_message(fields), COMPRESSED, 0.001)
+    np.testing.assert_allclose(found, depth, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f | {"format": "16UC1; compressedDepth rvl"}, "only PNG is read"),
+        (lambda f: f | {"format": "16UC1; jpeg compressed mono8"}, "not depth"),
+        (lambda f: f | {"format": ""}, "without an encoding"),
+        (lambda f: f | {"data": f["data"][:40]}, "PNG is damaged"),
+        (lambda f: f | {"data": f["data"][5:]}, "holds no PNG"),
+        (lambda f: f | {"data": np.zeros(0, np.uint8)}, "holds no PNG"),
+        (
+            lambda f: f | {"data": np.r_[f["data"][:28], np.full(8, 255, "u1"), f["data"][36:]]},
+            "PNG is damaged",
+        ),
+        (lambda f: f | {"format": "32FC1; compressedDepth png"}, "make no sense"),
+        (
+            lambda f: f | {"format": "32FC1; png compressed", "data": f["data"][12:]},
+            "header that says how is missing",
+        ),
+    ],
+)
+def test_compressed_images_of_another_kind_are_told(
+    change: Callable[[dict], dict], words: str
+) -> None:
+    message = as_message(change(compressed(some_depth(1)[0])))
+    with pytest.raises(ToftrackError, match=words):
+        ros_images.depth_image(message, COMPRESSED, 0.001)
+
+
+def test_an_image_with_too_few_bytes_is_told() -> None:
+    fields = image(some_depth(1)[0])
+    for change in ({"data": fields["data"][:-70]}, {"step": 3}, {"height": 0}, {"width": 2**31}):
+        with pytest.raises(ToftrackError, match="too few"):
+            ros_images.depth_image(as_message(fields | change), IMAGE, 0.001)
+
+
+LENSES = {
+    "plumb_bob": (0.1, -0.2, 0.001, -0.002, 0.05),
+    "rational_polynomial": (0.5, -0.1, 2e-3, -1e-3, 0.01, 0.85, 0.02, -0.005),
+    "equidistant": (0.05, -0.02, 0.01, -0.004),
+}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_every_lens_model_of_ros_is_taken(model: str) -> None:
+    info = as_message(camera_info(CAMERA, model, D=np.array(LENSES[model])))
+    camera = camera_of(info, rectified=False)
+    np.testing.assert_array_equal(camera.distortion, LENSES[model])
+    assert camera.lens == ("fisheye" if model == "equidistant" else "opencv")
+    assert not camera_of(info, rectified=True).distortion.any()
+
+
+def test_rectified_images_are_seen_through_p() -> None:
+    P = np.array([30.0, 0, 16, 0, 0, 31, 12, 0, 0, 0, 1, 0])
+    info = as_message(camera_info(CAMERA, D=np.ones(5), P=P))
+    camera = camera_of(info, rectified=True)
+    np.testing.assert_array_equal(camera.K, [[30, 0, 16], [0, 31, 12], [0, 0, 1]])
+    assert not camera.distortion.any()
+    assert camera_of(info, rectified=False).K[0, 0] == 40
+
+
+def test_a_part_of_the_sensor_and_binning_move_the_lens() -> None:
+    roi = {"x_offset": 8, "y_offset": 4, "height": 16, "width": 20, "do_rectify": False}
+    camera = camera_of(
+        as_message(camera_info(CAMERA, roi=roi, binning_x=2, binning_y=2)), rectified=False
+    )
+    assert (camera.width, camera.height) == (10, 8)
+    np.testing.assert_allclose(camera.K, [[20, 0, 3.75], [0, 20.5, 3.75], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"K": np.zeros(9), "P": np.zeros(12)}, "not calibrated"),
+        ({"distortion_model": "mei", "D": np.ones(5)}, "'mei' is none of plumb_bob"),
+        ({"D": np.ones(7)}, "4, 5, 8, 12, 14 numbers"),
+        ({"width": 0, "height": 0}, "not positive"),
+        ({"K": np.array([np.nan] * 9)}, "not calibrated"),
+    ],
+)
+def test_a_camera_info_that_tells_no_lens_is_told(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        camera_of(as_message(camera_info(CAMERA, **changes)), rectified=False)

@@ -1,0 +1,324 @@
+"""Azure Kinect's recordings, grey videos and .npy stacks give what went in; others are told."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.damage import damaged
+from helpers.videos import (
+    RATIONAL,
+    START_OFFSET_S,
+    calibration,
+    seen_through,
+    write_colour,
+    write_grey,
+    write_kinect,
+)
+
+from toftrack.camera import Camera
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.store import open_recording
+
+K = np.array([[252.0, 0, 166.0], [0, 253.0, 140.0], [0, 0, 1]])
+ABOUT = calibration(K, 512, (96, 90))
+TOLD = BareFacts((30.0, 31.0, 15.5, 11.5))
+
+
+def words(count: int = 7, size: tuple[int, int] = (24, 32)) -> np.ndarray:
+    """(count, *size) uint16 of all values."""
+    return np.random.default_rng(count).integers(0, 0x10000, (count, *size)).astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def images() -> tuple[np.ndarray, np.ndarray]:
+    """Depth and infrared of a Kinect's smallest mode."""
+    return words(7, (288, 320)), words(8, (288, 320))[:7]
+
+
+def test_a_kinects_recording_gives_depth_infrared_and_times(
+    tmp_path: Path, images: tuple[np.ndarray, np.ndarray]
+) -> None:
+    device = Replay(write_kinect(tmp_path / "a.mkv", *images, ABOUT))
+    frames = list(device)
+    assert (device.frames, len(frames)) == (7, 7)
+    for frame, depth, infrared in zip(frames, *images, strict=True):
+        np.testing.assert_allclose(frame.depth, depth / 1000, rtol=1e-6)
+        np.testing.assert_array_equal(frame.amplitude, infrared)
+        assert not frame.radial
+        assert frame.timestamp_s == pytest.approx(START_OFFSET_S + frame.index / 25, abs=2e-3)
+    assert device.fps == pytest.approx(25)
+    assert device.metadata == {"camera": "Azure Kinect", "serial": "0042"}
+
+
+@pytest.mark.parametrize(
+    ("size", "across", "corner"),
+    [
+        ((320, 288), 512, (96, 90)),
+        ((640, 576), 1024, (192, 180)),
+        ((512, 512), 512, (0, 0)),
+        ((1024, 1024), 1024, (0, 0)),
+    ],
+)
+def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
+    tmp_path: Path, size: tuple[int, int], across: int, corner: tuple[int, int]
+) -> None:
+    about = calibration(K, across, corner)
+    path = write_kinect(tmp_path / "a.mkv", np.ones((1, *size[::-1]), np.uint16), about=about)
+    camera = open_recording(path).camera
+    np.testing.assert_allclose(camera.K, K, atol=1e-9)
+    np.testing.assert_allclose(camera.distortion, RATIONAL)
+    assert (camera.width, camera.height) == size
+
+
+def test_a_published_calibration_gives_the_published_intrinsics(tmp_path: Path) -> None:
+    # Of one Azure Kinect, narrow and unbinned: fx, fy, cx, cy as its SDK tells them.
+    lens = ABOUT["CalibrationInformation"]["Cameras"][1]["Intrinsics"]
+    told = (0.51296979188919067, 0.51692354679107666, 0.4927808940410614, 0.49290284514427185)
+    about = calibration(K, 1024, (192, 180))
+    lens = about["CalibrationInformation"]["Cameras"][1]["Intrinsics"]
+    lens["ModelParameters"][:4] = told
+    path = write_kinect(tmp_path / "a.mkv", np.ones((1, 576, 640), np.uint16), about=about)
+    camera = open_recording(path).camera
+    expected = [[504.6076, 0, 332.7811], [0, 504.7325, 348.8297], [0, 0, 1]]
+    np.testing.assert_allclose(camera.K, expected, atol=1e-3)
+
+
+def test_a_plane_seen_through_a_kinects_lens_is_one_again(tmp_path: Path) -> None:
+    camera = Camera(K, 320, 288, np.array(RATIONAL))
+    pinhole = Camera(K, 320, 288)
+    plane = (0.8 / (1 + pinhole.normalised_rays() @ (0.3, 0.2))).astype(np.float32)
+    raw = np.rint(1000 * seen_through(camera, plane, pinhole)).astype(np.uint16)
+    store = open_recording(write_kinect(tmp_path / "a.mkv", raw[None], about=ABOUT))
+    z = store.camera.rectify(store.image(0)[0], store.radial)
+    inside = z > 0
+    assert inside.mean() > 0.9
+    np.testing.assert_allclose(z[inside], plane[inside], atol=0.003)
+    assert np.abs(raw / 1000 - plane)[inside].max() > 0.05
+
+
+def test_frames_come_in_any_order(tmp_path: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
+    kinect = open_recording(write_kinect(tmp_path / "a.mkv", *images, ABOUT))
+    grey = open_recording(
+        write_grey(tmp_path / "b.mkv", images[0]), bare=BareFacts((250.0, 250.0, 160.0, 144.0))
+    )
+    for number in (4, 5, 1, 6, 0):
+        np.testing.assert_array_equal(kinect.image(number)[1], images[1][number])
+        for store in (kinect, grey):
+            depth = store.image(number)[0]
+            np.testing.assert_allclose(depth, images[0][number] / 1000, rtol=1e-6)
+    kinect.close()
+    np.testing.assert_array_equal(kinect.image(2)[1], images[1][2])
+
+
+def test_missing_infrared_is_black(tmp_path: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
+    path = write_kinect(tmp_path / "a.mkv", images[0], images[1][:5], ABOUT)
+    frames = list(Replay(path))
+    assert frames[4].amplitude.any() and not frames[6].amplitude.any()
+    path = write_kinect(tmp_path / "b.mkv", images[0], None, ABOUT)
+    assert next(iter(Replay(path))).amplitude is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.8, 0.95])
+def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_told(
+    tmp_path: Path, images: tuple[np.ndarray, np.ndarray], share: float
+) -> None:
+    depth = np.concatenate([images[0]] * 3)
+    path = write_kinect(tmp_path / "cut.mkv", depth, about=ABOUT)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    if share < 0.05:
+        with pytest.raises(ToftrackError, match="cut.mkv.*(cannot be read|no frame of depth)"):
+            Replay(path)
+        return
+    store = open_recording(path)
+    assert store.damage or share > 0.9, "a frame or two at the end may be missing anyway"
+    frames = list(Replay(path))
+    assert len(frames) == len(store) == pytest.approx(share * 21, abs=1.01)
+    np.testing.assert_allclose(frames[-1].depth, depth[len(frames) - 1] / 1000, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["kinect.mkv", "grey.mkv", "grey.avi", "stack.npy"])
+def test_whatever_bytes_are_damaged_it_is_read_or_told(
+    tmp_path: Path, images: tuple[np.ndarray, np.ndarray], name: str
+) -> None:
+    path = tmp_path / name
+    if name == "kinect.mkv":
+        write_kinect(path, images[0][:2], images[1][:2], ABOUT)
+    elif name == "stack.npy":
+        np.save(path, words() // 8)
+    else:
+        write_grey(path, words())
+    content = path.read_bytes()
+    for seed in range(24):
+        path.write_bytes(damaged(content, seed))
+        with contextlib.suppress(ToftrackError):
+            store = open_recording(path, bare=TOLD)
+            for number in range(len(store)):
+                store.image(number)
+
+
+def broken(change: Callable[[dict], Any]) -> dict:
+    about = calibration(K, 512, (96, 90))
+    change(about["CalibrationInformation"]["Cameras"][1])
+    return about
+
+
+@pytest.mark.parametrize(
+    ("about", "complaint"),
+    [
+        (None, "no attachment calibration.json"),
+        (b"{", "calibration.json.*damaged"),
+        (b"\xff\xfe", "calibration.json.*damaged"),
+        ({"CalibrationInformation": {"Cameras": []}}, "damaged"),
+        (broken(lambda c: c.update(Purpose="colour")), "damaged"),
+        (broken(lambda c: c["Intrinsics"].pop("ModelParameters")), "damaged"),
+        (broken(lambda c: c["Intrinsics"]["ModelParameters"].pop()), "13 parameters"),
+        (broken(lambda c: c.update(SensorWidth=640)), "another kind.*640"),
+        (
+            broken(lambda c: c["Intrinsics"].update(ModelType="CALIBRATION_LensTheta")),
+            "another kind.*Theta",
+        ),
+        (
+            broken(lambda c: c["Intrinsics"]["ModelParameters"].__setitem__(2, -1)),
+            "positive focal lengths",
+        ),
+    ],
+)
+def test_a_calibration_that_tells_no_lens_is_told(
+    tmp_path: Path, about: Any, complaint: str
+) -> None:
+    path = write_kinect(tmp_path / "a.mkv", np.ones((1, 288, 320), np.uint16), about=about)
+    with pytest.raises(ToftrackError, match=rf"{complaint}.*camera\.file"):
+        Replay(path)
+    Camera(K, 320, 288).save(tmp_path / "camera.json")
+    assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 252
+
+
+def test_a_kinects_recording_without_depth_and_of_no_mode_are_told(tmp_path: Path) -> None:
+    ones = np.ones((1, 288, 320), np.uint16)
+    path = write_kinect(tmp_path / "a.mkv", ones, about=ABOUT, titles=("COLOR", "IR"))
+    with pytest.raises(ToftrackError, match="Azure Kinect without depth"):
+        Replay(path)
+    path = write_kinect(tmp_path / "b.mkv", ones[:, :280], about=ABOUT)
+    with pytest.raises(ToftrackError, match="320x280 pixels, which is no mode"):
+        Replay(path)
+
+
+# Videos and stacks that say nothing of themselves.
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels"),
+    [
+        ("a.mkv", "ffv1", "gray16le"),
+        ("a.avi", "ffv1", "gray16le"),
+        ("a.mov", "png", "gray16be"),
+        ("a.nut", "rawvideo", "gray16le"),
+    ],
+)
+def test_lossless_grey_videos_are_depth_in_millimetres(
+    tmp_path: Path, name: str, codec: str, pixels: str
+) -> None:
+    pixels_in = words()
+    store = open_recording(write_grey(tmp_path / name, pixels_in, codec, pixels), bare=TOLD)
+    assert len(store) == 7
+    for number, image in enumerate(pixels_in):
+        depth, amplitude = store.image(number)
+        np.testing.assert_allclose(depth, image / 1000, rtol=1e-6)
+        assert amplitude is None
+    np.testing.assert_allclose(store.timestamp_s, np.arange(7) / 25, atol=1e-3)
+    np.testing.assert_array_equal(store.camera.K, [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]])
+
+
+def test_unit_and_rate_of_a_video_can_be_told(tmp_path: Path) -> None:
+    pixels = words()
+    bare = BareFacts((30.0, 31.0, 15.5, 11.5), unit_m=0.0002, fps=10.0)
+    store = open_recording(write_grey(tmp_path / "a.mkv", pixels), bare=bare)
+    np.testing.assert_allclose(store.image(3)[0], pixels[3] * 0.0002, rtol=1e-6)
+    np.testing.assert_allclose(store.timestamp_s, np.arange(7) / 10)
+    assert store.fps == 10
+
+
+def test_without_a_camera_a_video_asks_for_one(tmp_path: Path) -> None:
+    path = write_grey(tmp_path / "a.mkv", words())
+    with pytest.raises(
+        ToftrackError, match=r"32x24 pixels.*--intrinsics FX FY CX CY.*camera\.file"
+    ):
+        Replay(path)
+    Camera(np.diag((30.0, 30, 1)), 32, 24).save(tmp_path / "camera.json")
+    assert Replay(path).camera.K[0, 0] == 30
+    Camera(np.diag((30.0, 30, 1)), 8, 6).save(tmp_path / "camera.json")
+    with pytest.raises(ToftrackError, match="8x6.*32x24"):
+        Replay(path)
+
+
+def test_colour_video_and_what_is_no_video_are_told(tmp_path: Path) -> None:
+    for name in ("a.mkv", "a.avi", "a.mp4"):
+        with pytest.raises(ToftrackError, match="colour or 8-bit images.*mpeg4 yuv420p.*16 bits"):
+            Replay(write_colour(tmp_path / name))
+    (tmp_path / "b.mp4").write_bytes(b"nonsense" * 99)
+    with pytest.raises(ToftrackError, match="b.mp4' cannot be read as a video"):
+        Replay(tmp_path / "b.mp4")
+    with pytest.raises(ToftrackError, match="no file"):
+        Replay(tmp_path / "none.mkv")
+
+
+@pytest.mark.parametrize(
+    ("stack", "factor"),
+    [
+        (words() // 8, 0.001),
+        (words().astype(np.int32) // 8, 0.001),
+        (words()[0] // 8, 0.001),
+        ((words() / 5000).astype(np.float32), 1),
+        (words() / 5000, 1),
+    ],
+)
+def test_stacks_are_depth(tmp_path: Path, stack: np.ndarray, factor: float) -> None:
+    np.save(tmp_path / "a.npy", stack)
+    store = open_recording(tmp_path / "a.npy", bare=TOLD)
+    images = stack.reshape(-1, 24, 32)
+    assert len(store) == len(images)
+    np.testing.assert_allclose(store.image(len(images) - 1)[0], images[-1] * factor, rtol=1e-6)
+    assert store.image(0)[0].dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("stack", "complaint"),
+    [
+        (np.ones((2, 3, 4, 3)), "must be depth images"),
+        (np.ones((0, 3, 4)), "must be depth images"),
+        (np.array([["a"] * 4] * 3), "must be depth images"),
+        (np.full((2, 24, 32), 900.0), "plainly another unit.*--source-unit"),
+        (np.array([[None] * 4] * 3), "no .npy of numbers"),
+    ],
+)
+def test_stacks_of_another_kind_are_told(tmp_path: Path, stack: np.ndarray, complaint: str) -> None:
+    np.save(tmp_path / "a.npy", stack, allow_pickle=True)
+    with pytest.raises(ToftrackError, match=complaint):
+        open_recording(tmp_path / "a.npy", bare=TOLD)
+
+
+def test_damaged_stacks_are_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", words())
+    content = (tmp_path / "a.npy").read_bytes()
+    for part in (b"", content[:7], content[:50], content[:-9], b"nonsense" * 30):
+        (tmp_path / "a.npy").write_bytes(part)
+        with pytest.raises(ToftrackError, match="a.npy' is no .npy of numbers, or was cut off"):
+            open_recording(tmp_path / "a.npy", bare=TOLD)
+
+
+@pytest.mark.parametrize("name", ["a.oni", "a.ply", "a.png", "a.xef", "a.h5"])
+def test_of_other_kinds_it_is_told_how_to_convert_them(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ToftrackError, match=rf"{name}' is not read: .*(PNG|npy|folder|points)"):
+        open_recording(tmp_path / name)
+
+
+def test_a_topic_of_what_is_no_bag_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ToftrackError, match="no ROS bag, and has no topic /depth"):
+        open_recording(tmp_path / "a.npz", topic="/depth")

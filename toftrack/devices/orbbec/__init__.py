@@ -1,0 +1,1 @@
+"""Orbbec's depth cameras (Femto, Gemini, Astra), through the vendor's SDK."""

@@ -1,0 +1,66 @@
+"""What is told of images that do not say it themselves: lens, unit, frame rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+
+MILLIMETRE = 0.001
+_BESIDE = "camera.json"
+
+
+@dataclass(frozen=True)
+class BareFacts:
+    """None = not told.
+
+    Raises ToftrackError for a unit or a rate that is not positive.
+    """
+
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy in pixels, without distortion."""
+    unit_m: float | None = None
+    """Metres of one step of whole numbers."""
+    fps: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("unit_m", "fps"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < 1e6:
+                raise ToftrackError(f"{name} must be a positive number, but is {value!r}")
+
+    def camera(self, width: int, height: int) -> Camera | None:
+        """The camera of the intrinsics for images of that size; None when they are not told."""
+        if self.intrinsics is None:
+            return None
+        fx, fy, cx, cy = self.intrinsics
+        return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), width, height)
+
+
+NOTHING_TOLD = BareFacts()
+
+
+def bare_camera(
+    path: Path, camera_file: str | Path | None, bare: BareFacts, width: int, height: int
+) -> Camera:
+    """The camera of a file of bare images of that size: as told, else camera.json beside it.
+
+    Raises ToftrackError where there is none, or it is of another size.
+    """
+    if camera_file is not None:
+        return Camera.load_for(camera_file, width, height, f"'{path}'")
+    told = bare.camera(width, height)
+    if told is not None:
+        return told
+    beside = path.parent / _BESIDE
+    if beside.exists():
+        return Camera.load_for(beside, width, height, f"'{path}'")
+    raise ToftrackError(
+        f"'{path}' ({width}x{height} pixels) does not say what camera made it; give the lens with "
+        "toftrack convert --intrinsics FX FY CX CY, or a camera file with camera.file=FILE "
+        "(toftrack convert: --camera FILE)"
+    )

@@ -1,0 +1,132 @@
+"""Depth images as ROS sends them: `Image` and `CompressedImage` of sensor_msgs to metres.
+
+REP 118: `16UC1` counts millimetres, 0 = no reading; `32FC1` is metres, NaN or infinity = no
+reading. Of compressed ones those without loss are read: `compressedDepth` (a header of 12 bytes,
+then a PNG; of 32FC1 the PNG holds quantised inverse depths, whose two parameters stand in the
+header), and plain PNGs of 16 bits. Messages are objects with ROS's fields, whoever parsed them.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+
+from toftrack.errors import ToftrackError
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_WORDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+"""Encodings that may hold depth, and their type. mono16 is rather infrared: only when asked for."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_HEADER = struct.Struct("<iff")
+"""Of compressedDepth: the kind of quantisation, and its two parameters."""
+_SIZE = struct.Struct(">II")
+_LARGEST_PIXELS = 64_000_000  # a damaged header must not make us allocate gigabytes
+
+
+def encoding(message: Any, kind: str) -> str:
+    """How the pixels of a message are stored: `16UC1`, `rgb8`, `16UC1; compressedDepth png`."""
+    return str(message.encoding if kind == IMAGE else message.format)
+
+
+def is_depth(words: str) -> bool:
+    """An `encoding` is one of depth images."""
+    transport = words.partition(";")[2]
+    return words.startswith(("16UC1", "32FC1")) and (
+        not transport or "compressedDepth" in transport or _lossless(words)
+    )
+
+
+def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:
+    """The depth image of a message.
+
+    Args:
+        message: an Image or CompressedImage.
+        kind: `IMAGE` or `COMPRESSED`.
+        unit_m: metres of one step of whole numbers.
+
+    Returns:
+        (H, W) float32 metres, 0 = no reading, a new array.
+
+    Raises:
+        ToftrackError: its pixels are of another kind, or damaged; the sentence begins with "it".
+    """
+    words = _pixels(message) if kind == IMAGE else _decompressed(message)
+    if words.dtype.kind == "u":
+        return words.astype(np.float32) * np.float32(unit_m)
+    return np.where((words > 0) & (words < np.inf), words, 0).astype(np.float32)
+
+
+def _pixels(message: Any) -> np.ndarray:
+    if message.encoding not in _WORDS:
+        raise ToftrackError(f"it is {_colour(message.encoding)}, not 16UC1 or 32FC1 depth")
+    kind = np.dtype(_WORDS[message.encoding]).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.asarray(message.data, np.uint8)
+    row = width * kind.itemsize
+    if height < 1 or width < 1 or step < row or data.size < (height - 1) * step + row:
+        raise ToftrackError(f"it has {data.size} bytes, too few for {width}x{height} pixels")
+    # The last row may lack the padding that the others have.
+    rows = np.zeros(height * step, np.uint8)
+    rows[: min(data.size, rows.size)] = data[: rows.size]
+    return rows.reshape(height, step)[:, :row].copy().view(kind)
+
+
+def _decompressed(message: Any) -> np.ndarray:
+    words = str(message.format)
+    if not is_depth(words) and not words.startswith("mono16"):
+        raise ToftrackError(f"it is {_colour(words)}, not depth")
+    if not _lossless(words):
+        raise ToftrackError(
+            f"it is compressed as '{words}', of which only PNG is read; play the bag and record it "
+            "again with image_transport's format png, or as raw images"
+        )
+    data = np.asarray(message.data, np.uint8)
+    start = data[: _HEADER.size + len(_PNG)].tobytes().find(_PNG)
+    if start not in (0, _HEADER.size):
+        raise ToftrackError(
+            f"it says '{words}', but holds no PNG; it is damaged or of another kind"
+        )
+    image = _decoded_png(data[start:])
+    if image is None or image.ndim != 2 or image.dtype != np.uint16:
+        raise ToftrackError("its PNG is damaged, or not of 16 bits and one channel")
+    if not words.startswith("32FC1"):
+        return image
+    if start == 0:
+        raise ToftrackError("its 32FC1 depth is quantised, and the header that says how is missing")
+    return _from_inverse(image, data[:start].tobytes())
+
+
+def _decoded_png(data: np.ndarray) -> np.ndarray | None:
+    """The image of a PNG file's bytes, None where they are damaged."""
+    size = _SIZE.unpack(data[16:24].tobytes()) if data.size >= 24 else (0, 0)
+    if not 0 < size[0] * size[1] <= _LARGEST_PIXELS:
+        return None
+    try:
+        return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+
+
+def _from_inverse(image: np.ndarray, header: bytes) -> np.ndarray:
+    """The quantised inverse depths of compressed 32FC1 to (H, W) float32 metres."""
+    _, a, b = _HEADER.unpack(header)
+    if not (np.isfinite([a, b]).all() and a > 0):
+        raise ToftrackError(f"the parameters of its quantised depth make no sense, {a:g} and {b:g}")
+    gap = image.astype(np.float32) - np.float32(b)
+    with np.errstate(divide="ignore"):
+        return np.where(image > 0, np.float32(a) / gap, np.float32(0))
+
+
+def _lossless(words: str) -> bool:
+    transport = words.partition(";")[2]
+    if "compressedDepth" in transport:
+        return "rvl" not in transport
+    return "png" in transport
+
+
+def _colour(words: str) -> str:
+    return f"an image of the encoding '{words}'" if words else "an image without an encoding"

@@ -1,0 +1,334 @@
+"""ROS bags, by the library rosbags: `.bag` of ROS 1, `.mcap`, `.db3` and folders of ROS 2.
+
+One topic of depth images is played, with the lens that its camera_info tells. A bag is read through
+once for the times, and then again, message by message: long ones need no more memory than short
+ones. What is read of each message stands in `ros_images.py` and `ros_camera.py`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.frames import LARGEST_MEDIAN_M
+from toftrack.recordings.bag_names import storage_of
+from toftrack.recordings.bare import MILLIMETRE, BareFacts
+from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.recordings.ros_camera import CAMERA_INFO, camera_of
+from toftrack.recordings.ros_images import COMPRESSED, IMAGE, depth_image, encoding, is_depth
+
+_REPAIR = {
+    ".bag": "rosbag reindex FILE repairs a bag that was cut off",
+    ".mcap": "mcap recover FILE repairs one that was cut off",
+    ".db3": "record or copy it again",
+    "": "ros2 bag reindex FOLDER repairs one that was cut off",
+}
+_OF_CAMERAS = {"/device_0/sensor_": "realsense", "/cam/sensor_": "orbbec"}
+"""How topics begin in the bags that cameras' own programs write, and the devices that play them."""
+
+
+class RosBag:
+    """The depth images of one topic, from the disk one at a time. Made by `read_rosbag`."""
+
+    truth = None
+    radial = False
+
+    def __init__(
+        self, bag: _Bag, topic: _Topic, camera: Camera, times: _Times, unit_m: float
+    ) -> None:
+        self.path, self.camera, self.unit_m = bag.path, camera, unit_m
+        self.timestamp_s = times.seconds
+        """(T,) float64, not decreasing: when the images were taken, by their own stamps, or when
+        they were recorded, where those make no sense."""
+        self.damage = times.damage
+        steps = np.diff(self.timestamp_s)
+        median = float(np.median(steps)) if len(steps) else 0.0
+        self.fps = 1 / median if median > 0 else DEFAULT_FPS
+        self.metadata: dict[str, Any] = {"topic": topic.name, "encoding": topic.encoding}
+        self._bag, self._topic, self._recorded_ns = bag, topic, times.recorded_ns
+        self._messages: Iterator[tuple[int, Any]] | None = None
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self.timestamp_s)
+
+    def image(self, index: int) -> tuple[np.ndarray, None]:
+        """A frame's depth, (H, W) float32 metres, 0 = no reading; bags have no amplitude here.
+
+        Raises ToftrackError when it is damaged or of another size than its camera.
+        """
+        if self._messages is None or index != self._next:
+            self._go_to(index)
+        assert self._messages is not None
+        try:
+            _, message = next(self._messages)
+        except StopIteration:
+            raise ToftrackError(f"'{self.path}' ended while it was read; is it copied?") from None
+        self._next = index + 1
+        depth = _image(self.path, self._topic, message, self.unit_m, index)
+        if depth.shape != (self.camera.height, self.camera.width):
+            raise ToftrackError(
+                f"frame {index} of '{self.path}' has {depth.shape[1]}x{depth.shape[0]} pixels, but "
+                f"its camera {self.camera.width}x{self.camera.height}; record images of one size"
+            )
+        return depth, None
+
+    def close(self) -> None:
+        """Close the file; it opens again by itself."""
+        self._messages = None
+        self._bag.close()
+
+    def _go_to(self, index: int) -> None:
+        start_ns = int(self._recorded_ns[index])
+        self._messages = self._bag.messages(self._topic, start_ns)
+        # Several messages may have been recorded at the same time.
+        before = index - int(np.searchsorted(self._recorded_ns, start_ns))
+        for _ in islice(self._messages, before):
+            pass
+
+
+def read_rosbag(
+    path: str | Path,
+    topic: str | None = None,
+    camera_file: str | Path | None = None,
+    unit_m: float | None = None,
+) -> RosBag:
+    """Open a bag and read its times.
+
+    Args:
+        path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.
+        topic: of the depth images; None = the only one there is.
+        camera_file: a camera file instead of the bag's camera_info.
+        unit_m: metres of one step of 16UC1; None = a millimetre, as ROS says.
+
+    Raises:
+        ToftrackError: rosbags is not installed, the bag is damaged, it has no depth images or
+            several topics of them, or nothing tells their lens; one sentence.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise ToftrackError(f"there is no bag '{path}'; give the path of a recording")
+    unit_m = BareFacts(unit_m=unit_m).unit_m or MILLIMETRE
+    bag = _Bag(path)
+    try:
+        chosen = _choose(bag, topic)
+        camera = _camera(bag, chosen) if camera_file is None else Camera.load(camera_file)
+        first = _image(path, chosen, chosen.first, unit_m, 0)
+        _check_metres(path, chosen, first)
+        return RosBag(bag, chosen, camera, _times(bag, chosen), unit_m)
+    finally:
+        bag.close()
+
+
+@dataclass(frozen=True, eq=False)
+class _Topic:
+    """A topic of images."""
+
+    name: str
+    kind: str
+    """IMAGE or COMPRESSED."""
+    encoding: str
+    first: Any
+    """Its first message."""
+
+    @property
+    def base(self) -> str:
+        """The topic without what image_transport appends for a compression."""
+        return self.name.rpartition("/")[0] if self.kind == COMPRESSED else self.name
+
+
+class _Bag:
+    """A bag as rosbags reads it, opened when it is needed; its errors are sentences."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._one = importlib.import_module("rosbags.rosbag1")
+            self._two = importlib.import_module("rosbags.rosbag2")
+            types = importlib.import_module("rosbags.typesys")
+        except ImportError as error:
+            raise ToftrackError(
+                f"'{path}' is read by rosbags ({error}): pip install -e '.[ros]' (recordings of "
+                "cameras' own programs: device=realsense or orbbec, device.bag=FILE)"
+            ) from error
+        self._is_one = path.suffix.lower() == ".bag" and path.is_file()
+        # The messages that are read are the same in every release of ROS 2.
+        store = types.Stores.ROS1_NOETIC if self._is_one else types.Stores.ROS2_HUMBLE
+        self._types = types.get_typestore(store)
+        self._reader: Any = None
+
+    def reader(self) -> Any:
+        """The opened reader of rosbags."""
+        if self._reader is None:
+            with self._told():
+                make = self._one.Reader if self._is_one else self._two.Reader
+                reader = make(storage_of(self.path))
+                reader.open()
+            self._reader = reader
+        return self._reader
+
+    def close(self) -> None:
+        """Close the file, if it is open."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.close()
+
+    def topics(self, kind: str) -> list[str]:
+        """The names of the topics of a type of messages that hold any."""
+        connections = self.reader().connections
+        return sorted({c.topic for c in connections if c.msgtype == kind and c.msgcount})
+
+    def all_topics(self) -> list[str]:
+        """The names of all topics."""
+        return sorted({connection.topic for connection in self.reader().connections})
+
+    def messages(self, topic: _Topic | tuple[str, str], start_ns: int = 0) -> Iterator[Any]:
+        """When recorded, ns, and the message, of a topic (or a name and a type), from then on."""
+        name, kind = topic if isinstance(topic, tuple) else (topic.name, topic.kind)
+        reader = self.reader()
+        connections = [c for c in reader.connections if (c.topic, c.msgtype) == (name, kind)]
+        parse = self._types.deserialize_ros1 if self._is_one else self._types.deserialize_cdr
+        with self._told():
+            for _, recorded_ns, data in reader.messages(connections, start=start_ns or None):
+                yield recorded_ns, parse(data, kind)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """What rosbags says of a damaged bag becomes one sentence; it raises errors of any kind."""
+        try:
+            yield
+        except ToftrackError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise ToftrackError(
+                f"the bag '{self.path}' cannot be read ({reason}); it is damaged or no bag: "
+                f"{_REPAIR[self.path.suffix.lower() if self.path.is_file() else '']}"
+            ) from error
+
+
+def _choose(bag: _Bag, wanted: str | None) -> _Topic:
+    """The topic of depth images; ToftrackError, with those there are, where it is not clear."""
+    for start, device in _OF_CAMERAS.items():
+        if any(name.startswith(start) for name in bag.all_topics()):
+            raise ToftrackError(
+                f"'{bag.path}' is a recording of a camera's own program, which only that can read: "
+                f"play it with device={device} device.bag=FILE"
+            )
+    images = list(_image_topics(bag))
+    if wanted is not None:
+        for topic in images:
+            if topic.name == "/" + wanted.strip("/") or topic.name == wanted:
+                return topic
+        raise ToftrackError(
+            f"'{bag.path}' has no images of the topic {wanted}; its topics of images are "
+            f"{_listed(images)}"
+        )
+    depth = [topic for topic in images if is_depth(topic.encoding)]
+    raw = {topic.base for topic in depth if topic.kind == IMAGE}
+    # What image_transport compressed is there twice: once is enough.
+    depth = [topic for topic in depth if topic.kind == IMAGE or topic.base not in raw]
+    if not depth:
+        raise ToftrackError(
+            f"'{bag.path}' has no depth images (16UC1, 32FC1, or compressedDepth); its topics of "
+            f"images are {_listed(images)}"
+        )
+    if len(depth) > 1:
+        raise ToftrackError(
+            f"'{bag.path}' has {len(depth)} topics of depth images; choose one with device=rosbag "
+            f"device.topic= (toftrack convert: --topic): {_listed(depth)}"
+        )
+    return depth[0]
+
+
+def _image_topics(bag: _Bag) -> Iterator[_Topic]:
+    for kind in (IMAGE, COMPRESSED):
+        for name in bag.topics(kind):
+            first = next(bag.messages((name, kind)), None)
+            if first is not None:
+                yield _Topic(name, kind, encoding(first[1], kind), first[1])
+
+
+def _listed(topics: list[_Topic]) -> str:
+    return ", ".join(f"{topic.name} ({topic.encoding})" for topic in topics) or "none"
+
+
+def _camera(bag: _Bag, topic: _Topic) -> Camera:
+    """The lens of a topic's images: its camera_info, wherever in the bag that comes."""
+    sibling = f"{topic.base.rpartition('/')[0]}/camera_info"
+    names = bag.topics(CAMERA_INFO)
+    infos = {name: next(bag.messages((name, CAMERA_INFO)))[1] for name in names}
+    if sibling not in infos:
+        frame = topic.first.header.frame_id
+        fitting = [name for name, info in infos.items() if frame and info.header.frame_id == frame]
+        if len(fitting) != 1:
+            raise ToftrackError(
+                f"'{bag.path}' has no message of {sibling}, which tells the lens of {topic.name} "
+                f"(there are {', '.join(infos) or 'none'}); record it, too, or give a camera with "
+                "camera.file=FILE"
+            )
+        sibling = fitting[0]
+    try:
+        return camera_of(infos[sibling], rectified="rect" in topic.base.rpartition("/")[2])
+    except ToftrackError as error:
+        raise ToftrackError(
+            f"{sibling} of '{bag.path}' cannot be used as camera: {error}"
+        ) from None
+
+
+def _image(path: Path, topic: _Topic, message: Any, unit_m: float, index: int) -> np.ndarray:
+    try:
+        return depth_image(message, topic.kind, unit_m)
+    except ToftrackError as error:
+        raise ToftrackError(
+            f"image {index} of the topic {topic.name} in '{path}' cannot be used: {error}"
+        ) from None
+
+
+def _check_metres(path: Path, topic: _Topic, depth: np.ndarray) -> None:
+    readings = depth[depth > 0]
+    median = float(np.median(readings)) if readings.size else 0.0
+    if median > LARGEST_MEDIAN_M:
+        raise ToftrackError(
+            f"the median of the first image of {topic.name} in '{path}' is {median:.0f} m, which "
+            "is plainly another unit: 32FC1 must be metres, and of 16UC1 one step is told by "
+            "device=rosbag device.unit_m="
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Times:
+    seconds: np.ndarray
+    """(T,) float64."""
+    recorded_ns: np.ndarray
+    """(T,) int64, not decreasing: by it the messages are found."""
+    damage: str | None
+    """What ended the bag before its end."""
+
+
+def _times(bag: _Bag, topic: _Topic) -> _Times:
+    """The times of a topic's messages, up to where the bag can be read."""
+    stamps, recorded, damage = [], [], None
+    try:
+        for recorded_ns, message in bag.messages(topic):
+            stamp = message.header.stamp
+            stamps.append(int(stamp.sec) * 10**9 + int(stamp.nanosec))
+            recorded.append(recorded_ns)
+    except ToftrackError as error:
+        if not stamps:
+            raise
+        damage = str(error)
+    taken = np.array(stamps, np.int64)
+    # Some drivers leave the stamps empty, or count them by two clocks.
+    sound = taken[0] > 0 and (np.diff(taken) >= 0).all() and (len(taken) < 2 or np.ptp(taken) > 0)
+    times = taken if sound else np.array(recorded, np.int64)
+    return _Times(times / 1e9, np.array(recorded, np.int64), damage)

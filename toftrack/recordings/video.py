@@ -1,0 +1,250 @@
+"""Videos whose pixels are depth: recordings of an Azure Kinect, and lossless grey ones of 16 bits.
+
+A video is read through once for the times of its images, without decoding them; the images then
+come from the disk one at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.recordings import kinect
+from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera
+from toftrack.recordings.npz import DEFAULT_FPS
+
+VIDEOS = frozenset(".mkv .avi .mov .mp4 .m4v .webm .mpg .mpeg .wmv .nut".split())
+"""How the names of videos end."""
+_GREY = ("gray16le", "gray16be")
+_MISSING_FRAMES = 5  # fewer at the end say nothing of a file that was cut off
+
+
+class DepthVideo:
+    """The frames of a video. Made by `read_video`."""
+
+    truth = None
+    radial = False
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        depth: Track,
+        amplitude: Track | None,
+        unit_m: float,
+        fps: float | None,
+        damage: str | None,
+        metadata: dict[str, Any],
+    ) -> None:
+        self.path, self.camera, self.unit_m = path, camera, unit_m
+        self.damage, self.metadata = damage, metadata
+        steps = np.diff(depth.times_s)
+        median = float(np.median(steps)) if len(steps) else 0.0
+        self.fps = fps or (1 / median if median > 0 else DEFAULT_FPS)
+        self.timestamp_s = np.arange(len(steps) + 1) / fps if fps else depth.times_s
+        """(T,) float64 seconds, not decreasing."""
+        self._depth, self._amplitude = depth, amplitude
+
+    def __len__(self) -> int:
+        return len(self.timestamp_s)
+
+    def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """A frame's depth, (H, W) float32 metres, and amplitude, (H, W) uint16; new arrays.
+
+        An infrared image that is missing is black. Raises ToftrackError when one is damaged.
+        """
+        depth = self._depth.image(index).astype(np.float32) * np.float32(self.unit_m)
+        if self._amplitude is None:
+            return depth, None
+        found = self._amplitude.number_at(self._depth.ticks[index])
+        if found is None:
+            return depth, np.zeros(depth.shape, np.uint16)
+        return depth, self._amplitude.image(found)
+
+    def close(self) -> None:
+        """Close the file; it opens again by itself."""
+        self._depth.close()
+        if self._amplitude is not None:
+            self._amplitude.close()
+
+
+class Track:
+    """The images of one track of a video, 16 bits a pixel, each to be had by its number."""
+
+    def __init__(self, path: Path, stream: int, ticks: np.ndarray, tick_s: float) -> None:
+        self.ticks = ticks
+        """(T,) int64: the images' times as the file counts them, rising."""
+        self.times_s = ticks * tick_s
+        """(T,) float64 seconds."""
+        self._path, self._stream = path, stream
+        self._container: Any = None
+        self._images: Iterator[Any] | None = None
+        self._next = 0
+
+    def number_at(self, tick: int) -> int | None:
+        """The number of the image of that time, None where there is none."""
+        number = int(np.searchsorted(self.ticks, tick))
+        return number if number < len(self.ticks) and self.ticks[number] == tick else None
+
+    def image(self, number: int) -> np.ndarray:
+        """(H, W) uint16, a new array. Raises ToftrackError when it is damaged."""
+        import av  # takes a while, and most recordings are no videos
+
+        try:
+            if self._images is None or number != self._next:
+                self._go_to(number)
+            assert self._images is not None
+            image = next(frame for frame in self._images if frame.pts >= self.ticks[number])
+            self._next = number + 1
+            if image.pts != self.ticks[number]:
+                raise ToftrackError(
+                    f"frame {number} of '{self._path}' is damaged; copy or record it again"
+                )
+            return image.to_ndarray().astype(np.uint16)
+        except (av.FFmpegError, OSError, StopIteration) as error:
+            raise ToftrackError(
+                f"frame {number} of '{self._path}' cannot be decoded ({_reason(error)}); copy or "
+                "record it again"
+            ) from error
+
+    def close(self) -> None:
+        """Close the file, if it is open."""
+        container, self._container, self._images = self._container, None, None
+        if container is not None:
+            container.close()
+
+    def _go_to(self, number: int) -> None:
+        if self._container is None:
+            self._container = opened(self._path)
+        stream = self._container.streams[self._stream]
+        self._container.seek(int(self.ticks[number]), stream=stream)
+        self._images = self._container.decode(stream)
+
+
+def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> DepthVideo:
+    """Open a video of depth images.
+
+    Args:
+        path: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of 16 bits (FFV1).
+        camera_file: a camera file; None = the recording's own calibration, or what is told.
+        bare: intrinsics, unit (a millimetre) and frame rate of a video that does not tell them.
+
+    Raises:
+        ToftrackError: it is damaged, has colour images or no depth, or nothing tells its camera.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise ToftrackError(f"there is no file '{path}'; give the path of a recording")
+    container = opened(path)
+    try:
+        own = kinect.tracks_of(container, path)
+        number = _grey_stream(container, path, None if own is None else own.depth)
+        shape = container.streams[number].width, container.streams[number].height
+        if camera_file is not None or own is None:
+            camera = bare_camera(path, camera_file, bare, *shape)
+        else:
+            camera = kinect.camera_of(container, path, *shape)
+        infrared = [] if own is None else own.infrared
+        grey = [index for index in infrared if _kind(container.streams[index])[1] in _GREY]
+        found = _scanned(container, path, [number, *grey])
+    finally:
+        container.close()
+    depth, *others = (
+        Track(path, stream, ticks, found.tick_s[stream]) for stream, ticks in found.ticks.items()
+    )
+    unit_m = MILLIMETRE if bare.unit_m is None else bare.unit_m
+    about = {} if own is None else own.facts
+    if own is not None:
+        depth.times_s += own.offset_s
+    return DepthVideo(
+        path, camera, depth, others[0] if others else None, unit_m, bare.fps, found.damage, about
+    )
+
+
+def opened(path: Path) -> Any:
+    """The container of PyAV; ToftrackError when the file is no video."""
+    import av  # takes a while, and most recordings are no videos
+
+    try:
+        # A damaged text among the tags is no reason to refuse the images.
+        return av.open(str(path), metadata_errors="replace")
+    except (av.FFmpegError, OSError) as error:
+        raise ToftrackError(
+            f"'{path}' cannot be read as a video ({_reason(error)}); it is damaged, cut off or of "
+            "another kind"
+        ) from error
+
+
+def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
+    """The number of the wanted, or the only track of grey 16-bit images."""
+    videos = [s for s in container.streams.video if wanted in (None, s.index)]
+    kinds = [(s.index, *_kind(s)) for s in videos]
+    grey = [index for index, _, pixels in kinds if pixels in _GREY]
+    if len(grey) == 1:
+        return grey[0]
+    told = ", ".join(f"{codec} {pixels}" for _, codec, pixels in kinds) or "no video at all"
+    if grey:
+        raise ToftrackError(f"'{path}' has {len(grey)} tracks of grey 16-bit images; keep one")
+    raise ToftrackError(
+        f"'{path}' is a video of colour or 8-bit images ({told}), from which depth cannot be had; "
+        "give the depth images: lossless grey of 16 bits (ffmpeg -c:v ffv1 -pix_fmt gray16le), "
+        "16-bit PNG, or .npy"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    ticks: dict[int, np.ndarray]
+    """By stream, the images' times, (T,) int64, rising."""
+    tick_s: dict[int, float]
+    damage: str | None
+
+
+def _scanned(container: Any, path: Path, streams: list[int]) -> _Found:
+    """The times of all images of some tracks; ToftrackError when the first one has none."""
+    import av
+
+    ticks: dict[int, list[int]] = {number: [] for number in streams}
+    damage = None
+    try:
+        for packet in container.demux([container.streams[number] for number in streams]):
+            if packet.pts is None or not packet.size:
+                continue
+            if packet.is_corrupt or packet.size < _least(packet.stream):
+                damage = "it breaks off within a frame"
+                break
+            ticks[packet.stream_index].append(packet.pts)
+    except (av.FFmpegError, OSError) as error:
+        damage = f"it is damaged further on ({_reason(error)})"
+    if not ticks[streams[0]]:
+        raise ToftrackError(f"'{path}' has no frame of depth ({damage or 'it is empty'})")
+    tick_s = {number: float(container.streams[number].time_base) for number in streams}
+    times = {number: np.unique(np.array(values, np.int64)) for number, values in ticks.items()}
+    first = times[streams[0]]
+    missing_s = (container.duration or 0) / 1e6 - first[-1] * tick_s[streams[0]]
+    step_s = (first[-1] - first[0]) / max(1, len(first) - 1) * tick_s[streams[0]]
+    if damage is None and len(first) > 1 and missing_s > _MISSING_FRAMES * step_s:
+        damage = f"it ends {missing_s:.1f} s before the end that it states"
+    return _Found(times, tick_s, damage)
+
+
+def _kind(stream: Any) -> tuple[str, str | None]:
+    """The names of a track's codec and pixels."""
+    codec = stream.codec_context  # None where FFmpeg knows no decoder
+    return ("unknown", None) if codec is None else (codec.name, codec.pix_fmt)
+
+
+def _least(stream: Any) -> int:
+    """The fewest bytes that an image of a track may have: all of them where none is compressed."""
+    raw = _kind(stream)[0] == "rawvideo"
+    return 2 * stream.width * stream.height if raw else 1
+
+
+def _reason(error: BaseException) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
