@@ -41,9 +41,9 @@ def stream() -> Iterator[WebSocketStream]:
 def listening(stream: WebSocketStream, **headers: str) -> Any:
     """A client that is no browser, or says that it is a page of some origin."""
     url = f"ws{stream.url.removeprefix('http')}stream"
-    before = len(stream._clients)
+    before = set(stream._clients)
     opened = client.connect(url, additional_headers=headers, compression=None)
-    eventually(lambda: len(stream._clients) > before)
+    eventually(lambda: stream._clients - before)
     return opened
 
 
