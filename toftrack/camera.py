@@ -28,6 +28,8 @@ _UNTIL = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 _SHORTEST, _LONGEST = 0.1, 50.0
 """Focal lengths as multiples of the image's longer side: from an extreme wide angle to a small part
 of a narrow view."""
+_TINY_PX = 16
+"""Smaller images are parts of others."""
 _MOST_OBLONG = 2.5
 """Pixels that were put together in one direction only."""
 _FARTHEST_ASIDE = 1.5
@@ -52,7 +54,8 @@ def _numbers(value: object, shape: tuple[int, ...], name: str) -> np.ndarray:
 def _check_plausible(K: np.ndarray, width: int, height: int) -> None:
     """ToftrackError for a matrix that no depth camera with images of that size has."""
     (fx, fy), (cx, cy), size = K[[0, 1], [0, 1]], K[:2, 2], max(width, height)
-    focal = all(_SHORTEST <= f / size <= _LONGEST for f in (fx, fy))
+    longest = _LONGEST * max(size, _TINY_PX)
+    focal = all(_SHORTEST * size <= f <= longest for f in (fx, fy))
     square = 1 / _MOST_OBLONG <= fx / fy <= _MOST_OBLONG
     # Of a part of a larger image the centre may lie outside, but not far beside the view, too.
     aside = abs(np.array([width / 2 - cx, height / 2 - cy]))
