@@ -130,6 +130,11 @@ def test_other_numbers_of_hands_are_refused(hands: float) -> None:
         HandsTracker(model, 0, hands)  # type: ignore[arg-type]
 
 
+def test_two_hands_without_networks_are_refused() -> None:
+    with pytest.raises(ToftrackError, match="relocation=network"):
+        tracker_of("hands=2", "relocation=none", "lost=score")
+
+
 def test_the_second_hand_has_to_convince_more_than_the_first() -> None:
     lost = calibrated_belief()
     assert lost.second > lost.believe

@@ -152,9 +152,7 @@ class HandShape:
     def of_side(self, side: str) -> HandShape:
         """The mirror image, or the same; ToftrackError for an unknown side."""
         if side not in SIDES:
-            raise ToftrackError(
-                f"hand.side={side} is unknown; give hand.side=right or hand.side=left"
-            )
+            raise ToftrackError(f"hand.side={side} is unknown; give hand.side=auto, right or left")
         return replace(self, side=side)
 
     def save(self, path: str | Path) -> None:
@@ -222,7 +220,7 @@ def default_hand_shape(
     Raises ToftrackError for an unknown side or a length that no hand has.
     """
     if side not in SIDES:
-        raise ToftrackError(f"hand.side={side} is unknown; give hand.side=right or hand.side=left")
+        raise ToftrackError(f"hand.side={side} is unknown; give hand.side=auto, right or left")
     if not 0.08 <= hand_length_m <= 0.30:
         raise ToftrackError(
             f"a hand length of {hand_length_m} m is outside 0.08 .. 0.30 m; give metres from"

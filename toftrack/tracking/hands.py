@@ -12,6 +12,7 @@ import torch
 from toftrack.checks import check_number
 from toftrack.compute.pace import elapsed_s
 from toftrack.compute.threads import small_operations
+from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import DepthImage, checked_image
 from toftrack.hand.shape import HandShape
@@ -125,8 +126,13 @@ class HandsTracker:
     """
 
     def __init__(self, model: TrackerModel, seed: int = 0, hands: int = 1) -> None:
-        """Raises ToftrackError when `hands` is neither 1 nor 2."""
+        """Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without networks."""
         check_number("hands", hands, 1, 2, whole=True)
+        if hands > 1 and model.relocaliser is None:
+            raise ToftrackError(
+                "hands=2 tells two hands apart by the networks, but relocation=none has none; give "
+                "hands=1, or relocation=network"
+            )
         self.model = model
         self.state = first_states(model, seed, hands)
         self.infos: tuple[StepInfo | None, ...] = (None,) * hands
