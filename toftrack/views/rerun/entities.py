@@ -193,9 +193,9 @@ class Entities:
         log(f"{entity}/joints", rr.Points3D(joints, colors=colours, radii=_JOINT_M))
 
     def _log_plots(self, estimate: Estimate, slot: int) -> None:
-        values = {
+        values: dict[str, list[float]] = {
             "score": [estimate.score, estimate.confidence, float(estimate.lost)],
-            "latent": estimate.latent,
+            "latent": estimate.latent.tolist(),
             "pinch": [estimate.pinch],
         }
         if slot not in self._named:
