@@ -88,18 +88,10 @@ def test_the_hand_is_drawn_bends_and_turns_grey_when_it_is_lost(stream: Any, pag
     assert left.mean() > 0.03
 
 
-def test_several_hands_are_drawn(stream: Any, page: Any, monkeypatch: Any) -> None:
-    from toftrack.output import lines
-    from toftrack.output.web import stream as module
-
-    def both(estimate: Estimate, _: Any) -> str:
-        hands = [lines.line_content((hand_estimate(0, side),)) for side in ("right", "left")]
-        content = {"index": estimate.index, "timestamp_s": 0.0, "hands": hands}
-        return lines.json.dumps(content)
-
-    monkeypatch.setattr(module, "json_line", both)
+def test_several_hands_are_drawn(stream: Any, page: Any) -> None:
+    both = hand_estimate(9), hand_estimate(9, "left")
     page.get(stream.url)
-    shown(page, "window.drawn?.hands === 2", lambda: stream.send((hand_estimate(9),)))
+    shown(page, "window.drawn?.hands === 2", lambda: stream.send(both))
 
 
 def pointing(index: int, x: float, y: float, **changes: Any) -> Estimate:

@@ -154,8 +154,15 @@ class WebSocketStream:
         while any(client.lines for client in self._clients) and self._loop.time() < deadline:
             await asyncio.sleep(_PAUSE_S)
         self._dropped += sum(len(client.lines) for client in self._clients)
+        # Who does not read does not say goodbye either.
+        mute = [connection for connection in self._server.connections if connection.transport]
         self._server.close()
-        await self._server.wait_closed()
+        try:
+            await asyncio.wait_for(self._server.wait_closed(), _LAST_WORDS_S)
+        except TimeoutError:
+            for connection in mute:
+                connection.transport.abort()
+            await self._server.wait_closed()
 
     def _offer(self, line: str) -> None:
         for client in self._clients:
