@@ -30,8 +30,6 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1])]
-
 import numpy as np
 
 MOST_S, MOST_BYTES = 5.0, 2**30
@@ -141,7 +139,7 @@ def _odd_array(random: np.random.Generator, data: bytes) -> bytes:
     shape = old.shape
     if random.random() < 0.6:
         shape = tuple(int(n) for n in random.integers(0, 5, random.integers(0, 5)))
-    kinds = "? i1 u1 i2 u2 i4 u4 i8 u8 f2 f4 f8 >f4 >u2 c8 c16 U0 U3 S4 M8[s] m8[s] V3 f4,i2".split()
+    kinds = "? i1 u1 i2 u4 i8 u8 f2 f4 f8 >f4 >u2 c8 c16 U0 U3 S4 M8[s] m8[s] V3 f4,i2".split()
     kind = np.dtype(kinds[random.integers(len(kinds))])
     if kind.kind in "US":
         return _saved(np.full(shape, "ab", kind))
@@ -151,7 +149,21 @@ def _odd_array(random: np.random.Generator, data: bytes) -> bytes:
 
 def _odd_header(random: np.random.Generator, data: bytes) -> bytes:
     """Other words in the array's header, of the same length."""
-    words = [b"(", b")", b"'", b"{", b"}", b",", b"L", b"-1", b"True", b"'|O'", b"9e9", b"\\", b"\0"]
+    words = [
+        b"(",
+        b")",
+        b"'",
+        b"{",
+        b"}",
+        b",",
+        b"L",
+        b"-1",
+        b"True",
+        b"'|O'",
+        b"9e9",
+        b"\\",
+        b"\0",
+    ]
     end = max(12, data.find(b"\n", 0, 200))
     place = int(random.integers(6, end))
     word = words[random.integers(len(words))]
@@ -198,7 +210,11 @@ def mutated(random: np.random.Generator, suffix: str, content: bytes, plain: Any
         except Exception:  # too damaged already for anything but bytes
             pass
         if suffix == ".npy":
-            return _odd_array(random, content) if random.random() < 0.5 else _odd_header(random, content)
+            return (
+                _odd_array(random, content)
+                if random.random() < 0.5
+                else _odd_header(random, content)
+            )
     if random.random() < 0.3:
         return _odd_bytes(random, content)
     return plain(content, len(content) + 64)
@@ -248,10 +264,11 @@ def work(folder: Path, until: float, seed: int) -> None:
     """The process that reads: does not return."""
     import atheris
 
+    sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1])]
     with atheris.instrument_imports(["toftrack", "rosbags"], others(), False):
-        import toftrack.output.run_folder  # noqa: F401
         from helpers.readers import write_readers
 
+        import toftrack.output.run_folder  # noqa: F401
         from toftrack.errors import ToftrackError
 
     readers = write_readers(Path(tempfile.mkdtemp(dir=folder)))
@@ -324,7 +341,7 @@ def work(folder: Path, until: float, seed: int) -> None:
 def main() -> int:
     arguments = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     arguments.add_argument("--minutes", type=float, default=20.0)
-    arguments.add_argument("--findings", type=Path, help="a folder; a new temporary one if left out")
+    arguments.add_argument("--findings", type=Path, help="a folder; by default a new one")
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--until", type=float, help=argparse.SUPPRESS)
     given = arguments.parse_args()

@@ -96,7 +96,8 @@ def _mapped(path: Path) -> np.ndarray:
     except OSError as error:
         raise ToftrackError(f"'{path}' cannot be read ({error.strerror or error})") from error
     except (ValueError, EOFError, TypeError, SyntaxError, tokenize.TokenError) as error:
+        reason = " ".join(str(error).split())
         raise ToftrackError(
-            f"'{path}' is no .npy of numbers, or was cut off ({error}); save the depth with "
+            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
             "numpy.save"
         ) from error
