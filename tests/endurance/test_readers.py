@@ -28,7 +28,7 @@ pytestmark = pytest.mark.endurance
 
 _PATIENT = settings(
     deadline=timedelta(seconds=10),
-    max_examples=int(os.environ.get("ENDURANCE_EXAMPLES", "150")),
+    max_examples=int(os.environ.get("ENDURANCE_EXAMPLES", "500")),
     suppress_health_check=list(HealthCheck),
 )
 _SCALARS = st.one_of(
@@ -157,7 +157,7 @@ def test_any_text(readers: list[Reader], data: st.DataObject) -> None:
     depth=nps.arrays(
         st.sampled_from(["f2", "f4"]),
         nps.array_shapes(min_dims=3, max_dims=3, max_side=6),
-        elements=st.floats(0, 8, width=16) | st.just(0.0),
+        elements=st.floats(0.125, 8, width=16) | st.just(0.0),
     ),
     focal=st.floats(0.2, 40),
     radial=st.booleans(),

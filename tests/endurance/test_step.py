@@ -28,7 +28,7 @@ pytestmark = pytest.mark.endurance
 
 _PATIENT = settings(
     deadline=timedelta(seconds=30),
-    max_examples=int(os.environ.get("ENDURANCE_EXAMPLES", "60")),
+    max_examples=int(os.environ.get("ENDURANCE_EXAMPLES", "300")),
     suppress_health_check=list(HealthCheck),
 )
 _ODD = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-30, 1e30, 0.3, 70.0)
