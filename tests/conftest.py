@@ -1,4 +1,5 @@
-"""Tests marked `slow` run only with `pytest --slow`; and the list of what was skipped, and why.
+"""Tests marked `slow` run only with `pytest --slow`, and those marked `endurance` only with
+`pytest -m endurance`; and the list of what was skipped, and why.
 
 A test may be skipped where a machine lacks what it needs, for the reasons below. Any other skip
 fails the run, so that no test falls asleep unnoticed.
@@ -19,6 +20,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 ALLOWED_SKIPS = (
     r"slow; run with --slow",
+    r"endurance; run with -m endurance",
+    r"hypothesis is not installed",
     r"needs a CUDA device|there is no CUDA device|there is a CUDA device",
     r"triton is not installed",
     r"pyrealsense2",  # the error's own sentence names it
@@ -39,11 +42,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--slow"):
-        return
+    asked = {"slow": config.getoption("--slow"), "endurance": "endurance" in config.option.markexpr}
+    how = {"slow": "--slow", "endurance": "-m endurance"}
     for item in items:
-        if "slow" in item.keywords:
-            item.add_marker(pytest.mark.skip(reason="slow; run with --slow"))
+        for mark, wanted in asked.items():
+            if mark in item.keywords and not wanted:
+                item.add_marker(pytest.mark.skip(reason=f"{mark}; run with {how[mark]}"))
 
 
 def _skips(config: pytest.Config) -> Counter[str]:

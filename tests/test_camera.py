@@ -281,3 +281,11 @@ def test_a_matrix_that_no_camera_has_is_refused_with_one_that_is_plausible(place
 )
 def test_unusual_cameras_are_plausible(K: list, size: tuple[int, int]) -> None:
     assert Camera(np.array([*K, [0, 0, 1]]), *size).width == size[0]
+
+
+@pytest.mark.parametrize("width", [float("inf"), float("nan"), "wide", None, []])
+def test_a_width_that_is_no_whole_number_is_told(width: object, tmp_path: Path) -> None:
+    content = Camera(np.array([[40.0, 0, 15.5], [0, 40, 11.5], [0, 0, 1]]), 32, 24).to_dict()
+    (tmp_path / "camera.json").write_text(json.dumps(content | {"width": width}))
+    with pytest.raises(ToftrackError, match="width or height that is not a whole number"):
+        Camera.load(tmp_path / "camera.json")

@@ -311,7 +311,7 @@ class Camera:
             ) from None
         except ToftrackError as error:
             raise ToftrackError(f"in the camera file '{path}', {error}") from None
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ToftrackError(
                 f"the camera file '{path}' has a width or height that is not a whole number"
             ) from None

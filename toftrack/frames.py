@@ -141,9 +141,9 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
             f"the depth image must have two dimensions (rows, columns), but its shape is "
             f"{depth.shape}; give one frame at a time"
         )
-    if np.issubdtype(depth.dtype, np.integer):
+    if depth.dtype.kind in "iu":
         raise wrong_unit("the depth image", median_reading(depth), str(depth.dtype))
-    if not np.issubdtype(depth.dtype, np.floating):
+    if depth.dtype.kind != "f":
         raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
     depth = np.ascontiguousarray(depth, np.float32)
     nearest, farthest = depth.min(), depth.max()

@@ -454,3 +454,29 @@ def test_a_result_without_a_key_is_told(tmp_path: Path) -> None:
     np.savez(tmp_path / "track.npz", lost=np.zeros(3, bool))
     with pytest.raises(ToftrackError, match="joints_m"):
         read_results(tmp_path / "track.npz")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"lost": np.array(False)},
+        {"lost": np.zeros((2, 1, 1), bool)},
+        {"index": np.array(["a", "b"])},
+        {"score": np.zeros((2, 3), np.float32)},
+        {"latent": np.zeros((1, 2), np.float32)},
+        {"state": np.zeros((2, 26), np.float32)},
+        {"metadata": np.array("[]")},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_arrays_that_do_not_fit_together_are_no_result(
+    changes: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    write(tmp_path, [estimate(0), estimate(1)])
+    path = tmp_path / "track.npz"
+    with np.load(path) as content:
+        arrays = dict(content)
+    read_results(path)
+    np.savez(path, **(arrays | changes))
+    with pytest.raises(ToftrackError, match=r"is not a track\.npz, or it is damaged"):
+        read_results(path)

@@ -165,3 +165,11 @@ def test_sources_are_mixed_by_the_configuration(recorded: Path, tmp_path: Path) 
     data = hydra.utils.instantiate(config.data)
     assert [source["data"] for source in data.sources] == ["synthetic", "leap", "file"]
     assert len(data) == 30 + 30 + 6
+
+
+def test_positions_that_no_hand_can_have_are_one_clear_error(recorded: Path) -> None:
+    with np.load(recorded) as content:
+        arrays = dict(content)
+    np.savez(recorded, **(arrays | {"joints_mm": np.full_like(arrays["joints_mm"], 3e38)}))
+    with pytest.raises(ToftrackError, match=f"{recorded}"):
+        leap_data(str(recorded), None, 1e3)

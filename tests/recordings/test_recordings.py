@@ -359,3 +359,8 @@ def test_depth_of_no_number_type(tmp_path: Path, kind: Any) -> None:
 def test_bad_optional_key_is_named(tmp_path: Path, key: str, value: Any) -> None:
     text = complaint(save(tmp_path, **{key: value}))
     assert key in text
+
+
+def test_times_are_no_depth(tmp_path: Path) -> None:
+    path = save(tmp_path, depth_m=np.ones(arrays()["depth_m"].shape, "m8[s]"))
+    assert "must be float32 or float16 metres" in complaint(path)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -32,7 +34,7 @@ from toftrack.camera import Camera
 from toftrack.devices.replay import Replay
 from toftrack.devices.rosbag import Bag
 from toftrack.errors import ToftrackError
-from toftrack.recordings import ros_images
+from toftrack.recordings import ros_images, rosbag
 from toftrack.recordings.bag_names import is_bag
 from toftrack.recordings.ros_camera import camera_of
 from toftrack.recordings.rosbag import read_rosbag
@@ -403,3 +405,24 @@ def test_a_part_of_the_sensor_and_binning_move_the_lens() -> None:
 def test_a_camera_info_that_tells_no_lens_is_told(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         camera_of(as_message(camera_info(CAMERA, **changes)), rectified=False)
+
+
+def test_a_camera_info_that_is_announced_and_missing_is_told(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "db3", recording(some_depth(), CAMERA))
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as store, store:
+        store.execute(
+            "DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = ?)", (INFO,)
+        )
+    with pytest.raises(ToftrackError, match="has no message of"):
+        read_rosbag(path)
+
+
+def test_a_bag_is_used_up_to_where_its_times_go_back() -> None:
+    stamp = SimpleNamespace(sec=1, nanosec=0)
+    message = SimpleNamespace(header=SimpleNamespace(stamp=stamp))
+    bag: Any = SimpleNamespace(
+        path="hand.bag", messages=lambda _: iter([(5, message), (6, message), (4, message)])
+    )
+    times = rosbag._times(bag, cast(Any, None))
+    assert times.recorded_ns.tolist() == [5, 6]
+    assert "out of order" in (times.damage or "")

@@ -31,6 +31,8 @@ KINDS: dict[str, type] = {
     field.name: _EXACT.get(field.name, _KINDS[_HINTS[field.name]]) for field in fields(Estimate)
 }
 """Of what type each field is in track.npz; arrays have their shape behind the frames' axis."""
+NUMBERS = frozenset(name for name, hint in _HINTS.items() if hint is not np.ndarray)
+"""The fields that are one number or text."""
 
 _FIRST = (
     "index",

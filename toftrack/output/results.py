@@ -23,7 +23,7 @@ from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, LineFile, write_whole
-from toftrack.output.lines import KINDS, json_line, strict
+from toftrack.output.lines import HAND_FIELDS, KINDS, NUMBERS, json_line, strict
 from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.records import Records, write_archive
 from toftrack.output.summary import run_metrics, summarise
@@ -45,6 +45,8 @@ _FROM_THE_START = (
     "compute_s",
 )
 """Arrays that every track.npz has; older files without the others are results as well."""
+
+_SHAPES = {"joints_m": (21, 3), "state": (27,)}
 
 
 class ResultWriter:
@@ -212,6 +214,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
+        _check_arrays({name: arrays[name] for name in known}, content["metadata"])
     except OSError as error:
         raise ToftrackError(
             f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
@@ -226,6 +229,24 @@ def read_results(path: str | Path) -> dict[str, Any]:
             f"'{path}' is not a track.npz, or it is damaged; give the path of one"
         ) from error
     return content
+
+
+def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:
+    """ValueError where arrays are not of as many frames and slots, or not of the types, that a
+    track.npz has, or where the metadata are no JSON object."""
+    if not isinstance(metadata, dict):
+        raise ValueError("the metadata are no object")
+    slots = arrays["lost"].shape
+    if len(slots) not in (1, 2):
+        raise ValueError(f"'lost' has the shape {slots}")
+    for name, array in arrays.items():
+        of_hand = slots if name in HAND_FIELDS else slots[:1]
+        end = _SHAPES.get(name, () if name in NUMBERS else array.shape[len(of_hand) :])
+        if array.shape != (*of_hand, *end):
+            raise ValueError(f"{name!r} has the shape {array.shape}")
+        known = np.dtype(KINDS.get(name, np.float32)).kind
+        if array.dtype.kind not in {"f": "fiu", "i": "iu"}.get(known, known):
+            raise ValueError(f"{name!r} is {array.dtype}")
 
 
 def read_run_facts(folder: Path) -> dict[str, Any]:

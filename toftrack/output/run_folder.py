@@ -58,7 +58,8 @@ class Run:
     @property
     def config(self) -> dict[str, Any]:
         """The run's configuration."""
-        return self.results["metadata"].get("config") or {}
+        config = self.results["metadata"].get("config")
+        return config if isinstance(config, dict) else {}
 
     @property
     def shape(self) -> HandShape:
@@ -121,7 +122,8 @@ class Run:
     def _ran_in(self) -> str | None:
         """The working folder of the run; None: nobody knows."""
         if (self.folder / "run.json").is_file():
-            return str(read_run_facts(self.folder)["working_folder"])
+            folder = read_run_facts(self.folder).get("working_folder")
+            return None if folder is None else str(folder)
         try:  # of an older version
             return str(OmegaConf.load(self.folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd)
         except Exception:  # no such file, or whatever a YAML reader may say about it
@@ -204,6 +206,8 @@ def read_run(folder: str | Path) -> Run:
         frames, names = _lines(folder / "track.jsonl", rows)
     try:
         summary = read_json(folder / "summary.json")
+        if not isinstance(summary, dict):
+            raise ValueError("it is no JSON object")
     except (OSError, ValueError) as error:
         raise ToftrackError(
             f"'{folder / 'summary.json'}' cannot be read ({error}); run track.py again"

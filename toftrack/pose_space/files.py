@@ -106,7 +106,8 @@ def load_pose_space(path: str | Path) -> PoseSpace:
             f"{path} holds a pose space of the unknown kind {header.get('kind')!r}; known:"
             f" {', '.join(pose_space_kinds())}"
         )
-    if tuple(header.get("angle_names", ())) != ANGLE_NAMES:
+    names, labels = header.get("angle_names"), header.get("training_labels", [])
+    if names != list(ANGLE_NAMES):
         raise ToftrackError(
             f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
             f" hand; {_ADVICE}"
@@ -116,7 +117,9 @@ def load_pose_space(path: str | Path) -> PoseSpace:
         name = min(set(arrays) ^ needed)
         what = f"no array {name!r}" if name in needed else f"an array {name!r} too many"
         raise ToftrackError(f"{path} is a damaged pose-space file: it has {what}; {_ADVICE}")
-    labels = tuple(header.get("training_labels", ()))
+    if not isinstance(labels, list):
+        raise ToftrackError(f"{path} is a damaged pose-space file (no labels); {_ADVICE}")
+    labels = tuple(labels)
     try:
         tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
         space = module.Space(**tensors, training_labels=labels)
@@ -128,7 +131,9 @@ def load_pose_space(path: str | Path) -> PoseSpace:
         raise ToftrackError(f"{path} is a damaged pose-space file ({error}); {_ADVICE}") from None
     if not usable:
         raise ToftrackError(f"{path} is a damaged pose-space file (not all finite); {_ADVICE}")
-    if angles.shape[-1] != len(ANGLE_NAMES) or space.lower.shape != (space.dims,):
+    if angles.shape[-1] != len(ANGLE_NAMES) or any(
+        bound.shape != (space.dims,) for bound in (space.lower, space.upper)
+    ):
         raise ToftrackError(
             f"{path} is a pose space of another size ({angles.shape[-1]} angles); {_ADVICE}"
         )

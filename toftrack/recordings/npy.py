@@ -95,8 +95,16 @@ def _mapped(path: Path) -> np.ndarray:
         raise ToftrackError(f"there is no file '{path}'; give the path of a recording") from None
     except OSError as error:
         raise ToftrackError(f"'{path}' cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError, TypeError, SyntaxError, tokenize.TokenError) as error:
+    except (
+        ValueError,
+        EOFError,
+        TypeError,
+        SyntaxError,
+        OverflowError,
+        tokenize.TokenError,
+    ) as error:
+        reason = " ".join(str(error).split())
         raise ToftrackError(
-            f"'{path}' is no .npy of numbers, or was cut off ({error}); save the depth with "
+            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
             "numpy.save"
         ) from error

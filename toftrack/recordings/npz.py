@@ -228,8 +228,8 @@ def _check_depth(depth: Images, key: str) -> Images:
             f"'{key}' must have 3 dimensions (frames, rows, columns), but has {depth.ndim}, shape "
             f"{depth.shape}"
         )
-    whole = np.issubdtype(depth.dtype, np.integer)
-    if not whole and not np.issubdtype(depth.dtype, np.floating):
+    whole = depth.dtype.kind in "iu"
+    if not whole and depth.dtype.kind != "f":
         raise ToftrackError(f"'{key}' must be float32 or float16 metres, but is {depth.dtype}")
     if len(depth) == 0:
         raise ToftrackError(f"'{key}' has zero frames; record at least one")

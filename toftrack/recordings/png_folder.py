@@ -28,10 +28,9 @@ from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.recordings.png import LARGEST_PIXELS, SIGNATURE, decoded_png
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_LARGEST_PIXELS = 64_000_000  # a damaged header must not make us allocate gigabytes
 
 
 class PngFolder:
@@ -75,15 +74,12 @@ class PngFolder:
 
     def _read(self, path: Path) -> np.ndarray:
         try:
-            content = np.frombuffer(path.read_bytes(), np.uint8)
+            content = path.read_bytes()
         except OSError as error:
             raise ToftrackError(
                 f"the image '{path}' cannot be read ({error.strerror}); check its permissions"
             ) from error
-        try:
-            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
-        except cv2.error:
-            image = None
+        image = decoded_png(content)
         if image is None:
             raise ToftrackError(f"the image '{path}' is damaged; copy or record it again")
         if image.dtype != np.uint16 or image.shape != (self.camera.height, self.camera.width):
@@ -292,7 +288,7 @@ def _png_size(path: Path) -> tuple[int, int]:
             start = stream.read(26)
     except OSError as error:
         raise ToftrackError(f"the image '{path}' cannot be read ({error.strerror})") from error
-    if len(start) < 26 or start[:8] != _PNG_START:
+    if len(start) < 26 or start[:8] != SIGNATURE:
         raise ToftrackError(f"the image '{path}' is not a PNG file, or it was cut off")
     width, height, bits, colour = struct.unpack(">IIBB", start[16:26])
     if bits != 16 or colour != 0:
@@ -300,7 +296,7 @@ def _png_size(path: Path) -> tuple[int, int]:
             f"the image '{path}' is not a 16-bit grey PNG; save the depth as such, in steps of a "
             "millimetre"
         )
-    if width * height > _LARGEST_PIXELS:
+    if width * height > LARGEST_PIXELS:
         raise ToftrackError(f"the image '{path}' claims {width}x{height} pixels; it is damaged")
     return width, height
 

@@ -11,20 +11,17 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.recordings.png import SIGNATURE, decoded_png
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _WORDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encodings that may hold depth, and their type. mono16 is rather infrared: only when asked for."""
-_PNG = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct("<iff")
 """Of compressedDepth: the kind of quantisation, and its two parameters."""
-_SIZE = struct.Struct(">II")
-_LARGEST_PIXELS = 64_000_000  # a damaged header must not make us allocate gigabytes
 
 
 def encoding(message: Any, kind: str) -> str:
@@ -85,12 +82,12 @@ def _decompressed(message: Any) -> np.ndarray:
             "again with image_transport's format png, or as raw images"
         )
     data = np.asarray(message.data, np.uint8)
-    start = data[: _HEADER.size + len(_PNG)].tobytes().find(_PNG)
+    start = data[: _HEADER.size + len(SIGNATURE)].tobytes().find(SIGNATURE)
     if start not in (0, _HEADER.size):
         raise ToftrackError(
             f"it says '{words}', but holds no PNG; it is damaged or of another kind"
         )
-    image = _decoded_png(data[start:])
+    image = decoded_png(data[start:].tobytes())
     if image is None or image.ndim != 2 or image.dtype != np.uint16:
         raise ToftrackError("its PNG is damaged, or not of 16 bits and one channel")
     if not words.startswith("32FC1"):
@@ -98,17 +95,6 @@ def _decompressed(message: Any) -> np.ndarray:
     if start == 0:
         raise ToftrackError("its 32FC1 depth is quantised, and the header that says how is missing")
     return _from_inverse(image, data[:start].tobytes())
-
-
-def _decoded_png(data: np.ndarray) -> np.ndarray | None:
-    """The image of a PNG file's bytes, None where they are damaged."""
-    size = _SIZE.unpack(data[16:24].tobytes()) if data.size >= 24 else (0, 0)
-    if not 0 < size[0] * size[1] <= _LARGEST_PIXELS:
-        return None
-    try:
-        return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
 
 
 def _from_inverse(image: np.ndarray, header: bytes) -> np.ndarray:

@@ -265,8 +265,8 @@ def _listed(topics: list[_Topic]) -> str:
 def _camera(bag: _Bag, topic: _Topic) -> Camera:
     """The lens of a topic's images: its camera_info, wherever in the bag that comes."""
     sibling = f"{topic.base.rpartition('/')[0]}/camera_info"
-    names = bag.topics(CAMERA_INFO)
-    infos = {name: next(bag.messages((name, CAMERA_INFO)))[1] for name in names}
+    firsts = {n: next(bag.messages((n, CAMERA_INFO)), None) for n in bag.topics(CAMERA_INFO)}
+    infos = {name: first[1] for name, first in firsts.items() if first is not None}
     if sibling not in infos:
         frame = topic.first.header.frame_id
         fitting = [name for name, info in infos.items() if frame and info.header.frame_id == frame]
@@ -317,9 +317,13 @@ class _Times:
 
 def _times(bag: _Bag, topic: _Topic) -> _Times:
     """The times of a topic's messages, up to where the bag can be read."""
-    stamps, recorded, damage = [], [], None
+    stamps: list[int] = []
+    recorded: list[int] = []
+    damage = None
     try:
         for recorded_ns, message in bag.messages(topic):
+            if recorded and recorded_ns < recorded[-1]:
+                raise ToftrackError(f"the messages of '{bag.path}' are out of order")
             stamp = message.header.stamp
             stamps.append(int(stamp.sec) * 10**9 + int(stamp.nanosec))
             recorded.append(recorded_ns)

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.recordings.png import decoded_png
 
 MILLIMETRE = 1e-3
 _TIPS = (4, 8, 12, 16, 20)
-_PNG_END = b"IEND\xaeB`\x82"
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +105,7 @@ def read_png(path: Path, kind: type, shape: tuple[int, ...]) -> np.ndarray:
 
     Raises ToftrackError when it is missing, damaged or of another kind.
     """
-    content = read_bytes(path)
-    whole = content.endswith(_PNG_END)  # the decoder fills up what was cut off
-    try:
-        image = (
-            cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
-        )
-    except cv2.error:
-        image = None
+    image = decoded_png(read_bytes(path))
     if image is None:
         raise ToftrackError(f"the image '{path}' is damaged; copy the data set again")
     if image.dtype != kind or image.shape != shape:

@@ -1,0 +1,252 @@
+"""Every reader of files, and a valid file of each kind made by the project's own writers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from helpers import bags, videos
+from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
+from helpers.tracking import run
+
+from toftrack.camera import Camera
+from toftrack.devices.replay import Replay
+from toftrack.devices.sample import Sample
+from toftrack.gestures.files import NamedPose, read_poses, save_poses
+from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.skeleton import ANGLE_NAMES
+from toftrack.output.run_folder import Run, read_run
+from toftrack.pose_space.data.leap import leap_data
+from toftrack.pose_space.data.pose_files import file_data
+from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
+from toftrack.recordings.datasets import icvl, msra, nyu, open_data_set
+from toftrack.recordings.npz import Recording, write_recording
+from toftrack.recordings.png_folder import PngFolderWriter
+from toftrack.recordings.sr_frame import encode_frame, nominal_camera
+from toftrack.recordings.srs import SrsWriter
+
+HEIGHT, WIDTH, FRAMES = 24, 32, 3
+_MOST_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class Reader:
+    """file: the one that is changed.  given: what the reader is given, that file or its folder."""
+
+    name: str
+    file: Path
+    given: Path
+    read: Callable[[Path], object]
+
+
+def small_camera() -> Camera:
+    return Camera(np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]]), WIDTH, HEIGHT)
+
+
+def small_images() -> np.ndarray:
+    """(FRAMES, HEIGHT, WIDTH) float32 metres: something near before a wall."""
+    depth = np.full((FRAMES, HEIGHT, WIDTH), 1.5, np.float32)
+    for number in range(FRAMES):
+        depth[number, 6:18, 8 + number : 20 + number] = 0.5 + 0.01 * number
+    return depth
+
+
+def play(path: Path) -> None:
+    """A recording as the tracker gets it, from its first frames."""
+    with Replay(path, camera_file=_beside(path)) as device:
+        for number, frame in enumerate(device):
+            device.camera.rectify(frame.depth, frame.radial)
+            device.camera.undistort_amplitude(frame.amplitude)
+            if number + 1 == _MOST_FRAMES:
+                break
+
+
+def _beside(path: Path) -> Path | None:
+    """Recordings without a camera of their own lie in a folder with one."""
+    camera = path.parent / "of_bare.json"
+    return camera if camera.exists() else None
+
+
+def read_whole_run(folder: Path) -> None:
+    """A finished run as reports and figures read it."""
+    run_there: Run = read_run(folder)
+    run_there.estimates(0)
+    run_there.estimates(len(run_there) - 1)
+    run_there.likelihood()
+    run_there.segmentation()
+    run_there.found("anything")
+
+
+def read_data_set(name: str) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        _, sequences = open_data_set(name, folder)
+        for sequence in sequences:
+            for number in range(min(len(sequence), _MOST_FRAMES)):
+                sequence.frame(number)
+
+    return read
+
+
+def write_readers(folder: Path, whole: bool = True) -> list[Reader]:
+    """Valid files in folders of their own below a folder, and who reads them.
+
+    whole: also what takes seconds to make: a run, a bag where rosbags is installed, data sets.
+    """
+    readers = [*_recordings(folder), *_small_files(folder)]
+    if whole:
+        readers += [*_runs(folder), *_data_sets(folder)]
+        if find_spec("rosbags") is not None:
+            readers += _bags(folder)
+    return readers
+
+
+def _new(folder: Path, name: str) -> Path:
+    (folder / name).mkdir(parents=True)
+    return folder / name
+
+
+def _alone(name: str, file: Path, read: Callable[[Path], object]) -> Reader:
+    return Reader(name, file, file, read)
+
+
+def _recordings(folder: Path) -> list[Reader]:
+    camera, depth = small_camera(), small_images()
+    times = np.arange(FRAMES) / 25
+    amplitude = np.full(depth.shape, 700, np.uint16)
+    npz = _new(folder, "npz") / "recording.npz"
+    facts: dict[str, Any] = {"what": "a test"}
+    write_recording(npz, Recording(depth, False, camera, times, 25.0, amplitude, None, facts))
+    srs = _new(folder, "srs") / "recording.srs"
+    range_m = 7.5
+    shape = (nominal_camera().height, nominal_camera().width)
+    with SrsWriter(srs) as writer:
+        for time in times[:2]:
+            writer.append(encode_frame(np.full(shape, 0.8, np.float32), None, range_m), float(time))
+    png = folder / "png"
+    with PngFolderWriter(png, camera) as images:
+        for image, time in zip(depth, times, strict=True):
+            images.append(image, amplitude[0], float(time))
+    stack = _new(folder, "npy") / "stack.npy"
+    np.save(stack, np.rint(1000 * depth).astype(np.uint16))
+    words = np.rint(1000 * depth).astype(np.uint16)
+    grey = videos.write_grey(_new(folder, "grey") / "grey.mkv", words)
+    for bare in (stack, grey):
+        camera.save(bare.parent / "of_bare.json")
+    about = videos.calibration(np.array([[252.0, 0, 160], [0, 252, 144], [0, 0, 1]]), 512, (96, 90))
+    large = np.tile(words[:1], (1, 12, 10))  # a mode of its camera
+    kinect = videos.write_kinect(_new(folder, "kinect") / "kinect.mkv", large, large, about)
+    return [
+        _alone("recording .npz", npz, play),
+        _alone("recording .srs", srs, play),
+        Reader("PNG folder: camera.json", png / "camera.json", png, play),
+        Reader("PNG folder: an image", png / "depth_000000.png", png, play),
+        Reader("PNG folder: timestamps.txt", png / "timestamps.txt", png, play),
+        _alone("stack .npy", stack, play),
+        _alone("grey video", grey, play),
+        _alone("Kinect's video", kinect, play),
+    ]
+
+
+def _small_files(folder: Path) -> list[Reader]:
+    small = _new(folder, "small")
+    random = np.random.default_rng(0)
+    poses = [NamedPose(name, np.radians(random.uniform(0, 9, 21))) for name in ("one", "two")]
+    save_poses(small / "gestures.json", poses)
+    row = ",".join(f"{angle:.2f}" for angle in np.degrees(poses[0].angles_rad))
+    header = ",".join(ANGLE_NAMES)
+    (small / "gestures.csv").write_text(f"# units: degrees\nname,{header}\none,{row}\n")
+    rows = "".join(f"{row},a\n" for _ in range(3))
+    (small / "poses.csv").write_text(f"# units: degrees\n{header},label\n{rows}")
+    angles = random.uniform(0, 20, (4, 21))
+    np.savez(small / "poses.npz", angles=angles, units="degrees", labels=["a", "b", "a", "b"])
+    save_pose_space(fit_pose_space("pca", 2), small / "pose_space.npz")
+    default_hand_shape().save(small / "hand_shape.json")
+    small_camera().save(small / "camera.json")
+    joints = 50.0 * random.standard_normal((6, 5, 4, 3)).astype(np.float32)
+    np.savez(
+        small / "leap.npz",
+        joints_mm=joints,
+        is_left=np.zeros(6, bool),
+        seq_name=["a.json.lz", "b.json.lz"],
+        seq_len=[3, 3],
+    )
+    readers: dict[str, Callable[[Path], object]] = {
+        "gestures.json": read_poses,
+        "gestures.csv": read_poses,
+        "poses.csv": lambda path: file_data(str(path)),
+        "poses.npz": lambda path: file_data(str(path)),
+        "pose_space.npz": load_pose_space,
+        "hand_shape.json": HandShape.load,
+        "camera.json": Camera.load,
+        "leap.npz": lambda path: leap_data(str(path), None, 1e3),
+    }
+    return [_alone(name, small / name, read) for name, read in readers.items()]
+
+
+def _runs(folder: Path) -> list[Reader]:
+    quick = ("start.hypotheses=100", "start.samples=32", "start.islands=4", "filter.particles=50")
+    there = _new(folder, "run")
+    with Sample(stop=2) as device:
+        run(there, device, *quick, "view=none")
+    files = ("track.npz", "run.json", "summary.json", "hand_shape.json")
+    return [Reader(f"run: {name}", there / name, there, read_whole_run) for name in files]
+
+
+def _data_sets(folder: Path) -> list[Reader]:
+    write_msra(folder / "msra" / "P0" / "TIP", scene(msra._CAMERA, 2), boxed=True)
+    write_icvl(folder / "icvl" / "Testing", scene(icvl._CAMERA, 2))
+    write_nyu(folder / "nyu" / "test", scene(nyu._CAMERA, 2))
+    readers = []
+    for name, there in (("MSRA15", "msra"), ("ICVL", "icvl"), ("NYU", "nyu")):
+        first = {path.suffix: path for path in sorted((folder / there).rglob("*.*"))}
+        for suffix, file in first.items():
+            reader = read_data_set(name)
+            readers.append(Reader(f"{name}: {suffix}", file, folder / there, reader))
+    return readers
+
+
+def _bags(folder: Path) -> list[Reader]:
+    messages = bags.recording(list(small_images()), small_camera())
+    readers = []
+    for kind in bags.KINDS:
+        path = bags.write_bag(_new(folder, f"{kind}_bag"), kind, messages)
+        files = [path] if path.is_file() else sorted(path.iterdir())
+        readers += [Reader(f"bag .{kind}: {file.suffix}", file, path, play) for file in files]
+    return readers
+
+
+def odd_json(random: np.random.Generator, text: bytes) -> bytes:
+    """JSON of which one value is another, or missing."""
+    content = json.loads(text)
+    holder, key = _some_place(random, content)
+    if holder is None:
+        return json.dumps(ODD_VALUES[random.integers(len(ODD_VALUES))]).encode()
+    if random.random() < 0.15:
+        del holder[key]
+    else:
+        holder[key] = ODD_VALUES[random.integers(len(ODD_VALUES))]
+    return json.dumps(content).encode()
+
+
+ODD_VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, -1, 1, 1e308, -1e308, 1e-308, 2**63, 10**29, float("nan")),
+    *(float("inf"), "", "a", "\ud800", "\0", [], [[]], {}, [None], [1, 2], {"": None}, "right"),
+    *(3, 21, 0.5, [0.5] * 3, [[1.0, 0, 0]] * 3, [["a"]], "nan", "1e999", [{}], [[1], [1, 2]]),
+)
+
+
+def _some_place(random: np.random.Generator, content: Any) -> tuple[Any, Any]:
+    """A random place in JSON: who holds it, and by which key or index."""
+    holder, key, node = None, None, content
+    while isinstance(node, (dict, list)) and node:
+        if holder is not None and random.random() < 0.2:
+            break
+        keys = list(node) if isinstance(node, dict) else range(len(node))
+        holder, key = node, keys[int(random.integers(len(keys)))]
+        node = holder[key]
+    return holder, key
