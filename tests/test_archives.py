@@ -191,3 +191,13 @@ def test_random_damage_never_ends_otherwise_than_with_a_value_error(
             refused += 1
             assert "\n" not in str(error)
     assert refused > 75
+
+
+@pytest.mark.parametrize("kind", ["<U2", ">U2"])
+def test_characters_that_are_none_are_told(kind: str, tmp_path: Path) -> None:
+    whole = np.array(["a", "\U0010ffff"], kind)
+    path = save(tmp_path / "a.npz", {"a": npy(whole)}, zipfile.ZIP_STORED)
+    assert read_archive(path)["a"].tolist() == whole.tolist()
+    broken = npy(whole)[:-4] + b"\x7f\x7f\x7f\x7f"
+    path = save(tmp_path / "b.npz", {"a": broken}, zipfile.ZIP_STORED)
+    assert "text is damaged" in told(path)

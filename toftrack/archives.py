@@ -14,6 +14,7 @@ import io
 import lzma
 import math
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -111,6 +112,8 @@ class Archive:
             if _fill(stream, memoryview(content)) < header.size or stream.read(1):
                 raise ValueError("it is of another length than its header says")
             array = np.frombuffer(content, header.kind)
+            if header.kind.kind == "U" and not _is_text(array):
+                raise ValueError("its text is damaged")
             return array.reshape(header.shape, order="F" if header.fortran_order else "C")
 
     @contextmanager
@@ -196,6 +199,12 @@ def _check(name: str, header: Header, entry: zipfile.ZipInfo, most_bytes: int | 
         raise ValueError(
             f"it would make {entry.file_size / 1e6:.0f} MB of {entry.compress_size} bytes"
         )
+
+
+def _is_text(array: np.ndarray) -> bool:
+    """Whether all characters of texts (n,) are some; Python cannot make a string of others."""
+    characters = array.view(np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
+    return int(characters.max(initial=0)) <= sys.maxunicode
 
 
 def _fill(stream: IO[bytes], target: memoryview) -> int:

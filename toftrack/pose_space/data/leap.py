@@ -132,10 +132,11 @@ def _read(path: str) -> tuple[np.ndarray, np.ndarray, list[str], list[int]]:
             f"{path} is not a file of recorded joints, it has no array {error}; data=file reads"
             " joint angles"
         ) from None
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, OverflowError) as error:
         raise ToftrackError(f"{path} is not a readable .npz of recorded joints ({error})") from None
     shapes = joints.ndim == 4 and joints.shape[1:] == (5, 4, 3) and left.shape == joints.shape[:1]
-    if not shapes or len(names) != len(lengths) or sum(lengths) != len(joints) or not len(joints):
+    counted = len(names) == len(lengths) and joints.shape[:1] == (sum(lengths),)
+    if not shapes or not counted or min(lengths, default=0) < 1:
         raise ToftrackError(
             f"{path} is not a file of recorded joints: joints_mm {joints.shape}, is_left"
             f" {left.shape}, {len(names)} clips of {sum(lengths)} frames together"
