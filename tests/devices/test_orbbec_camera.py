@@ -89,6 +89,8 @@ def test_the_newest_frame_wins(plug: Callable[..., Sdk]) -> None:
     for frame in device:
         indices.append(frame.depth[0, 0] / np.float32(0.25e-3))
         assert camera.begun.wait(10)  # all were sent while this one was being tracked
+        if round(float(indices[-1])) == 99:  # it may have been the first that was taken
+            break
     assert len(indices) <= 2 and round(float(indices[-1])) == 99
 
 
