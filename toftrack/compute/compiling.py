@@ -24,6 +24,14 @@ compiled = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 _SILENT_S = 1.0
 """Taking a kernel from numba's cache is faster than this, compiling it is slower."""
 _compiling = threading.Lock()
+_uncached = threading.Event()
+"""There is no place to keep the machine code."""
+_told = threading.Event()
+"""And that was said."""
+_HINT = (
+    "compiled kernels cannot be kept, because neither the installation nor the home can be written; "
+    "set NUMBA_CACHE_DIR to a folder of your own that can be"
+)
 
 
 def entry_point(*sources: str | Path | None) -> Callable:
@@ -40,6 +48,7 @@ def entry_point(*sources: str | Path | None) -> Callable:
         try:
             return numba.njit(cache=True, **OPTIONS)(function)
         except RuntimeError:  # there is no place to write to
+            _uncached.set()
             return numba.njit(**OPTIONS)(function)
 
     return decorator
@@ -60,13 +69,24 @@ def take(typingctx, counter):
 def announced(message: str) -> Iterator[None]:
     """Around the first call of an entry point: logs the message if compiling it takes long.
 
+    Where the machine code cannot be cached, the first message is followed by what to do.
     Only one thread compiles at a time, so that the others do not compile the same once more.
     """
     with _compiling:
-        timer = threading.Timer(_SILENT_S, log.info, (message,))
+        timer = threading.Timer(_SILENT_S, _tell, (message,))
         timer.daemon = True
         timer.start()
         try:
             yield
         finally:
             timer.cancel()
+
+
+def _tell(message: str) -> None:
+    if not _uncached.is_set():
+        log.info(message)
+        return
+    log.info(message.replace("(once", "(in every run"))
+    if not _told.is_set():
+        _told.set()
+        log.info(_HINT)

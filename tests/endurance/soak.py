@@ -1,0 +1,289 @@
+"""A long live run under observation: does anything grow?
+
+    python tests/endurance/soak.py --minutes 20
+
+The tracker follows an emulated SR3000 at the camera's pace, in a process of its own. Each 50th
+request to the camera goes wrong, in all ways in turn; a visitor watches the page and comes anew
+after every 100 pictures; a listener takes the datagrams. At the end a table compares the first
+quarter with the last one, and the status is 1 if memory, threads or file handles grew, or if the
+run failed. Needs /proc, that is Linux.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from http.client import HTTPConnection, HTTPException
+from pathlib import Path
+from typing import TypeVar
+from urllib.parse import urlsplit
+
+import numpy as np
+
+_T = TypeVar("_T")
+ROOT = Path(__file__).parents[2]
+OVERRIDES = (
+    "device=sr3000",
+    "device.transport=emulated",
+    "device.emulated.loop=true",
+    "device.emulated.fault_every=50",
+    "view=browser",
+    "view.port=0",
+    "stream=udp",
+)
+_PICTURES_A_VISIT = 100
+_STARTING_S = 180.0
+"""Kernels may have to be compiled first."""
+_WARM_FRAMES = 100
+"""Caches and pools are filled by then; the observation begins."""
+_ENDING_S = 120.0
+_MOST_MEMORY = 0.05
+"""Of the first quarter's memory, by which the allocator's moods may raise it."""
+_MOST_COUNT = 1
+"""Threads and handles that may be more: a visitor comes and goes."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The process at a moment."""
+
+    time_s: float
+    """Unix time."""
+    memory_mb: float
+    """Resident."""
+    threads: int
+    handles: int
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A datagram."""
+
+    time_s: float
+    """Unix time of its arrival."""
+    index: int
+    frame_s: float
+    """The frame's time stamp."""
+    compute_s: float
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What was seen of a run from its hundredth frame on."""
+
+    samples: tuple[Sample, ...]
+    arrivals: tuple[Arrival, ...]
+    pictures: int
+    visits: int
+    status: int
+    """With which the program ended after Ctrl-C; 130 is as it should be."""
+
+    def quarter(self, number: int) -> tuple[list[Sample], list[Arrival]]:
+        """Number 0 is the first."""
+        begin, end = self.samples[0].time_s, self.samples[-1].time_s
+        low, high = (begin + (end - begin) * k / 4 for k in (number, number + 1))
+        return (
+            [sample for sample in self.samples if low <= sample.time_s <= high],
+            [arrival for arrival in self.arrivals if low <= arrival.time_s <= high],
+        )
+
+
+def grown(first: Sequence[Sample], last: Sequence[Sample]) -> list[str]:
+    """What of memory, threads and handles is larger in the last samples, by their medians."""
+
+    def median(samples: Sequence[Sample], name: str) -> float:
+        return float(np.median([getattr(sample, name) for sample in samples]))
+
+    limits: dict[str, Callable[[float], float]] = {
+        "memory_mb": lambda before: before * (1 + _MOST_MEMORY),
+        "threads": lambda before: before + _MOST_COUNT,
+        "handles": lambda before: before + _MOST_COUNT,
+    }
+    return [
+        name for name, limit in limits.items() if median(last, name) > limit(median(first, name))
+    ]
+
+
+def table(observation: Observation) -> str:
+    """The first quarter against the last one."""
+    columns = [_figures(*observation.quarter(number)) for number in (0, 3)]
+    lines = [f"{'':44}{'first quarter':>16}{'last quarter':>16}"]
+    lines += [f"{name:44}{columns[0][name]:>16}{columns[1][name]:>16}" for name in columns[0]]
+    return "\n".join(lines)
+
+
+def _figures(samples: Sequence[Sample], arrivals: Sequence[Arrival]) -> dict[str, str]:
+    def spread(values: Sequence[float], parts: Sequence[float]) -> str:
+        return " / ".join(f"{value:.0f}" for value in np.percentile(values, parts))
+
+    indices = [arrival.index for arrival in arrivals]
+    late = [1e3 * (arrival.time_s - arrival.frame_s) for arrival in arrivals]
+    of_all = (0, 50, 100)
+    return {
+        "memory, MB (least / median / most)": spread([s.memory_mb for s in samples], of_all),
+        "threads": spread([s.threads for s in samples], of_all),
+        "file handles": spread([s.handles for s in samples], of_all),
+        "compute_s, ms (50 / 95 / 99 %)": spread(
+            [1e3 * arrival.compute_s for arrival in arrivals], (50, 95, 99)
+        ),
+        "time stamp to arrival, ms (50 / 95 / 99 %)": spread(late, (50, 95, 99)),
+        "frames tracked": str(len(arrivals)),
+        "frames dropped or damaged": str(indices[-1] - indices[0] + 1 - len(arrivals)),
+    }
+
+
+def soak(minutes: float, folder: Path, told: Callable[[str], None] = print) -> Observation:
+    """Run the tracker in a folder and observe it for so long; `told` gets a line a sample."""
+    ended, pictures = threading.Event(), [0, 0]
+    arrivals: list[Arrival] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(0.5)
+        port = listener.getsockname()[1]
+        with _program(folder, port) as program, _threads(ended) as start:
+            start(lambda: _listen(listener, arrivals, ended))
+            url = _until(lambda: _address(folder / "err.txt"), program)
+            start(lambda: _watch(url, pictures, ended))
+            _until(lambda: len(arrivals) > _WARM_FRAMES, program)
+            samples = _samples(program, 60 * minutes, arrivals, told)
+            program.send_signal(signal.SIGINT)
+            status = program.wait(_ENDING_S)
+    seen = tuple(arrival for arrival in arrivals if arrival.time_s >= samples[0].time_s)
+    return Observation(tuple(samples), seen, *pictures, status)
+
+
+@contextmanager
+def _program(folder: Path, port: int) -> Iterator[subprocess.Popen]:
+    command = [sys.executable, str(ROOT / "track.py"), *OVERRIDES, f"stream.port={port}"]
+    with open(folder / "err.txt", "wb") as words:
+        program = subprocess.Popen(
+            [*command, "hydra.run.dir=run"], cwd=folder, stdout=words, stderr=words
+        )
+        try:
+            yield program
+        finally:
+            program.kill()
+            program.wait()
+
+
+@contextmanager
+def _threads(ended: threading.Event) -> Iterator[Callable[[Callable[[], None]], None]]:
+    started: list[threading.Thread] = []
+
+    def start(work: Callable[[], None]) -> None:
+        started.append(threading.Thread(target=work, daemon=True))
+        started[-1].start()
+
+    try:
+        yield start
+    finally:
+        ended.set()
+        for thread in started:
+            thread.join()
+
+
+def _until(told: Callable[[], _T], program: subprocess.Popen) -> _T:
+    deadline = time.monotonic() + _STARTING_S
+    while not (value := told()):
+        if program.poll() is not None or time.monotonic() > deadline:
+            raise RuntimeError("the tracker did not start; see err.txt in its folder")
+        time.sleep(0.1)
+    return value
+
+
+def _address(words: Path) -> str:
+    found = re.search(r"live view: (http://[^#]+)#", words.read_text())
+    return found[1] if found else ""
+
+
+def _samples(
+    program: subprocess.Popen, seconds: float, arrivals: list[Arrival], told: Callable[[str], None]
+) -> list[Sample]:
+    samples, began = [], time.monotonic()
+    every_s = min(10.0, seconds / 16)
+    for number in range(int(seconds / every_s) + 1):
+        time.sleep(max(0.0, began + number * every_s - time.monotonic()))
+        if program.poll() is not None:
+            raise RuntimeError(f"the tracker ended with status {program.returncode}")
+        samples.append(sample := _sample(program.pid))
+        told(
+            f"{number * every_s:6.0f} s  {sample.memory_mb:6.1f} MB  {sample.threads} threads  "
+            f"{sample.handles} handles  {len(arrivals)} frames"
+        )
+    return samples
+
+
+def _sample(process: int) -> Sample:
+    folder = Path(f"/proc/{process}")
+    status = dict(
+        line.split(":", 1) for line in (folder / "status").read_text().splitlines() if ":" in line
+    )
+    memory_mb = int(status["VmRSS"].split()[0]) / 1024
+    handles = sum(1 for _ in (folder / "fd").iterdir())
+    return Sample(time.time(), memory_mb, int(status["Threads"]), handles)
+
+
+def _listen(listener: socket.socket, arrivals: list[Arrival], ended: threading.Event) -> None:
+    while not ended.is_set():
+        try:
+            datagram = listener.recv(65536)
+        except TimeoutError:
+            continue
+        now, said = time.time(), json.loads(datagram)
+        arrivals.append(Arrival(now, said["index"], said["timestamp_s"], said["compute_s"]))
+
+
+def _watch(url: str, counts: list[int], ended: threading.Event) -> None:
+    """Ask for one picture after the other, as the page does; count pictures and visits."""
+    host = urlsplit(url).netloc
+    while not ended.is_set():
+        connection = HTTPConnection(host, timeout=10)
+        counts[1] += 1
+        run, version = "", 0
+        try:
+            for _ in range(_PICTURES_A_VISIT):
+                connection.request("GET", f"/moment?run={run}&after={version}")
+                answer = connection.getresponse()
+                counts[0] += bool(answer.read())
+                facts = json.loads(answer.headers["X-Moment"])
+                run, version = facts["run"], facts["version"]
+                if ended.is_set():
+                    break
+        except (OSError, HTTPException):
+            ended.wait(0.2)  # the program ends, or is busy
+        finally:
+            connection.close()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Does anything grow in a long live run?")
+    parser.add_argument("--minutes", type=float, default=20.0, help="how long; 20 if not given")
+    minutes = parser.parse_args().minutes
+    with tempfile.TemporaryDirectory() as folder:
+        observation = soak(minutes, Path(folder), lambda line: print(line, flush=True))
+        words = (Path(folder) / "err.txt").read_text()
+    print(table(observation))
+    print(f"{observation.pictures} pictures were seen in {observation.visits} visits")
+    print(*re.findall(r"sr3000: frames: .*", words)[-1:])
+    problems = [
+        f"{name} grew" for name in grown(observation.quarter(0)[0], observation.quarter(3)[0])
+    ]
+    if observation.status != 130:
+        problems.append(f"the tracker ended with status {observation.status}\n{words[-2000:]}")
+    print("; ".join(problems) or "nothing grew")
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
