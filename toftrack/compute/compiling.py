@@ -29,7 +29,7 @@ _uncached = threading.Event()
 _told = threading.Event()
 """And that was said."""
 _HINT = (
-    "compiled kernels cannot be kept, because neither the installation nor the home can be written; "
+    "compiled kernels cannot be kept, because neither installation nor home can be written; "
     "set NUMBA_CACHE_DIR to a folder of your own that can be"
 )
 
