@@ -316,3 +316,10 @@ def test_a_reach_beyond_the_image_or_beside_it_is_no_error() -> None:
 def test_a_reach_that_cannot_be_is_refused(reach_m: float) -> None:
     with pytest.raises(ToftrackError, match="segmentation.reach_m=.*above 0, or .inf"):
         nearest_surface(reach_m=reach_m)
+
+
+@pytest.mark.parametrize("z", [-0.3, 0.0, 1e-6])
+def test_a_hand_that_is_expected_behind_the_camera_is_no_error(z: float) -> None:
+    depth, k = np.full((144, 176), 0.5, np.float32), np.diag([200.0, 200.0, 1.0])
+    expected = Expected(z, z + 0.1, (0.0, 0.0, z))
+    nearest_surface()(depth, k, expected)

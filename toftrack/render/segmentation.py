@@ -13,6 +13,9 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 
+_NEAREST_M = 0.05
+"""No camera sees anything nearer."""
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -166,6 +169,7 @@ def _disc(
 ) -> np.ndarray:
     """(H, W) bool: the pixels within `radius_m` of a point, seen at its distance."""
     x, y, z = centre_m
+    z = max(z, _NEAREST_M)  # what is expected of a track may even lie behind the camera
     u, v = k[0, 0] * x / z + k[0, 2], k[1, 1] * y / z + k[1, 2]
     disc = np.zeros(shape, np.uint8)
     limit = 4 * max(shape)
