@@ -90,3 +90,12 @@ def _tell(message: str) -> None:
     if not _told.is_set():
         _told.set()
         log.info(_HINT)
+
+
+def called(kernel: Callable, message: str, *arguments: object) -> None:
+    """Call an entry point; the message is logged if it must be compiled before."""
+    if kernel.signatures:  # type: ignore[attr-defined]
+        kernel(*arguments)
+        return
+    with announced(message):
+        kernel(*arguments)

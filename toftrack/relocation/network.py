@@ -28,11 +28,12 @@ STRIDE = 4
 """Pixels of the finder's image to a cell of its map."""
 ANGLES = 21
 JOINTS = 21
-_OFFSET_M = 0.15
-_LOG_SIZE = 0.3
-_JOINT_M = 0.05
+OFFSET_M = 0.15
+LOG_SIZE = 0.3
+JOINT_M = 0.05
 """The scales in which places, sizes and offsets of joints are predicted."""
-_SIGMA_M = 0.01
+SIGMA_M, LEAST_SIGMA_M = 0.01, 0.001
+ERROR_M, LEAST_ERROR_M = 0.02, 0.003
 
 
 def cube_rotations() -> Tensor:
@@ -135,13 +136,22 @@ class PoseNet(nn.Module):
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The last layers' outputs: heads (N, ...), votes and parts (N, ..., 16, 16)."""
+        heads, merged = self._trunk(image)
+        return heads, self.votes(merged), self.painted(merged)
+
+    def told(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """The same without the parts, which nobody but the training asks for."""
+        heads, merged = self._trunk(image)
+        return heads, self.votes(merged)
+
+    def _trunk(self, image: Tensor) -> tuple[Tensor, Tensor]:
         fine = self.fine(self.stem(image))
         middle = self.middle(fine)
         dense = self.dense(self.coarse(middle))
         merged = self.lateral_16(fine) + self.context(dense)[:, :, None, None]
         merged = merged + F.interpolate(self.lateral_8(middle), scale_factor=2.0, mode="nearest")
         merged = self.smooth(F.relu(merged))
-        return self.heads(dense), self.votes(merged), self.painted(merged)
+        return self.heads(dense), merged
 
     def decode(self, image: Tensor, heads: Tensor, votes: Tensor, painted: Tensor) -> Proposed:
         """What the outputs of `features` mean; in full precision."""
@@ -156,10 +166,10 @@ class PoseNet(nn.Module):
         return Proposed(
             rotation=turned @ self.anchors,
             angles=low + (high - low) * torch.sigmoid(angles),
-            log_size=_LOG_SIZE * size[..., 0],
-            pivot_m=_OFFSET_M * pivot,
+            log_size=LOG_SIZE * size[..., 0],
+            pivot_m=OFFSET_M * pivot,
             log_probability=chance[..., 0].log_softmax(1),
-            error_m=0.02 * F.softplus(error[..., 0]) + 0.003,
+            error_m=ERROR_M * F.softplus(error[..., 0]) + LEAST_ERROR_M,
             joints_m=joints,
             sigma_m=sigma,
             right=right,
@@ -174,9 +184,9 @@ class PoseNet(nn.Module):
         across, down = self.cells.flatten(1)
         # Depth is voted for about the surface that the cell sees.
         seen = F.avg_pool2d(depth, depth.shape[-1] // 16).flatten(2) * (CROP_M / 2)
-        at = torch.stack((across + _JOINT_M * x, down + _JOINT_M * y, seen + _JOINT_M * z), 3)
+        at = torch.stack((across + JOINT_M * x, down + JOINT_M * y, seen + JOINT_M * z), 3)
         joints = (weight[..., None] * at).sum(2)
-        sigma = _SIGMA_M * F.softplus((weight * spread).sum(2)) + 0.001
+        sigma = SIGMA_M * F.softplus((weight * spread).sum(2)) + LEAST_SIGMA_M
         return joints, sigma
 
 
