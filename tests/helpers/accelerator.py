@@ -28,7 +28,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 from toftrack.hand.shape import HandShape
-from toftrack.hand.surface import HandSurface
 from toftrack.render import scoring
 from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.scoring import Evidence
@@ -165,8 +164,10 @@ def _computed(func: Any, args: tuple, kwargs: dict, counts: Counts | None) -> An
 
 
 def _is_composite(func: Any) -> bool:
-    return bool(
-        torch._C._dispatch_has_kernel_for_dispatch_key(func.name(), "CompositeImplicitAutograd")
+    """Whether an operation is divided into others; not, where Python would do it for tracers."""
+    key = torch._C.DispatchKey.CompositeImplicitAutograd
+    return key not in func.py_kernels and bool(
+        torch._C._dispatch_has_kernel_for_dispatch_key(func.name(), key)
     )
 
 
@@ -432,23 +433,23 @@ def _pretended_scorer(kind: type) -> type:
     class PretendedScorer(kind):  # type: ignore[misc]
         """Launches as it does, with the counts of the compiled back end."""
 
-        def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-            super().__init__(shape, surface)
-            here = replace(
-                shape,
-                **{f.name: held(getattr(shape, f.name)) for f in fields(shape)},
-            )
-            self._here = NumbaScorer(here)
+        def __init__(self, shape: HandShape, *args: Any, **kwargs: Any) -> None:
+            super().__init__(shape, *args, **kwargs)
+            self._here = NumbaScorer(_here(shape))
 
         def __call__(self, states: Tensor, evidence: Evidence) -> scoring.Counts:
             found = super().__call__(states, evidence)
-            images = {f.name: held(getattr(evidence, f.name)) for f in fields(evidence)}
-            right = self._here(held(states), replace(evidence, **images))
+            right = self._here(held(states), _here(evidence))
             for field_, values in zip(found, right, strict=True):
                 held(field_).copy_(values)
             return found
 
     return PretendedScorer
+
+
+def _here(parts: Any) -> Any:
+    """A dataclass of tensors with their values."""
+    return replace(parts, **{f.name: held(getattr(parts, f.name)) for f in fields(parts)})
 
 
 def held(x: Any) -> Any:

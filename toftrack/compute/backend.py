@@ -34,9 +34,11 @@ class Backend:
     """One way to compute everything that depends on the machine.
 
     name: "torch", "numba" or "triton", as `renderer=` says it.
-    device: where the particles are.
-    motions: of particles.
-    make_scorer, make_refiner: for a hand of some sizes, which are moved to the device.
+    device: where the particles are. A frame's estimate is on the CPU, where its few poses are
+        refined and compared, as is all that is said of it.
+    motions: of particles, there and on the CPU.
+    make_scorer: for a hand of some sizes, given on the CPU; it takes states on the device.
+    make_refiner: likewise, on the CPU.
     """
 
     name: str

@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP_M
 
@@ -140,9 +141,12 @@ class PoseNet(nn.Module):
         return heads, self.votes(merged), self.painted(merged)
 
     def told(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """The same without the parts, which nobody but the training asks for."""
-        heads, merged = self._trunk(image)
-        return heads, self.votes(merged)
+        """The same without the parts, which nobody but the training asks for; on the CPU, whatever
+        device the network is on.
+        """
+        heads, merged = self._trunk(on_device(image, self.anchors.device))
+        heads, votes = on_host(heads, self.votes(merged))
+        return heads, votes
 
     def _trunk(self, image: Tensor) -> tuple[Tensor, Tensor]:
         fine = self.fine(self.stem(image))

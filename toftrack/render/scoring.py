@@ -7,10 +7,13 @@ back end knows geometry and pixels but no policy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
+import torch
 from torch import Tensor
+
+from toftrack.compute.transfer import on_device
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ class Evidence:
     hand: Tensor
     k: Tensor
     radius_px: float
+
+    def to(self, device: torch.device) -> Evidence:
+        """The same on a device, from the CPU."""
+        images = ("low", "high", "occluder", "hand", "k")
+        return replace(self, **{name: on_device(getattr(self, name), device) for name in images})
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Evidence:
         """The part [top, bottom) x [left, right) with intrinsics to match."""

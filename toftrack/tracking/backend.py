@@ -6,12 +6,14 @@ import logging
 from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.backend import Backend
+from toftrack.compute.backend import Backend, Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
-from toftrack.refinement.gauss_newton import TorchRefiner
+from toftrack.hand.surface import hand_surface
+from toftrack.refinement.gauss_newton import Refiner, TorchRefiner
 from toftrack.render.scoring import Scorer
 from toftrack.render.torch_scorer import TorchScorer
 
@@ -52,13 +54,36 @@ def make_scorer(renderer: str, shape: HandShape, device: torch.device | str = "c
 
 
 def _torch(device: torch.device) -> Backend:
+    motions, make_refiner = _beside(device)
     return Backend(
         "torch",
         device,
-        rigid.MOTIONS,
-        make_scorer=lambda shape: TorchScorer(shape.to(device)),
-        make_refiner=lambda shape: TorchRefiner(shape.to(device)),
+        motions,
+        make_scorer=lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
+        make_refiner=make_refiner,
     )
+
+
+def _beside(device: torch.device) -> tuple[Motions, Callable[[HandShape], Refiner]]:
+    """Motions and refiners beside a scorer on a device: compiled ones on the CPU next to it."""
+    if device.type == "cpu":
+        return rigid.MOTIONS, TorchRefiner
+    try:
+        from toftrack.compute import rigid_numba
+        from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+    except ImportError:
+        return rigid.MOTIONS, TorchRefiner
+    here = rigid_numba.motions()
+
+    def compose(reference: Tensor, tangent: Tensor) -> Tensor:
+        motions = here if reference.device.type == "cpu" else rigid.MOTIONS
+        return motions.compose(reference, tangent)
+
+    def difference(particles: Tensor, reference: Tensor) -> Tensor:
+        motions = here if particles.device.type == "cpu" else rigid.MOTIONS
+        return motions.difference(particles, reference)
+
+    return Motions(compose, difference), CompiledRefiner
 
 
 def _numba(device: torch.device) -> Backend:
@@ -71,9 +96,9 @@ def _numba(device: torch.device) -> Backend:
     return Backend(
         "numba",
         device,
-        rigid_numba.motions() if here else rigid.MOTIONS,
-        make_scorer=lambda shape: NumbaScorer(shape.to(device)),
-        make_refiner=lambda shape: (CompiledRefiner if here else TorchRefiner)(shape.to(device)),
+        rigid_numba.motions() if here else _beside(device)[0],
+        make_scorer=NumbaScorer,
+        make_refiner=CompiledRefiner,
     )
 
 
@@ -81,12 +106,13 @@ def _triton(device: torch.device) -> Backend:
     from toftrack.render.triton.scorer import TritonScorer, require_device
 
     require_device()
+    motions, make_refiner = _beside(device)
     return Backend(
         "triton",
         device,
-        rigid.MOTIONS,
-        make_scorer=lambda shape: TritonScorer(shape.to(device)),
-        make_refiner=lambda shape: TorchRefiner(shape.to(device)),
+        motions,
+        make_scorer=lambda shape: TritonScorer(shape, device=device),
+        make_refiner=make_refiner,
     )
 
 

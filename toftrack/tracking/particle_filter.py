@@ -16,7 +16,8 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
-from toftrack.compute.rigid import mean_rotation
+from toftrack.compute.rigid import main_rotation, rotation_scatter
+from toftrack.compute.transfer import on_host
 from toftrack.errors import ToftrackError
 
 
@@ -221,9 +222,10 @@ def annealed(
 
 
 def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d), the rotation averaged on SO(3)."""
+    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d) on the CPU, the rotation's on SO(3)."""
     mean = (weights.to(particles.dtype) @ particles)[None]
-    mean[0, 3:6] = mean_rotation(particles[:, 3:6], weights)
+    mean, scatter = on_host(mean, rotation_scatter(particles[:, 3:6], weights))
+    mean[0, 3:6] = main_rotation(scatter).to(mean.dtype)
     return mean
 
 

@@ -46,16 +46,22 @@ class TritonScorer:
 
     name = "triton"
 
-    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """shape: on the CUDA device.  surface: instead of the shape's own.
+    def __init__(
+        self,
+        shape: HandShape,
+        surface: HandSurface | None = None,
+        device: torch.device | None = None,
+    ) -> None:
+        """surface: instead of the shape's own.  device: of the states to come; None = the shape's.
 
         Raises ImportError where it cannot run.
         """
         require_device()
-        surface = surface or hand_surface(shape)
-        self._large = TorchScorer(shape, surface)
-        device = shape.base_m.device
-        numbers, slots = _tables(shape.to("cpu"), surface.to("cpu"))
+        device = device or shape.base_m.device
+        here = shape.to("cpu")
+        surface = hand_surface(here) if surface is None else surface.to("cpu")
+        self._large = TorchScorer(shape.to(device), surface.to(device))
+        numbers, slots = _tables(here, surface)
         self._numbers, self._slots = numbers.to(device), slots.to(device)
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
