@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from types import ModuleType
@@ -27,7 +27,11 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
+from toftrack.compute import rigid, transfer
+from toftrack.compute.backend import Motions
+from toftrack.hand import overlap
 from toftrack.hand.shape import HandShape
+from toftrack.pose_space import base
 from toftrack.render import scoring
 from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.scoring import Evidence
@@ -351,6 +355,10 @@ def _dimensions(part: Any) -> int:
     return part.dim() if isinstance(part, Tensor) and part.dtype == torch.bool else 1
 
 
+_KEPT = (transfer.table, base._limits, overlap._tables)
+"""What keeps tensors of a device."""
+
+
 @contextmanager
 def pretended_device() -> Iterator[Counts]:
     """Within, torch has a CUDA device that is none, and what is asked of it is counted.
@@ -369,6 +377,8 @@ def pretended_device() -> Iterator[Counts]:
         _Counting(counts),
     ):
         yield counts
+    for kept in _KEPT:
+        kept.cache_clear()
 
 
 @contextmanager
@@ -381,10 +391,12 @@ def pretended_triton(counts: Counts) -> Iterator[None]:
     if importlib.util.find_spec("triton") is None:
         sys.modules["triton"] = sys.modules["triton.language"] = _no_triton()
     try:
-        scorer = importlib.import_module(_TRITON_MODULES[-1])
-        kernels = {name: _Kernel(name, counts) for name in vars(scorer) if name.endswith("_kernel")}
+        scorer, motions = map(importlib.import_module, _TRITON_MODULES[-2:])
+        pairs = zip(motions.MOTIONS, rigid.MOTIONS, strict=True)
+        moved = Motions(*(_pretended_motion(there, here) for there, here in pairs))
         with (
-            patch.multiple(scorer, **kernels),
+            patch.multiple(scorer, **_kernels(scorer, counts)),
+            patch.multiple(motions, MOTIONS=moved, **_kernels(motions, counts)),
             patch.object(scorer, "TritonScorer", _pretended_scorer(scorer.TritonScorer)),
         ):
             yield
@@ -392,6 +404,9 @@ def pretended_triton(counts: Counts) -> Iterator[None]:
         for name in _TRITON_MODULES:
             sys.modules.pop(name, None)
         sys.modules.update(before)
+        for package, name in (("toftrack.compute", "rigid_triton"), ("toftrack.render", "triton")):
+            if f"{package}.{name}" not in before:
+                vars(sys.modules[package]).pop(name, None)
 
 
 _TRITON_MODULES = (
@@ -400,6 +415,7 @@ _TRITON_MODULES = (
     "toftrack.render.triton",
     "toftrack.render.triton.kernel",
     "toftrack.render.triton.scorer",
+    "toftrack.compute.rigid_triton",
 )
 
 
@@ -411,6 +427,10 @@ def _no_triton() -> Any:
     module.cdiv = lambda size, block: -(-size // block)
     module.next_power_of_2 = lambda size: 1 << (size - 1).bit_length()
     return module
+
+
+def _kernels(module: ModuleType, counts: Counts) -> dict[str, _Kernel]:
+    return {name: _Kernel(name, counts) for name in vars(module) if name.endswith("_kernel")}
 
 
 class _Kernel:
@@ -427,6 +447,19 @@ class _Kernel:
         given = [x for x in args if isinstance(x, Tensor)]
         assert given and all(isinstance(x, Pretended) and x.is_contiguous() for x in given)
         self.counts.launched(self.name)
+
+
+def _pretended_motion(
+    there: Callable[[Tensor, Tensor], Tensor], here: Callable[[Tensor, Tensor], Tensor]
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """A motion that launches as one on the device does, with the numbers of one on the CPU."""
+
+    def moved(first: Tensor, second: Tensor) -> Tensor:
+        found = there(first, second)
+        held(found).copy_(here(held(first), held(second)))
+        return found
+
+    return moved
 
 
 def _pretended_scorer(kind: type) -> type:

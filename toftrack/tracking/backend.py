@@ -64,26 +64,31 @@ def _torch(device: torch.device) -> Backend:
     )
 
 
-def _beside(device: torch.device) -> tuple[Motions, Callable[[HandShape], Refiner]]:
-    """Motions and refiners beside a scorer on a device: compiled ones on the CPU next to it."""
+def _beside(
+    device: torch.device, there: Motions = rigid.MOTIONS
+) -> tuple[Motions, Callable[[HandShape], Refiner]]:
+    """Motions and refiners beside a scorer on a device: compiled ones on the CPU next to it.
+
+    there: motions on the device.
+    """
     if device.type == "cpu":
         return rigid.MOTIONS, TorchRefiner
     try:
         from toftrack.compute import rigid_numba
         from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     except ImportError:
-        return rigid.MOTIONS, TorchRefiner
-    here = rigid_numba.motions()
+        here: Motions = rigid.MOTIONS
+        make_refiner: Callable[[HandShape], Refiner] = TorchRefiner
+    else:
+        here, make_refiner = rigid_numba.motions(), CompiledRefiner
 
     def compose(reference: Tensor, tangent: Tensor) -> Tensor:
-        motions = here if reference.device.type == "cpu" else rigid.MOTIONS
-        return motions.compose(reference, tangent)
+        return (here if reference.device.type == "cpu" else there).compose(reference, tangent)
 
     def difference(particles: Tensor, reference: Tensor) -> Tensor:
-        motions = here if particles.device.type == "cpu" else rigid.MOTIONS
-        return motions.difference(particles, reference)
+        return (here if particles.device.type == "cpu" else there).difference(particles, reference)
 
-    return Motions(compose, difference), CompiledRefiner
+    return Motions(compose, difference), make_refiner
 
 
 def _numba(device: torch.device) -> Backend:
@@ -103,10 +108,11 @@ def _numba(device: torch.device) -> Backend:
 
 
 def _triton(device: torch.device) -> Backend:
+    from toftrack.compute import rigid_triton
     from toftrack.render.triton.scorer import TritonScorer, require_device
 
     require_device()
-    motions, make_refiner = _beside(device)
+    motions, make_refiner = _beside(device, rigid_triton.MOTIONS)
     return Backend(
         "triton",
         device,

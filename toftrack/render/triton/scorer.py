@@ -13,6 +13,7 @@ import torch
 import triton
 from torch import Tensor
 
+from toftrack.compute.transfer import on_device
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
@@ -57,12 +58,15 @@ class TritonScorer:
         Raises ImportError where it cannot run.
         """
         require_device()
-        device = device or shape.base_m.device
-        here = shape.to("cpu")
-        surface = hand_surface(here) if surface is None else surface.to("cpu")
-        self._large = TorchScorer(shape.to(device), surface.to(device))
-        numbers, slots = _tables(here, surface)
-        self._numbers, self._slots = numbers.to(device), slots.to(device)
+        self._device = device or shape.base_m.device
+        self._shape = shape.to("cpu")
+        self._surface = hand_surface(self._shape) if surface is None else surface.to("cpu")
+        tables = _tables(self._shape, self._surface)
+        self._numbers, self._slots = (on_device(part, self._device) for part in tables)
+
+    @functools.cached_property
+    def _large(self) -> TorchScorer:
+        return TorchScorer(self._shape.to(self._device), self._surface.to(self._device))
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""
@@ -146,7 +150,7 @@ class TritonScorer:
 def _steps(radius_px: float, height: int, width: int, device: torch.device) -> tuple[Tensor, int]:
     """Steps of the disc on the device, and its reach; kept, a copy to the device takes time."""
     steps = torch.from_numpy(disc_steps(radius_px, height, width)).int()
-    return steps.to(device), int(steps[:, 1].max())
+    return on_device(steps, device), int(steps[:, 1].max())
 
 
 def _tables(shape: HandShape, surface: HandSurface) -> tuple[Tensor, Tensor]:
