@@ -7,7 +7,7 @@ back end knows geometry and pixels but no policy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
@@ -38,8 +38,16 @@ class Evidence:
 
     def to(self, device: torch.device) -> Evidence:
         """The same on a device, from the CPU."""
-        images = ("low", "high", "occluder", "hand", "k")
-        return replace(self, **{name: on_device(getattr(self, name), device) for name in images})
+        if device.type == "cpu":
+            return self
+        return Evidence(
+            low=on_device(self.low, device),
+            high=on_device(self.high, device),
+            occluder=on_device(self.occluder, device),
+            hand=on_device(self.hand, device),
+            k=on_device(self.k, device),
+            radius_px=self.radius_px,
+        )
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Evidence:
         """The part [top, bottom) x [left, right) with intrinsics to match."""
