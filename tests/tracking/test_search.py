@@ -77,7 +77,7 @@ def first_error_mm(start: Start, scene: Scene, seed: int, side: str = "right") -
     seen = observed(scene)
     scores = log_scores_of(seen, shape)
     particles = start(sought(seen, scores), 50, generator(seed))
-    mean = mean_particle(particles, torch.full((50,), 0.02))
+    mean = mean_particle(particles, torch.full((50,), 0.02), MOTIONS)
     joints = forward_kinematics(states_of(mean), shape).joints_m[0].numpy()
     return 1e3 * float(np.linalg.norm(joints - scene.joints_m[0], axis=-1).mean())
 
@@ -147,7 +147,7 @@ def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     middle = (x[:, :3] + rotated_pivot(x[:, 3:6])).mean(0).numpy()
     true_palm = scene.joints_m[0, PALM].mean(0)
     assert np.linalg.norm(middle - true_palm) < 0.06
-    mean = mean_particle(x, torch.full((300,), 1 / 300))
+    mean = mean_particle(x, torch.full((300,), 1 / 300), MOTIONS)
     joints = forward_kinematics(states_of(mean), default_hand_shape()).joints_m[0]
     tips = joints[[8, 12, 16, 20]]
     assert (tips[:, 1] < joints[0, 1] - 0.1).all(), "the fingers point up"

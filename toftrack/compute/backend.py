@@ -14,7 +14,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from toftrack.hand.shape import HandShape
-    from toftrack.refinement.gauss_newton import Refiner
+    from toftrack.refinement.gauss_newton import Landmarks, Refiner
     from toftrack.render.scoring import Scorer
 
 
@@ -23,10 +23,12 @@ class Motions(NamedTuple):
 
     compose: reference particles and tangent offsets, (N, 6 + d) or broadcast, to particles.
     difference: particles (N, 6 + d) and one reference (1, 6 + d) to tangent offsets (N, 6 + d).
+    mean_rotation: rotation vectors (N, 3) and weights (N,) to their mean (3,).
     """
 
     compose: Callable[[Tensor, Tensor], Tensor]
     difference: Callable[[Tensor, Tensor], Tensor]
+    mean_rotation: Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,13 @@ class Backend:
     name: "torch", "numba" or "triton", as `renderer=` says it.
     device: where the particles are.
     motions: of particles.
+    joints_penalty: what speaks against joints besides the image, see tracking/penalty.py.
     make_scorer, make_refiner: for a hand of some sizes, which are moved to the device.
     """
 
     name: str
     device: torch.device
     motions: Motions
+    joints_penalty: Callable[[Tensor, float, float, Landmarks | None, float], Tensor]
     make_scorer: Callable[[HandShape], Scorer]
     make_refiner: Callable[[HandShape], Refiner]

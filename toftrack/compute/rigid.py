@@ -36,9 +36,6 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
 
 
-MOTIONS = Motions(compose, difference)
-
-
 def rotated_pivot(rotvec: Tensor) -> Tensor:
     """The pivot's offset from the wrist, by Rodrigues' formula, (N, 3) to (N, 3)."""
     p = rotvec.new_tensor(PIVOT_M).expand_as(rotvec)
@@ -67,3 +64,6 @@ def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
     scatter = (q * weights[:, None]).mT @ q
     main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
     return roma.unitquat_to_rotvec(main).to(rotvec.dtype)
+
+
+MOTIONS = Motions(compose, difference, mean_rotation)

@@ -19,6 +19,8 @@ from toftrack.compute.rigid import PIVOT_M
 
 _cached = entry_point(__file__)
 _PIVOT = np.array(PIVOT_M)
+_SWEEPS = 8
+"""Of Jacobi's method, which doubles the number of exact digits in each."""
 
 
 @compiled
@@ -163,6 +165,53 @@ def joints_of(states, base_frames, base, lengths, mirror, joints):
         pose_hand(states[i], base_frames, base, lengths, mirror, frames, joints[i])
 
 
+@_cached
+def mean_of_rows(rotvec, weights, out):
+    """See rigid.mean_rotation; rotvec: (N, 3), weights: (N,), float64.  out: (3,) float32."""
+    scatter = np.zeros((4, 4))
+    for n in range(len(rotvec)):
+        q = quaternion(rotvec[n, 0], rotvec[n, 1], rotvec[n, 2])
+        for i in range(4):
+            for j in range(4):
+                scatter[i, j] += weights[n] * q[i] * q[j]
+    main = main_axis(scatter)
+    vector = rotation_vector((main[0], main[1], main[2], main[3]))
+    for i in range(3):
+        out[i] = vector[i]
+
+
+@compiled
+def main_axis(symmetric):
+    """The eigenvector (4,) of the largest eigenvalue of (4, 4), by Jacobi's rotations; overwrites.
+
+    Golub and Van Loan, "Matrix computations", section 8.5.
+    """
+    axes = np.eye(4)
+    for _ in range(_SWEEPS):
+        for p in range(3):
+            for q in range(p + 1, 4):
+                if symmetric[p, q] == 0.0:
+                    continue
+                tau = (symmetric[q, q] - symmetric[p, p]) / (2 * symmetric[p, q])
+                t = 1 / (abs(tau) + math.sqrt(1 + tau * tau))
+                t = t if tau >= 0 else -t
+                cosine = 1 / math.sqrt(1 + t * t)
+                sine = t * cosine
+                for k in range(4):
+                    a, b = symmetric[k, p], symmetric[k, q]
+                    symmetric[k, p], symmetric[k, q] = cosine * a - sine * b, sine * a + cosine * b
+                for k in range(4):
+                    a, b = symmetric[p, k], symmetric[q, k]
+                    symmetric[p, k], symmetric[q, k] = cosine * a - sine * b, sine * a + cosine * b
+                    a, b = axes[k, p], axes[k, q]
+                    axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
+    largest = 0
+    for i in range(1, 4):
+        if symmetric[i, i] > symmetric[largest, largest]:
+            largest = i
+    return axes[:, largest]
+
+
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """See rigid.compose; on the CPU, in float32."""
     return _called(compose_rows, *torch.broadcast_tensors(reference, tangent))
@@ -171,6 +220,14 @@ def compose(reference: Tensor, tangent: Tensor) -> Tensor:
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
     """See rigid.difference; on the CPU, in float32."""
     return _called(difference_rows, particles, reference)
+
+
+def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
+    """See rigid.mean_rotation; on the CPU, in float32."""
+    out = torch.empty(3)
+    given = (t.detach().to("cpu", torch.float64).contiguous() for t in (rotvec, weights))
+    mean_of_rows(*(t.numpy() for t in given), out.numpy())
+    return out
 
 
 def _called(kernel: Callable[..., None], left: Tensor, right: Tensor) -> Tensor:
@@ -186,4 +243,5 @@ def motions() -> Motions:
         with announced("filter: compiling its numba kernels (once, about 1 s)"):
             row = torch.zeros(1, 7)
             difference(compose(row, row), row)
-    return Motions(compose, difference)
+            mean_rotation(row[:, 3:6], row[:, 0])
+    return Motions(compose, difference, mean_rotation)

@@ -14,6 +14,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.refinement.gauss_newton import TorchRefiner
 from toftrack.render.scoring import Scorer
 from toftrack.render.torch_scorer import TorchScorer
+from toftrack.tracking import penalty
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +57,7 @@ def _torch(device: torch.device) -> Backend:
         "torch",
         device,
         rigid.MOTIONS,
+        penalty.joints_penalty,
         make_scorer=lambda shape: TorchScorer(shape.to(device)),
         make_refiner=lambda shape: TorchRefiner(shape.to(device)),
     )
@@ -66,12 +68,14 @@ def _numba(device: torch.device) -> Backend:
     from toftrack.compute import rigid_numba
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.render.numba.scorer import NumbaScorer
+    from toftrack.tracking import penalty_numba
 
     here = device.type == "cpu"
     return Backend(
         "numba",
         device,
         rigid_numba.motions() if here else rigid.MOTIONS,
+        penalty_numba.joints_penalty if here else penalty.joints_penalty,
         make_scorer=lambda shape: NumbaScorer(shape.to(device)),
         make_refiner=lambda shape: (CompiledRefiner if here else TorchRefiner)(shape.to(device)),
     )
@@ -85,6 +89,7 @@ def _triton(device: torch.device) -> Backend:
         "triton",
         device,
         rigid.MOTIONS,
+        penalty.joints_penalty,
         make_scorer=lambda shape: TritonScorer(shape.to(device)),
         make_refiner=lambda shape: TorchRefiner(shape.to(device)),
     )

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
-from toftrack.compute.rigid import mean_rotation
 from toftrack.errors import ToftrackError
 
 
@@ -220,10 +219,10 @@ def annealed(
     return particles, weights
 
 
-def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:
+def mean_particle(particles: Tensor, weights: Tensor, motions: Motions) -> Tensor:
     """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d), the rotation averaged on SO(3)."""
     mean = (weights.to(particles.dtype) @ particles)[None]
-    mean[0, 3:6] = mean_rotation(particles[:, 3:6], weights)
+    mean[0, 3:6] = motions.mean_rotation(particles[:, 3:6], weights)
     return mean
 
 

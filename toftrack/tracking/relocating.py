@@ -12,7 +12,6 @@ from torch import Tensor
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.frames import DepthImage
-from toftrack.hand.overlap import finger_overlap
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.refinement.seen_points import SeenPoints, seen_points
@@ -31,8 +30,6 @@ _UNLIKELY = 0.03
 _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
 """How many hypotheses are bent to the votes, in how many steps; how sure the votes are at best, and
 how far an angle may go."""
-_FAR_SIGMAS = 3.0
-"""Farther off, a joint is as wrong as it can be."""
 _AS_WELL = 1.3
 """Hands are seen about as well when their expected errors differ by less than this factor."""
 _IN_OTHER = 4.0
@@ -183,18 +180,15 @@ def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
     votes are.
     """
     model, glance = frame.model, frame.glance
-    word = joints_m.new_zeros(len(joints_m))
+    overlap = 0.0 if model.refinement is None else model.refinement.overlap
+    votes, weight = None, 0.0
+    if model.relocaliser is not None and glance is not None:
+        votes, weight = landmarks_of(glance, model), model.relocaliser.settings.votes
+    length = frame.hand.shape.hand_length_m
+    word = -model.backend.joints_penalty(joints_m, length, overlap, votes, weight)
     if frame.other is not None and frame.other.pixels is not None:
         word = word - _IN_OTHER * touching(joints_m, frame.other)
-    if model.refinement is not None and model.refinement.overlap:
-        length = frame.hand.shape.hand_length_m
-        word = word - model.refinement.overlap * finger_overlap(joints_m, length)
-    if model.relocaliser is None or glance is None:
-        return word
-    votes = landmarks_of(glance, model)
-    off = ((joints_m - votes.points_m).norm(dim=-1) / votes.sigma_m).square()
-    far = (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
-    return word - model.relocaliser.settings.votes * far
+    return word
 
 
 def known_scores(

@@ -90,7 +90,7 @@ def step(
         track = begin(track, state, dt_s, frame, generator)
     with spans("filter: rest"):
         particles, weights = filtered(track, dt_s, frame, generator, spans)
-        mean = particle_filter.mean_particle(particles, weights)
+        mean = particle_filter.mean_particle(particles, weights, model.backend.motions)
     with spans("refinement"):
         outcome = refined(track, mean, dt_s, frame, generator)
         track, pose, trend = challenged(track, outcome, dt_s, frame)
