@@ -159,3 +159,14 @@ def test_the_mean_rotation_is_nearest_to_all() -> None:
     near_pi = torch.tensor([[math.pi - 0.1, 0.0, 0.0], [-math.pi + 0.1, 0.0, 0.0]])
     found = rigid.mean_rotation(near_pi, torch.tensor([0.5, 0.5], dtype=torch.float64))
     assert float(found.norm()) == pytest.approx(math.pi, abs=1e-5)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 3.0])
+def test_the_compiled_mean_rotation_is_the_reference_s(spread: float) -> None:
+    draw = torch.Generator().manual_seed(3)
+    rotvec = torch.tensor([2.0, -1.0, 0.5]) + spread * torch.randn(150, 3, generator=draw)
+    weights = torch.rand(150, generator=draw, dtype=torch.float64)
+    weights /= weights.sum()
+    found, expected = (m.mean_rotation(rotvec, weights) for m in (rigid_numba, rigid))
+    off = roma.rotvec_geodesic_distance(found.double(), expected.double())
+    assert float(off) < 1e-5  # rad
