@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.rigid import rotated_pivot
+from toftrack.compute.threads import beside
 from toftrack.frames import DepthImage
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
@@ -22,7 +23,7 @@ from toftrack.tracking.life_cycle import lasted
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.other_hand import OtherHand, touching
 from toftrack.tracking.search import LastSeen
-from toftrack.tracking.side_belief import OTHER_SIDE
+from toftrack.tracking.side_belief import OTHER_SIDE, look_due
 from toftrack.tracking.state import Track, TrackerState
 
 _UNLIKELY = 0.03
@@ -74,13 +75,38 @@ def glanced(
             return None, best
     elif _sure(track, relocaliser.settings, dt_s):
         return track, None
+    centre = _expected_centre(track, dt_s, model)
+    if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
+        return None, best
+    return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
+
+
+def glancing(
+    state: TrackerState, dt_s: float, image: DepthImage, model: TrackerModel
+) -> Callable[[], Glance] | None:
+    """The look at a hand that is followed, begun beside whatever does not need it; see `glanced`.
+
+    What is returned waits for it. None where a frame's first question is what the networks say: is
+    there a hand, is it this one, of which side; or where they need not look.
+    """
+    relocaliser, track = model.relocaliser, state.track
+    if relocaliser is None or track is None or track.doubted:
+        return None
+    if _sure(track, relocaliser.settings, dt_s) or look_due(state.sides, model.sides, True, dt_s):
+        return None
+    centre = _expected_centre(track, dt_s, model)
+    look = partial(relocaliser.glance, image.depth_m, image.k, centre, state.side)
+    wait = beside(look)
+    return lambda: wait()[0]
+
+
+def _expected_centre(track: Track, dt_s: float, model: TrackerModel) -> np.ndarray:
+    """(1, 3) middle of the palm, dt_s after the last frame, camera frame."""
     moved = displacement(track, dt_s, model.filter)[None]
     ahead = model.backend.motions.compose(track.mean, moved)
     centre = (ahead[:, :3] + rotated_pivot(ahead[:, 3:6])).cpu().numpy()
     centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
-    if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
-        return None, best
-    return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
+    return centre
 
 
 def _first(found: Sequence[Glance]) -> Glance | None:
