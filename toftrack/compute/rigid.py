@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Motions
+from toftrack.compute.transfer import on_host, table
 
 PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
@@ -38,7 +39,7 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
 
 def rotated_pivot(rotvec: Tensor) -> Tensor:
     """The pivot's offset from the wrist, by Rodrigues' formula, (N, 3) to (N, 3)."""
-    p = rotvec.new_tensor(PIVOT_M).expand_as(rotvec)
+    p = table(PIVOT_M, rotvec.dtype, rotvec.device).expand_as(rotvec)
     square = rotvec.square().sum(1, keepdim=True)
     angle = square.clamp(min=1e-12).sqrt()
     cross = torch.linalg.cross(rotvec, p)
@@ -56,14 +57,30 @@ def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
     The rotation nearest to the mean matrix (chordal L2 mean; Hartley et al., "Rotation averaging",
     IJCV 2013).
     """
+    return main_rotation(rotation_scatter(rotvec, weights)).to(rotvec.dtype)
+
+
+def rotation_scatter(rotvec: Tensor, weights: Tensor) -> Tensor:
+    """What `main_rotation` needs to know of (N, 3) rotations of (N,) weights, (4, 4) float64."""
     half = 0.5 * rotvec.double()
     angle = half.norm(dim=1, keepdim=True)
     q = torch.cat((half * (angle / torch.pi).sinc(), angle.cos()), 1)
     # The nearest rotation's quaternion is the main axis of all quaternions (Markley et al., JGCD
     # 2007), whatever their signs.
-    scatter = (q * weights[:, None]).mT @ q
-    main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
-    return roma.unitquat_to_rotvec(main).to(rotvec.dtype)
+    return (q * weights[:, None]).mT @ q
 
 
-MOTIONS = Motions(compose, difference, mean_rotation)
+def main_rotation(scatter: Tensor) -> Tensor:
+    """The mean rotation (3,) of what `rotation_scatter` has summed up, float64."""
+    return roma.unitquat_to_rotvec(torch.linalg.eigh(scatter).eigenvectors[:, -1])
+
+
+def mean(particles: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d) on the CPU, the rotation's on SO(3)."""
+    found = (weights.to(particles.dtype) @ particles)[None]
+    found, scatter = on_host(found, rotation_scatter(particles[:, 3:6], weights))
+    found[0, 3:6] = main_rotation(scatter).to(found.dtype)
+    return found
+
+
+MOTIONS = Motions(compose, difference, mean)

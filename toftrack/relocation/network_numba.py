@@ -89,9 +89,9 @@ def _residual(builder: NetworkBuilder, x: Image, block: nn.Module, border: int =
 
 @compiled
 def pose_outputs(image, net):
-    """PoseNet.told of one crop (3, CROP, CROP): the heads' numbers and the votes (16, 16, ...).
+    """Of one crop (3, CROP, CROP): the heads' numbers and the votes, see PoseNet.features.
 
-    net: PackedPoseNet. Both have more numbers than there are outputs.
+    net: PackedPoseNet.  The votes are (16, 16, channels); both have more numbers than outputs.
     """
     network, heads, votes, channels = net
     steps, weights, room = network

@@ -16,11 +16,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.relocation.crops import crop, wide
-from toftrack.relocation.network import STRIDE, Finder, PoseNet
+from toftrack.relocation.network import STRIDE, Finder, Found, PoseNet, Proposed
 
 KEPT = 12
 """Hypotheses of a crop that are looked at further."""
@@ -82,7 +83,7 @@ def find_hands(
     depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
     """
     image, wide_k = wide(depth_m, k)
-    found = finder(image)
+    found = Found(*on_host(*finder(on_device(image, finder.heads.weight.device))))
     heat = found.heat.sigmoid()
     peaks = (heat == F.max_pool2d(heat, 3, 1, 1)) & (heat >= least)
     places = {}
@@ -111,7 +112,7 @@ def look(
         centres_m = centres_m * MIRROR.numpy()
     crops, turns = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
     image = torch.from_numpy(np.stack(crops)).to(memory_format=torch.channels_last)
-    p = pose(image)
+    p = Proposed(*on_host(*pose(on_device(image, pose.anchors.device))))
     turn = torch.from_numpy(np.stack(turns)).float()  # (C, 3, 3)
     centre = torch.from_numpy(centres_m).float()
     order = p.log_probability.argsort(1, descending=True)[:, :KEPT]

@@ -20,7 +20,7 @@ from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.hand.skeleton import ANGLE_LIMITS
-from toftrack.relocation import crops, crops_numba, network, network_numba
+from toftrack.relocation import crops, crops_numba, network, network_numba, proposals
 from toftrack.relocation.crops import CROP, CROP_M, crop_rotation
 from toftrack.relocation.crops_numba import read_crop
 from toftrack.relocation.network import (
@@ -53,7 +53,9 @@ _CELLS = 16
 def look(
     pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
 ) -> Look:
-    """See proposals.look."""
+    """See proposals.look, which it is where the network is on another device."""
+    if pose.anchors.device.type != "cpu":
+        return proposals.look(pose, depth_m, k, centres_m, side)
     centres = np.asarray(centres_m, np.float64).reshape(-1, 3)
     left = side == "left"
     k = np.asarray(k, np.float64)

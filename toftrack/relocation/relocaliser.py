@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -123,11 +123,15 @@ class Glance:
 
 @dataclass(frozen=True, eq=False)
 class Relocaliser:
-    """Both networks and how they are used; on the CPU."""
+    """Both networks and how they are used; images are read, and answers given, on the CPU."""
 
     pose: PoseNet
     finder: Finder
     settings: RelocationSettings
+
+    def to(self, device: torch.device) -> Relocaliser:
+        """The same with the networks on a device, where they are moved."""
+        return replace(self, pose=self.pose.to(device), finder=self.finder.to(device))
 
     def glance(
         self, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str

@@ -219,13 +219,6 @@ def annealed(
     return particles, weights
 
 
-def mean_particle(particles: Tensor, weights: Tensor, motions: Motions) -> Tensor:
-    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d), the rotation averaged on SO(3)."""
-    mean = (weights.to(particles.dtype) @ particles)[None]
-    mean[0, 3:6] = motions.mean_rotation(particles[:, 3:6], weights)
-    return mean
-
-
 def covariance(tangents: Tensor, weights: Tensor) -> Tensor:
     """Weighted covariance of tangent offsets about their own mean, (6 + d, 6 + d)."""
     w = weights.to(tangents.dtype)

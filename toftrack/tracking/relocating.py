@@ -12,6 +12,7 @@ from torch import Tensor
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import beside
+from toftrack.compute.transfer import on_device
 from toftrack.frames import DepthImage
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
@@ -168,7 +169,7 @@ def landmarks_of(glance: Glance, model: TrackerModel) -> Landmarks:
     assert model.relocaliser is not None
     cfg, found = model.relocaliser.settings, glance.landmarks
     sigma = (cfg.landmark_sigmas * found.sigma_m).clamp(min=cfg.landmark_m)
-    return Landmarks(found.points_m.to(model.device), sigma.to(model.device))
+    return Landmarks(found.points_m, sigma)
 
 
 def hypotheses(glance: Glance, hand: SizedHand, count: int) -> tuple[Tensor, Tensor]:
@@ -193,8 +194,7 @@ def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
     nothing = SeenPoints(
         states.new_zeros(0, 3), states.new_zeros(0, 0, 2), frame.observation.k, (0, 0)
     )
-    sigma = glance.landmarks.sigma_m.clamp(min=_BENT_M).to(model.device)
-    votes = Landmarks(glance.landmarks.points_m.to(model.device), sigma)
+    votes = Landmarks(glance.landmarks.points_m, glance.landmarks.sigma_m.clamp(min=_BENT_M))
     freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
     return torch.cat((frame.hand.refiner(bent, bent[:, 6:], nothing, freely, votes), states))
 
@@ -260,8 +260,8 @@ def track_of(pose: Tensor, model: TrackerModel) -> Track:
     """A track that begins with a pose (1, 27)."""
     particle, off = model.nearest(pose)
     n = model.filter.particles
-    particles = particle.repeat(n, 1)
+    particles = on_device(particle, model.device).repeat(n, 1)
     weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)
     carry = 0.0 if model.refinement is None else model.refinement.carry
-    still = particles.new_zeros(particles.shape[1])
+    still = particle.new_zeros(particle.shape[1])
     return Track(particles, weights, particle, still, carry * off, pose)

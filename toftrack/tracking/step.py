@@ -11,10 +11,10 @@ from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S, elapsed_s
 from toftrack.compute.threads import small_operations
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
-from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.relocaliser import Glance
 from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
@@ -47,7 +47,7 @@ from toftrack.tracking.state import StepInfo, Track, TrackerState, resumed
 
 def first_state(model: TrackerModel, seed: int) -> TrackerState:
     """Before any frame."""
-    generator = torch.Generator(model.device).manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     size: SizeBelief | ShapeBelief | None = None
     if model.adapt is not None:
         size = shape_fit.first_belief()
@@ -67,7 +67,7 @@ def step(
 
     other: another hand that is tracked as well; it is not taken for this one.
     """
-    spans, generator = Spans(), resumed(state.generator, model.device)
+    spans, generator = Spans(), resumed(state.generator)
     dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
     state = at(state, image)
     with spans("relocaliser"):
@@ -95,7 +95,7 @@ def step(
         track = begin(track, state, dt_s, frame, generator)
     with spans("filter: rest"):
         particles, weights = filtered(track, dt_s, frame, generator, spans)
-        mean = particle_filter.mean_particle(particles, weights, model.backend.motions)
+        mean = model.backend.motions.mean(particles, weights)
     if coming is not None:
         with spans("relocaliser"):
             state, _, glance = _told(state, track, coming(), dt_s, alone, model, other)
@@ -261,7 +261,7 @@ def _sized(
         likelihood = replace(model.likelihood, beta=model.fit.beta)
 
         def log_scores(states: Tensor, evidence: Evidence) -> Tensor:
-            return likelihood.log_score(frame.hand.scorer(states, evidence))
+            return likelihood.log_score(frame.counts(states, evidence))
 
         motions, evidence = model.backend.motions, frame.evidence
         size = size_fit.update(
@@ -279,10 +279,8 @@ def _shape_learned(belief: ShapeBelief, found: Found, frame: ObservedFrame) -> S
     if model.adapt is None or glance is None or frame.hidden:
         return belief
     votes = landmarks_of(glance, model)
-    votes = Landmarks(votes.points_m.cpu(), votes.sigma_m.cpu())
-    shape, state = hand.shape.to("cpu"), found.pose.cpu()
     return shape_fit.learned(
-        belief, state, shape, hand.derivatives, glance, votes, model.adapt, hand.first
+        belief, found.pose, hand.shape, hand.derivatives, glance, votes, model.adapt, hand.first
     )
 
 
@@ -291,9 +289,13 @@ def _estimate(
 ) -> Estimate:
     """What is told of a frame, but for its gesture and the time that it took."""
     model, mean, particles = frame.model, found.mean, found.particles
+    mean = on_device(mean, model.device)
     tangents = model.backend.motions.difference(particles, mean)
     tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
-    covariance = particle_filter.covariance(tangents, found.weights)
+    covariance, effective = on_host(
+        particle_filter.covariance(tangents, found.weights),
+        particle_filter.effective_sample_size(found.weights),
+    )
     return Estimate(
         index=image.index,
         timestamp_s=image.timestamp_s,
@@ -306,7 +308,7 @@ def _estimate(
         latent=_host(model.space.encode(found.pose[:, 6:])[0]),
         score=score,
         covariance=_host(covariance + torch.diag(model.model_variance)),
-        effective_sample_size=float(particle_filter.effective_sample_size(found.weights)),
+        effective_sample_size=float(effective),
         compute_s=math.nan,
     )
 
@@ -345,10 +347,10 @@ def _spread(joints_m: np.ndarray, found: Found, frame: ObservedFrame) -> np.ndar
         moved = motions.compose(found.refined.repeat(len(tangents), 1), tangents)
         return frame.hand.refiner.joints(model.decode(moved, found.offset))
 
-    around = motions.difference(found.particles, found.mean)
-    covariance = particle_filter.covariance(around, found.weights)
+    around = motions.difference(found.particles, on_device(found.mean, model.device))
+    (covariance,) = on_host(particle_filter.covariance(around, found.weights))
     return propagated_sigma(joints_m, covariance + torch.diag(model.model_variance), joints_of)
 
 
 def _host(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().astype(np.float32)
+    return tensor.detach().numpy().astype(np.float32)
