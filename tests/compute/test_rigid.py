@@ -159,3 +159,16 @@ def test_the_mean_rotation_is_nearest_to_all() -> None:
     near_pi = torch.tensor([[math.pi - 0.1, 0.0, 0.0], [-math.pi + 0.1, 0.0, 0.0]])
     found = rigid.mean_rotation(near_pi, torch.tensor([0.5, 0.5], dtype=torch.float64))
     assert float(found.norm()) == pytest.approx(math.pi, abs=1e-5)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 3.0])
+def test_the_compiled_mean_is_that_of_the_reference(spread: float) -> None:
+    draw = torch.Generator().manual_seed(3)
+    rotvec = torch.tensor([2.0, -1.0, 0.5]) + spread * torch.randn(150, 3, generator=draw)
+    weights = torch.rand(150, generator=draw, dtype=torch.float64)
+    weights /= weights.sum()
+    particles = torch.cat((rotvec.roll(1, 1), rotvec, rotvec), 1)
+    found, expected = (module.mean(particles, weights)[0] for module in (rigid_numba, rigid))
+    off = roma.rotvec_geodesic_distance(found[3:6].double(), expected[3:6].double())
+    assert float(off) < 1e-5  # rad
+    torch.testing.assert_close(found[[0, 1, 2, 6, 7, 8]], expected[[0, 1, 2, 6, 7, 8]])

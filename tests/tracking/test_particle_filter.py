@@ -157,7 +157,7 @@ def test_mean_and_covariance_of_particles_are_the_weighted_ones() -> None:
     x[:, 3:6] *= 0.1
     weights = torch.rand(200, generator=generator(1)).double()
     weights /= weights.sum()
-    mean = sir.mean_particle(x, weights)
+    mean = MOTIONS.mean(x, weights)
     torch.testing.assert_close(mean[0, 6:], (weights.float() @ x)[6:])
     tangents = MOTIONS.difference(x, mean)
     expected = torch.cov(tangents.double().T, aweights=weights, correction=0)

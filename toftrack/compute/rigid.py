@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Motions
-from toftrack.compute.transfer import table
+from toftrack.compute.transfer import on_host, table
 
 PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
@@ -35,9 +35,6 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     turn = roma.rotvec_composition((particles[:, 3:6], inverse))
     move = _pivot(particles) - _pivot(reference)
     return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
-
-
-MOTIONS = Motions(compose, difference)
 
 
 def rotated_pivot(rotvec: Tensor) -> Tensor:
@@ -76,3 +73,14 @@ def rotation_scatter(rotvec: Tensor, weights: Tensor) -> Tensor:
 def main_rotation(scatter: Tensor) -> Tensor:
     """The mean rotation (3,) of what `rotation_scatter` has summed up, float64."""
     return roma.unitquat_to_rotvec(torch.linalg.eigh(scatter).eigenvectors[:, -1])
+
+
+def mean(particles: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d) on the CPU, the rotation's on SO(3)."""
+    found = (weights.to(particles.dtype) @ particles)[None]
+    found, scatter = on_host(found, rotation_scatter(particles[:, 3:6], weights))
+    found[0, 3:6] = main_rotation(scatter).to(found.dtype)
+    return found
+
+
+MOTIONS = Motions(compose, difference, mean)

@@ -10,6 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toftrack.compute import rigid
 from toftrack.compute.backend import Motions
 from toftrack.compute.rigid import PIVOT_M
 
@@ -163,5 +164,5 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return out
 
 
-MOTIONS = Motions(compose, difference)
+MOTIONS = Motions(compose, difference, rigid.mean)
 """Of particles on a CUDA device."""

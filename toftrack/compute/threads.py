@@ -10,9 +10,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from threading import Lock
+from typing import TypeVar
 
 import torch
 
+Result = TypeVar("Result")
 _given: ContextVar[int | None] = ContextVar("toftrack_threads", default=None)
 
 
@@ -76,6 +78,16 @@ def run_shared(task: Callable[[], object], parts: int) -> None:
         # A helper that has not begun has nothing left to do.
         if not other.cancel():
             other.result()
+
+
+def beside(task: Callable[[], Result]) -> Callable[[], Result]:
+    """Begin a task in another thread, if there may be one; what is returned waits for its result.
+
+    The task must not need the interpreter's lock for long, or the threads wait for each other.
+    """
+    if threads() == 1:
+        return task
+    return _pool(os.getpid()).submit(task).result
 
 
 @functools.cache

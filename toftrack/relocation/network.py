@@ -17,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toftrack.compute.transfer import on_device, on_host
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP_M
 
@@ -137,25 +136,13 @@ class PoseNet(nn.Module):
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The last layers' outputs: heads (N, ...), votes and parts (N, ..., 16, 16)."""
-        heads, merged = self._trunk(image)
-        return heads, self.votes(merged), self.painted(merged)
-
-    def told(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """The same without the parts, which nobody but the training asks for; on the CPU, whatever
-        device the network is on.
-        """
-        heads, merged = self._trunk(on_device(image, self.anchors.device))
-        heads, votes = on_host(heads, self.votes(merged))
-        return heads, votes
-
-    def _trunk(self, image: Tensor) -> tuple[Tensor, Tensor]:
         fine = self.fine(self.stem(image))
         middle = self.middle(fine)
         dense = self.dense(self.coarse(middle))
         merged = self.lateral_16(fine) + self.context(dense)[:, :, None, None]
         merged = merged + F.interpolate(self.lateral_8(middle), scale_factor=2.0, mode="nearest")
         merged = self.smooth(F.relu(merged))
-        return self.heads(dense), merged
+        return self.heads(dense), self.votes(merged), self.painted(merged)
 
     def decode(self, image: Tensor, heads: Tensor, votes: Tensor, painted: Tensor) -> Proposed:
         """What the outputs of `features` mean; in full precision."""

@@ -1,4 +1,4 @@
-"""Hypotheses of a crop in compiled code, but for the network itself; see proposals.look.
+"""Hypotheses of a crop in one compiled call; see proposals.look.
 
 The same formulas as PoseNet.decode's and proposals.look's, which are the reference, without the
 microseconds that every operation costs on a few numbers.
@@ -7,11 +7,12 @@ microseconds that every operation costs on a few numbers.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
 
-from toftrack.compute import rigid_numba
+from toftrack.compute import convolution_numba, rigid_numba
 from toftrack.compute.compiling import called, compiled, entry_point
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rigid_numba import pose_hand, rotation_vector
@@ -19,7 +20,7 @@ from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.hand.skeleton import ANGLE_LIMITS
-from toftrack.relocation import crops, crops_numba, network
+from toftrack.relocation import crops, crops_numba, network, network_numba, proposals
 from toftrack.relocation.crops import CROP, CROP_M, crop_rotation
 from toftrack.relocation.crops_numba import read_crop
 from toftrack.relocation.network import (
@@ -35,10 +36,11 @@ from toftrack.relocation.network import (
     PoseNet,
     cube_rotations,
 )
+from toftrack.relocation.network_numba import PackedPoseNet, pack_pose_net, pose_outputs
 from toftrack.relocation.proposals import DOUBT_M, KEPT, MIRROR, Look, mean_hand
 
-_SOURCES = (rigid_numba, overlap, overlap_numba, crops, crops_numba, network)
-_cached = entry_point(__file__, *(module.__file__ for module in _SOURCES))
+_SOURCES = (rigid_numba, overlap, overlap_numba, crops, crops_numba, network, network_numba)
+_cached = entry_point(__file__, *(module.__file__ for module in (*_SOURCES, convolution_numba)))
 _COMPILING = "relocaliser: compiling its numba kernels (once, about 5 s)"
 _ANCHORS = cube_rotations().double().numpy()
 _LIMITS = np.array(ANGLE_LIMITS)
@@ -48,11 +50,12 @@ _EACH = 6 + ANGLES + 1 + 3 + 2
 _CELLS = 16
 
 
-@torch.inference_mode()
 def look(
     pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
 ) -> Look:
-    """See proposals.look."""
+    """See proposals.look, which it is where the network is on another device."""
+    if pose.anchors.device.type != "cpu":
+        return proposals.look(pose, depth_m, k, centres_m, side)
     centres = np.asarray(centres_m, np.float64).reshape(-1, 3)
     left = side == "left"
     k = np.asarray(k, np.float64)
@@ -61,26 +64,30 @@ def look(
         k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
         centres = centres * MIRROR.numpy()
     turns = np.stack([crop_rotation(centre) for centre in centres])
-    depth_m = np.ascontiguousarray(depth_m, np.float32)
-    images = np.empty((len(centres), 3, CROP, CROP), np.float32)
-    called(read_crops, _COMPILING, depth_m, left, k, centres, turns, images)
-    heads, votes = pose.told(torch.from_numpy(images).to(memory_format=torch.channels_last))
     out = _empty(len(centres))
     shape = mean_hand(side)
     called(
-        decode_crops,
+        look_at,
         _COMPILING,
-        heads.float().contiguous().numpy(),
-        votes.float().permute(0, 2, 3, 1).contiguous().numpy(),
-        images,
-        turns,
-        centres,
+        np.ascontiguousarray(depth_m, np.float32),
         left,
-        (shape.base_frames.double().numpy(), shape.base_m.double().numpy()),
-        shape.bone_lengths_m.double().numpy(),
+        k,
+        centres,
+        turns,
+        _packed(pose),
+        (
+            shape.base_frames.double().numpy(),
+            shape.base_m.double().numpy(),
+            shape.bone_lengths_m.double().numpy(),
+        ),
         tuple(out.values()),
     )
     return Look(**{name: torch.from_numpy(array) for name, array in out.items()})
+
+
+@lru_cache(maxsize=2)
+def _packed(pose: PoseNet) -> PackedPoseNet:
+    return pack_pose_net(pose)
 
 
 def _empty(count: int) -> dict[str, np.ndarray]:
@@ -102,63 +109,65 @@ def _empty(count: int) -> dict[str, np.ndarray]:
 
 
 @_cached
-def read_crops(depth, mirror, k, centres, turns, images):
-    """Crops (C, 3, CROP, CROP) float32 about centres (C, 3), turned by (C, 3, 3), see crops.crop.
+def look_at(depth, mirror, k, centres, turns, net, hand, out):
+    """Crops about centres (C, 3), turned by (C, 3, 3), through the network, into Look's arrays.
 
     mirror: the image is to be read as a mirror shows it; k and centres are those of the mirrored.
+    net: PackedPoseNet.  hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
     """
-    mapping, single, slope = np.empty((3, 3)), np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    image = np.empty((3, CROP, CROP), np.float32)
     for c in range(len(centres)):
-        turn, centre = turns[c], centres[c]
-        distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
-        focal, middle = 2 * CROP * distance / CROP_M, (2 * CROP - 1) / 2
-        largest = 0.0
-        for i in range(3):
-            for j in range(3):
-                mapping[i, j] = k[i, 0] * turn[0, j] + k[i, 1] * turn[1, j] + k[i, 2] * turn[2, j]
-            # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.
-            mapping[i, 0] /= focal
-            mapping[i, 1] /= focal
-            mapping[i, 2] -= middle * (mapping[i, 0] + mapping[i, 1])
-            for j in range(3):
-                largest = max(largest, abs(mapping[i, j]))
-        for i in range(3):
-            for j in range(3):  # only the ratios count, and a large scale says infinity in float32
-                single[i, j] = mapping[i, j] / largest
-        slope[0], slope[1] = turn[2, 0] / focal, turn[2, 1] / focal
-        slope[2] = turn[2, 2] - middle * (turn[2, 0] + turn[2, 1]) / focal
-        scale = np.float32(2 / CROP_M)
-        read_crop(depth, mirror, single, slope, scale, np.float32(distance), images[c])
-
-
-@_cached
-def decode_crops(heads, votes, images, turns, centres, mirror, base, lengths, out):
-    """What the network's outputs mean, see PoseNet.decode and proposals.look.
-
-    heads: (C, 24 * _EACH + 2), votes: (C, 16, 16, 5 * JOINTS), both float32.
-    images, turns, centres, mirror: see read_crops.
-    base, lengths: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean hand.
-    out: the arrays of Look, written.
-    """
-    _, _, _, log_size, _, _, _, joints, sigma, present, right = out
-    for c in range(len(heads)):
-        present[c], right[c] = heads[c, -2], heads[c, -1]
-        _decode_hypotheses(heads[c], turns[c], centres[c], mirror, base, lengths, c, out)
-        _decode_votes(votes[c], images[c, 0], joints[c], sigma[c])
-        for j in range(JOINTS):
-            p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
-            _into_camera(p, turns[c], centres[c], mirror, joints[c, j])
-        of_finger = np.zeros(5)
-        length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
-        add_overlaps(joints[c].astype(np.float64), length, of_finger)
-        for finger in range(5):
-            doubt = DOUBT_M * min(of_finger[finger], 1.0)
-            for joint in range(2 + 4 * finger, 5 + 4 * finger):
-                sigma[c, joint] = math.sqrt(sigma[c, joint] ** 2 + doubt * doubt)
+        _crop(depth, mirror, k, centres[c], turns[c], image)
+        heads, votes = pose_outputs(image, net)
+        _decode(heads, votes, image[0], turns[c], centres[c], mirror, hand, c, out)
 
 
 @compiled
-def _decode_hypotheses(told, turn, centre, mirror, base, lengths, c, out):
+def _crop(depth, mirror, k, centre, turn, image):
+    """See crops.crop."""
+    mapping, single, slope = np.empty((3, 3)), np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
+    focal, middle = 2 * CROP * distance / CROP_M, (2 * CROP - 1) / 2
+    largest = 0.0
+    for i in range(3):
+        for j in range(3):
+            mapping[i, j] = k[i, 0] * turn[0, j] + k[i, 1] * turn[1, j] + k[i, 2] * turn[2, j]
+        # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.
+        mapping[i, 0] /= focal
+        mapping[i, 1] /= focal
+        mapping[i, 2] -= middle * (mapping[i, 0] + mapping[i, 1])
+        for j in range(3):
+            largest = max(largest, abs(mapping[i, j]))
+    for i in range(3):
+        for j in range(3):  # only the ratios count, and a large scale says infinity in float32
+            single[i, j] = mapping[i, j] / largest
+    slope[0], slope[1] = turn[2, 0] / focal, turn[2, 1] / focal
+    slope[2] = turn[2, 2] - middle * (turn[2, 0] + turn[2, 1]) / focal
+    scale = np.float32(2 / CROP_M)
+    read_crop(depth, mirror, single, slope, scale, np.float32(distance), image)
+
+
+@compiled
+def _decode(heads, votes, depth, turn, centre, mirror, hand, c, out):
+    """What the network's outputs for a crop mean, see PoseNet.decode and proposals.look."""
+    _, _, _, log_size, _, _, _, joints, sigma, present, right = out
+    present[c], right[c] = heads[len(_ANCHORS) * _EACH], heads[len(_ANCHORS) * _EACH + 1]
+    _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
+    _decode_votes(votes, depth, joints[c], sigma[c])
+    for j in range(JOINTS):
+        p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
+        _into_camera(p, turn, centre, mirror, joints[c, j])
+    of_finger = np.zeros(5)
+    length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
+    add_overlaps(joints[c].astype(np.float64), length, of_finger)
+    for finger in range(5):
+        doubt = DOUBT_M * min(of_finger[finger], 1.0)
+        for joint in range(2 + 4 * finger, 5 + 4 * finger):
+            sigma[c, joint] = math.sqrt(sigma[c, joint] ** 2 + doubt * doubt)
+
+
+@compiled
+def _decode_hypotheses(told, turn, centre, mirror, hand, c, out):
     """The likeliest hypotheses of a crop, in their order."""
     pivot, rotvec, angles, log_size, log_probability, error, joints, _, _, _, _ = out
     count = len(_ANCHORS)
@@ -169,7 +178,7 @@ def _decode_hypotheses(told, turn, centre, mirror, base, lengths, c, out):
     for h in range(count):
         total += math.exp(chance[h] - top)
     matrix, state = np.empty((3, 3)), np.zeros(27)
-    frames, hand = np.empty((16, 3, 3)), np.empty((JOINTS, 3))
+    frames, posed = np.empty((16, 3, 3)), np.empty((JOINTS, 3))
     for kept in range(KEPT):
         h = chance.argmax()
         log_probability[c, kept] = chance[h] - top - math.log(total)
@@ -190,7 +199,7 @@ def _decode_hypotheses(told, turn, centre, mirror, base, lengths, c, out):
         at = (OFFSET_M * p[0], OFFSET_M * p[1], OFFSET_M * p[2])
         _into_camera(at, turn, centre, mirror, pivot[c, kept])
         error[c, kept] = ERROR_M * _softplus(one[_EACH - 1]) + LEAST_ERROR_M
-        pose_hand(state, base[0], base[1], lengths, sign, frames, hand)
+        pose_hand(state, hand[0], hand[1], hand[2], sign, frames, posed)
         size = math.exp(log_size[c, kept])
         for i in range(3):
             # A mirror changes nothing on the palm's middle line.
@@ -198,7 +207,7 @@ def _decode_hypotheses(told, turn, centre, mirror, base, lengths, c, out):
             for k in range(3):
                 middle += frames[0, i, k] * _PIVOT[k]
             for j in range(JOINTS):
-                joints[c, kept, j, i] = pivot[c, kept, i] + size * (hand[j, i] - middle)
+                joints[c, kept, j, i] = pivot[c, kept, i] + size * (posed[j, i] - middle)
 
 
 @compiled

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rigid import rotated_pivot
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.network import Finder, PoseNet
@@ -91,8 +90,7 @@ class Glance:
 
     def states(self, ratio: float) -> Tensor:
         """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
-        pivot = self.pivot_m.new_tensor(PIVOT_M) * ratio
-        wrist = self.pivot_m - roma.rotvec_to_rotmat(self.rotvec) @ pivot
+        wrist = self.pivot_m - ratio * rotated_pivot(self.rotvec)
         return torch.cat((wrist, self.rotvec, self.angles), 1)
 
     @property

@@ -89,13 +89,10 @@ class FMeasure:
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
-        correct = counts.correct - self.residual_weight * counts.residual
-        # What the residual takes from correct, it does not give to false: F only falls.
-        false = counts.false + (counts.correct - correct)
-        b2 = self.beta**2
-        if self.naming == "printed":
-            rest = b2 * false + counts.missed
-        else:
-            rest = false + b2 * counts.missed
+        taken, b2 = self.residual_weight * counts.residual, self.beta**2
+        # What the residual takes from correct, it gives to false: F only falls.
+        correct, false = counts.correct - taken, counts.false + taken
+        printed = self.naming == "printed"
+        rest = b2 * false + counts.missed if printed else false + b2 * counts.missed
         weighted = (1 + b2) * correct
-        return weighted / (weighted + rest).clamp(min=1e-9)
+        return weighted / (weighted + rest).clamp_(min=1e-9)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from functools import partial
+from typing import TypedDict
 
 import torch
 from torch import Tensor
@@ -16,6 +18,7 @@ from toftrack.hand.surface import hand_surface
 from toftrack.refinement.gauss_newton import Refiner, TorchRefiner
 from toftrack.render.scoring import Scorer
 from toftrack.render.torch_scorer import TorchScorer
+from toftrack.tracking import penalty
 
 log = logging.getLogger(__name__)
 
@@ -54,57 +57,67 @@ def make_scorer(renderer: str, shape: HandShape, device: torch.device | str = "c
 
 
 def _torch(device: torch.device) -> Backend:
-    motions, make_refiner = _beside(device)
     return Backend(
         "torch",
         device,
-        motions,
+        **_beside(device),
         make_scorer=lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
-        make_refiner=make_refiner,
     )
 
 
-def _beside(
-    device: torch.device, there: Motions = rigid.MOTIONS
-) -> tuple[Motions, Callable[[HandShape], Refiner]]:
-    """Motions and refiners beside a scorer on a device: compiled ones on the CPU next to it.
+class _Beside(TypedDict):
+    """What a back end has beside its scorer."""
 
-    there: motions on the device.
-    """
+    motions: Motions
+    joints_penalty: Callable[..., Tensor]
+    make_refiner: Callable[[HandShape], Refiner]
+
+
+def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
+    """In torch on the CPU; on a device `there`, with compiled code on the CPU next to it."""
+    in_torch = _Beside(
+        motions=there, joints_penalty=penalty.joints_penalty, make_refiner=TorchRefiner
+    )
     if device.type == "cpu":
-        return rigid.MOTIONS, TorchRefiner
+        return in_torch
     try:
-        from toftrack.compute import rigid_numba
-        from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+        here = _compiled()
     except ImportError:
-        here: Motions = rigid.MOTIONS
-        make_refiner: Callable[[HandShape], Refiner] = TorchRefiner
-    else:
-        here, make_refiner = rigid_numba.motions(), CompiledRefiner
+        here = in_torch
 
-    def compose(reference: Tensor, tangent: Tensor) -> Tensor:
-        return (here if reference.device.type == "cpu" else there).compose(reference, tangent)
+    def at(tensor: Tensor) -> Motions:
+        return here["motions"] if tensor.device.type == "cpu" else there
 
-    def difference(particles: Tensor, reference: Tensor) -> Tensor:
-        return (here if particles.device.type == "cpu" else there).difference(particles, reference)
+    motions = Motions(
+        compose=lambda reference, tangent: at(reference).compose(reference, tangent),
+        difference=lambda particles, reference: at(particles).difference(particles, reference),
+        mean=there.mean,
+    )
+    return _Beside(
+        motions=motions,
+        joints_penalty=here["joints_penalty"],
+        make_refiner=here["make_refiner"],
+    )
 
-    return Motions(compose, difference), make_refiner
+
+def _compiled() -> _Beside:
+    from toftrack.compute import rigid_numba
+    from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+    from toftrack.tracking import penalty_numba
+
+    return _Beside(
+        motions=rigid_numba.motions(),
+        joints_penalty=penalty_numba.joints_penalty,
+        make_refiner=CompiledRefiner,
+    )
 
 
 def _numba(device: torch.device) -> Backend:
     """Compiled code on the CPU; particles elsewhere are scored by it, and moved where they are."""
-    from toftrack.compute import rigid_numba
-    from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.render.numba.scorer import NumbaScorer
 
-    here = device.type == "cpu"
-    return Backend(
-        "numba",
-        device,
-        rigid_numba.motions() if here else _beside(device)[0],
-        make_scorer=NumbaScorer,
-        make_refiner=CompiledRefiner,
-    )
+    beside = _compiled() if device.type == "cpu" else _beside(device)
+    return Backend("numba", device, **beside, make_scorer=NumbaScorer)
 
 
 def _triton(device: torch.device) -> Backend:
@@ -112,14 +125,9 @@ def _triton(device: torch.device) -> Backend:
     from toftrack.render.triton.scorer import TritonScorer, require_device
 
     require_device()
-    motions, make_refiner = _beside(device, rigid_triton.MOTIONS)
-    return Backend(
-        "triton",
-        device,
-        motions,
-        make_scorer=lambda shape: TritonScorer(shape, device=device),
-        make_refiner=make_refiner,
-    )
+    beside = _beside(device, rigid_triton.MOTIONS)
+    make_scorer = partial(TritonScorer, device=device)
+    return Backend("triton", device, **beside, make_scorer=make_scorer)
 
 
 _MAKERS: dict[str, Callable[[torch.device], Backend]] = {

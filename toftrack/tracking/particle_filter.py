@@ -16,8 +16,6 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
-from toftrack.compute.rigid import main_rotation, rotation_scatter
-from toftrack.compute.transfer import on_host
 from toftrack.errors import ToftrackError
 
 
@@ -219,14 +217,6 @@ def annealed(
         prior = log_prior(particles)
         weights = normalise(log_weights if prior is None else log_weights + prior)
     return particles, weights
-
-
-def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d) on the CPU, the rotation's on SO(3)."""
-    mean = (weights.to(particles.dtype) @ particles)[None]
-    mean, scatter = on_host(mean, rotation_scatter(particles[:, 3:6], weights))
-    mean[0, 3:6] = main_rotation(scatter).to(mean.dtype)
-    return mean
 
 
 def covariance(tangents: Tensor, weights: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.other_hand import OtherHand, without
 from toftrack.tracking.refining import refined
-from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
+from toftrack.tracking.relocating import expected_of, glanced, glancing, landmarks_of
 from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.side_belief import SideBelief, probability
 from toftrack.tracking.sides import sided
@@ -72,9 +72,12 @@ def step(
     state = at(state, image)
     with spans("relocaliser"):
         alone = without(image, other)
-        track, glance = glanced(state, dt_s, alone, model, other)
-        state, track, glance = sided(state, track, glance, dt_s, alone, model, other)
-        state = replace(state, size=_hand_told(state, track, glance, model))
+        coming = glancing(state, dt_s, alone, model)
+        if coming is None:
+            track, glance = glanced(state, dt_s, alone, model, other)
+            state, track, glance = _told(state, track, glance, dt_s, alone, model, other)
+        else:
+            track, glance = state.track, None
     hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
         expected = expected_depths(track, dt_s, hand, model)
@@ -84,13 +87,19 @@ def step(
         observation = model.segmentation(image.depth_m, image.k, expected, theirs)
         nowhere = model.relocaliser is not None and glance is None and track is None
         if observation.empty or nowhere:
+            if coming is not None:
+                state = _told(state, track, coming(), dt_s, alone, model, other)[0]
             return _without_hand(state, image, observation, model, spans)
         frame = observed(observation, hand, model, glance, state.seen, other)
     with spans("start"):
         track = begin(track, state, dt_s, frame, generator)
     with spans("filter: rest"):
         particles, weights = filtered(track, dt_s, frame, generator, spans)
-        mean = particle_filter.mean_particle(particles, weights)
+        mean = model.backend.motions.mean(particles, weights)
+    if coming is not None:
+        with spans("relocaliser"):
+            state, _, glance = _told(state, track, coming(), dt_s, alone, model, other)
+            frame = replace(frame, glance=glance)
     with spans("refinement"):
         outcome = refined(track, mean, dt_s, frame, generator)
         track, pose, trend = challenged(track, outcome, dt_s, frame)
@@ -128,6 +137,20 @@ def step(
     )
     info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs, seen_signs)
     return after, info, estimate
+
+
+def _told(
+    state: TrackerState,
+    track: Track | None,
+    glance: Glance | None,
+    dt_s: float,
+    image: DepthImage,
+    model: TrackerModel,
+    other: OtherHand | None,
+) -> tuple[TrackerState, Track | None, Glance | None]:
+    """What a look at the hand says of its side and its size."""
+    state, track, glance = sided(state, track, glance, dt_s, image, model, other)
+    return replace(state, size=_hand_told(state, track, glance, model)), track, glance
 
 
 def _worth_keeping(last: Estimate | None, estimate: Estimate) -> Estimate:
