@@ -54,14 +54,15 @@ class Pretended(Tensor):
 
     @staticmethod
     def __new__(cls, held: Tensor) -> Pretended:
-        made: Pretended = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
-            cls,
-            held.shape,
-            strides=held.stride(),
-            storage_offset=held.storage_offset(),
-            dtype=held.dtype,
-            device=DEVICE,
-        )
+        with torch.inference_mode(False):  # a view of what was made outside is none made within
+            made: Pretended = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+                cls,
+                held.shape,
+                strides=held.stride(),
+                storage_offset=held.storage_offset(),
+                dtype=held.dtype,
+                device=DEVICE,
+            )
         made.held = held
         return made
 
@@ -316,6 +317,8 @@ def pretended_device() -> Iterator[Counts]:
     with (
         patch("torch.cuda._lazy_init", lambda: None),
         patch("torch.cuda.is_available", lambda: True),
+        # What torch does is seen in the thread that asks for it.
+        patch("toftrack.compute.threads.threads", lambda: 1),
         patch("torch.Generator", lambda device="cpu": generator()),
         # A module's parameters cannot become another class in place.
         patch("torch.__future__._overwrite_module_params_on_conversion", True),

@@ -35,8 +35,11 @@ def pretended_triton(counts: Counts) -> Iterator[None]:
     sys.modules.update(absent)
     try:
         scorer, motions = map(importlib.import_module, _THEIRS[:2])
-        pairs = zip(motions.MOTIONS, rigid.MOTIONS, strict=True)
-        moved = Motions(*(_pretended_motion(there, here) for there, here in pairs))
+        moved = Motions(
+            _pretended_motion(motions.compose, rigid.compose),
+            _pretended_motion(motions.difference, rigid.difference),
+            rigid.mean,
+        )
         with (
             patch.multiple(scorer, **_kernels(scorer, counts)),
             patch.multiple(motions, MOTIONS=moved, **_kernels(motions, counts)),
