@@ -10,11 +10,13 @@ the hand, so that turning the hand does not also carry it away, as turning about
 
 from __future__ import annotations
 
+import numpy as np
 import roma
 import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Motions
+from toftrack.compute.redraw import redraw_with
 from toftrack.compute.transfer import on_host, table
 
 PIVOT_M = (0.0, -0.085, 0.0)
@@ -45,6 +47,16 @@ def rotated_pivot(rotvec: Tensor) -> Tensor:
     cross = torch.linalg.cross(rotvec, p)
     along = torch.linalg.cross(rotvec, cross)
     return p + angle.sin() / angle * cross + (1 - angle.cos()) / angle.square() * along
+
+
+def pivot_offset(rotvec: np.ndarray) -> np.ndarray:
+    """The same on the CPU, (N, 3) to (N, 3), where torch's operations take longer than this."""
+    p = np.array(PIVOT_M, rotvec.dtype)
+    angle = np.sqrt(np.maximum(np.square(rotvec).sum(1, keepdims=True), 1e-12))
+    cross = np.cross(rotvec, p)
+    along = np.cross(rotvec, cross)
+    found: np.ndarray = p + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * along
+    return found
 
 
 def _pivot(particles: Tensor) -> Tensor:
@@ -83,4 +95,4 @@ def mean(particles: Tensor, weights: Tensor) -> Tensor:
     return found
 
 
-MOTIONS = Motions(compose, difference, mean)
+MOTIONS = Motions(compose, difference, redraw_with(compose), mean)

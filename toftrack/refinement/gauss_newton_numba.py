@@ -242,4 +242,4 @@ class CompiledRefiner:
 
 def _array(tensor: Tensor) -> np.ndarray:
     """A float64 copy."""
-    return tensor.detach().numpy().astype(np.float64, order="C")
+    return tensor.numpy().astype(np.float64, order="C")

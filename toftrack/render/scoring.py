@@ -38,8 +38,9 @@ class Evidence:
 
     def to(self, device: torch.device) -> Evidence:
         """The same on a device, from the CPU."""
-        images = self.low, self.high, self.occluder, self.hand, self.k
-        return Evidence(*(on_device(image, device) for image in images), self.radius_px)
+        given = self.low, self.high, self.occluder, self.hand, self.k
+        low, high, occluder, hand, k = (on_device(image, device) for image in given)
+        return Evidence(low, high, occluder, hand, k, self.radius_px)
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Evidence:
         """The part [top, bottom) x [left, right) with intrinsics to match."""
