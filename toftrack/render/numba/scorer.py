@@ -71,6 +71,7 @@ class NumbaScorer:
             np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
             images,
             hand,
+            height,
             width,
             disc_steps(evidence.radius_px, height, width),
             *self._hand,
