@@ -6,6 +6,7 @@ each row; then the tile is compared with the evidence, which leaves the silhouet
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,12 @@ from toftrack.render.numba.hand import (
 from toftrack.render.numba.missed import clipped, count_missed, find_wanted, run
 from toftrack.render.numba.vector import (
     BLOCK,
+    NARROW,
     WORDS,
     compare,
     down,
     draw,
+    draw_narrow,
     larger,
     load,
     ramp,
@@ -51,7 +54,10 @@ _cached = entry_point(
     *(Path(__file__).with_name(f"{part}.py") for part in ("hand", "kernel", "missed", "vector"))
 )
 
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+_VALUES = 5
+_LISTED = 256
+"""Rows that are listed before they are drawn; and what is listed of each."""
 _BITS = 4
 """Of a column, that say where in its block it is."""
 _IMAGES = 3
@@ -92,12 +98,16 @@ def _box(conics, i, width, height):
 
 
 @compiled
-def _render(conics, i, box, origin, stride, tile, spans, lines, columns):
+def _render(conics, i, box, origin, stride, tile, spans, lines, places):
     """The largest inverse depth of each pixel of the box, drawn into a tile of zeros.
+
+    What each row of each ellipsoid has of its own is first listed, several rows at once, then drawn
+    in one loop, whose length does not depend on the ellipsoids'.
 
     tile: flat, rows of `stride` pixels from row `top` and column `origin` of the image.
     spans: flat; one half is set to the first, the other to the last tile column drawn in each row.
-    lines: (3 * BLOCK,) float32, columns: (2 * BLOCK,) int32 scratch.
+    lines: (2, _VALUES * _LISTED) float32, places: (2, _LISTED) int32 scratch, for narrow rows and
+    others.
     """
     left, top, right, bottom = box
     lasts = spans.shape[0] // 2
@@ -107,48 +117,84 @@ def _render(conics, i, box, origin, stride, tile, spans, lines, columns):
     left_most, right_most = np.float32(left - origin), np.float32(right - 1 - origin)
     # The last block that is drawn may reach so far.
     utmost = right_most + np.float32(BLOCK - 1)
+    narrow, others = 0, 0
     for e in range(conics.shape[0] - 1):
         conic = conics[e]
-        high = conic[HY * LANES + i]
-        if not high > _ZERO:
+        high, dx = conic[HY * LANES + i], conic[DX * LANES + i]
+        if not (high > _ZERO and dx > _ZERO):
             continue
         x, y = conic[X * LANES + i] - np.float32(origin), conic[Y * LANES + i]
         shear, inverse = conic[XY * LANES + i], conic[IY * LANES + i]
-        dx, du = conic[DX * LANES + i], conic[DU * LANES + i]
-        u, slope_y, slope_x = conic[U * LANES + i], conic[UY * LANES + i], conic[UX * LANES + i]
-        slopes, next_block, curve = slope_x * ramp(), slope_x * np.float32(BLOCK), splat(du / dx)
+        du, u = conic[DU * LANES + i], conic[U * LANES + i]
+        slope_y, slope = conic[UY * LANES + i], conic[UX * LANES + i]
+        curve = du / dx
+        widest = _TWO * math.sqrt(dx)
+        few = widest < np.float32(NARROW)
         first = max(clipped(np.ceil(y - high), bottom), top)
         rows = clipped(y + high + _ONE, bottom) - first
         for row in range(0, rows, BLOCK):
-            # What the rows have of their own, side by side.
             dy = (np.float32(first + row) - y) + ramp()
             rest = _ONE - dy * dy * inverse
             middle, half = x + shear * dy, root(dx * rest)
             # NaN, as in a row beside the ellipsoid, stays inside, too.
             low = smaller(larger(up(middle - half), left_most), right_most)
             last = larger(down(middle + half), low)
-            store(columns, 0, low)
-            store(columns, BLOCK, smaller(last, right_most))
-            t = low - middle
-            store(lines, 0, t)
-            store(lines, BLOCK, u + slope_y * dy + slope_x * t)
-            store(lines, 2 * BLOCK, du * rest)
-            # Rounding may let a pixel more be drawn.
-            last = smaller(last + _ONE, utmost)
             line = first - top + row
             before, after = load(spans, line), load(spans, lasts + line)
+            # Rounding may let a pixel more be drawn.
+            end = larger(smaller(last + _ONE, utmost), after)
             store(spans, line, where_positive(rest, smaller(low, before), before))
-            store(spans, lasts + line, where_positive(rest, larger(last, after), after))
-            for j in range(min(BLOCK, rows - row)):
-                column = columns[j]
-                at = (line + j) * stride + column
-                t, plane, peak = lines[j], lines[BLOCK + j], lines[2 * BLOCK + j]
-                draw(tile, at, t, plane, peak, slopes, curve)
-                for _ in range(column + BLOCK, columns[BLOCK + j] + 1, BLOCK):
-                    at += BLOCK
-                    t += np.float32(BLOCK)
-                    plane += next_block
-                    draw(tile, at, t, plane, peak, slopes, curve)
+            store(spans, lasts + line, where_positive(rest, end, after))
+            t, peak = low - middle, du * rest
+            plane = u + slope_y * dy + slope * t
+            at = (np.float32(line) + ramp()) * np.float32(stride) + low
+            count = min(BLOCK, rows - row)
+            if few:
+                _list(lines[0], places[0], narrow, at, t, plane, peak, slope, curve)
+                narrow += count
+                if narrow > _LISTED - BLOCK:
+                    _draw_narrow(lines[0], places[0], narrow, tile)
+                    narrow = 0
+                continue
+            last = smaller(last, right_most)
+            for column in range(0, int(min(widest, right_most - left_most)) + 1, BLOCK):
+                beyond = np.float32(column)
+                there = where_positive(last - low - beyond, peak, splat(-_ONE))
+                ahead = plane + slope * beyond
+                _list(
+                    lines[1], places[1], others, at + beyond, t + beyond, ahead, there, slope, curve
+                )
+                others += count
+                if others > _LISTED - BLOCK:
+                    _draw(lines[1], places[1], others, tile)
+                    others = 0
+    _draw_narrow(lines[0], places[0], narrow, tile)
+    _draw(lines[1], places[1], others, tile)
+
+
+@compiled
+def _list(lines, places, count, at, t, plane, peak, slope, curve):
+    """What `draw` is to be given for a row in each place, listed from `count` on."""
+    store(places, count, at)
+    store(lines, count, t)
+    store(lines, _LISTED + count, plane)
+    store(lines, 2 * _LISTED + count, peak)
+    store(lines, 3 * _LISTED + count, splat(slope))
+    store(lines, 4 * _LISTED + count, splat(curve))
+
+
+@compiled
+def _draw(lines, places, count, tile):
+    for j in range(count):
+        t, plane, peak = lines[j], lines[_LISTED + j], lines[2 * _LISTED + j]
+        draw(tile, places[j], t, plane, peak, lines[3 * _LISTED + j], lines[4 * _LISTED + j])
+
+
+@compiled
+def _draw_narrow(lines, places, count, tile):
+    for j in range(count):
+        t, plane, peak = lines[j], lines[_LISTED + j], lines[2 * _LISTED + j]
+        draw_narrow(tile, places[j], t, plane, peak, lines[3 * _LISTED + j], lines[4 * _LISTED + j])
 
 
 @compiled
@@ -247,7 +293,8 @@ def score_hands(
     conics = np.empty((index.shape[0], TERMS * LANES), np.float32)
     tile = _zeros(0)
     spans = np.empty(2 * (height + BLOCK), np.float32)
-    lines, columns = np.empty(3 * BLOCK, np.float32), np.empty(2 * BLOCK, np.int32)
+    lines = np.empty((2, _VALUES * _LISTED), np.float32)
+    places = np.empty((2, _LISTED), np.int32)
     model = np.empty((parts + 3, height + 2 * reach + WORDS), np.uint64)
     wanted = np.empty((parts + 1, height + WORDS), np.uint64)
     buffer = np.empty((2, (parts + 3) * WORDS), np.uint64)
@@ -269,9 +316,10 @@ def score_hands(
             rows = min(height, bottom + reach) - first_row
             words = (min(width, right + reach) - origin + 63) >> 6
             stride = ((right - origin + 2 * BLOCK - 1) >> _BITS) << _BITS
-            if (bottom - top) * stride > tile.shape[0]:
+            # What is listed may begin a row farther than it is drawn.
+            if (bottom - top + 1) * stride > tile.shape[0]:
                 tile = _zeros((bottom - top + BLOCK) * (stride + 2 * BLOCK))
-            _render(conics, i, box, origin, stride, tile, spans, lines, columns)
+            _render(conics, i, box, origin, stride, tile, spans, lines, places)
             model[: words + 2, : rows + 2 * reach + WORDS] = np.uint64(0)
             above = reach + top - first_row
             correct, false, residual = _compare(

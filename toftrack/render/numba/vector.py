@@ -19,6 +19,9 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 BLOCK = 16
 """Pixels of a row that are worked on at once; images need as much padding on the right."""
 
+NARROW = 8
+"""Pixels that are drawn at once where an ellipsoid is no wider."""
+
 WORDS = 8
 """Words of 64 pixels, one above the other, that are worked on at once."""
 
@@ -191,25 +194,56 @@ def total(typingctx, vector):
     return types.float32(FLOATS), codegen
 
 
-@intrinsic
-def draw(typingctx, tile, index, t, plane, peak, slopes, curve):
-    """tile[index + j] = max(itself, plane + slopes_j + sqrt(peak - curve t_j^2)), t_j = t + j."""
+def _root_estimate(context, builder, square):
+    """Square root to four digits where the processor has such an instruction, else in full.
 
-    def codegen(context, builder, signature, args):
-        tile, index, t, plane, peak, slopes, curve = args
-        steps = ir.Constant(_VECTOR, [float(j) for j in range(BLOCK)])
-        t = builder.fadd(_splat(builder, t), steps)
-        bend = builder.fmul(curve, builder.fmul(t, t), flags=_FAST)
-        below = builder.fsub(_splat(builder, peak), bend, flags=_FAST)
-        plane = builder.fadd(_splat(builder, plane), slopes)
-        new = builder.fadd(plane, _call(builder, f"sqrt.v{BLOCK}f32", below))
-        at = _pointer(context, builder, signature.args[0], tile, index)
-        old = builder.load(at, align=4)
-        # An ordered comparison: the NaN of a missed pixel loses.
-        builder.store(builder.select(builder.fcmp_ordered(">", new, old), new, old), at, align=4)
-        return context.get_dummy_value()
+    Of a surface's thickness these are microns, and the root is what drawing waits for most.
+    """
+    count = square.type.count
+    features = context.codegen().magic_tuple()[-1].split(",")
+    if not {"+avx512f", "+avx512vl"} <= set(features):
+        return _call(builder, f"sqrt.v{count}f32", square)
+    mask = ir.IntType(count)
+    kinds = [square.type, square.type, mask]
+    estimate = cgutils.get_or_insert_function(
+        builder.module,
+        ir.FunctionType(square.type, kinds),
+        f"llvm.x86.avx512.rsqrt14.ps.{32 * count}",
+    )
+    none = ir.Constant(square.type, [0.0] * count)
+    return builder.fmul(square, builder.call(estimate, [square, none, mask(-1)]), flags=_FAST)
 
-    return types.void(tile, types.intp, *(types.float32,) * 3, FLOATS, FLOATS), codegen
+
+def _drawing(count: int):
+    def function(typingctx, tile, index, t, plane, peak, slope, curve):
+        def codegen(context, builder, signature, args):
+            vector, bits = ir.VectorType(_FLOAT, count), ir.VectorType(_INT, count)
+            t, plane, peak, slope, curve = (_splat(builder, arg, vector) for arg in args[2:])
+            steps = ir.Constant(vector, [float(j) for j in range(count)])
+            t = builder.fadd(t, steps)
+            bend = builder.fmul(curve, builder.fmul(t, t), flags=_FAST)
+            below = builder.fsub(peak, bend, flags=_FAST)
+            plane = builder.fadd(plane, builder.fmul(slope, steps, flags=_FAST), flags=_FAST)
+            new = builder.fadd(plane, _root_estimate(context, builder, below), flags=_FAST)
+            # As whole numbers, floats from 0 on are in the same order, and what misses, whose
+            # square is negative, is made so. A choice between floats would be a masked store.
+            sign = builder.and_(builder.bitcast(below, bits), ir.Constant(bits, [1 << 31] * count))
+            new = builder.or_(builder.bitcast(new, bits), sign)
+            at = _pointer(context, builder, signature.args[0], *args[:2], bits)
+            old = builder.load(at, align=4)
+            builder.store(_call(builder, f"smax.v{count}i32", new, old), at, align=4)
+            return context.get_dummy_value()
+
+        return types.void(tile, types.intp, *(types.float32,) * 5), codegen
+
+    return intrinsic(function)
+
+
+draw, draw_narrow = _drawing(BLOCK), _drawing(NARROW)
+"""tile[index + j] = max(itself, plane + slope j + sqrt(peak - curve t_j^2)), t_j = t + j.
+
+For BLOCK or NARROW pixels.
+"""
 
 
 @intrinsic
