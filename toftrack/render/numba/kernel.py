@@ -13,13 +13,16 @@ import numpy as np
 
 from toftrack.compute.compiling import compiled, entry_point, take
 from toftrack.render.numba.hand import (
+    BOTTOM,
     DU,
     DX,
-    HX,
     HY,
     IY,
     LANES,
+    LEFT,
+    RIGHT,
     TERMS,
+    TOP,
     UX,
     UY,
     XY,
@@ -32,22 +35,22 @@ from toftrack.render.numba.hand import (
 from toftrack.render.numba.missed import clipped, count_missed, find_wanted, run
 from toftrack.render.numba.vector import (
     BLOCK,
-    NARROW,
     WORDS,
     compare,
     down,
     draw,
-    draw_narrow,
     larger,
     load,
+    no_rows,
     ramp,
     root,
     smaller,
     splat,
     store,
+    store_rows,
     total,
     up,
-    where_positive,
+    where_above,
 )
 
 _cached = entry_point(
@@ -55,9 +58,10 @@ _cached = entry_point(
 )
 
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
-_VALUES = 5
 _LISTED = 256
-"""Rows that are listed before they are drawn; and what is listed of each."""
+"""How many blocks are listed before they are drawn."""
+_FAR = np.float32(1e-30)
+"""Inverse depth of what is farther than any surface, but nearer than what is not drawn."""
 _BITS = 4
 """Of a column, that say where in its block it is."""
 _IMAGES = 3
@@ -79,35 +83,15 @@ def _zeros(size):
 
 
 @compiled
-def _box(conics, i, width, height):
-    """First and one-past-last column and row of all ellipsoids but the wrist's, in the image."""
-    left, top, right, bottom = width, height, 0, 0
-    for e in range(conics.shape[0] - 1):
-        high = conics[e, HY * LANES + i]
-        if high > _ZERO:
-            x, wide, y = (
-                conics[e, X * LANES + i],
-                conics[e, HX * LANES + i],
-                conics[e, Y * LANES + i],
-            )
-            left = min(left, clipped(np.ceil(x - wide), width))
-            right = max(right, clipped(np.floor(x + wide) + _ONE, width))
-            top = min(top, clipped(np.ceil(y - high), height))
-            bottom = max(bottom, clipped(np.floor(y + high) + _ONE, height))
-    return left, top, right, bottom
-
-
-@compiled
 def _render(conics, i, box, origin, stride, tile, spans, lines, places):
     """The largest inverse depth of each pixel of the box, drawn into a tile of zeros.
 
-    What each row of each ellipsoid has of its own is first listed, several rows at once, then drawn
-    in one loop, whose length does not depend on the ellipsoids'.
+    What each row of each ellipsoid has of its own is listed, several rows at once, then drawn in
+    one loop, whose length does not depend on the ellipsoids', so that it is foreseen.
 
     tile: flat, rows of `stride` pixels from row `top` and column `origin` of the image.
     spans: flat; one half is set to the first, the other to the last tile column drawn in each row.
-    lines: (2, _VALUES * _LISTED) float32, places: (2, _LISTED) int32 scratch, for narrow rows and
-    others.
+    lines: (5 * _LISTED,) float32, places: (_LISTED,) int32 scratch.
     """
     left, top, right, bottom = box
     lasts = spans.shape[0] // 2
@@ -117,19 +101,17 @@ def _render(conics, i, box, origin, stride, tile, spans, lines, places):
     left_most, right_most = np.float32(left - origin), np.float32(right - 1 - origin)
     # The last block that is drawn may reach so far.
     utmost = right_most + np.float32(BLOCK - 1)
-    narrow, others = 0, 0
+    listed = 0
     for e in range(conics.shape[0] - 1):
         conic = conics[e]
         high, dx = conic[HY * LANES + i], conic[DX * LANES + i]
-        if not (high > _ZERO and dx > _ZERO):
+        if not high > _ZERO:
             continue
         x, y = conic[X * LANES + i] - np.float32(origin), conic[Y * LANES + i]
         shear, inverse = conic[XY * LANES + i], conic[IY * LANES + i]
         du, u = conic[DU * LANES + i], conic[U * LANES + i]
         slope_y, slope = conic[UY * LANES + i], conic[UX * LANES + i]
-        curve = du / dx
-        widest = _TWO * math.sqrt(dx)
-        few = widest < np.float32(NARROW)
+        curve, widest = splat(du / dx), min(_TWO * math.sqrt(dx), right_most - left_most)
         first = max(clipped(np.ceil(y - high), bottom), top)
         rows = clipped(y + high + _ONE, bottom) - first
         for row in range(0, rows, BLOCK):
@@ -143,58 +125,33 @@ def _render(conics, i, box, origin, stride, tile, spans, lines, places):
             before, after = load(spans, line), load(spans, lasts + line)
             # Rounding may let a pixel more be drawn.
             end = larger(smaller(last + _ONE, utmost), after)
-            store(spans, line, where_positive(rest, smaller(low, before), before))
-            store(spans, lasts + line, where_positive(rest, end, after))
-            t, peak = low - middle, du * rest
+            store(spans, line, where_above(rest, smaller(low, before), before))
+            store(spans, lasts + line, where_above(rest, end, after))
+            t, peak, last = low - middle, du * rest, smaller(last, right_most)
             plane = u + slope_y * dy + slope * t
             at = (np.float32(line) + ramp()) * np.float32(stride) + low
-            count = min(BLOCK, rows - row)
-            if few:
-                _list(lines[0], places[0], narrow, at, t, plane, peak, slope, curve)
-                narrow += count
-                if narrow > _LISTED - BLOCK:
-                    _draw_narrow(lines[0], places[0], narrow, tile)
-                    narrow = 0
-                continue
-            last = smaller(last, right_most)
-            for column in range(0, int(min(widest, right_most - left_most)) + 1, BLOCK):
+            for column in range(0, int(widest) + 1, BLOCK):
                 beyond = np.float32(column)
-                there = where_positive(last - low - beyond, peak, splat(-_ONE))
-                ahead = plane + slope * beyond
-                _list(
-                    lines[1], places[1], others, at + beyond, t + beyond, ahead, there, slope, curve
-                )
-                others += count
-                if others > _LISTED - BLOCK:
-                    _draw(lines[1], places[1], others, tile)
-                    others = 0
-    _draw_narrow(lines[0], places[0], narrow, tile)
-    _draw(lines[1], places[1], others, tile)
+                store(places, listed, at + beyond)
+                store(lines, listed, t + beyond)
+                store(lines, _LISTED + listed, plane + slope * beyond)
+                there = where_above(last - low - beyond + _ONE, peak, splat(-_ONE))
+                store(lines, 2 * _LISTED + listed, there)
+                store(lines, 3 * _LISTED + listed, splat(slope))
+                store(lines, 4 * _LISTED + listed, curve)
+                listed += min(BLOCK, rows - row)
+                if listed > _LISTED - BLOCK:
+                    _draw(lines, places, listed, tile)
+                    listed = 0
+    _draw(lines, places, listed, tile)
 
 
 @compiled
-def _list(lines, places, count, at, t, plane, peak, slope, curve):
-    """What `draw` is to be given for a row in each place, listed from `count` on."""
-    store(places, count, at)
-    store(lines, count, t)
-    store(lines, _LISTED + count, plane)
-    store(lines, 2 * _LISTED + count, peak)
-    store(lines, 3 * _LISTED + count, splat(slope))
-    store(lines, 4 * _LISTED + count, splat(curve))
-
-
-@compiled
-def _draw(lines, places, count, tile):
-    for j in range(count):
+def _draw(lines, places, listed, tile):
+    """The rows that are listed: t, plane, peak, slope and curve of `draw`, and where it begins."""
+    for j in range(listed):
         t, plane, peak = lines[j], lines[_LISTED + j], lines[2 * _LISTED + j]
         draw(tile, places[j], t, plane, peak, lines[3 * _LISTED + j], lines[4 * _LISTED + j])
-
-
-@compiled
-def _draw_narrow(lines, places, count, tile):
-    for j in range(count):
-        t, plane, peak = lines[j], lines[_LISTED + j], lines[2 * _LISTED + j]
-        draw_narrow(tile, places[j], t, plane, peak, lines[3 * _LISTED + j], lines[4 * _LISTED + j])
 
 
 @compiled
@@ -209,19 +166,20 @@ def _compare(tile, stride, spans, box, origin, images, width, model, above):
     lasts, pitch = spans.shape[0] // 2, blocks(width)
     correct, false, residual = splat(_ZERO), splat(_ZERO), splat(_ZERO)
     for row in range(bottom - top):
-        begin = (top + row) * pitch + origin // BLOCK
+        begin = (top + row) * pitch + (origin >> _BITS)
         for block in range(int(spans[row]) >> _BITS, (int(spans[lasts + row]) >> _BITS) + 1):
-            bits, correct, false, residual = compare(
+            correct, false, residual = compare(
                 tile,
-                row * stride + block * BLOCK,
+                row * stride + (block << _BITS),
                 images,
-                (begin + block) * _IMAGES * BLOCK,
+                (begin + block) * (_IMAGES * BLOCK),
+                model,
+                # Four blocks to a word, and words of one column one after the other.
+                (((block >> 2) + 1) * model.shape[1] + above + row << 2) + (block & 3),
                 correct,
                 false,
                 residual,
             )
-            word, place = 1 + block * BLOCK // 64, np.uint64(block * BLOCK % 64)
-            model[word, above + row] |= bits << place
     if right == width:
         # A block may reach past the image's edge.
         word, inside = 1 + (right - 1 - origin) // 64, run(0, (right - 1 - origin) % 64)
@@ -249,10 +207,12 @@ def pack_evidence(low, high, occluder, hand):
                 u = block * BLOCK + j
                 middle, scale, hidden = _ZERO, np.float32(np.inf), np.float32(np.inf)
                 if u < width:
-                    hidden = occluder[v, u]
+                    hidden = max(occluder[v, u], _FAR)
                     if high[v, u] > low[v, u]:
-                        middle = np.float32(0.5) * (high[v, u] + low[v, u])
-                        scale = np.float32(2.0) / (high[v, u] - low[v, u])
+                        # What is not drawn is 0, and must not be correct.
+                        least = max(low[v, u], np.float32(1e-6) * high[v, u])
+                        middle = np.float32(0.5) * (high[v, u] + least)
+                        scale = _TWO / (high[v, u] - least)
                 images[at + j] = middle
                 images[at + BLOCK + j] = scale
                 images[at + 2 * BLOCK + j] = hidden
@@ -287,28 +247,39 @@ def score_hands(
     """
     reach, parts = steps[:, 1].max(), hand.shape[0] - 1
     x = np.empty(27 * LANES, np.float32)
-    sines, cosines = np.empty((2, 25 * LANES), np.float32)
     frames = np.empty((16, 12 * LANES), np.float32)
     valid = np.empty(LANES, np.uint8)
     conics = np.empty((index.shape[0], TERMS * LANES), np.float32)
+    boxes = np.empty(4 * LANES, np.float32)
     tile = _zeros(0)
     spans = np.empty(2 * (height + BLOCK), np.float32)
-    lines = np.empty((2, _VALUES * _LISTED), np.float32)
-    places = np.empty((2, _LISTED), np.int32)
-    model = np.empty((parts + 3, height + 2 * reach + WORDS), np.uint64)
+    lines, places = np.empty(5 * _LISTED, np.float32), np.empty(_LISTED, np.int32)
+    model = np.empty((parts + 3, height + 2 * (reach + WORDS)), np.uint64)
     wanted = np.empty((parts + 1, height + WORDS), np.uint64)
     buffer = np.empty((2, (parts + 3) * WORDS), np.uint64)
     while True:
         first = take(counter) * LANES
         if first >= states.shape[0]:
             break
-        pose_hands(states, first, slots, base, lengths, mirror, x, sines, cosines, frames, valid)
-        project_hands(frames, index, surface, k[0], k[1], k[2], k[3], conics)
+        pose_hands(states, first, slots, base, lengths, mirror, x, frames, valid)
+        project_hands(
+            frames,
+            index,
+            surface,
+            k[0],
+            k[1],
+            k[2],
+            k[3],
+            np.float32(width),
+            np.float32(height),
+            conics,
+            boxes,
+        )
         for i in range(min(LANES, states.shape[0] - first)):
             for j in range(4):
                 out[j, first + i] = _ZERO
-            box = _box(conics, i, width, height)
-            left, top, right, bottom = box
+            left, top = int(boxes[LEFT * LANES + i]), int(boxes[TOP * LANES + i])
+            right, bottom = int(boxes[RIGHT * LANES + i]), int(boxes[BOTTOM * LANES + i])
             if not valid[i] or right <= left or bottom <= top:
                 continue
             # Blocks of the tile are blocks of the evidence.
@@ -319,9 +290,12 @@ def score_hands(
             # What is listed may begin a row farther than it is drawn.
             if (bottom - top + 1) * stride > tile.shape[0]:
                 tile = _zeros((bottom - top + BLOCK) * (stride + 2 * BLOCK))
+            box = left, top, right, bottom
             _render(conics, i, box, origin, stride, tile, spans, lines, places)
-            model[: words + 2, : rows + 2 * reach + WORDS] = np.uint64(0)
             above = reach + top - first_row
+            for w in range(words + 2):
+                for row in range(0, rows + 2 * reach + WORDS, WORDS):
+                    store_rows(model, w, row, no_rows())
             correct, false, residual = _compare(
                 tile, stride, spans, box, origin, images, width, model, above
             )

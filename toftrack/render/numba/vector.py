@@ -19,13 +19,11 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 BLOCK = 16
 """Pixels of a row that are worked on at once; images need as much padding on the right."""
 
-NARROW = 8
-"""Pixels that are drawn at once where an ellipsoid is no wider."""
-
 WORDS = 8
 """Words of 64 pixels, one above the other, that are worked on at once."""
 
 _FLOAT, _INT, _WORD = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_NUMBERS = ir.VectorType(_INT, BLOCK)
 _VECTOR, _ROWS = ir.VectorType(_FLOAT, BLOCK), ir.VectorType(_WORD, WORDS)
 # A product and a sum may be one operation, as everywhere in compiling.OPTIONS.
 _FAST = ("contract",)
@@ -77,6 +75,7 @@ def _operator(function: Callable, kind: _Vector, number: types.Type, emit: str) 
 _operator(operator.add, FLOATS, types.float32, "fadd")
 _operator(operator.sub, FLOATS, types.float32, "fsub")
 _operator(operator.mul, FLOATS, types.float32, "fmul")
+_operator(operator.truediv, FLOATS, types.float32, "fdiv")
 _operator(operator.and_, ROWS, types.uint64, "and_")
 _operator(operator.or_, ROWS, types.uint64, "or_")
 
@@ -138,11 +137,11 @@ larger, smaller = _choice(">"), _choice("<")
 
 
 @intrinsic
-def where_positive(typingctx, condition, vector, otherwise):
-    """The second where the first is 0 or above, elsewhere the third."""
+def where_above(typingctx, condition, vector, otherwise):
+    """The second where the first is above 0, elsewhere the third."""
 
     def codegen(context, builder, signature, args):
-        yes = builder.fcmp_ordered(">=", args[0], ir.Constant(_VECTOR, [0.0] * BLOCK))
+        yes = builder.fcmp_ordered(">", args[0], ir.Constant(_VECTOR, [0.0] * BLOCK))
         return builder.select(yes, args[1], args[2])
 
     return FLOATS(FLOATS, FLOATS, FLOATS), codegen
@@ -199,64 +198,58 @@ def _root_estimate(context, builder, square):
 
     Of a surface's thickness these are microns, and the root is what drawing waits for most.
     """
-    count = square.type.count
     features = context.codegen().magic_tuple()[-1].split(",")
-    if not {"+avx512f", "+avx512vl"} <= set(features):
-        return _call(builder, f"sqrt.v{count}f32", square)
-    mask = ir.IntType(count)
-    kinds = [square.type, square.type, mask]
+    if "+avx512f" not in features:
+        return _call(builder, f"sqrt.v{BLOCK}f32", square)
+    mask = ir.IntType(BLOCK)
     estimate = cgutils.get_or_insert_function(
         builder.module,
-        ir.FunctionType(square.type, kinds),
-        f"llvm.x86.avx512.rsqrt14.ps.{32 * count}",
+        ir.FunctionType(_VECTOR, [_VECTOR, _VECTOR, mask]),
+        "llvm.x86.avx512.rsqrt14.ps.512",
     )
-    none = ir.Constant(square.type, [0.0] * count)
+    none = ir.Constant(_VECTOR, [0.0] * BLOCK)
     return builder.fmul(square, builder.call(estimate, [square, none, mask(-1)]), flags=_FAST)
 
 
-def _drawing(count: int):
-    def function(typingctx, tile, index, t, plane, peak, slope, curve):
-        def codegen(context, builder, signature, args):
-            vector, bits = ir.VectorType(_FLOAT, count), ir.VectorType(_INT, count)
-            t, plane, peak, slope, curve = (_splat(builder, arg, vector) for arg in args[2:])
-            steps = ir.Constant(vector, [float(j) for j in range(count)])
-            t = builder.fadd(t, steps)
-            bend = builder.fmul(curve, builder.fmul(t, t), flags=_FAST)
-            below = builder.fsub(peak, bend, flags=_FAST)
-            plane = builder.fadd(plane, builder.fmul(slope, steps, flags=_FAST), flags=_FAST)
-            new = builder.fadd(plane, _root_estimate(context, builder, below), flags=_FAST)
-            # As whole numbers, floats from 0 on are in the same order, and what misses, whose
-            # square is negative, is made so. A choice between floats would be a masked store.
-            sign = builder.and_(builder.bitcast(below, bits), ir.Constant(bits, [1 << 31] * count))
-            new = builder.or_(builder.bitcast(new, bits), sign)
-            at = _pointer(context, builder, signature.args[0], *args[:2], bits)
-            old = builder.load(at, align=4)
-            builder.store(_call(builder, f"smax.v{count}i32", new, old), at, align=4)
-            return context.get_dummy_value()
+@intrinsic
+def draw(typingctx, tile, index, t, plane, peak, slope, curve):
+    """tile[index + j] = max(itself, plane + slope j + sqrt(peak - curve t_j^2)), t_j = t + j."""
 
-        return types.void(tile, types.intp, *(types.float32,) * 5), codegen
+    def codegen(context, builder, signature, args):
+        t, plane, peak, slope, curve = (_splat(builder, arg) for arg in args[2:])
+        steps = ir.Constant(_VECTOR, [float(j) for j in range(BLOCK)])
+        t = builder.fadd(t, steps)
+        below = builder.fsub(
+            peak, builder.fmul(curve, builder.fmul(t, t), flags=_FAST), flags=_FAST
+        )
+        plane = builder.fadd(plane, builder.fmul(slope, steps, flags=_FAST), flags=_FAST)
+        new = builder.fadd(plane, _root_estimate(context, builder, below), flags=_FAST)
+        # As whole numbers, floats from 0 on are in the same order, and what misses, whose square is
+        # negative, is made so. A choice between floats would become a masked store.
+        sign = builder.and_(
+            builder.bitcast(below, _NUMBERS), ir.Constant(_NUMBERS, [1 << 31] * BLOCK)
+        )
+        new = builder.or_(builder.bitcast(new, _NUMBERS), sign)
+        at = _pointer(context, builder, signature.args[0], *args[:2], _NUMBERS)
+        old = builder.load(at, align=4)
+        builder.store(_call(builder, f"smax.v{BLOCK}i32", new, old), at, align=4)
+        return context.get_dummy_value()
 
-    return intrinsic(function)
-
-
-draw, draw_narrow = _drawing(BLOCK), _drawing(NARROW)
-"""tile[index + j] = max(itself, plane + slope j + sqrt(peak - curve t_j^2)), t_j = t + j.
-
-For BLOCK or NARROW pixels.
-"""
+    return types.void(tile, types.intp, *(types.float32,) * 5), codegen
 
 
 @intrinsic
-def compare(typingctx, tile, index, images, block, correct, false, residual):
+def compare(typingctx, tile, index, images, block, model, place, correct, false, residual):
     """A block of the tile against the evidence: its silhouette's bits, and what is summed up.
 
     The block is then cleared. images: see pack_evidence; block: its index there, times 3 * BLOCK.
-    Returns the bits, and correct, false and residual (FLOATS) with the block's added.
+    model: words of bits; place: which of their quarters, in the order of memory, is set.
+    Returns correct, false and residual (FLOATS) with the block's added.
     """
 
     def codegen(context, builder, sig, args):
         kinds = sig.args
-        tile, index, images, block, correct, false, residual = args
+        tile, index, images, block, model, place, *sums = args
         at = _pointer(context, builder, kinds[0], tile, index)
         u = builder.load(at, align=4)
         zero, one = (ir.Constant(_VECTOR, [value] * BLOCK) for value in (0.0, 1.0))
@@ -270,20 +263,26 @@ def compare(typingctx, tile, index, images, block, correct, false, residual):
         )
         off = builder.fmul(builder.fsub(u, middle), scale)
         square = builder.fmul(off, off, flags=_FAST)
-        model = builder.fcmp_ordered(">", u, zero)
-        right = builder.and_(model, builder.fcmp_ordered("<=", square, one))
-        wrong = builder.and_(model, builder.fcmp_ordered(">=", u, occluder))
-        wrong = builder.and_(wrong, builder.not_(right))
+        drawn = builder.fcmp_ordered(">", u, zero)
+        right = builder.fcmp_ordered("<=", square, one)
+        wrong = builder.and_(
+            builder.fcmp_unordered(">", square, one), builder.fcmp_ordered(">=", u, occluder)
+        )
+        quarter = ir.IntType(BLOCK)
+        words = context.make_array(kinds[4])(context, builder, model).data
+        quarters = builder.bitcast(words, quarter.as_pointer())
+        builder.store(builder.bitcast(drawn, quarter), builder.gep(quarters, [place]))
         found = [
-            builder.zext(builder.bitcast(model, ir.IntType(BLOCK)), _WORD),
-            builder.select(right, builder.fadd(correct, one), correct),
-            builder.select(wrong, builder.fadd(false, one), false),
-            builder.select(right, builder.fadd(residual, square, flags=_FAST), residual),
+            builder.select(which, builder.fadd(before, more, flags=_FAST), before)
+            for which, before, more in zip(
+                (right, wrong, right), sums, (one, one, square), strict=True
+            )
         ]
         return context.make_tuple(builder, sig.return_type, found)
 
-    returned = types.Tuple((types.uint64, FLOATS, FLOATS, FLOATS))
-    return returned(tile, types.intp, images, types.intp, FLOATS, FLOATS, FLOATS), codegen
+    sums = (FLOATS,) * 3
+    given = (tile, types.intp, images, types.intp, model, types.intp)
+    return types.Tuple(sums)(*given, *sums), codegen
 
 
 @intrinsic
