@@ -300,5 +300,7 @@ def score_hands(
                 tile, stride, spans, box, origin, images, width, model, above
             )
             out[0, first + i], out[1, first + i], out[3, first + i] = correct, false, residual
-            find_wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted)
+            find_wanted(
+                conics, i, model, words, first_row, rows, origin, hand, reach, wanted, places
+            )
             out[2, first + i] = count_missed(model, words, rows, reach, steps, wanted, buffer)

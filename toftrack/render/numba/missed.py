@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from toftrack.compute.compiling import compiled
 from toftrack.render.numba.hand import DX, HY, IY, LANES, XY, X, Y
 from toftrack.render.numba.vector import (
+    BLOCK,
     WORDS,
     any_bit,
+    down,
+    larger,
     load_rows,
     no_rows,
     ones,
+    ramp,
+    root,
     shifted,
+    smaller,
+    splat,
+    store,
     store_rows,
+    up,
     widened,
     without,
 )
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ALL = ~np.uint64(0)
 
 
 @compiled
@@ -29,7 +37,7 @@ def run(first, last):
     first, last = max(first, 0), min(last, 63)
     if last < first:
         return np.uint64(0)
-    return (~np.uint64(0) >> np.uint64(63 - (last - first))) << np.uint64(first)
+    return (_ALL >> np.uint64(63 - last)) & (_ALL << np.uint64(first))
 
 
 @compiled
@@ -41,11 +49,12 @@ def clipped(value, size):
 
 
 @compiled
-def find_wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted):
+def find_wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted, places):
     """Bits of the hand's pixels outside of the silhouette and of the wrist's ellipsoid.
 
     hand: (words of a row + 1, H + WORDS) bits of the evidence.  wanted: (words, rows + WORDS) is
     set; rows from `rows` on may hold pixels that are too far away to be missed.
+    places: (2 * BLOCK,) int32 scratch.
     """
     shift, column = np.uint64(origin & 63), origin >> 6
     for w in range(words):
@@ -56,17 +65,21 @@ def find_wanted(conics, i, model, words, first_row, rows, origin, hand, reach, w
             store_rows(wanted, w, row, without(shifted(here, after, shift), covered))
     conic = conics[conics.shape[0] - 1]
     high, y = conic[HY * LANES + i], conic[Y * LANES + i] - np.float32(first_row)
-    if high > _ZERO:
-        x, shear = conic[X * LANES + i] - np.float32(origin), conic[XY * LANES + i]
-        inverse, dx = conic[IY * LANES + i], conic[DX * LANES + i]
-        for r in range(clipped(np.ceil(y - high), rows), clipped(y + high + _ONE, rows)):
-            dy = np.float32(r) - y
-            middle = x + shear * dy
-            half = math.sqrt(dx * max(_ONE - dy * dy * inverse, _ZERO))
-            first = clipped(np.ceil(middle - half), 64 * words)
-            last = clipped(np.floor(middle + half) + _ONE, 64 * words) - 1
+    if not high > _ZERO:
+        return
+    x, shear = conic[X * LANES + i] - np.float32(origin), conic[XY * LANES + i]
+    inverse, dx = conic[IY * LANES + i], conic[DX * LANES + i]
+    begin, end = clipped(np.ceil(y - high), rows), clipped(y + high + _ONE, rows)
+    left_most, right_most = splat(_ZERO), splat(np.float32(64 * words))
+    for row in range(begin, end, BLOCK):
+        dy = (np.float32(row) - y) + ramp()
+        middle, half = x + shear * dy, root(dx * (_ONE - dy * dy * inverse))
+        # In a row that just misses it, where the root is NaN, there is nothing to leave out.
+        store(places, 0, smaller(larger(up(middle - half), left_most), right_most))
+        store(places, BLOCK, smaller(larger(down(middle + half), left_most - _ONE), right_most))
+        for j in range(min(BLOCK, end - row)):
             for w in range(words):
-                wanted[w, r] &= ~run(first - 64 * w, last - 64 * w)
+                wanted[w, row + j] &= ~run(places[j] - 64 * w, places[BLOCK + j] - 64 * w)
 
 
 @compiled
