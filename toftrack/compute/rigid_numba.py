@@ -189,10 +189,11 @@ def mix_columns(frame, column, angle):
 
 @_cached
 def joints_of(states, base_frames, base, lengths, mirror, joints):
-    """The joints of N hands alone, see pose_hand; states: (N, 27).  joints: (N, 21, 3)."""
-    frames = np.empty((16, 3, 3))
+    """The joints of N hands alone, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32."""
+    frames, posed = np.empty((16, 3, 3)), np.empty((21, 3))
     for i in range(len(states)):
-        pose_hand(states[i], base_frames, base, lengths, mirror, frames, joints[i])
+        pose_hand(states[i].astype(np.float64), base_frames, base, lengths, mirror, frames, posed)
+        joints[i] = posed
 
 
 @_cached
