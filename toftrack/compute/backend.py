@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from toftrack.compute.redraw import Redraw
+
 if TYPE_CHECKING:
     from toftrack.hand.shape import HandShape
     from toftrack.refinement.gauss_newton import Landmarks, Refiner
@@ -23,11 +25,13 @@ class Motions(NamedTuple):
 
     compose: reference particles and tangent offsets, (N, 6 + d) or broadcast, to particles.
     difference: particles (N, 6 + d) and one reference (1, 6 + d) to tangent offsets (N, 6 + d).
+    redraw: particles anew from weighted ones, see compute/redraw.py.
     mean: particles (N, 6 + d) and weights (N,) to their mean (1, 6 + d), which is on the CPU.
     """
 
     compose: Callable[[Tensor, Tensor], Tensor]
     difference: Callable[[Tensor, Tensor], Tensor]
+    redraw: Redraw
     mean: Callable[[Tensor, Tensor], Tensor]
 
 

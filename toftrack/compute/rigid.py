@@ -10,15 +10,20 @@ the hand, so that turning the hand does not also carry it away, as turning about
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import roma
 import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Motions
+from toftrack.compute.redraw import redraw_with
 from toftrack.compute.transfer import on_host, table
 
 PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
+_X, _Y, _Z = PIVOT_M
 
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
@@ -45,6 +50,21 @@ def rotated_pivot(rotvec: Tensor) -> Tensor:
     cross = torch.linalg.cross(rotvec, p)
     along = torch.linalg.cross(rotvec, cross)
     return p + angle.sin() / angle * cross + (1 - angle.cos()) / angle.square() * along
+
+
+def pivot_offset(rotvec: np.ndarray) -> np.ndarray:
+    """The same on the CPU, (N, 3) to (N, 3), where torch's operations take longer than this."""
+    out = np.empty_like(rotvec)
+    for row, (a, b, c) in enumerate(rotvec.tolist()):
+        square = max(a * a + b * b + c * c, 1e-12)
+        angle = math.sqrt(square)
+        first, second = math.sin(angle) / angle, (1 - math.cos(angle)) / square
+        along = second * (a * _X + b * _Y + c * _Z)
+        cosine = math.cos(angle)
+        out[row, 0] = cosine * _X + first * (b * _Z - c * _Y) + a * along
+        out[row, 1] = cosine * _Y + first * (c * _X - a * _Z) + b * along
+        out[row, 2] = cosine * _Z + first * (a * _Y - b * _X) + c * along
+    return out
 
 
 def _pivot(particles: Tensor) -> Tensor:
@@ -83,4 +103,4 @@ def mean(particles: Tensor, weights: Tensor) -> Tensor:
     return found
 
 
-MOTIONS = Motions(compose, difference, mean)
+MOTIONS = Motions(compose, difference, redraw_with(compose), mean)

@@ -65,22 +65,53 @@ def turned(q, x, y, z):
     )
 
 
+@compiled
+def compose_row(r, t, pivot, out):
+    """One row of compose_rows."""
+    before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
+    turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
+    after = product(turn, before)
+    old = turned(before, pivot[0], pivot[1], pivot[2])
+    new = turned(after, pivot[0], pivot[1], pivot[2])
+    vector = rotation_vector(after)
+    for j in range(3):
+        out[j] = r[j] + old[j] + t[j] - new[j]
+        out[3 + j] = vector[j]
+    for j in range(6, len(out)):
+        out[j] = r[j] + t[j]
+
+
 @_cached
 def compose_rows(reference, tangent, pivot, out):
     """See rigid.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
     for i in range(len(out)):
-        r, t = reference[i], tangent[i]
-        before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
-        turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
-        after = product(turn, before)
-        old = turned(before, pivot[0], pivot[1], pivot[2])
-        new = turned(after, pivot[0], pivot[1], pivot[2])
-        vector = rotation_vector(after)
-        for j in range(3):
-            out[i, j] = r[j] + old[j] + t[j] - new[j]
-            out[i, 3 + j] = vector[j]
-        for j in range(6, out.shape[1]):
-            out[i, j] = r[j] + t[j]
+        compose_row(reference[i], tangent[i], pivot, out[i])
+
+
+@_cached
+def redraw_rows(particles, weights, positions, tangents, lower, upper, reflect, pivot, out):
+    """See redraw.redraw_with; weights, positions, pivot: float64, the others float32."""
+    last, total = 0, 0.0
+    for i in range(len(weights)):
+        total += weights[i]
+        if weights[i] > 0:
+            last = i
+    at, reached = 0, weights[0]
+    for n in range(len(out)):
+        while at < last and reached <= positions[n] * total:
+            at += 1
+            reached += weights[at]
+        compose_row(particles[at], tangents[n], pivot, out[n])
+        for j in range(len(lower)):
+            value = out[n, 6 + j]
+            if reflect:
+                # As numpy's remainder, which is never below 0.
+                wide = upper[j] - lower[j]
+                folded = (value - lower[j]) % (2 * wide)
+                value = lower[j] + min(folded, 2 * wide - folded)
+            else:
+                value = min(max(value, lower[j]), upper[j])
+            out[n, 6 + j] = value
 
 
 @_cached
@@ -158,10 +189,11 @@ def mix_columns(frame, column, angle):
 
 @_cached
 def joints_of(states, base_frames, base, lengths, mirror, joints):
-    """The joints of N hands alone, see pose_hand; states: (N, 27).  joints: (N, 21, 3)."""
-    frames = np.empty((16, 3, 3))
+    """The joints of N hands alone, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32."""
+    frames, posed = np.empty((16, 3, 3)), np.empty((21, 3))
     for i in range(len(states)):
-        pose_hand(states[i], base_frames, base, lengths, mirror, frames, joints[i])
+        pose_hand(states[i].astype(np.float64), base_frames, base, lengths, mirror, frames, posed)
+        joints[i] = posed
 
 
 @_cached
@@ -231,6 +263,31 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return out
 
 
+def redraw(
+    particles: Tensor,
+    weights: Tensor,
+    positions: Tensor,
+    tangents: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    mode: str,
+) -> Tensor:
+    """See redraw.redraw_with; on the CPU, in float32."""
+    out = torch.empty(tangents.shape)
+    redraw_rows(
+        _rows(particles),
+        np.ascontiguousarray(weights.numpy(), np.float64),
+        np.ascontiguousarray(positions.numpy(), np.float64),
+        _rows(tangents),
+        _rows(lower),
+        _rows(upper),
+        mode == "reflect",
+        _PIVOT,
+        out.numpy(),
+    )
+    return out
+
+
 def mean(particles: Tensor, weights: Tensor) -> Tensor:
     """See rigid.mean; on the CPU, in float32."""
     out = torch.empty(1, particles.shape[1])
@@ -249,5 +306,7 @@ def motions() -> Motions:
         with announced("filter: compiling its numba kernels (once, about 1 s)"):
             row = torch.zeros(1, 7)
             difference(compose(row, row), row)
-            mean(row, row[:, 0])
-    return Motions(compose, difference, mean)
+            one, none = row[:, 0] + 1, row[0, 6:]
+            redraw(row, one, row[:, 0], row, none, none, "reflect")
+            mean(row, one)
+    return Motions(compose, difference, redraw, mean)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from toftrack.compute import rigid
 from toftrack.compute.backend import Motions
+from toftrack.compute.redraw import redraw_with
 from toftrack.compute.rigid import PIVOT_M
 
 _BLOCK = 64
@@ -164,5 +165,5 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return out
 
 
-MOTIONS = Motions(compose, difference, rigid.mean)
+MOTIONS = Motions(compose, difference, redraw_with(compose), rigid.mean)
 """Of particles on a CUDA device."""

@@ -72,6 +72,9 @@ def run_shared(task: Callable[[], object], parts: int) -> None:
     Plain threads, not numba's own: these are one choice for a whole process and some of them do not
     allow calls from two threads at once. One part is done without any.
     """
+    if parts <= 1:
+        task()
+        return
     others = [_pool(os.getpid()).submit(task) for _ in range(min(threads(), parts) - 1)]
     task()
     for other in others:

@@ -185,9 +185,10 @@ class CompiledRefiner:
 
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
-        joints = np.empty((len(states), 21, 3))
-        joints_of(_array(states), *self._shape, joints)
-        return torch.from_numpy(joints.astype(np.float32))
+        joints = torch.empty(len(states), 21, 3)
+        states_read = np.ascontiguousarray(states.numpy(), np.float32)
+        joints_of(states_read, *self._shape, joints.numpy())
+        return joints
 
     def __call__(
         self,
@@ -242,4 +243,4 @@ class CompiledRefiner:
 
 def _array(tensor: Tensor) -> np.ndarray:
     """A float64 copy."""
-    return tensor.detach().numpy().astype(np.float64, order="C")
+    return tensor.numpy().astype(np.float64, order="C")

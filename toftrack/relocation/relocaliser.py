@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.rigid import rotated_pivot
+from toftrack.compute.rigid import pivot_offset
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.network import Finder, PoseNet
@@ -90,8 +90,10 @@ class Glance:
 
     def states(self, ratio: float) -> Tensor:
         """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
-        wrist = self.pivot_m - ratio * rotated_pivot(self.rotvec)
-        return torch.cat((wrist, self.rotvec, self.angles), 1)
+        states = np.zeros((len(self.rotvec), 27), np.float32)
+        states[:, 3:6], states[:, 6:] = self.rotvec.numpy(), self.angles.numpy()
+        states[:, :3] = self.pivot_m.numpy() - np.float32(ratio) * pivot_offset(states[:, 3:6])
+        return torch.from_numpy(states)
 
     @property
     def length_m(self) -> float:

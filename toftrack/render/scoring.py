@@ -40,14 +40,9 @@ class Evidence:
         """The same on a device, from the CPU."""
         if device.type == "cpu":
             return self
-        return Evidence(
-            low=on_device(self.low, device),
-            high=on_device(self.high, device),
-            occluder=on_device(self.occluder, device),
-            hand=on_device(self.hand, device),
-            k=on_device(self.k, device),
-            radius_px=self.radius_px,
-        )
+        given = self.low, self.high, self.occluder, self.hand, self.k
+        low, high, occluder, hand, k = (on_device(image, device) for image in given)
+        return Evidence(low, high, occluder, hand, k, self.radius_px)
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Evidence:
         """The part [top, bottom) x [left, right) with intrinsics to match."""

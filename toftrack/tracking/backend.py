@@ -91,6 +91,7 @@ def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
     motions = Motions(
         compose=lambda reference, tangent: at(reference).compose(reference, tangent),
         difference=lambda particles, reference: at(particles).difference(particles, reference),
+        redraw=there.redraw,
         mean=there.mean,
     )
     return _Beside(

@@ -72,7 +72,7 @@ def filtered(
         space.lower,
         space.upper,
         model.filter,
-        model.backend.motions,
+        model.backend.motions.redraw,
         generator_on(model.device, generator),
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.rigid import rotated_pivot
+from toftrack.compute.rigid import pivot_offset
 from toftrack.compute.threads import beside
 from toftrack.compute.transfer import on_device
 from toftrack.frames import DepthImage
@@ -104,8 +104,8 @@ def glancing(
 def _expected_centre(track: Track, dt_s: float, model: TrackerModel) -> np.ndarray:
     """(1, 3) middle of the palm, dt_s after the last frame, camera frame."""
     moved = displacement(track, dt_s, model.filter)[None]
-    ahead = model.backend.motions.compose(track.mean, moved)
-    centre = (ahead[:, :3] + rotated_pivot(ahead[:, 3:6])).cpu().numpy()
+    ahead = model.backend.motions.compose(track.mean, moved).numpy()
+    centre: np.ndarray = ahead[:, :3] + pivot_offset(ahead[:, 3:6])
     centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
     return centre
 
@@ -151,8 +151,9 @@ def _reachable(
         return -np.inf
     if seen is None:
         return 0.0
-    before = seen.particle[:, :3] + rotated_pivot(seen.particle[:, 3:6])
-    away = float(np.linalg.norm(before[0].cpu().numpy() - centre_m))
+    particle = seen.particle.numpy()
+    before = particle[0, :3] + pivot_offset(particle[:, 3:6])[0]
+    away = float(np.linalg.norm(before - centre_m))
     off = away / (_STEP_M + _SPEED_M_S * seen.age_s)
     return -0.5 * off**2 if seen.age_s < _FORGOTTEN_S else 0.0
 
