@@ -85,6 +85,8 @@ class Refinement:
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     swaps: other poses of single fingers that are tried; the log scores by which one is better must
         sum up to `swap_gain` over frames, of each of which `drift` is taken off.
+    sure: probability of a hand from which on the networks' poses and single other fingers are tried
+        in turn, and not both in every frame.
     overlap: of the log score, for fingers that are in one another (see finger_overlap).
     keep_gain: by how much the log score of another pose must exceed the last frame's.
     steadying: how much of a change from frame to frame is believed.
@@ -100,6 +102,7 @@ class Refinement:
     damping: float
     swaps: int
     swap_gain: float
+    sure: float
     drift: float
     overlap: float
     keep_gain: float
@@ -115,6 +118,7 @@ class Refinement:
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
         for name in ("damping", "swap_gain", "drift", "keep_gain", "overlap"):
             check_number(f"refine.{name}", getattr(self, name), 0)
+        check_number("refine.sure", self.sure, 0.5, 1)
         check_number("refine.carry", self.carry, 0, 1)
 
 

@@ -20,7 +20,7 @@ from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance, RelocationSettings
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
-from toftrack.tracking.life_cycle import lasted
+from toftrack.tracking.life_cycle import lasted, log_odds
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.other_hand import OtherHand, touching
 from toftrack.tracking.search import LastSeen
@@ -128,13 +128,9 @@ def _chosen(found: Sequence[Glance]) -> Glance | None:
 
 def _sure(track: Track, settings: RelocationSettings, dt_s: float) -> bool:
     """Whether a track is believed so much that the networks need not look in this frame."""
-    believed = track.log_odds is not None and track.log_odds > _logit(settings.sure)
+    believed = track.log_odds is not None and track.log_odds > log_odds(settings.sure)
     due = lasted(track.unlooked_s + dt_s, settings.every)
     return believed and not due and track.challenged_s == 0
-
-
-def _logit(probability: float) -> float:
-    return float(np.log(probability / (1 - probability)))
 
 
 def _reachable(
