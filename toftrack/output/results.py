@@ -1,8 +1,8 @@
 """The result files of a run: run.json, track.jsonl, track.npz and summary.json.
 
 `run.json` is written at the start, `track.jsonl` grows by a line as each frame is done. The two
-others are made of these when the writer is closed, also after an interruption, for the frames that
-were done until then; or later, by `finish`, if it never was.
+others are made when the writer is closed, also after an interruption, for the frames that were done
+until then; or later, of the lines, if it never was.
 """
 
 from __future__ import annotations
@@ -102,6 +102,7 @@ class ResultWriter:
         except OSError as error:
             self._lines.close()
             raise _unwritable(self.folder, error) from error
+        self._records: Records | None = None
         self._closed = False
 
     def append(self, estimates: Sequence[Estimate]) -> None:
@@ -111,6 +112,9 @@ class ResultWriter:
         """
         try:
             self._lines.append(json_line(estimates))
+            if self._records is None:
+                self._records = Records(self.folder, vars(estimates[0]), len(estimates))
+            self._records.append(estimates)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         self.frames += 1
@@ -124,7 +128,8 @@ class ResultWriter:
             return
         self._closed = True
         try:
-            self.summary = finish(self.folder, self._facts, self._truth)
+            with self._records or records_of(self.folder, self._facts) as records:
+                self.summary = finish(self.folder, self._facts, self._truth, records)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         finally:
@@ -142,32 +147,41 @@ class ResultWriter:
         self.close()
 
 
-def finish(folder: Path, facts: dict[str, Any], truth: Truth | None) -> dict[str, Any]:
-    """Make track.npz and summary.json of a run's lines; returns the summary.
+def records_of(folder: Path, facts: dict[str, Any]) -> Records:
+    """The records of a run's lines, which take a while to read.
 
-    folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
-
-    Raises ToftrackError for damaged lines, OSError when something cannot be read or written.
+    folder, facts: as for `finish`.  Raises ToftrackError for damaged lines, OSError.
     """
     metadata = facts["metadata"]
     latent_size = int((metadata.get("pose_space") or {}).get("dims", 4))
     slots = int((metadata.get("config") or {}).get("hands", 1))
-    with Records(folder / LINES, latent_size, slots) as records:
-        rows, changed, held = _every_frame(records)
-        if held:
-            metadata = metadata | {"held_frames": held}
-        small = {
-            "joint_names": np.array(facts["joint_names"], np.str_),
-            "metadata": np.array(json.dumps(metadata)),
-        } | facts_for_readers(metadata)
-        summary = summarise(records, len(rows), len(held), folder, metadata)
-        if truth is not None and len(rows):
-            metrics = run_metrics(records, rows, changed["index"], truth)
-            summary |= {"metrics": metrics} if metrics else {}
-        write_whole(
-            folder / "track.npz",
-            lambda stream: write_archive(stream, records, rows, changed, small),
-        )
+    return Records.of_lines(folder / LINES, latent_size, slots)
+
+
+def finish(
+    folder: Path, facts: dict[str, Any], truth: Truth | None, records: Records
+) -> dict[str, Any]:
+    """Make track.npz and summary.json of a run's frames; returns the summary.
+
+    folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
+
+    Raises OSError when something cannot be read or written.
+    """
+    metadata = facts["metadata"]
+    rows, changed, held = _every_frame(records)
+    if held:
+        metadata = metadata | {"held_frames": held}
+    small = {
+        "joint_names": np.array(facts["joint_names"], np.str_),
+        "metadata": np.array(json.dumps(metadata)),
+    } | facts_for_readers(metadata)
+    summary = summarise(records, len(rows), len(held), folder, metadata)
+    if truth is not None and len(rows):
+        metrics = run_metrics(records, rows, changed["index"], truth)
+        summary |= {"metrics": metrics} if metrics else {}
+    write_whole(
+        folder / "track.npz", lambda stream: write_archive(stream, records, rows, changed, small)
+    )
     _write_json(folder / "summary.json", summary)
     return summary
 
