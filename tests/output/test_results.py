@@ -20,6 +20,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Truth
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output import records
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate, metrics_table
 from toftrack.output.files import save_whole, write_whole
@@ -347,6 +348,41 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
     one = estimate(0)
     few, many = peak(600), peak(1200)
     assert many - few < 600 * 200  # a frame's numbers alone are 1100 bytes
+
+
+def test_the_end_of_a_run_does_not_wait_for_its_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise AssertionError("a run's lines take long to read")
+
+    monkeypatch.setattr(records, "read_lines", refuse)
+    write(tmp_path, [estimate(i) for i in range(records._PIECE + 2)])
+    assert len(read_results(tmp_path / "track.npz")["lost"]) == records._PIECE + 2
+
+
+def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
+    odd = estimate(4, score=math.inf, gesture="", joints_m=np.full((21, 3), -np.inf))
+    many = [no_estimate(0, 0.0, "searching", 4, 0.01), *(estimate(i) for i in range(1, 4)), odd]
+    write(tmp_path, many)
+    before = read_results(tmp_path / "track.npz")
+    recover(tmp_path)
+    after = read_results(tmp_path / "track.npz")
+    for name in LINE_FIELDS:
+        np.testing.assert_array_equal(after[name], before[name])
+
+
+def test_what_takes_long_shows_how_far_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path, [estimate(i) for i in range(6)])
+    recover(tmp_path)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(records, "_SOON_S", 0)
+    recover(tmp_path)
+    told = capsys.readouterr().err
+    assert "reading the lines" in told
+    assert "writing the results" in told
 
 
 def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ class Records:
             except BaseException:
                 records.close()
                 raise
-        except (LookupError, TypeError, ValueError) as error:
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
             raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
         return records
 
