@@ -241,16 +241,16 @@ def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
     if len(estimates) == 1:
         one = estimates[0]
         _write_line(halves[0], (number, gesture_words(one)), 8)
-        facts = (_state(one), confidence_words(one.confidence), f"score {_score(one)}")
+        facts = [_state(one), confidence_words(one.confidence), f"score {_score(one)}"]
         _write_line(halves[1], facts, 8)
         return np.hstack(halves)
     for slot, (one, half) in enumerate(zip(estimates, halves, strict=True)):
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), SLOT_RGB[slot][::-1], -1)
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), _WHITE, 1)
         told = _state(one) if one.lost else gesture_words(one) or _state(one)
-        facts = (told, side_words(one), confidence_words(one.confidence))
-        facts = ("no hand",) if is_vacant(one) else facts
-        _write_line(half, facts if slot else (number, *facts), 38)
+        facts = [told, side_words(one), confidence_words(one.confidence)]
+        facts = ["no hand"] if is_vacant(one) else facts
+        _write_line(half, facts if slot else [number, *facts], 38)
     return np.hstack(halves)
 
 
