@@ -87,7 +87,7 @@ class Observation:
     pictures: int
     visits: int
     status: int | None
-    """With which the program ended after Ctrl-C; 130 is as it should be. None: it did not end."""
+    """With which the program ended; 143 is as it should be. None: it did not end."""
     ending_s: float
     """How long that took."""
     written_mb: float
@@ -177,8 +177,11 @@ def soak(minutes: float, folder: Path, told: Callable[[str], None] = print) -> O
 
 
 def _ended(program: subprocess.Popen) -> int | None:
-    """The status after Ctrl-C; of a program that does not end, err.txt tells then where it is."""
-    program.send_signal(signal.SIGINT)
+    """The status; of a program that does not end, err.txt tells then where it is.
+
+    Not by Ctrl-C, which shells let programs in the background ignore.
+    """
+    program.terminate()
     try:
         return program.wait(_ENDING_S)
     except subprocess.TimeoutExpired:
@@ -305,7 +308,7 @@ def main() -> int:
     problems = [
         f"{name} grew" for name in grown(observation.part(0, 4)[0], observation.part(3, 4)[0])
     ]
-    if observation.status != 130:
+    if observation.status != 143:
         problems.append(f"the tracker ended with status {observation.status}\n{words[-5000:]}")
     print("; ".join(problems) or "nothing grew")
     return 1 if problems else 0
