@@ -227,8 +227,11 @@ def read_weights(path: Path) -> None:
     except ToftrackError as error:
         if "checksum" not in str(error):
             raise
-        with np.load(path, allow_pickle=False) as content:
-            arrays = dict(content)
+        try:
+            with np.load(path, allow_pickle=False) as content:
+                arrays = dict(content)
+        except Exception:  # it is damaged in another way, too
+            raise error from None
         metadata = json.loads(arrays.pop("metadata").item())
         metadata["sha256"] = _checksum(arrays)
         right = path.with_name("right.npz")

@@ -395,6 +395,58 @@ def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
             recover(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"metadata": []},
+        {"metadata": {"camera": [1]}},
+        {"metadata": {"hand_shape": ["right"]}},
+        {"metadata": {"pose_space": {"dims": 10**9}}},
+        {"metadata": {"config": {"hands": 3}}},
+        {"metadata": {"config": {"device": 3}}, "truth": True},
+        {"metadata": {"camera": {"K": 1}}},
+        {"joint_names": None},
+    ],
+    ids=str,
+)
+def test_a_run_json_that_is_damaged_is_told(tmp_path: Path, changes: dict[str, Any]) -> None:
+    write(tmp_path, [estimate(i) for i in range(3)])
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    with pytest.raises(ToftrackError) as error:
+        recover(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "told"),
+    [
+        ("index", None, "has no 'index'"),
+        ("joints_m", [[0, 0, 0]], "shape"),
+        ("lost", [True], "shape"),
+        ("state", [[1, 2], [3]], "line 1 of"),
+        ("index", 10**19, "line 1 of"),
+    ],
+)
+def test_a_first_line_that_is_damaged_is_named(
+    tmp_path: Path, field: str, value: object, told: str
+) -> None:
+    write(tmp_path, [estimate(0)])
+    path = tmp_path / "track.jsonl"
+    line = json.loads(path.read_text())
+    line[field] = value
+    path.write_text(json.dumps({k: v for k, v in line.items() if v is not None or k != field}))
+    with open(path, "a") as stream:
+        stream.write("\n")
+    with pytest.raises(ToftrackError, match=told):
+        recover(tmp_path)
+
+
+def test_a_number_far_beyond_the_others_fills_no_disk(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(0), dataclasses.replace(estimate(1), index=10**15)])
+    assert read_results(tmp_path / "track.npz")["index"].tolist() == [0, 10**15]
+
+
 @pytest.mark.parametrize("rest", [b'{"index":9,"jo', b"\0\0\0\0", b""])
 def test_what_a_killed_run_left_unfinished_is_dropped(tmp_path: Path, rest: bytes) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])

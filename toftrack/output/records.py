@@ -15,7 +15,7 @@ import itertools
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, BinaryIO, Self
@@ -24,7 +24,15 @@ import numpy as np
 from tqdm import tqdm
 
 from toftrack.estimate import Estimate, is_vacant, no_estimate
-from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, KINDS, damaged, read_lines
+from toftrack.output.lines import (
+    FRAME_FIELDS,
+    FROM_THE_START,
+    HAND_FIELDS,
+    KINDS,
+    SHAPES,
+    damaged,
+    read_lines,
+)
 
 SLOTS = 2
 """Of lines with `hands`."""
@@ -73,8 +81,9 @@ class Records:
             count = sum(1 for _ in stream)
         last = 1
         try:
-            none = vars(no_estimate(0, 0, "", latent_size, 0))
-            records = cls(lines.parent, like or none, slots)
+            like = like or vars(no_estimate(0, 0, "", latent_size, 0))
+            _check(like, {*FROM_THE_START, "index"} - set(FRAME_FIELDS if slots > 1 else ()))
+            records = cls(lines.parent, like, slots)
             try:
                 read = read_lines(lines)
                 with _bar("reading the lines", count) as bar:
@@ -182,6 +191,17 @@ class Records:
             slots[hand["slot"]] = hand
         frame = {name: line[name] for name in FRAME_FIELDS}
         return frame | {name: [hand[name] for hand in slots] for name in self._vacant}
+
+
+def _check(hand: Mapping[str, Any], needed: Set[str]) -> None:
+    """ValueError where what a line says of a hand lacks a field, or has one of another shape."""
+    for name in KINDS:
+        if name in hand:
+            shape = np.shape(hand[name])
+            if shape != SHAPES.get(name, shape):
+                raise ValueError(f"{name!r} has the shape {shape}")
+        elif name in needed:
+            raise ValueError(f"it has no {name!r}")
 
 
 def _hands(line: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -59,6 +59,11 @@ def recover(folder: Path, recording: str | Path | None = None) -> dict[str, Any]
                 return finish(folder, facts, truth, records)
         finally:
             lines.close()
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ToftrackError(
+            f"'{folder / 'run.json'}' is damaged ({' '.join(repr(error).split())}); put that of "
+            "another run with the same settings in its place, or track again"
+        ) from error
     except OSError as error:
         raise ToftrackError(
             f"'{folder}' cannot be read or written ({error.strerror or error}); make room, or copy "
