@@ -11,30 +11,22 @@ to wait; the allocator. Nothing here takes the time that it would take on a devi
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
-from types import ModuleType
+from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
 
 import torch
+from helpers.indexing import item, set_item
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
 
-from toftrack.compute import rigid, transfer
-from toftrack.compute.backend import Motions
+from toftrack.compute import transfer
 from toftrack.hand import overlap
-from toftrack.hand.shape import HandShape
 from toftrack.pose_space import base
-from toftrack.render import scoring
-from toftrack.render.numba.scorer import NumbaScorer
-from toftrack.render.scoring import Evidence
 
 DEVICE = torch.device("cuda", 0)
 
@@ -62,14 +54,15 @@ class Pretended(Tensor):
 
     @staticmethod
     def __new__(cls, held: Tensor) -> Pretended:
-        made: Pretended = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
-            cls,
-            held.shape,
-            strides=held.stride(),
-            storage_offset=held.storage_offset(),
-            dtype=held.dtype,
-            device=DEVICE,
-        )
+        with torch.inference_mode(False):  # a view of what was made outside is none made within
+            made: Pretended = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+                cls,
+                held.shape,
+                strides=held.stride(),
+                storage_offset=held.storage_offset(),
+                dtype=held.dtype,
+                device=DEVICE,
+            )
         made.held = held
         return made
 
@@ -77,7 +70,7 @@ class Pretended(Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _computed(func, args, kwargs or {}, None)
+        return _computed(func, args, kwargs or {}, Counts())
 
     def __repr__(self, *, tensor_contents: object = None) -> str:
         return f"Pretended({self.held!r})"
@@ -122,19 +115,33 @@ class Counts:
             self.part = before
 
 
+def _mapped(function: Callable[[Any], Any], values: Any) -> Any:
+    """A function of each of what an operation is given, or gives."""
+    if isinstance(values, dict):
+        return {name: _mapped(function, value) for name, value in values.items()}
+    if type(values) in (list, tuple):
+        return type(values)(_mapped(function, value) for value in values)
+    return function(values)
+
+
+def _tensors(values: Any) -> list[Tensor]:
+    found: list[Tensor] = []
+    _mapped(lambda value: found.append(value) if isinstance(value, Tensor) else None, values)
+    return found
+
+
 def _is_there(device: Any) -> bool:
     return device is not None and torch.device(device).type == DEVICE.type
 
 
-def _is_named(x: Any) -> bool:
-    return (isinstance(x, torch.device) and x == torch.device("cuda")) or (
-        isinstance(x, str) and x == "cuda"
-    )
+def _named(x: Any) -> Any:
+    """The device itself, where only its kind is given: torch would ask the driver which."""
+    return DEVICE if isinstance(x, (str, torch.device)) and str(x) == DEVICE.type else x
 
 
-def _computed(func: Any, args: tuple, kwargs: dict, counts: Counts | None) -> Any:
+def _computed(func: Any, args: tuple, kwargs: dict, counts: Counts) -> Any:
     """An operation on the values that are held, its results on the device where they would be."""
-    given = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
+    given = _tensors((args, kwargs))
     there = [x for x in given if isinstance(x, Pretended)]
     name = func.overloadpacket.__name__
     if name in ("_to_copy", "copy_"):
@@ -144,19 +151,13 @@ def _computed(func: Any, args: tuple, kwargs: dict, counts: Counts | None) -> An
         return func(*args, **kwargs)
     if func._schema.name.split("::")[0] == "aten" and _is_composite(func):
         # In inference mode these come undivided.
-        with _Counting(counts) if counts is not None else _Plain():
+        with _Counting(counts):
             divided = func.decompose(*args, **kwargs)
         if divided is not NotImplemented:
             return divided
     _check_devices(name, args, given)
-    if counts is not None:
-        _count(func, name, args, kwargs, counts)
-    plain_args, plain_kwargs = tree_map(
-        lambda x: x.held if isinstance(x, Pretended) else x, (args, kwargs)
-    )
-    if "device" in kwargs:
-        plain_kwargs["device"] = "cpu"
-    result = func(*plain_args, **plain_kwargs)
+    _count(func, name, args, kwargs, counts)
+    result = _on_values(func, args, kwargs)
     known = {id(x.held): x for x in there}
 
     def put_there(x: Any) -> Any:
@@ -164,7 +165,7 @@ def _computed(func: Any, args: tuple, kwargs: dict, counts: Counts | None) -> An
             return x
         return known[id(x)] if id(x) in known else Pretended(x)
 
-    return tree_map(put_there, result)
+    return _mapped(put_there, result)
 
 
 def _is_composite(func: Any) -> bool:
@@ -203,50 +204,43 @@ def _count(func: Any, name: str, args: tuple, kwargs: dict, counts: Counts) -> N
         counts.waited(name)
 
 
-def _copied(func: Any, args: tuple, kwargs: dict, counts: Counts | None) -> Any:
+def _copied(func: Any, args: tuple, kwargs: dict, counts: Counts) -> Any:
     """Copies between the devices, or on one of them."""
-    source = args[1] if func.overloadpacket.__name__ == "copy_" else args[0]
     inplace = func.overloadpacket.__name__ == "copy_"
+    source = args[1] if inplace else args[0]
     from_there = isinstance(source, Pretended)
     if inplace:
-        to_there = isinstance(args[0], Pretended)
-        without_wait = bool(kwargs.get("non_blocking", args[2] if len(args) > 2 else False))
+        to_there, patient = isinstance(args[0], Pretended), True
     else:
         device = kwargs.get("device")
         to_there = from_there if device is None else _is_there(device)
-        without_wait = bool(kwargs.get("non_blocking", False))
-    if counts is not None and (from_there or to_there):
-        if from_there and to_there:
-            counts.launched("copy")
-        elif from_there:
-            counts.waited("copy to the host")
-        elif without_wait:
-            counts.uploaded()
-        else:
-            counts.waited("copy to the device")
-    plain_args, plain_kwargs = tree_map(
-        lambda x: x.held if isinstance(x, Pretended) else x, (args, kwargs)
-    )
-    if "device" in kwargs:
-        plain_kwargs["device"] = torch.device("cpu")
-    result = func(*plain_args, **plain_kwargs)
+        # Without pinned memory the host would wait after all.
+        patient = not (kwargs.get("non_blocking") and hasattr(source, "pinned"))
+    if from_there and to_there:
+        counts.launched("copy")
+    elif from_there:
+        counts.waited("copy to the host")
+    elif to_there and patient:
+        counts.waited("copy to the device")
+    elif to_there:
+        counts.uploaded()
+    result = _on_values(func, args, kwargs)
     if inplace:
         return args[0]
     return Pretended(result) if to_there else result
 
 
-class _Plain(TorchDispatchMode):
-    """Factories work on the device, nothing is counted."""
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _computed(func, args, kwargs or {}, None)
-
-    @classmethod
-    def _should_skip_dynamo(cls) -> bool:
-        return False  # it would be loaded, which takes seconds
+def _on_values(func: Any, args: tuple, kwargs: dict) -> Any:
+    """An operation on the values that are held, which are on the CPU."""
+    plain = _mapped(held, kwargs)
+    if "device" in kwargs:
+        plain["device"] = torch.device("cpu")
+    return func(*_mapped(held, args), **plain)
 
 
 class _Counting(TorchDispatchMode):
+    """What goes through the dispatcher."""
+
     def __init__(self, counts: Counts) -> None:
         super().__init__()
         self.counts = counts
@@ -256,7 +250,7 @@ class _Counting(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False
+        return False  # it would be loaded, which takes seconds
 
 
 _NUMBERS = {
@@ -282,8 +276,7 @@ class _Entrances(TorchFunctionMode):
     """What does not go through the dispatcher as one would think."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        # Which of the devices is meant would be asked of the driver.
-        args, kwargs = tree_map(lambda x: DEVICE if _is_named(x) else x, (args, kwargs or {}))
+        args, kwargs = _mapped(_named, args), _mapped(_named, kwargs or {})
         if func in (torch.tensor, torch.as_tensor) and _is_there(kwargs.get("device")):
             return func(*args, **{**kwargs, "device": "cpu"}).to(DEVICE)
         if args and isinstance(args[0], Pretended):
@@ -299,60 +292,14 @@ class _Entrances(TorchFunctionMode):
             if func in _ALIKE:
                 return _ALIKE[func](*args, **kwargs)
             if func is Tensor.__getitem__:
-                return _item(args[0], args[1])
+                return item(args[0], args[1])
             if func is Tensor.__setitem__:
-                return _set_item(*args)
+                return set_item(*args)
         if func is Tensor.pin_memory:
-            return args[0]
+            pinned = args[0].clone()
+            pinned.pinned = True
+            return pinned
         return func(*args, **kwargs)
-
-
-def _item(tensor: Tensor, index: Any) -> Tensor:
-    """tensor[index]; torch's own asks for the driver."""
-    aten = torch.ops.aten
-    parts = list(index) if isinstance(index, tuple) else [index]
-    if Ellipsis in [part for part in parts if not isinstance(part, Tensor)]:
-        at = next(i for i, part in enumerate(parts) if part is Ellipsis)
-        taken = sum(_dimensions(part) for part in parts if part is not Ellipsis)
-        parts[at : at + 1] = [slice(None)] * (tensor.dim() - taken)
-    found, dim, picked = tensor, 0, []
-    for part in parts:
-        if part is None:
-            found = aten.unsqueeze(found, dim)
-        elif isinstance(part, slice):
-            if part != slice(None):
-                found = aten.slice(found, dim, part.start, part.stop, part.step or 1)
-        elif isinstance(part, int):
-            found, dim = aten.select(found, dim, part), dim - 1
-        else:
-            picked += [None] * (dim - len(picked)) + [torch.as_tensor(part)]
-            dim += _dimensions(part) - 1
-        dim += 1
-    return aten.index(found, picked) if picked else found
-
-
-def _set_item(tensor: Tensor, index: Any, value: Any) -> None:
-    """tensor[index] = value."""
-    parts = index if isinstance(index, tuple) else (index,)
-    value = value if isinstance(value, Tensor) else torch.tensor(value, dtype=tensor.dtype)
-    if not any(isinstance(part, (Tensor, list)) for part in parts):
-        there = _item(tensor, index)
-        if value.dim() == 0 and not isinstance(value, Pretended):
-            there.fill_(value.item())
-        else:
-            torch.ops.aten.copy_(there, value)
-        return
-    basic = [slice(None) if isinstance(part, (Tensor, list)) else part for part in parts]
-    assert all(isinstance(part, slice) for part in basic), "no such index is assigned to here"
-    picked = [torch.as_tensor(p) if isinstance(p, (Tensor, list)) else None for p in parts]
-    torch.ops.aten.index_put_(_item(tensor, tuple(basic)), picked, value)
-
-
-def _dimensions(part: Any) -> int:
-    """How many dimensions of a tensor a part of an index is about."""
-    if part is None:
-        return 0
-    return part.dim() if isinstance(part, Tensor) and part.dtype == torch.bool else 1
 
 
 _KEPT = (transfer.table, base._limits, overlap._tables)
@@ -370,6 +317,8 @@ def pretended_device() -> Iterator[Counts]:
     with (
         patch("torch.cuda._lazy_init", lambda: None),
         patch("torch.cuda.is_available", lambda: True),
+        # What torch does is seen in the thread that asks for it.
+        patch("toftrack.compute.threads.threads", lambda: 1),
         patch("torch.Generator", lambda device="cpu": generator()),
         # A module's parameters cannot become another class in place.
         patch("torch.__future__._overwrite_module_params_on_conversion", True),
@@ -379,110 +328,6 @@ def pretended_device() -> Iterator[Counts]:
         yield counts
     for kept in _KEPT:
         kept.cache_clear()
-
-
-@contextmanager
-def pretended_triton(counts: Counts) -> Iterator[None]:
-    """Within, `renderer=triton` launches kernels that do nothing, and the counts come from numba.
-
-    triton itself need not be there.
-    """
-    before = {name: module for name, module in sys.modules.items() if name in _TRITON_MODULES}
-    if importlib.util.find_spec("triton") is None:
-        sys.modules["triton"] = sys.modules["triton.language"] = _no_triton()
-    try:
-        scorer, motions = map(importlib.import_module, _TRITON_MODULES[-2:])
-        pairs = zip(motions.MOTIONS, rigid.MOTIONS, strict=True)
-        moved = Motions(*(_pretended_motion(there, here) for there, here in pairs))
-        with (
-            patch.multiple(scorer, **_kernels(scorer, counts)),
-            patch.multiple(motions, MOTIONS=moved, **_kernels(motions, counts)),
-            patch.object(scorer, "TritonScorer", _pretended_scorer(scorer.TritonScorer)),
-        ):
-            yield
-    finally:
-        for name in _TRITON_MODULES:
-            sys.modules.pop(name, None)
-        sys.modules.update(before)
-        for package, name in (("toftrack.compute", "rigid_triton"), ("toftrack.render", "triton")):
-            if f"{package}.{name}" not in before:
-                vars(sys.modules[package]).pop(name, None)
-
-
-_TRITON_MODULES = (
-    "triton",
-    "triton.language",
-    "toftrack.render.triton",
-    "toftrack.render.triton.kernel",
-    "toftrack.render.triton.scorer",
-    "toftrack.compute.rigid_triton",
-)
-
-
-def _no_triton() -> Any:
-    """What is used of the module but for running kernels."""
-    module: Any = ModuleType("triton")
-    module.language = module
-    module.jit = lambda function: function
-    module.cdiv = lambda size, block: -(-size // block)
-    module.next_power_of_2 = lambda size: 1 << (size - 1).bit_length()
-    return module
-
-
-def _kernels(module: ModuleType, counts: Counts) -> dict[str, _Kernel]:
-    return {name: _Kernel(name, counts) for name in vars(module) if name.endswith("_kernel")}
-
-
-class _Kernel:
-    """`kernel[grid](...)`, which runs nothing."""
-
-    def __init__(self, name: str, counts: Counts) -> None:
-        self.name, self.counts = name, counts
-
-    def __getitem__(self, grid: tuple[int, ...]) -> _Kernel:
-        assert all(isinstance(size, int) and size > 0 for size in grid)
-        return self
-
-    def __call__(self, *args: Any, **kwargs: Any) -> None:
-        given = [x for x in args if isinstance(x, Tensor)]
-        assert given and all(isinstance(x, Pretended) and x.is_contiguous() for x in given)
-        self.counts.launched(self.name)
-
-
-def _pretended_motion(
-    there: Callable[[Tensor, Tensor], Tensor], here: Callable[[Tensor, Tensor], Tensor]
-) -> Callable[[Tensor, Tensor], Tensor]:
-    """A motion that launches as one on the device does, with the numbers of one on the CPU."""
-
-    def moved(first: Tensor, second: Tensor) -> Tensor:
-        found = there(first, second)
-        held(found).copy_(here(held(first), held(second)))
-        return found
-
-    return moved
-
-
-def _pretended_scorer(kind: type) -> type:
-    class PretendedScorer(kind):  # type: ignore[misc]
-        """Launches as it does, with the counts of the compiled back end."""
-
-        def __init__(self, shape: HandShape, *args: Any, **kwargs: Any) -> None:
-            super().__init__(shape, *args, **kwargs)
-            self._here = NumbaScorer(_here(shape))
-
-        def __call__(self, states: Tensor, evidence: Evidence) -> scoring.Counts:
-            found = super().__call__(states, evidence)
-            right = self._here(held(states), _here(evidence))
-            for field_, values in zip(found, right, strict=True):
-                held(field_).copy_(values)
-            return found
-
-    return PretendedScorer
-
-
-def _here(parts: Any) -> Any:
-    """A dataclass of tensors with their values."""
-    return replace(parts, **{f.name: held(getattr(parts, f.name)) for f in fields(parts)})
 
 
 def held(x: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Between the host and the device of the particles: copies that are few, and tables kept there.
+"""Between the host and the device that particles are on: few copies, and tables kept there.
 
 The host waits for a copy from the device until all that was asked of it before is done, so what is
 wanted together comes together. It does not wait for a copy to the device from pinned memory. On the
@@ -38,4 +38,4 @@ def on_device(tensor: Tensor, device: torch.device) -> Tensor:
 def table(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Numbers that never change as a tensor, copied to a device once; not to be written to."""
     with torch.inference_mode(False):
-        return torch.tensor(values, dtype=dtype, device=device)
+        return on_device(torch.tensor(values, dtype=dtype), device)

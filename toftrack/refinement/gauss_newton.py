@@ -48,11 +48,8 @@ _AXIS_ROW = tuple(
 _ORIGIN_ROW = tuple(1 + 3 * finger + bone for finger, bone, _ in _JOINTS)
 # (16, 21) which angles move a point that is attached to a frame.
 _MOVES = tuple(
-    tuple(
-        frame > 0 and finger == (frame - 1) // 3 and bone <= (frame - 1) % 3
-        for finger, bone, _ in _JOINTS
-    )
-    for frame in range(16)
+    tuple(f > 0 and finger == (f - 1) // 3 and bone <= (f - 1) % 3 for finger, bone, _ in _JOINTS)
+    for f in range(16)
 )
 JOINT_FRAME = (
     0,
@@ -204,7 +201,7 @@ def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame
     Returns (N, P, 27): translation, small rotation about the wrist in the camera frame, angles.
     """
     frames, origins = pose.frames, pose.origins_m
-    axis_row, origin_row = (table(rows, torch.int64, x.device) for rows in (_AXIS_ROW, _ORIGIN_ROW))
+    axis_row, origin_row = table((_AXIS_ROW, _ORIGIN_ROW), torch.int64, x.device)
     base = (frames[:, 0] @ shape.base_frames[:, :, 2].mT).mT
     axes = torch.cat((frames[:, 1:, :, 0], base, frames[:, 1:2, :, 2]), 1)[:, axis_row]
     if shape.side == "left":  # a mirror turns the sense of rotation round
@@ -270,9 +267,9 @@ def _step(rows: Tensor, values: Tensor, off_prior: Tensor, settings: Refinement)
 
 def _moved(states: Tensor, step: Tensor) -> Tensor:
     """States after a step of translation, rotation in the camera frame and angles, in limits."""
-    limits = table(ANGLE_LIMITS, states.dtype, states.device)
+    low, high = table(ANGLE_LIMITS, states.dtype, states.device).unbind(1)
     turned = roma.rotvec_composition((step[:, 3:6], states[:, 3:6]))
-    bent = (states[:, 6:] + step[:, 6:]).clamp(limits[:, 0], limits[:, 1])
+    bent = (states[:, 6:] + step[:, 6:]).clamp(low, high)
     return torch.cat((states[:, :3] + step[:, :3], turned, bent), 1)
 
 

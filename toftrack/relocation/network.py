@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from toftrack.compute.transfer import table
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP_M
 
@@ -151,7 +152,7 @@ class PoseNet(nn.Module):
         present, right = heads[:, -2], heads[:, -1]
         each = heads[:, :-2].unflatten(1, (len(self.anchors), -1))
         turn, angles, size, pivot, chance, error = each.split((6, ANGLES, 1, 3, 1, 1), 2)
-        unit = turn.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+        unit = table((1.0, 0.0, 0.0, 0.0, 1.0, 0.0), turn.dtype, turn.device)
         turned = roma.special_gramschmidt((0.5 * turn + unit).unflatten(2, (2, 3)).mT)
         low, high = self.limits.unbind(1)
         return Proposed(

@@ -38,6 +38,8 @@ class Evidence:
 
     def to(self, device: torch.device) -> Evidence:
         """The same on a device, from the CPU."""
+        if device.type == "cpu":
+            return self
         given = self.low, self.high, self.occluder, self.hand, self.k
         low, high, occluder, hand, k = (on_device(image, device) for image in given)
         return Evidence(low, high, occluder, hand, k, self.radius_px)

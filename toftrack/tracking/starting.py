@@ -84,7 +84,8 @@ def started(track: Track | None, proposals: Proposals, dt_s: float, model: Track
     particles = proposals.particles
     if track is not None and isinstance(model.lost, LostSettings):
         ahead = displacement(track, dt_s, model.filter)
-        now = model.backend.motions.compose(on_host(track.particles)[0], ahead[None])
+        (before,) = on_host(track.particles)
+        now = model.backend.motions.compose(before, ahead[None])
         log_scores = proposals.log_scores
         # The search has seen this frame and the track has not, so a little better is no better.
         if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < model.lost.rival_gain:
