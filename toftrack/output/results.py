@@ -25,6 +25,7 @@ from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, LineFile, write_whole
 from toftrack.output.lines import HAND_FIELDS, KINDS, NUMBERS, json_line, strict
 from toftrack.output.reader_facts import facts_for_readers
+from toftrack.output.realtime import RealTime
 from toftrack.output.records import Records, write_archive
 from toftrack.output.summary import run_metrics, summarise
 
@@ -80,6 +81,8 @@ class ResultWriter:
         """The content of summary.json once the writer is closed."""
         self.frames = 0
         """How many were appended."""
+        self.realtime: RealTime | None = None
+        """How a live run kept up, for summary.json; to be set before the writer is closed."""
         self._truth = truth
         self._facts = {
             "format": RUN_FORMAT,
@@ -124,7 +127,7 @@ class ResultWriter:
             return
         self._closed = True
         try:
-            self.summary = finish(self.folder, self._facts, self._truth)
+            self.summary = finish(self.folder, self._facts, self._truth, self.realtime)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         finally:
@@ -142,10 +145,13 @@ class ResultWriter:
         self.close()
 
 
-def finish(folder: Path, facts: dict[str, Any], truth: Truth | None) -> dict[str, Any]:
+def finish(
+    folder: Path, facts: dict[str, Any], truth: Truth | None, realtime: RealTime | None = None
+) -> dict[str, Any]:
     """Make track.npz and summary.json of a run's lines; returns the summary.
 
     folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
+    realtime: of a live run; the lines do not tell it.
 
     Raises ToftrackError for damaged lines, OSError when something cannot be read or written.
     """
@@ -161,6 +167,8 @@ def finish(folder: Path, facts: dict[str, Any], truth: Truth | None) -> dict[str
             "metadata": np.array(json.dumps(metadata)),
         } | facts_for_readers(metadata)
         summary = summarise(records, len(rows), len(held), folder, metadata)
+        if realtime is not None:
+            summary["realtime"] = realtime.summary()
         if truth is not None and len(rows):
             metrics = run_metrics(records, rows, changed["index"], truth)
             summary |= {"metrics": metrics} if metrics else {}

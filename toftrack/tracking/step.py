@@ -34,7 +34,7 @@ from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.other_hand import OtherHand, without
 from toftrack.tracking.refining import refined
-from toftrack.tracking.relocating import expected_of, glanced, landmarks_of
+from toftrack.tracking.relocating import expected_of, glanced, landmarks_of, search_due
 from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.side_belief import SideBelief, probability
 from toftrack.tracking.sides import sided
@@ -73,6 +73,7 @@ def step(
     with spans("relocaliser"):
         alone = without(image, other)
         track, glance = glanced(state, dt_s, alone, model, other)
+        state = replace(state, unsearched_s=0.0) if search_due(state, model) else state
         state, track, glance = sided(state, track, glance, dt_s, alone, model, other)
         state = replace(state, size=_hand_told(state, track, glance, model))
     hand = model.hand(state.side, state.size)
@@ -181,6 +182,7 @@ def at(state: TrackerState, image: DepthImage) -> TrackerState:
     return replace(
         state,
         seen=aged(state.seen, passed),
+        unsearched_s=state.unsearched_s + passed,
         next_index=image.index + 1,
         timestamp_s=image.timestamp_s,
     )
