@@ -10,11 +10,11 @@ the hand, so that turning the hand does not also carry it away, as turning about
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Motions
+from toftrack.compute.rotations import rotvec_composition, unitquat_to_rotvec
 
 PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
@@ -23,7 +23,7 @@ PIVOT_M = (0.0, -0.085, 0.0)
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """Particles at tangent offsets from reference particles; (N, 6 + d) or broadcast, each."""
     reference, tangent = torch.broadcast_tensors(reference, tangent)
-    rotvec = roma.rotvec_composition((tangent[:, 3:6], reference[:, 3:6]))
+    rotvec = rotvec_composition(tangent[:, 3:6], reference[:, 3:6])
     translation = _pivot(reference) + tangent[:, :3] - rotated_pivot(rotvec)
     return torch.cat((translation, rotvec, reference[:, 6:] + tangent[:, 6:]), 1)
 
@@ -31,7 +31,7 @@ def compose(reference: Tensor, tangent: Tensor) -> Tensor:
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
     """Tangent offsets of particles from one reference, (N, 6 + d) and (1, 6 + d) to (N, 6 + d)."""
     inverse = -reference[:, 3:6].expand(len(particles), 3)
-    turn = roma.rotvec_composition((particles[:, 3:6], inverse))
+    turn = rotvec_composition(particles[:, 3:6], inverse)
     move = _pivot(particles) - _pivot(reference)
     return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
 
@@ -66,4 +66,4 @@ def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
     # 2007), whatever their signs.
     scatter = (q * weights[:, None]).mT @ q
     main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
-    return roma.unitquat_to_rotvec(main).to(rotvec.dtype)
+    return unitquat_to_rotvec(main).to(rotvec.dtype)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import roma
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from toftrack.compute.rotations import rotmat_to_rotvec
 from toftrack.relocation.crops import crop, wide
 from toftrack.relocation.network import STRIDE, Finder, PoseNet
 
@@ -113,7 +113,7 @@ def look(
         return values[torch.arange(len(order))[:, None], order]
 
     pivot = ordered(p.pivot_m) @ turn.mT + centre[:, None]
-    rotvec = roma.rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))
+    rotvec = rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))
     joints = p.joints_m @ turn.mT + centre[:, None]
     if side == "left":
         pivot, joints, rotvec = pivot * _MIRROR, joints * _MIRROR, rotvec * _MIRROR_TURN

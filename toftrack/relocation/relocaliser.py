@@ -9,12 +9,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rotations import rotvec_to_rotmat
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -94,7 +94,7 @@ class Glance:
     def states(self, ratio: float) -> Tensor:
         """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
         pivot = self.pivot_m.new_tensor(PIVOT_M) * ratio
-        wrist = self.pivot_m - roma.rotvec_to_rotmat(self.rotvec) @ pivot
+        wrist = self.pivot_m - rotvec_to_rotmat(self.rotvec) @ pivot
         return torch.cat((wrist, self.rotvec, self.angles), 1)
 
     @property

@@ -34,28 +34,27 @@ class Effort:
         they help.
     every: frames from one look of the networks to the next at a hand that is believed.
     search: likewise from one search of the whole image to the next, while none is.
-    share: of the particles, and of the poses with another finger that are tried.
-    rivals, places, passes, iterations: at most.
+    swaps: part of the poses with another finger that are tried.
+    rivals, places: at most.
     """
 
     threads: int | None = None
     every: int = 1
     search: int = 1
-    share: float = 1.0
+    swaps: float = 1.0
     rivals: int | None = None
     places: int | None = None
-    passes: int | None = None
-    iterations: int | None = None
 
 
 LEVELS = (
     Effort(),
     Effort(threads=1),
-    Effort(1, every=2, search=2, share=0.7, places=2),
-    Effort(1, every=3, search=3, share=0.5, rivals=1, places=1),
-    Effort(1, every=4, search=5, share=0.35, rivals=1, places=1, passes=1, iterations=3),
+    Effort(1, every=2, search=2, places=2),
+    Effort(1, every=3, search=3, swaps=0.5, rivals=2, places=1),
+    Effort(1, every=4, search=5, swaps=0.25, rivals=1, places=1),
 )
-"""All effort first; each leaves out more than the one before."""
+"""All effort first; each leaves out more than the one before. Fewer particles or passes save little
+and cost much of the accuracy: rather frames are dropped."""
 REDUCED = 2
 """The first level that leaves something out of the estimate."""
 

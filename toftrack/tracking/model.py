@@ -171,14 +171,9 @@ def _spending(model: TrackerModel, effort: Effort) -> TrackerModel:
     if effort == Effort(effort.threads):
         return model
 
-    def part(count: int) -> int:
-        return math.ceil(effort.share * count)
-
-    cfg, refinement, relocaliser = model.filter, model.refinement, model.relocaliser
-    cfg = replace(cfg, particles=part(cfg.particles), passes=_least(cfg.passes, effort.passes))
+    refinement, relocaliser = model.refinement, model.relocaliser
     if refinement is not None:
-        iterations = _least(refinement.iterations, effort.iterations)
-        refinement = replace(refinement, swaps=part(refinement.swaps), iterations=iterations)
+        refinement = replace(refinement, swaps=math.ceil(effort.swaps * refinement.swaps))
     if relocaliser is not None:
         told = relocaliser.settings
         told = replace(
@@ -189,7 +184,7 @@ def _spending(model: TrackerModel, effort: Effort) -> TrackerModel:
             places=_least(told.places, effort.places),
         )
         relocaliser = replace(relocaliser, settings=told)
-    made = replace(model, filter=cfg, refinement=refinement, relocaliser=relocaliser)
+    made = replace(model, refinement=refinement, relocaliser=relocaliser)
     vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the effort
     return made
 
