@@ -31,9 +31,9 @@ def test_conversions_are_romas(rotvecs: Tensor) -> None:
         rotations.rotmat_to_rotvec(matrices), roma.rotmat_to_rotvec(matrices)
     )
     quaternions = roma.rotvec_to_unitquat(rotvecs)
-    torch.testing.assert_close(
-        rotations.unitquat_to_rotvec(quaternions), roma.unitquat_to_rotvec(quaternions)
-    )
+    for name in ("unitquat_to_rotvec", "unitquat_to_rotmat"):
+        ours, theirs = getattr(rotations, name), getattr(roma, name)
+        torch.testing.assert_close(ours(quaternions), theirs(quaternions))
 
 
 def test_products_and_distances_are_romas(rotvecs: Tensor) -> None:

@@ -73,6 +73,17 @@ def unitquat_to_rotvec(quaternion: Tensor) -> Tensor:
     return (2.0 * factor)[..., None] * quaternion[..., :3]
 
 
+def unitquat_to_rotmat(quaternion: Tensor) -> Tensor:
+    """(..., 4) to (..., 3, 3)."""
+    x, y, z, w = quaternion.unbind(-1)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
 def special_gramschmidt(matrix: Tensor) -> Tensor:
     """(..., 3, 2) or more columns to the rotations (..., 3, 3) that the first two span."""
     x, y = matrix[..., 0], matrix[..., 1]
