@@ -16,7 +16,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from toftrack.api import build_hands_tracker
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, confidence_words, is_vacant
@@ -29,6 +28,7 @@ from toftrack.output.results import ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import endings
+from toftrack.programs.ahead import ready_tracker
 from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata, told_side
 from toftrack.tracking.conventions import in_all_conventions
 from toftrack.tracking.effort import Pace
@@ -47,7 +47,7 @@ def track(config: DictConfig, device: Device) -> float:
 
 
 def _track(config: DictConfig, device: Device, stream: Stream) -> float:
-    tracker = build_hands_tracker(config)
+    tracker = ready_tracker(config)
     tracker.time.pace = _pace(tracker.time.pace, device)
     reach_m = float(config.segmentation.get("max_distance_m", math.inf))
     make = hydra.utils.instantiate
@@ -78,6 +78,8 @@ def _notes(parts: _Parts, side: str | None) -> tuple[str, ...]:
 def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     ended: KeyboardInterrupt | None = None
+    if device.live:
+        parts.tracker.prepare()  # a camera does not wait for what is loaded at the first frame
     with device:
         metadata = run_metadata(config, device, parts.tracker)
         print(opening(metadata, device), file=sys.stderr)

@@ -16,8 +16,11 @@ from toftrack.compute.threads import at_most, small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import DepthImage, checked_image
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import PoseSpace
+from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Scorer
 from toftrack.render.segmentation import reduce_image
 from toftrack.tracking.effort import Pace, Timekeeper
@@ -44,6 +47,8 @@ _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track is given up when it was not believed for so long, and looked for so much later."""
 _ONE_S = 0.15
 """Two tracks that were believed may be on one hand for so long."""
+_RENDERED_PX = 72, 88
+"""Size of an image that nobody sees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +185,10 @@ class HandsTracker:
         took_s = self.time.took_s()
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
 
+    def prepare(self) -> None:
+        """Load and compile now what the first frame would have to wait for; changes nothing."""
+        step(self.states[0], _rendered_hand(), self.model)
+
     def restart(self, side: str | None = None) -> None:
         """Forget the hands, see Tracker.restart; a side is the first one's."""
         first, *others = self.states
@@ -220,3 +229,14 @@ class HandsTracker:
         return tuple(
             None if info is None or info.observation.empty else info for info in self.infos
         )
+
+
+def _rendered_hand() -> DepthImage:
+    """A small image of an open hand before a wall."""
+    shape, (height, width) = default_hand_shape(), _RENDERED_PX
+    state = torch.zeros(1, 27)
+    state[0, 1:3] = torch.tensor([0.08, 0.5])
+    k = torch.tensor([[110.0, 0, width / 2], [0, 110.0, height / 2], [0, 0, 1]])
+    hand = hand_surface(shape).pose(forward_kinematics(state, shape))
+    depth = render_range_images(hand, k, height, width)[0]
+    return DepthImage(torch.where(depth > 0, depth, 1.5).numpy(), k.double().numpy(), 0, 0.0)
