@@ -16,12 +16,14 @@ _USED = 0.9
 """Part of the budget that frames may take on average; the rest is for those that take longer."""
 _EASY = 0.65
 """Where they take less than this part, more is tried again."""
-_NEW = 0.25
+_NEW = 0.2
 """Part of the newest frame in the average."""
 _FEWEST = 4
 """Frames that a level is judged by at least."""
-_MOST = 3.0
+_MOST = 2.0
 """Times the budget that a single frame counts at most: one may be late for any reason."""
+_FAR = 1.6
+"""Where they take so many times as much on average, a level is passed over."""
 _PATIENCE, _MOST_PATIENT = 30, 960
 """Frames at ease before more is tried; twice as many after each time that it was too much."""
 
@@ -113,7 +115,7 @@ class Pace:
 
     def _less(self, mean_s: float) -> Pace:
         assert self.budget_s is not None
-        steps = 2 if mean_s > 2 * self.budget_s else 1
+        steps = 2 if mean_s > _FAR * self.budget_s else 1
         patience = min(2 * self.patience, _MOST_PATIENT) if self.trying else self.patience
         return Pace(self.budget_s, min(self.level + steps, len(LEVELS) - 1), patience=patience)
 
