@@ -114,7 +114,7 @@ class _Parts:
     watch: Watch
     shapes: ShapeFiles
     realtime: RealTime
-    """As of the newest frame."""
+    """As of the newest frame; of a recording nothing."""
 
 
 def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) -> None:
@@ -164,9 +164,11 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
                 view.show(TrackedFrame(frame, depth, device.camera, hands))
                 bar.update()
-                parts.realtime = parts.realtime.after(
-                    frame.timestamp_s, tracker.time.took_s(), tracker.time.reduced, device.dropped
-                )
+                if device.live:
+                    took_s, reduced = tracker.time.took_s(), tracker.time.reduced
+                    parts.realtime = parts.realtime.after(
+                        frame.timestamp_s, took_s, reduced, device.dropped
+                    )
                 bar.set_postfix_str(_progress_words(estimates, parts), refresh=False)
 
 
