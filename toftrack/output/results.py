@@ -25,6 +25,7 @@ from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, LineFile, write_whole
 from toftrack.output.lines import FROM_THE_START, HAND_FIELDS, KINDS, SHAPES, json_line, strict
 from toftrack.output.reader_facts import facts_for_readers
+from toftrack.output.realtime import RealTime
 from toftrack.output.records import Records, write_archive
 from toftrack.output.summary import run_metrics, summarise
 
@@ -68,6 +69,8 @@ class ResultWriter:
         """The content of summary.json once the writer is closed."""
         self.frames = 0
         """How many were appended."""
+        self.realtime: RealTime | None = None
+        """How a live run kept up, for summary.json; to be set before the writer is closed."""
         self._truth = truth
         self._facts = {
             "format": RUN_FORMAT,
@@ -117,7 +120,7 @@ class ResultWriter:
         self._closed = True
         try:
             with self._records or records_of(self.folder, self._facts) as records:
-                self.summary = finish(self.folder, self._facts, self._truth, records)
+                self.summary = finish(self.folder, self._facts, self._truth, records, self.realtime)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         finally:
@@ -152,11 +155,16 @@ def records_of(folder: Path, facts: dict[str, Any]) -> Records:
 
 
 def finish(
-    folder: Path, facts: dict[str, Any], truth: Truth | None, records: Records
+    folder: Path,
+    facts: dict[str, Any],
+    truth: Truth | None,
+    records: Records,
+    realtime: RealTime | None = None,
 ) -> dict[str, Any]:
     """Make track.npz and summary.json of a run's frames; returns the summary.
 
     folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
+    realtime: of a live run; the lines do not tell it.
 
     Raises OSError when something cannot be read or written.
     """
@@ -169,6 +177,8 @@ def finish(
         "metadata": np.array(json.dumps(metadata)),
     } | facts_for_readers(metadata)
     summary = summarise(records, len(rows), len(held), folder, metadata)
+    if realtime is not None:
+        summary["realtime"] = realtime.summary()
     if truth is not None and len(rows):
         metrics = run_metrics(records, rows, changed["index"], truth)
         summary |= {"metrics": metrics} if metrics else {}

@@ -20,11 +20,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
+from toftrack.compute.rotations import rotvec_composition
 from toftrack.compute.transfer import table
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
@@ -268,7 +268,7 @@ def _step(rows: Tensor, values: Tensor, off_prior: Tensor, settings: Refinement)
 def _moved(states: Tensor, step: Tensor) -> Tensor:
     """States after a step of translation, rotation in the camera frame and angles, in limits."""
     low, high = table(ANGLE_LIMITS, states.dtype, states.device).unbind(1)
-    turned = roma.rotvec_composition((step[:, 3:6], states[:, 3:6]))
+    turned = rotvec_composition(step[:, 3:6], states[:, 3:6])
     bent = (states[:, 6:] + step[:, 6:]).clamp(low, high)
     return torch.cat((states[:, :3] + step[:, :3], turned, bent), 1)
 
