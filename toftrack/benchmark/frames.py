@@ -21,14 +21,17 @@ CONFIGURATIONS: dict[str, tuple[str, ...]] = {
     "default": (),
     "paper": ("experiment=paper",),
 }
-PARTS = (
-    "relocaliser",
-    "segmentation and evidence",
-    "filter: scoring",
-    "filter: rest",
-    "refinement",
-    "rest",
-)
+BUDGET_MS = {
+    "relocaliser": 1.5,
+    "segmentation and evidence": 0.7,
+    "filter: scoring": 1.5,
+    "filter: rest": 1.0,
+    "refinement": 1.5,
+    "rest": 0.8,
+}
+"""What a frame is made of, and what each part may take, milliseconds. Of the networks, which look
+beside the filter where there is a second core, only what is waited for counts."""
+PARTS = tuple(BUDGET_MS)
 _CONF = configuration_folder()
 _FEWEST = 12
 _STARTS = 6

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from threading import Lock
+from typing import TypeVar
 
 import torch
 
+Result = TypeVar("Result")
 _given: ContextVar[int | None] = ContextVar("toftrack_threads", default=None)
+_most: ContextVar[int | None] = ContextVar("toftrack_most_threads", default=None)
 
 
 @dataclass
@@ -29,11 +33,21 @@ _lock = Lock()
 
 
 def threads() -> int:
-    """As many as torch may use, but no more than there are cores for this process."""
-    count = _given.get() or torch.get_num_threads()
+    """As many as torch may use, but no more than there are cores for this process, or `at_most`."""
+    count = min(_given.get() or torch.get_num_threads(), _most.get() or sys.maxsize)
     if hasattr(os, "sched_getaffinity"):
         count = min(count, len(os.sched_getaffinity(0)))
     return max(1, count)
+
+
+@contextmanager
+def at_most(count: int | None) -> Iterator[None]:
+    """Within, `threads` says no more than that; None changes nothing."""
+    token = _most.set(count or _most.get())
+    try:
+        yield
+    finally:
+        _most.reset(token)
 
 
 @contextmanager
@@ -79,6 +93,16 @@ def run_shared(task: Callable[[], object], parts: int) -> None:
         # A helper that has not begun has nothing left to do.
         if not other.cancel():
             other.result()
+
+
+def beside(task: Callable[[], Result]) -> Callable[[], Result]:
+    """Begin a task in another thread, if there may be one; what is returned waits for its result.
+
+    The task must not need the interpreter's lock for long, or the threads wait for each other.
+    """
+    if threads() == 1:
+        return task
+    return _pool(os.getpid()).submit(task).result
 
 
 @functools.cache

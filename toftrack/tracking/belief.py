@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 from toftrack.checks import check_number
 from toftrack.compute.pace import FRAME_S
 from toftrack.errors import ToftrackError
 from toftrack.tracking.joint_belief import JointBelief
-from toftrack.tracking.life_cycle import Belief, lasted, longer
+from toftrack.tracking.life_cycle import Belief, bad_for, lasted
 from toftrack.tracking.signs import SIGNS, Signs
 from toftrack.tracking.state import Track
 
@@ -65,7 +66,12 @@ class CalibratedBelief:
 
     def log_odds(self, signs: Signs) -> float:
         """That every joint is within 40 mm, from one frame."""
-        return self.intercept + sum(w * getattr(signs, name) for name, w in self.weights.items())
+        return self.intercept + sum(w * getattr(signs, name) for name, w in self._weights)
+
+    @cached_property
+    def _weights(self) -> list[tuple[str, float]]:
+        # A mapping out of a configuration takes microseconds for each of its items.
+        return [(name, float(weight)) for name, weight in self.weights.items()]
 
     def judge(
         self, track: Track, signs: Signs, dt_s: float, side: float = 1.0, second: bool = False
@@ -80,7 +86,7 @@ class CalibratedBelief:
         kept = self.memory ** (dt_s / FRAME_S)
         smooth = now if before is None else kept * before + (1 - kept) * now
         confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
-        bad = longer(track.bad_s, dt_s) if confidence < self.give_up else 0.0
+        bad = bad_for(track.bad_s, dt_s) if confidence < self.give_up else 0.0
         # What is hidden is waited for.
         patience = self.patience * (_WAITED if signs.hidden > _HIDDEN else 1)
         ends = patience > 0 and bad > 0 and lasted(bad, patience)

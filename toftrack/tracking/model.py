@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
 import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Backend
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import ToftrackError
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand.shape import HandShape
@@ -20,9 +22,10 @@ from toftrack.pose_space.density import LatentDensity, latent_density
 from toftrack.refinement.gauss_newton import Refinement, Refiner
 from toftrack.relocation.relocaliser import Glance, Relocaliser
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import Evidence, Scorer
+from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.belief import CalibratedBelief
+from toftrack.tracking.effort import Effort
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
@@ -61,7 +64,7 @@ class SizedHand:
 
 @dataclass(frozen=True, eq=False)
 class TrackerModel:
-    """The parts of a tracker; shape and pose space on the device that everything is computed on.
+    """The parts of a tracker, on the CPU but for those that the back end makes.
 
     shape: the hand as configured, before any of its size was fitted.
     refinement: None leaves the filter's estimate as it is.
@@ -96,8 +99,24 @@ class TrackerModel:
 
     @property
     def device(self) -> torch.device:
-        """Where everything is computed."""
+        """Where the particles are."""
         return self.backend.device
+
+    def space_of(self, particles: Tensor) -> PoseSpace:
+        """The pose space where particles are."""
+        return self.space if particles.device.type == "cpu" else self._space_there
+
+    @cached_property
+    def _space_there(self) -> PoseSpace:
+        return self.space.to(self.device)
+
+    def spending(self, effort: Effort) -> TrackerModel:
+        """The same tracker with less effort; itself where nothing is left out."""
+        return self._spending(effort)
+
+    @cached_property
+    def _spending(self) -> Callable[[Effort], TrackerModel]:
+        return lru_cache(partial(_spending, self))
 
     @property
     def rivals(self) -> int:
@@ -122,12 +141,13 @@ class TrackerModel:
 
     @cached_property
     def _density(self) -> LatentDensity | None:
-        return latent_density(self.space) if self.filter.density else None
+        space = self.space if self.device.type == "cpu" else self._space_there
+        return latent_density(space) if self.filter.density else None
 
     @cached_property
     def poses(self) -> Tensor:
         """(M, 21) rad, natural poses, to take single fingers from."""
-        return natural_poses().to(self.device)
+        return natural_poses()
 
     def hand(self, side: str, belief: SizeBelief | ShapeBelief | None) -> SizedHand:
         """The hand of a side in the size or the shape that is believed in."""
@@ -142,7 +162,8 @@ class TrackerModel:
 
     def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
         """(N, 6 + d) particles to (N, 27) hand states, all displaced by `offset` (21,) rad."""
-        angles = clamp_to_joint_limits(self.space.decode(particles[:, 6:]) + offset)
+        decoded = self.space_of(particles).decode(particles[:, 6:])
+        angles = clamp_to_joint_limits(decoded + offset)
         return torch.cat((particles[:, :6], angles), 1)
 
     def encode(self, states: Tensor) -> Tensor:
@@ -157,6 +178,32 @@ class TrackerModel:
         return particle, state[0, 6:] - self.space.decode(particle[:, 6:])[0]
 
 
+def _spending(model: TrackerModel, effort: Effort) -> TrackerModel:
+    if effort == Effort(effort.threads):
+        return model
+
+    refinement, relocaliser = model.refinement, model.relocaliser
+    if refinement is not None:
+        refinement = replace(refinement, swaps=math.ceil(effort.swaps * refinement.swaps))
+    if relocaliser is not None:
+        told = relocaliser.settings
+        told = replace(
+            told,
+            every=max(told.every, effort.every),
+            search=max(told.search, effort.search),
+            rivals=_least(told.rivals, effort.rivals),
+            places=_least(told.places, effort.places),
+        )
+        relocaliser = replace(relocaliser, settings=told)
+    made = replace(model, refinement=refinement, relocaliser=relocaliser)
+    vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the effort
+    return made
+
+
+def _least(count: int, most: int | None) -> int:
+    return count if most is None else min(count, most)
+
+
 def _sized_hand(
     shape: HandShape, backend: Backend, side: str, ratio: float, worn: tuple[float, ...]
 ) -> SizedHand:
@@ -169,6 +216,7 @@ def _sized_hand(
 class ObservedFrame:
     """A frame that may show a hand, and the hand looked for: the judge of hypotheses.
 
+    evidence: on the model's device.
     glance: what the networks say of the hand.  seen: the hand as it was last believed.
     other: another hand that is tracked as well.
     """
@@ -189,13 +237,24 @@ class ObservedFrame:
             return bool(occluder.any())
         return int(occluder.sum()) > _HIDDEN * int(self.observation.hand.sum())
 
+    def counts(self, states: Tensor, evidence: Evidence | None = None) -> Counts:
+        """(N, 27) hands, on the CPU or the model's device, counted there and told where they are.
+
+        evidence: instead of the frame's own, on the model's device.
+        """
+        evidence = evidence or self.evidence
+        if states.device.type != "cpu":
+            return self.hand.scorer(states, evidence)
+        there = on_device(states, self.model.device)
+        return Counts(*on_host(*self.hand.scorer(there, evidence)))
+
     def log_scores(self, states: Tensor, coverage: float | None = None) -> Tensor:
         """(N, 27) hands to (N,) what they are weighed by, see FMeasure.log_score."""
-        return self.model.likelihood.log_score(self.hand.scorer(states, self.evidence), coverage)
+        return self.model.likelihood.log_score(self.counts(states), coverage)
 
     def score(self, state: Tensor) -> float:
         """(1, 27) to the likelihood head's score, 0..1."""
-        return float(self.model.likelihood.score(self.hand.scorer(state, self.evidence)))
+        return float(self.model.likelihood.score(self.counts(state)))
 
 
 def observed(
@@ -206,7 +265,6 @@ def observed(
     seen: LastSeen | None = None,
     other: OtherHand | None = None,
 ) -> ObservedFrame:
-    """A segmented frame on the model's device, which is not empty."""
-    observation = observation.to(model.device)
-    evidence = model.likelihood.evidence(observation)
+    """A segmented frame, which is not empty; its evidence is on the model's device."""
+    evidence = model.likelihood.evidence(observation).to(model.device)
     return ObservedFrame(observation, evidence, hand, model, glance, seen, other)
