@@ -21,6 +21,7 @@ except ImportError:  # there is no numba
         """As toftrack.render.numba.median.thinned."""
         return cv2.medianBlur(image, 5)[offset::factor, offset::factor]
 
+
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""
 

@@ -1,4 +1,4 @@
-"""The median filter of segmentation.reduce_image in compiled code, only where its result is read."""
+"""The median filter of segmentation.reduce_image, compiled, and only where its result is read."""
 
 from __future__ import annotations
 
@@ -126,9 +126,7 @@ def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
 
     def call() -> None:
         counter = np.zeros(1, np.int64)
-        run_shared(
-            functools.partial(_thinned, image, factor, offset, counter, _TASKS, out), _TASKS
-        )
+        run_shared(functools.partial(_thinned, image, factor, offset, counter, _TASKS, out), _TASKS)
 
     if _thinned.signatures:
         call()
