@@ -1,4 +1,4 @@
-"""The median filter of segmentation.reduce_image, compiled, only where its result is read."""
+"""The median filter of segmentation.reduce_image, compiled, and only where its result is read."""
 
 from __future__ import annotations
 
