@@ -75,7 +75,7 @@ def frame_times(
     configurations: overrides by name; None = CONFIGURATIONS.
     Raises ToftrackError where the configuration files are not beside the package.
     """
-    rows = []
+    rows: list[FrameRow] = []
     for name, overrides in (configurations or CONFIGURATIONS).items():
         config = _config([*overrides, f"compute={device.type}"])
         enlarged = () if rows else SIZES
