@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from toftrack.devices.base import Device
+    from toftrack.tracking.effort import Pace
     from toftrack.tracking.hands import HandsTracker
     from toftrack.tracking.model import TrackerModel
     from toftrack.tracking.tracker import Tracker
@@ -83,14 +84,23 @@ def build_tracker(config: DictConfig) -> Tracker:
     # These take seconds: an override's error comes before.
     from toftrack.tracking.tracker import Tracker
 
-    return Tracker(build_model(config), config.seed)
+    return Tracker(build_model(config), config.seed, pace=_pace(config))
 
 
 def build_hands_tracker(config: DictConfig) -> HandsTracker:
     """The tracker of as many hands as a configuration says."""
     from toftrack.tracking.hands import HandsTracker
 
-    return HandsTracker(build_model(config), config.seed, config.get("hands", 1))
+    hands = config.get("hands", 1)
+    return HandsTracker(build_model(config), config.seed, hands, pace=_pace(config))
+
+
+def _pace(config: DictConfig) -> Pace:
+    """Who gives a budget to a tracker of their own has a camera that does not wait."""
+    from toftrack.tracking.effort import pace_within
+
+    # A configuration of one's own may do without.
+    return pace_within((config.get("tracker") or {}).get("budget_ms"))
 
 
 def build_model(config: DictConfig) -> TrackerModel:

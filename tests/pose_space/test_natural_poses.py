@@ -64,3 +64,11 @@ def test_the_recorded_poses_are_those_of_hands() -> None:
     assert recorded.shape[1] == 21 and len(recorded) > 100
     # Recorded hands bend a little beyond what clinics tabulate.
     assert (recorded > LOW - 0.35).all() and (recorded < HIGH + 0.35).all()
+
+
+def test_the_poses_that_are_kept_are_the_sampled_ones() -> None:
+    """They are kept since drawing them takes a second: if this fails, keep the new ones."""
+    recorded = poses.recorded_poses()
+    kept = poses.natural_poses()
+    assert torch.equal(kept[: len(recorded)], recorded)
+    torch.testing.assert_close(kept[len(recorded) :], poses.sampled_poses())

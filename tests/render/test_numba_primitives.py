@@ -15,11 +15,12 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.render.closed_form import project
 from toftrack.render.disc import disc_steps
-from toftrack.render.numba import hand, missed, vector
+from toftrack.render.numba import hand, missed, vector, words
 from toftrack.render.numba.hand import LANES, TERMS
 from toftrack.render.numba.kernel import pack_evidence
 from toftrack.render.numba.scorer import NumbaScorer
-from toftrack.render.numba.vector import BLOCK, WORDS
+from toftrack.render.numba.vector import BLOCK
+from toftrack.render.numba.words import WORDS
 from toftrack.render.reference import dilate_disc
 from toftrack.render.torch_scorer import Outlines, outlines
 
@@ -40,7 +41,7 @@ ROWS = {
 WIDTH, HEIGHT = 176, 144
 K = torch.tensor([[170.0, 0.0, 88.2], [0.0, 175.0, 71.8], [0.0, 0.0, 1.0]])
 
-_cached = entry_point(__file__, *(module.__file__ for module in (hand, missed, vector)))
+_cached = entry_point(__file__, *(module.__file__ for module in (hand, missed, vector, words)))
 
 
 @_cached

@@ -13,12 +13,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Motions
 from toftrack.compute.redraw import redraw_with
+from toftrack.compute.rotations import rotvec_composition, unitquat_to_rotvec
 from toftrack.compute.transfer import on_host, table
 
 PIVOT_M = (0.0, -0.085, 0.0)
@@ -29,7 +29,7 @@ _X, _Y, _Z = PIVOT_M
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """Particles at tangent offsets from reference particles; (N, 6 + d) or broadcast, each."""
     reference, tangent = torch.broadcast_tensors(reference, tangent)
-    rotvec = roma.rotvec_composition((tangent[:, 3:6], reference[:, 3:6]))
+    rotvec = rotvec_composition(tangent[:, 3:6], reference[:, 3:6])
     translation = _pivot(reference) + tangent[:, :3] - rotated_pivot(rotvec)
     return torch.cat((translation, rotvec, reference[:, 6:] + tangent[:, 6:]), 1)
 
@@ -37,7 +37,7 @@ def compose(reference: Tensor, tangent: Tensor) -> Tensor:
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
     """Tangent offsets of particles from one reference, (N, 6 + d) and (1, 6 + d) to (N, 6 + d)."""
     inverse = -reference[:, 3:6].expand(len(particles), 3)
-    turn = roma.rotvec_composition((particles[:, 3:6], inverse))
+    turn = rotvec_composition(particles[:, 3:6], inverse)
     move = _pivot(particles) - _pivot(reference)
     return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
 
@@ -92,7 +92,7 @@ def rotation_scatter(rotvec: Tensor, weights: Tensor) -> Tensor:
 
 def main_rotation(scatter: Tensor) -> Tensor:
     """The mean rotation (3,) of what `rotation_scatter` has summed up, float64."""
-    return roma.unitquat_to_rotvec(torch.linalg.eigh(scatter).eigenvectors[:, -1])
+    return unitquat_to_rotvec(torch.linalg.eigh(scatter).eigenvectors[:, -1])
 
 
 def mean(particles: Tensor, weights: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ import torch
 
 Result = TypeVar("Result")
 _given: ContextVar[int | None] = ContextVar("toftrack_threads", default=None)
+_most: ContextVar[int | None] = ContextVar("toftrack_most_threads", default=None)
 
 
 @dataclass
@@ -31,11 +33,21 @@ _lock = Lock()
 
 
 def threads() -> int:
-    """As many as torch may use, but no more than there are cores for this process."""
-    count = _given.get() or torch.get_num_threads()
+    """As many as torch may use, but no more than there are cores for this process, or `at_most`."""
+    count = min(_given.get() or torch.get_num_threads(), _most.get() or sys.maxsize)
     if hasattr(os, "sched_getaffinity"):
         count = min(count, len(os.sched_getaffinity(0)))
     return max(1, count)
+
+
+@contextmanager
+def at_most(count: int | None) -> Iterator[None]:
+    """Within, `threads` says no more than that; None changes nothing."""
+    token = _most.set(count or _most.get())
+    try:
+        yield
+    finally:
+        _most.reset(token)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterator
 
+import yaml
 from hydra.errors import HydraException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -28,6 +29,8 @@ def sentence(error: BaseException) -> str:
         # Some of Hydra's errors are OSErrors too, without being of the system.
         if isinstance(cause, OSError) and not isinstance(cause, HydraException):
             return _of_system(cause)
+        if isinstance(cause, yaml.YAMLError):
+            return f"a file of the configuration is no YAML: {_one_line(str(cause))}; mend it there"
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
         return (
             f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "

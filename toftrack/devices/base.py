@@ -27,6 +27,10 @@ class Device(Protocol):
     """Facts for the result's metadata, JSON-able."""
     metadata: dict[str, Any]
     """What the recording says about itself."""
+    live: bool
+    """Frames do not wait: the newest is delivered, and what comes too late is dropped."""
+    dropped: int
+    """Frames of the latest iteration that nobody was there to take; 0 unless `live`."""
 
     def open(self) -> None: ...
 
@@ -47,6 +51,7 @@ class BaseDevice:
         fps: frames a second; what the overlay video plays at.
         frames: how many an iteration yields at most; None = nobody knows.
         truth: one row for each of `frames`.
+        live: frames do not wait, and what comes too late is dropped and counted in `dropped`.
     """
 
     def __init__(
@@ -55,8 +60,10 @@ class BaseDevice:
         fps: float = 30.0,
         frames: int | None = None,
         truth: Truth | None = None,
+        live: bool = False,
     ) -> None:
         self.camera, self.fps, self.frames, self.truth = camera, float(fps), frames, truth
+        self.live, self.dropped = live, 0
         self.description: dict[str, Any] = {"device": type(self).__name__}
         self.metadata: dict[str, Any] = {}
 

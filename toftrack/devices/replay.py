@@ -91,6 +91,7 @@ class Replay(BaseDevice):
             store.fps,
             frames=None if self._repeat else len(self._range),
             truth=None if truth is None else truth[self._range.start : self._range.stop],
+            live=self._realtime,
         )
         self.metadata = store.metadata
         self.description: dict[str, Any] = {
@@ -102,8 +103,6 @@ class Replay(BaseDevice):
             "repeat": self._repeat,
             "camera_file": None if camera_file is None else str(camera_file),
         }
-        self.dropped = 0
-        """Frames that came too late in the latest iteration; always 0 unless `realtime`."""
 
     def close(self) -> None:
         """Close the recording's file, if it is open."""

@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
+from toftrack.compute.rotations import rotvec_to_rotmat, unitquat_to_rotmat
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
@@ -136,7 +136,7 @@ def openxr_hand(joints_m: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> Open
 
 def _placed(joints: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> tuple[np.ndarray, np.ndarray]:
     """(N, 21, 3) and (N, 27) to positions (N, 26, 3) and quaternions (N, 26, 4) in the world."""
-    palm = Rotation.from_rotvec(state[:, 3:6]).as_matrix()
+    palm = rotvec_to_rotmat(torch.from_numpy(state[:, 3:6])).numpy()
     if rig.mirrored:
         palm = palm * np.array([-1.0, 1.0, 1.0])
     metacarpals = joints[:, :1] + rig.metacarpals_m @ palm.swapaxes(1, 2)
@@ -208,7 +208,8 @@ def openxr_rig(shape: HandShape) -> OpenXRRig:
     rig = rig._replace(radius_m=radius)
     joints = rest.joints_m.numpy()
     hand = openxr_hand(joints[0], np.zeros(27), rig)
-    _, up, back = np.moveaxis(Rotation.from_quat(hand.orientation).as_matrix(), 2, 0)
+    axes = unitquat_to_rotmat(torch.from_numpy(hand.orientation)).numpy()
+    _, up, back = np.moveaxis(axes, 2, 0)
     points = hand.position_m + _NEIGHBOURHOOD_M[:, None, None] * back
     ways = np.broadcast_to(_WORLD * up, points.shape)
     thickness = _thickness((_WORLD * points).reshape(-1, 3), ways.reshape(-1, 3), flesh)

@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import roma
 import torch
 from torch import Tensor
 
+from toftrack.compute.rotations import rotvec_to_rotmat
 from toftrack.compute.transfer import table
 from toftrack.hand.shape import HandShape
 
@@ -121,7 +121,7 @@ def forward_kinematics(state: Tensor, shape: HandShape) -> HandPose:
     base = shape.base_m.expand(n, 5, 3)[:, :, None]
     points = torch.cat((base, base + steps.cumsum(2)), 2)  # (N, 5, 4, 3)
 
-    rotation = roma.rotvec_to_rotmat(state[:, 3:6])
+    rotation = rotvec_to_rotmat(state[:, 3:6])
     if shape.side == "left":
         rotation = rotation * table((-1.0, 1.0, 1.0), rotation.dtype, rotation.device)
     translation = state[:, None, :3]

@@ -120,13 +120,8 @@ def evaluate(
 
 def metrics_table(summary: dict[str, Any]) -> str:
     """The content of summary.json as a short text table for the terminal, without final newline."""
-    dropped = summary.get("dropped_frames")
     rows = [
-        (
-            "frames",
-            f"{summary['frames']}, {summary['lost_frames']} of them lost"
-            + (f", {dropped} dropped" if dropped else ""),
-        ),
+        ("frames", _frames_text(summary)),
         ("time a frame", f"{_figure(summary['mean_ms'])} ms ({_figure(summary['fps'])} frames/s)"),
         ("mean score", _figure(summary["mean_score"], 3)),
     ]
@@ -148,6 +143,15 @@ def metrics_table(summary: dict[str, Any]) -> str:
             rows += _trust_rows(second["trust"]) + _error_rows(second)
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
+
+
+def _frames_text(summary: dict[str, Any]) -> str:
+    text = f"{summary['frames']}, {summary['lost_frames']} of them lost"
+    if dropped := summary.get("dropped_frames"):
+        text += f", {dropped} dropped"
+    if reduced := (summary.get("realtime") or {}).get("reduced_frames"):
+        text += f", {reduced} tracked with reduced effort"
+    return text
 
 
 def _hand_text(hand: dict[str, Any]) -> str:

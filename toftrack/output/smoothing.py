@@ -17,9 +17,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import roma
 import torch
 
+from toftrack.compute.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.gestures.recognition import pointing_ray
@@ -165,9 +165,9 @@ def _mix(before: np.ndarray, now: np.ndarray, share: np.ndarray | float) -> np.n
 
 def _exp(vector: np.ndarray) -> np.ndarray:
     """(3,) rotation vector to (3, 3)."""
-    return roma.rotvec_to_rotmat(torch.from_numpy(vector)).numpy()
+    return rotvec_to_rotmat(torch.from_numpy(vector)).numpy()
 
 
 def _log(rotation: np.ndarray) -> np.ndarray:
     """(3, 3) to the (3,) rotation vector."""
-    return roma.rotmat_to_rotvec(torch.from_numpy(rotation)).numpy()
+    return rotmat_to_rotvec(torch.from_numpy(rotation)).numpy()

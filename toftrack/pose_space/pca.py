@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import sklearn.decomposition
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,13 +52,17 @@ def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSp
             f" {angles.shape[1]} angles; give 1 to {min(angles.shape)}"
         )
     x = angles.double().cpu().numpy()
-    model = sklearn.decomposition.PCA(svd_solver="full").fit(x)
-    components = model.components_[:dims]
-    latents = (x - model.mean_) @ components.T
+    mean = x.mean(0)
+    _, singular, rows = np.linalg.svd(x - mean, full_matrices=False)
+    # The sign of a component is no one's: its largest entry is positive, as scikit-learn has it.
+    largest = np.abs(rows).argmax(1)
+    rows = rows * np.sign(rows[np.arange(len(rows)), largest])[:, None]
+    components = rows[:dims]
+    latents = (x - mean) @ components.T
     return PCAPoseSpace(
-        mean=torch.from_numpy(model.mean_).float(),
+        mean=torch.from_numpy(mean).float(),
         components=torch.from_numpy(components.copy()).float(),
-        explained_variance_ratio=torch.from_numpy(model.explained_variance_ratio_).float(),
+        explained_variance_ratio=torch.from_numpy(singular**2 / (singular**2).sum()).float(),
         lower=torch.from_numpy(latents.min(0)).float(),
         upper=torch.from_numpy(latents.max(0)).float(),
         training_latents=torch.from_numpy(latents).float(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +16,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from toftrack.api import build_hands_tracker
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, confidence_words, is_vacant
@@ -23,12 +23,15 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.advice import Watch
 from toftrack.output.evaluation import metrics_table
+from toftrack.output.realtime import RealTime
 from toftrack.output.results import ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import endings
+from toftrack.programs.ahead import ready_tracker
 from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata, told_side
 from toftrack.tracking.conventions import in_all_conventions
+from toftrack.tracking.effort import Pace
 from toftrack.tracking.hands import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 
@@ -44,29 +47,45 @@ def track(config: DictConfig, device: Device) -> float:
 
 
 def _track(config: DictConfig, device: Device, stream: Stream) -> float:
-    tracker = build_hands_tracker(config)
+    tracker = ready_tracker(config)
+    tracker.time.pace = _pace(tracker.time.pace, device)
     reach_m = float(config.segmentation.get("max_distance_m", math.inf))
+    make = hydra.utils.instantiate
+    shapes = ShapeFiles(Path(HydraConfig.get().runtime.output_dir), tracker)
     watch = Watch(reach_m, len(tracker.states))
+    parts = _Parts(tracker, stream, make(config.smooth), watch, shapes, RealTime(device.fps))
     try:
-        return _run(config, device, tracker, stream, watch)
+        return _run(config, device, parts)
     finally:  # a live run that lost the hand ends by an interruption
-        for sentence in watch.advice(told_side(config, tracker.shapes[0].side)):
+        for sentence in _notes(parts, told_side(config, tracker.shapes[0].side)):
             endings.say(f"note: {sentence}", sys.stderr)
 
 
-def _run(
-    config: DictConfig, device: Device, tracker: HandsTracker, stream: Stream, watch: Watch
-) -> float:
+def _pace(configured: Pace, device: Device) -> Pace:
+    """Recordings have no budget, so that they stay reproducible."""
+    if not device.live:
+        return Pace()
+    return Pace(1 / device.fps) if configured.budget_s is None else configured
+
+
+def _notes(parts: _Parts, side: str | None) -> tuple[str, ...]:
+    """What is to be said of a run at its end."""
+    dropped = tuple(filter(None, (parts.realtime.words(),)))
+    # Hands are lost, too, where most frames are not looked at.
+    return dropped if parts.realtime.too_slow else dropped + parts.watch.advice(side)
+
+
+def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
-    make = hydra.utils.instantiate
-    parts = _Parts(tracker, stream, make(config.smooth), watch, ShapeFiles(folder, tracker))
     ended: KeyboardInterrupt | None = None
+    if device.live:
+        parts.tracker.prepare()  # a camera does not wait for what is loaded at the first frame
     with device:
-        metadata = run_metadata(config, device, tracker)
+        metadata = run_metadata(config, device, parts.tracker)
         print(opening(metadata, device), file=sys.stderr)
         # It is the first to write into the folder, which it refuses to share with another run.
         with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
-            make_view = make(config.view, _partial_=True)
+            make_view = hydra.utils.instantiate(config.view, _partial_=True)
             try:
                 view: View
                 with make_view(folder=folder, fps=device.fps, frames=device.frames) as view:
@@ -85,7 +104,7 @@ def _run(
     return float(error) if error is not None else 1.0 - float(summary["mean_score"] or 0.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Parts:
     """What the loop needs beside the device, the results and the view."""
 
@@ -94,6 +113,8 @@ class _Parts:
     smoothing: OneEuro | None
     watch: Watch
     shapes: ShapeFiles
+    realtime: RealTime
+    """As of the newest frame; of a recording nothing."""
 
 
 def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) -> None:
@@ -104,6 +125,7 @@ def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) ->
         print(f"{gone}: tracking ends here", file=sys.stderr)
     finally:
         with endings.not_now():
+            results.realtime = parts.realtime if device.live else None
             try:
                 parts.shapes.save(last=True)
             finally:
@@ -116,12 +138,15 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
     progress = partial(tqdm, total=device.frames, unit=" frames", file=sys.stderr, mininterval=0.2)
     with progress() as bar:
         for frame in device:
+            began_s = time.perf_counter()
             with endings.not_now():
                 for command in view.commands():
                     tracker.restart(None if command == "restart" else command)
                 depth = device.camera.rectify(frame.depth, frame.radial)
                 before = tracker.shapes
-                estimates = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+                estimates = tracker.step(
+                    depth, device.camera.K, frame.index, frame.timestamp_s, began_s
+                )
                 shapes = tuple(map(_of_estimate, before, estimates))
                 parts.watch.see(estimates, depth, tracker.insights)
                 every = zip(smoothed, estimates, shapes, strict=True)
@@ -139,7 +164,12 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
                 view.show(TrackedFrame(frame, depth, device.camera, hands))
                 bar.update()
-                bar.set_postfix_str(_progress_words(estimates), refresh=False)
+                if device.live:
+                    took_s, reduced = tracker.time.took_s(), tracker.time.reduced
+                    parts.realtime = parts.realtime.after(
+                        frame.timestamp_s, took_s, reduced, device.dropped
+                    )
+                bar.set_postfix_str(_progress_words(estimates, parts), refresh=False)
 
 
 def _in_all_conventions(
@@ -156,11 +186,13 @@ def _of_estimate(shape: HandShape, estimate: Estimate) -> HandShape:
     return shape if estimate.side in ("", shape.side) else shape.of_side(estimate.side)
 
 
-def _progress_words(estimates: Sequence[Estimate]) -> str:
+def _progress_words(estimates: Sequence[Estimate], parts: _Parts) -> str:
+    dropped = f", {parts.realtime.dropped} dropped" if parts.realtime.dropped else ""
+    pace = dropped + (", reduced effort" if parts.tracker.time.pace.reduced else "")
     if len(estimates) == 1:
-        return f"score {estimates[0].score:.2f}, {_sure_words(estimates[0])}"
+        return f"score {estimates[0].score:.2f}, {_sure_words(estimates[0])}{pace}"
     there = [estimate for estimate in estimates if not is_vacant(estimate)]
-    return " | ".join(f"{one.side} {_sure_words(one)}" for one in there) or "no hand"
+    return (" | ".join(f"{one.side} {_sure_words(one)}" for one in there) or "no hand") + pace
 
 
 def _sure_words(estimate: Estimate) -> str:

@@ -20,11 +20,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
+from toftrack.compute.rotations import rotvec_composition
 from toftrack.compute.transfer import table
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
@@ -82,6 +82,8 @@ class Refinement:
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     swaps: other poses of single fingers that are tried; the log scores by which one is better must
         sum up to `swap_gain` over frames, of each of which `drift` is taken off.
+    sure: probability of a hand from which on the networks' poses and single other fingers are tried
+        in turn, and not both in every frame.
     overlap: of the log score, for fingers that are in one another (see finger_overlap).
     keep_gain: by how much the log score of another pose must exceed the last frame's.
     steadying: how much of a change from frame to frame is believed.
@@ -97,6 +99,7 @@ class Refinement:
     damping: float
     swaps: int
     swap_gain: float
+    sure: float
     drift: float
     overlap: float
     keep_gain: float
@@ -112,6 +115,7 @@ class Refinement:
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
         for name in ("damping", "swap_gain", "drift", "keep_gain", "overlap"):
             check_number(f"refine.{name}", getattr(self, name), 0)
+        check_number("refine.sure", self.sure, 0.5, 1)
         check_number("refine.carry", self.carry, 0, 1)
 
 
@@ -264,7 +268,7 @@ def _step(rows: Tensor, values: Tensor, off_prior: Tensor, settings: Refinement)
 def _moved(states: Tensor, step: Tensor) -> Tensor:
     """States after a step of translation, rotation in the camera frame and angles, in limits."""
     low, high = table(ANGLE_LIMITS, states.dtype, states.device).unbind(1)
-    turned = roma.rotvec_composition((step[:, 3:6], states[:, 3:6]))
+    turned = rotvec_composition(step[:, 3:6], states[:, 3:6])
     bent = (states[:, 6:] + step[:, 6:]).clamp(low, high)
     return torch.cat((states[:, :3] + step[:, :3], turned, bent), 1)
 

@@ -12,11 +12,11 @@ from __future__ import annotations
 import itertools
 from typing import NamedTuple
 
-import roma
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from toftrack.compute.rotations import special_gramschmidt
 from toftrack.compute.transfer import table
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP_M
@@ -153,7 +153,7 @@ class PoseNet(nn.Module):
         each = heads[:, :-2].unflatten(1, (len(self.anchors), -1))
         turn, angles, size, pivot, chance, error = each.split((6, ANGLES, 1, 3, 1, 1), 2)
         unit = table((1.0, 0.0, 0.0, 0.0, 1.0, 0.0), turn.dtype, turn.device)
-        turned = roma.special_gramschmidt((0.5 * turn + unit).unflatten(2, (2, 3)).mT)
+        turned = special_gramschmidt((0.5 * turn + unit).unflatten(2, (2, 3)).mT)
         low, high = self.limits.unbind(1)
         return Proposed(
             rotation=turned @ self.anchors,

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import roma
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rotations import rotmat_to_rotvec
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
@@ -121,7 +121,7 @@ def look(
         return values[torch.arange(len(order))[:, None], order]
 
     pivot = ordered(p.pivot_m) @ turn.mT + centre[:, None]
-    rotvec = roma.rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))
+    rotvec = rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))
     votes = p.joints_m @ turn.mT + centre[:, None]
     if side == "left":
         pivot, votes, rotvec = pivot * MIRROR, votes * MIRROR, rotvec * MIRROR_TURN

@@ -42,6 +42,7 @@ class RelocationSettings:
     hypotheses: int
     rivals: int
     every: int
+    search: int
     sure: float
     prior: float
     rival_m: float
@@ -55,7 +56,8 @@ class RelocationSettings:
         for name in ("places", "hypotheses"):
             check_number(f"relocation.{name}", getattr(self, name), 1, whole=True)
         check_number("relocation.rivals", self.rivals, 0, whole=True)
-        check_number("relocation.every", self.every, 1, whole=True)
+        for name in ("every", "search"):
+            check_number(f"relocation.{name}", getattr(self, name), 1, whole=True)
         check_number("relocation.sure", self.sure, 0.5, 0.999)
         check_number("relocation.rival_frames", self.rival_frames, 1, whole=True)
         check_number("relocation.least", self.least, 0, 1)

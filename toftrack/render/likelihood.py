@@ -90,17 +90,18 @@ class FMeasure:
         return score + coverage * counts.correct.log() if coverage else score
 
     def _log_score(self, counts: Counts, coverage: float) -> np.ndarray:
-        """The same on the CPU, where torch's operations take longer than their arithmetic."""
-        correct, false, missed, residual = (count.float().numpy() for count in counts)
+        host = _host(counts)
         with np.errstate(divide="ignore"):
-            score: np.ndarray = np.log(self._f_measure(correct, false, missed, residual))
-            return score + np.float32(coverage) * np.log(correct) if coverage else score
+            score: np.ndarray = np.log(self._f_measure(*host))
+            return score + np.float32(coverage) * np.log(host[0]) if coverage else score
 
     def _distance(self, observation: Observation) -> float:
         return observation.nearest_m if not observation.empty else 1.0
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
+        if counts.correct.device.type == "cpu":
+            return torch.from_numpy(self._f_measure(*_host(counts)))
         return self._f_measure(*counts)
 
     def _f_measure(
@@ -113,3 +114,9 @@ class FMeasure:
         rest = b2 * false + missed if printed else false + b2 * missed
         weighted = (1 + b2) * correct
         return weighted / (weighted + rest).clip(min=1e-9)
+
+
+def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    # On the CPU each of torch's operations takes longer than its arithmetic.
+    correct, false, missed, residual = (count.float().numpy() for count in counts)
+    return correct, false, missed, residual

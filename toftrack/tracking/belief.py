@@ -15,7 +15,7 @@ from toftrack.checks import check_number
 from toftrack.compute.pace import FRAME_S
 from toftrack.errors import ToftrackError
 from toftrack.tracking.joint_belief import JointBelief
-from toftrack.tracking.life_cycle import Belief, lasted, longer
+from toftrack.tracking.life_cycle import Belief, bad_for, lasted
 from toftrack.tracking.signs import SIGNS, Signs
 from toftrack.tracking.state import Track
 
@@ -86,7 +86,7 @@ class CalibratedBelief:
         kept = self.memory ** (dt_s / FRAME_S)
         smooth = now if before is None else kept * before + (1 - kept) * now
         confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
-        bad = longer(track.bad_s, dt_s) if confidence < self.give_up else 0.0
+        bad = bad_for(track.bad_s, dt_s) if confidence < self.give_up else 0.0
         # What is hidden is waited for.
         patience = self.patience * (_WAITED if signs.hidden > _HIDDEN else 1)
         ends = patience > 0 and bad > 0 and lasted(bad, patience)

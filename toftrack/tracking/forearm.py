@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
+from toftrack.compute.rotations import rotvec_to_rotmat
 from toftrack.render.segmentation import Observation
 
 _ALONG_M = (0.05, 0.07, 0.09)
@@ -79,7 +79,7 @@ def forearm_conflict(particles: Tensor, sight: ArmSight) -> Tensor:
     particles: (N, 6 + d), wrist translation and rotation vector first.
     """
     wrist = particles[:, :3]
-    axis = roma.rotvec_to_rotmat(particles[:, 3:6])[:, :, 1]  # from the fingers to the arm
+    axis = rotvec_to_rotmat(particles[:, 3:6])[:, :, 1]  # from the fingers to the arm
     along = particles.new_tensor((0.0, *_ALONG_M))
     x = wrist[:, None] + along[:, None] * axis[:, None]  # (N, 4 points, 3)
     k, z = sight.k, x[..., 2].clamp(min=0.05)

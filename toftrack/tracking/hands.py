@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,14 +12,18 @@ import torch
 
 from toftrack.checks import check_number
 from toftrack.compute.pace import elapsed_s
-from toftrack.compute.threads import small_operations
+from toftrack.compute.threads import at_most, small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import DepthImage, checked_image
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import PoseSpace
+from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Scorer
 from toftrack.render.segmentation import reduce_image
+from toftrack.tracking.effort import Pace, Timekeeper
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.side_belief import OTHER_SIDE
 from toftrack.tracking.slots import (
@@ -42,6 +47,8 @@ _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track is given up when it was not believed for so long, and looked for so much later."""
 _ONE_S = 0.15
 """Two tracks that were believed may be on one hand for so long."""
+_RENDERED_PX = 72, 88
+"""Size of an image that nobody sees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,17 +130,28 @@ class HandsTracker:
 
     state: all that is carried between frames; one that was kept may be put back.
     infos: what the last step saw and believed of each; None where it did not look.
+    time: what frames take, and what may be spent on them.
     """
 
-    def __init__(self, model: TrackerModel, seed: int = 0, hands: int = 1) -> None:
-        """Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without networks."""
+    def __init__(
+        self,
+        model: TrackerModel,
+        seed: int = 0,
+        hands: int = 1,
+        pace: Pace | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """pace, clock: see Tracker.
+
+        Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without networks.
+        """
         check_number("hands", hands, 1, 2, whole=True)
         if hands > 1 and model.relocaliser is None:
             raise ToftrackError(
                 "hands=2 tells two hands apart by the networks, but relocation=none has none; give "
                 "hands=1, or relocation=network"
             )
-        self.model = model
+        self.model, self.time = model, Timekeeper(pace, clock)
         self.state = first_states(model, seed, hands)
         self.infos: tuple[StepInfo | None, ...] = (None,) * hands
 
@@ -148,21 +166,28 @@ class HandsTracker:
         k: np.ndarray,
         index: int | None = None,
         timestamp_s: float | None = None,
+        began_s: float | None = None,
     ) -> tuple[Estimate, ...]:
         """One frame, see Tracker.step; an estimate a slot. One without a hand is lost and NaN."""
-        began = time.perf_counter()
+        effort = self.time.begin(began_s)
         depth_m, k = checked_image(depth_m, k)
         index = self.states[0].next_index if index is None else index
         timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
         image = DepthImage(depth_m, k, index, timestamp_s)
-        if len(self.states) == 1:
-            state, info, estimate = step(self.states[0], image, self.model)
-            estimates: tuple[Estimate, ...] = (estimate,)
-            self.state, self.infos = HandsState((state,)), (info,)
-        else:
-            self.state, self.infos, estimates = step_hands(self.state, image, self.model)
-        took = time.perf_counter() - began
-        return tuple(replace(estimate, compute_s=took) for estimate in estimates)
+        model = self.model.spending(effort)
+        with at_most(effort.threads):
+            if len(self.states) == 1:
+                state, info, estimate = step(self.states[0], image, model)
+                estimates: tuple[Estimate, ...] = (estimate,)
+                self.state, self.infos = HandsState((state,)), (info,)
+            else:
+                self.state, self.infos, estimates = step_hands(self.state, image, model)
+        took_s = self.time.took_s()
+        return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
+
+    def prepare(self) -> None:
+        """Load and compile now what the first frame would have to wait for; changes nothing."""
+        step(self.states[0], _rendered_hand(), self.model)
 
     def restart(self, side: str | None = None) -> None:
         """Forget the hands, see Tracker.restart; a side is the first one's."""
@@ -204,3 +229,14 @@ class HandsTracker:
         return tuple(
             None if info is None or info.observation.empty else info for info in self.infos
         )
+
+
+def _rendered_hand() -> DepthImage:
+    """A small image of an open hand before a wall."""
+    shape, (height, width) = default_hand_shape(), _RENDERED_PX
+    state = torch.zeros(1, 27)
+    state[0, 1:3] = torch.tensor([0.08, 0.5])
+    k = torch.tensor([[110.0, 0, width / 2], [0, 110.0, height / 2], [0, 0, 1]])
+    hand = hand_surface(shape).pose(forward_kinematics(state, shape))
+    depth = render_range_images(hand, k, height, width)[0]
+    return DepthImage(torch.where(depth > 0, depth, 1.5).numpy(), k.double().numpy(), 0, 0.0)

@@ -53,6 +53,11 @@ class Belief:
     log_odds: float | None = None
 
 
+def log_odds(probability: float) -> float:
+    """Of a probability in 0 .. 1, both excluded."""
+    return math.log(probability / (1 - probability))
+
+
 def lasted(seconds: float, frames: float) -> bool:
     """Whether something has gone on for so many frames of FRAME_S; half a frame is forgiven."""
     return seconds > (frames - 0.5) * FRAME_S
@@ -63,6 +68,13 @@ def longer(seconds: float, dt_s: float) -> float:
     return seconds + dt_s if seconds else FRAME_S
 
 
+def bad_for(seconds: float, dt_s: float) -> float:
+    """As `longer`, of what is to end a track: what was dropped between two frames was not bad, so
+    that a frame counts twice FRAME_S at most.
+    """
+    return longer(seconds, min(dt_s, 2 * FRAME_S))
+
+
 def believe(
     track: Track, score: float, off_rad: float, dt_s: float, settings: LostSettings
 ) -> Belief:
@@ -71,7 +83,7 @@ def believe(
     track: as of the frame before.  score: of the estimate, 0..1.
     off_rad: how far its pose lies off the pose space, rms.  dt_s: since the last frame.
     """
-    bad = longer(track.bad_s, dt_s) if score < settings.score else 0.0
+    bad = bad_for(track.bad_s, dt_s) if score < settings.score else 0.0
     outside = longer(track.outside_s, dt_s) if off_rad > settings.outside_rad else 0.0
     if track.age_s == 0 and score < settings.start_score:
         return Belief(False, "initialising", True, bad, outside)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
 import torch
@@ -24,6 +25,7 @@ from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.belief import CalibratedBelief
+from toftrack.tracking.effort import Effort
 from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
@@ -108,6 +110,14 @@ class TrackerModel:
     def _space_there(self) -> PoseSpace:
         return self.space.to(self.device)
 
+    def spending(self, effort: Effort) -> TrackerModel:
+        """The same tracker with less effort; itself where nothing is left out."""
+        return self._spending(effort)
+
+    @cached_property
+    def _spending(self) -> Callable[[Effort], TrackerModel]:
+        return lru_cache(partial(_spending, self))
+
     @property
     def rivals(self) -> int:
         """How many of the networks' poses compete with a track."""
@@ -166,6 +176,32 @@ class TrackerModel:
         """One hand (1, 27) as a particle (1, 6 + d), and how far off that is, (21,) rad."""
         particle = self.encode(state)
         return particle, state[0, 6:] - self.space.decode(particle[:, 6:])[0]
+
+
+def _spending(model: TrackerModel, effort: Effort) -> TrackerModel:
+    if effort == Effort(effort.threads):
+        return model
+
+    refinement, relocaliser = model.refinement, model.relocaliser
+    if refinement is not None:
+        refinement = replace(refinement, swaps=math.ceil(effort.swaps * refinement.swaps))
+    if relocaliser is not None:
+        told = relocaliser.settings
+        told = replace(
+            told,
+            every=max(told.every, effort.every),
+            search=max(told.search, effort.search),
+            rivals=_least(told.rivals, effort.rivals),
+            places=_least(told.places, effort.places),
+        )
+        relocaliser = replace(relocaliser, settings=told)
+    made = replace(model, refinement=refinement, relocaliser=relocaliser)
+    vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the effort
+    return made
+
+
+def _least(count: int, most: int | None) -> int:
+    return count if most is None else min(count, most)
 
 
 def _sized_hand(

@@ -20,7 +20,7 @@ from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance, RelocationSettings
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
-from toftrack.tracking.life_cycle import lasted
+from toftrack.tracking.life_cycle import lasted, log_odds
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.other_hand import OtherHand, touching
 from toftrack.tracking.search import LastSeen
@@ -63,7 +63,7 @@ def glanced(
     if relocaliser is None:
         return track, None
     best = None
-    if track is None or track.doubted:
+    if search_due(state, model):
         likely = partial(_reachable, state.seen, track, other)
         found = relocaliser.search(image.depth_m, image.k, side, likely)
         best = _chosen(found) if state.sides is not None and state.seen is None else _first(found)
@@ -72,9 +72,9 @@ def glanced(
             found = relocaliser.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
             again = np.array([glance.centre_m.numpy() for glance in found[:1]]).reshape(-1, 3)
             best = _first(relocaliser.glance(image.depth_m, image.k, again, side))
-        if track is None:
-            return None, best
-    elif _sure(track, relocaliser.settings, dt_s):
+    if track is None:
+        return None, best
+    if not track.doubted and _sure(track, relocaliser.settings, dt_s):
         return track, None
     centre = _expected_centre(track, dt_s, model)
     if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
@@ -110,6 +110,14 @@ def _expected_centre(track: Track, dt_s: float, model: TrackerModel) -> np.ndarr
     return centre
 
 
+def search_due(state: TrackerState, model: TrackerModel) -> bool:
+    """Whether the whole image is searched: while no hand is believed, and not each time if told."""
+    if model.relocaliser is None or (state.track is not None and not state.track.doubted):
+        return False
+    frames = model.relocaliser.settings.search
+    return frames == 1 or lasted(state.unsearched_s, frames)
+
+
 def _first(found: Sequence[Glance]) -> Glance | None:
     return next(iter(found), None)
 
@@ -128,13 +136,9 @@ def _chosen(found: Sequence[Glance]) -> Glance | None:
 
 def _sure(track: Track, settings: RelocationSettings, dt_s: float) -> bool:
     """Whether a track is believed so much that the networks need not look in this frame."""
-    believed = track.log_odds is not None and track.log_odds > _logit(settings.sure)
+    believed = track.log_odds is not None and track.log_odds > log_odds(settings.sure)
     due = lasted(track.unlooked_s + dt_s, settings.every)
     return believed and not due and track.challenged_s == 0
-
-
-def _logit(probability: float) -> float:
-    return float(np.log(probability / (1 - probability)))
 
 
 def _reachable(

@@ -7,13 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
 from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rotations import (
+    rotvec_composition,
+    rotvec_geodesic_distance,
+    rotvec_to_rotmat,
+)
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.segmentation import Observation
@@ -203,7 +207,7 @@ class SearchStart:
             known = -self.forearm * forearm_conflict(particles, sight)
             if last is not None:
                 before = last.particle[:, 3:6].expand(len(particles), -1)
-                turned = roma.rotvec_geodesic_distance(particles[:, 3:6], before)
+                turned = rotvec_geodesic_distance(particles[:, 3:6], before)
                 likeness = torch.exp(-0.5 * (turned / self.memory_rad).square())
                 known = known + self.memory * math.exp(-last.age_s / self.memory_s) * likeness
             return known
@@ -234,8 +238,8 @@ class SearchStart:
             in_plane = torch.where(uniform() < 0.8, towards_arm, in_plane)
         facing = (uniform() < 0.5) * math.pi
         tilt = normal(m, 2) * self.tilt_rad
-        rotation = roma.rotvec_composition(
-            (_about(in_plane, 2), _about(tilt[:, 0], 0), _about(tilt[:, 1] + facing, 1))
+        rotation = rotvec_composition(
+            _about(in_plane, 2), _about(tilt[:, 0], 0), _about(tilt[:, 1] + facing, 1)
         )
         rows = torch.randint(len(space.training_latents), (m,), generator=generator, device=device)
         latent = space.training_latents[rows]
@@ -243,9 +247,9 @@ class SearchStart:
             again = m // 4
             before = last.particle.expand(again, -1)
             turn = _TURN_RAD * normal(again, 3)
-            rotation[:again] = roma.rotvec_composition((turn, before[:, 3:6]))
+            rotation[:again] = rotvec_composition(turn, before[:, 3:6])
             latent[:again] = before[:, 6:]
-        pivot = roma.rotvec_to_rotmat(rotation) @ rotation.new_tensor(PIVOT_M)
+        pivot = rotvec_to_rotmat(rotation) @ rotation.new_tensor(PIVOT_M)
         translation = centre + normal(m, 3) * self.position_m - pivot
         return torch.cat((translation, rotation, latent), 1)
 

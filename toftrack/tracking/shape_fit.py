@@ -23,11 +23,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
+from toftrack.compute.rotations import rotvec_to_rotmat
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
 from toftrack.hand.skeleton import forward_kinematics
@@ -98,7 +98,7 @@ class KeyPoses:
         if not len(self.weight):
             return -1, math.inf
         bent = (self.angles - state[:, 6:]).square().mean(1).sqrt() / _KEY_RAD
-        rotation = roma.rotvec_to_rotmat(state[0, 3:6])
+        rotation = rotvec_to_rotmat(state[0, 3:6])
         cosine = 0.5 * ((self.rotations * rotation).sum((1, 2)) - 1)
         far = torch.hypot(bent, cosine.clamp(-1, 1).acos() / _KEY_TURN_RAD)
         row = int(far.argmin())
@@ -296,7 +296,7 @@ def _kept(
     """The key poses with one more frame, which belongs to one of them or takes a row's place."""
     new = (
         state[0, 6:].clone(),
-        roma.rotvec_to_rotmat(state[0, 3:6]),
+        rotvec_to_rotmat(state[0, 3:6]),
         torch.tensor(1.0),
         torch.tensor(weight),
         torch.tensor(weight**2),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -87,6 +88,7 @@ class TrackerState:
     refused: how many starts in a row were not believed.
     gesture: smoothed probabilities of the gestures.
     last: the last estimate that there was.
+    unsearched_s: how long ago the whole image was searched for a hand.
     next_index: number of the next frame that comes without one.
     timestamp_s: of the last frame.
     """
@@ -100,6 +102,7 @@ class TrackerState:
     refused: int = 0
     gesture: GestureState | None = None
     last: Estimate | None = None
+    unsearched_s: float = math.inf
     next_index: int = 0
     timestamp_s: float | None = None
 

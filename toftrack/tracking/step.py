@@ -34,7 +34,7 @@ from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.other_hand import OtherHand, without
 from toftrack.tracking.refining import refined
-from toftrack.tracking.relocating import expected_of, glanced, glancing, landmarks_of
+from toftrack.tracking.relocating import expected_of, glanced, glancing, landmarks_of, search_due
 from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.side_belief import SideBelief, probability
 from toftrack.tracking.sides import sided
@@ -75,6 +75,7 @@ def step(
         coming = glancing(state, dt_s, alone, model)
         if coming is None:
             track, glance = glanced(state, dt_s, alone, model, other)
+            state = replace(state, unsearched_s=0.0) if search_due(state, model) else state
             state, track, glance = _told(state, track, glance, dt_s, alone, model, other)
         else:
             track, glance = state.track, None
@@ -204,6 +205,7 @@ def at(state: TrackerState, image: DepthImage) -> TrackerState:
     return replace(
         state,
         seen=aged(state.seen, passed),
+        unsearched_s=state.unsearched_s + passed,
         next_index=image.index + 1,
         timestamp_s=image.timestamp_s,
     )

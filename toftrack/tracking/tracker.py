@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
+from toftrack.compute.threads import at_most
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage, checked_image
 from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.scoring import Scorer
+from toftrack.tracking.effort import Pace, Timekeeper
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.state import StepInfo, Track, TrackerState
@@ -24,10 +27,18 @@ class Tracker:
 
     state: all that is carried between frames; one that was kept may be put back.
     info: what the last step saw and believed; None before the first one.
+    time: what frames take, and what may be spent on them.
     """
 
-    def __init__(self, model: TrackerModel, seed: int = 0) -> None:
-        self.model = model
+    def __init__(
+        self,
+        model: TrackerModel,
+        seed: int = 0,
+        pace: Pace | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`."""
+        self.model, self.time = model, Timekeeper(pace, clock)
         self.state: TrackerState = first_state(model, seed)
         self.info: StepInfo | None = None
 
@@ -37,6 +48,7 @@ class Tracker:
         k: np.ndarray,
         index: int | None = None,
         timestamp_s: float | None = None,
+        began_s: float | None = None,
     ) -> Estimate:
         """One frame.
 
@@ -44,16 +56,19 @@ class Tracker:
         k: (3, 3) intrinsics in pixels.
         index: number of the frame; None counts on from the last.
         timestamp_s: None is now, seconds on a clock that never goes back.
+        began_s: time.perf_counter() when the raw frame was there, from which on compute_s counts;
+            None is now.
 
         Raises ToftrackError when the image or k has the wrong shape, type or unit.
         """
-        began = time.perf_counter()
+        effort = self.time.begin(began_s)
         depth_m, k = checked_image(depth_m, k)
         index = self.state.next_index if index is None else index
         timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
         image = DepthImage(depth_m, k, index, timestamp_s)
-        self.state, self.info, estimate = step(self.state, image, self.model)
-        return replace(estimate, compute_s=time.perf_counter() - began)
+        with at_most(effort.threads):
+            self.state, self.info, estimate = step(self.state, image, self.model.spending(effort))
+        return replace(estimate, compute_s=self.time.took_s())
 
     def restart(self, side: str | None = None) -> None:
         """Forget the hand, also its size, and look for one anew; of another side if one is given.

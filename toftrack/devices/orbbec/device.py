@@ -91,9 +91,7 @@ class Orbbec(BaseDevice):
             else:
                 camera = Camera.load_for(camera_file, *size, owner)
             about = sdk.facts(device)
-        super().__init__(camera, depth.get_fps() or 30.0)
-        self.dropped = 0
-        """Frames of the latest iteration that came between two delivered ones."""
+        super().__init__(camera, depth.get_fps() or 30.0, live=keep == "newest")
         self._device, self._serial, self._path = device, number, path
         self._pipeline, self._running = pipeline, False
         self._start, self._stop, self._timeout_s = start, stop, timeout_s

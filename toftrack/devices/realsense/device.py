@@ -99,9 +99,8 @@ class RealSense(BaseDevice):
             camera = sdk.camera_of(rs, own)
         else:
             camera = Camera.load_for(camera_file, own.width, own.height, owner)
-        super().__init__(camera, self._streams.depth.fps())
-        self.dropped = 0
-        """Frames of the latest iteration that came between two delivered ones."""
+        newest = bool(realtime) if path is not None else keep == "newest"
+        super().__init__(camera, self._streams.depth.fps(), live=newest)
         self._device, self._path, self._realtime = device, path, bool(realtime)
         self._capacity = queue_frames if keep == "every" else 1
         self._start, self._stop, self._timeout_s = start, stop, timeout_s

@@ -87,7 +87,7 @@ class Sr3000(BaseDevice):
                 f"fps above 0, but they are {keep}, {queue_frames}, {stop} and {fps}"
             )
         self.exposure = Exposure(modulation_mhz, integration_time, amplitude_threshold)
-        super().__init__(nominal_camera(), fps, frames=stop)
+        super().__init__(nominal_camera(), fps, frames=stop, live=keep == "newest")
         self.emulator: EmulatedBackend | None = None
         self.counts = Counts()
         """What became of the frames; those of the latest iteration."""
@@ -163,7 +163,9 @@ class Sr3000(BaseDevice):
             self._reader.request_stop()
 
     def __iter__(self) -> Iterator[Frame]:
+        self.dropped = 0
         for capture in self.captures():
+            self.dropped = self.counts.dropped
             depth, amplitude = decode_frame(
                 capture.data, self.exposure.range_m, self.exposure.amplitude_threshold
             )

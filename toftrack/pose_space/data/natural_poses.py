@@ -73,9 +73,15 @@ def recorded_poses() -> Tensor:
 
 
 @functools.cache
-def natural_poses(sampled: int = 800) -> Tensor:
+def natural_poses() -> Tensor:
     """(M, 21) radians: the recorded poses and as many sampled ones, always the same."""
-    return torch.cat((recorded_poses(), sample_poses(sampled, torch.Generator().manual_seed(0))))
+    with np.load(_DATA, allow_pickle=False) as content:
+        return torch.cat((recorded_poses(), torch.from_numpy(content["sampled_rad"])))
+
+
+def sampled_poses() -> Tensor:
+    """(M, 21) radians: those that are kept beside the recorded ones, as drawing takes a second."""
+    return sample_poses(len(recorded_poses()), torch.Generator().manual_seed(0))
 
 
 def sample_poses(n: int, generator: torch.Generator) -> Tensor:

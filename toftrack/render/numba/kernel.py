@@ -35,27 +35,24 @@ from toftrack.render.numba.hand import (
 from toftrack.render.numba.missed import clipped, count_missed, find_wanted, run
 from toftrack.render.numba.vector import (
     BLOCK,
-    WORDS,
     compare,
     down,
     draw,
     larger,
     load,
-    no_rows,
     ramp,
     root,
     smaller,
     splat,
     store,
-    store_rows,
     total,
     up,
     where_above,
 )
+from toftrack.render.numba.words import WORDS, no_rows, store_rows
 
-_cached = entry_point(
-    *(Path(__file__).with_name(f"{part}.py") for part in ("hand", "kernel", "missed", "vector"))
-)
+_PARTS = ("hand", "kernel", "missed", "vector", "words")
+_cached = entry_point(*(Path(__file__).with_name(f"{part}.py") for part in _PARTS))
 
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _LISTED = 256

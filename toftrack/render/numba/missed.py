@@ -8,21 +8,23 @@ from toftrack.compute.compiling import compiled
 from toftrack.render.numba.hand import DX, HY, IY, LANES, XY, X, Y
 from toftrack.render.numba.vector import (
     BLOCK,
-    WORDS,
-    any_bit,
     down,
     larger,
-    load_rows,
-    no_rows,
-    ones,
     ramp,
     root,
-    shifted,
     smaller,
     splat,
     store,
-    store_rows,
     up,
+)
+from toftrack.render.numba.words import (
+    WORDS,
+    any_bit,
+    load_rows,
+    no_rows,
+    ones,
+    shifted,
+    store_rows,
     widened,
     without,
 )

@@ -1,7 +1,6 @@
 """Vectors of the CPU kernel: values of a compiled function that hold sixteen pixels at once.
 
-Written as LLVM vectors, which every processor has or gets split into what it has. `Floats` are
-pixels side by side in a row; `Rows` are words of 64 pixels, one above the other. Numba keeps them
+Written as LLVM vectors, which every processor has or gets split into what it has. Numba keeps them
 in registers as it does a number.
 """
 
@@ -9,6 +8,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from functools import partial
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -19,17 +19,14 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 BLOCK = 16
 """Pixels of a row that are worked on at once; images need as much padding on the right."""
 
-WORDS = 8
-"""Words of 64 pixels, one above the other, that are worked on at once."""
-
 _FLOAT, _INT, _WORD = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _NUMBERS = ir.VectorType(_INT, BLOCK)
-_VECTOR, _ROWS = ir.VectorType(_FLOAT, BLOCK), ir.VectorType(_WORD, WORDS)
+_VECTOR = ir.VectorType(_FLOAT, BLOCK)
 # A product and a sum may be one operation, as everywhere in compiling.OPTIONS.
 _FAST = ("contract",)
 
 
-class _Vector(types.Type):
+class Vector(types.Type):
     """A numba type of a plain LLVM vector."""
 
     def __init__(self, name: str, lltype: ir.VectorType) -> None:
@@ -37,16 +34,17 @@ class _Vector(types.Type):
         super().__init__(name)
 
 
-@register_model(_Vector)
+@register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, dmm, fe_type) -> None:
         super().__init__(dmm, fe_type, fe_type.lltype)
 
 
-FLOATS, ROWS = _Vector("toftrack_floats", _VECTOR), _Vector("toftrack_rows", _ROWS)
+FLOATS = Vector("toftrack_floats", _VECTOR)
 
 
-def _splat(builder, value, lltype=_VECTOR):
+def spread(builder, value, lltype=_VECTOR):
+    """A number in every place of an LLVM vector; a vector as it is."""
     if value.type == lltype:
         return value
     one = builder.insert_element(ir.Constant(lltype, ir.Undefined), value, _INT(0))
@@ -54,38 +52,38 @@ def _splat(builder, value, lltype=_VECTOR):
     return builder.shuffle_vector(one, ir.Constant(lltype, ir.Undefined), zeros)
 
 
-def _operator(function: Callable, kind: _Vector, number: types.Type, emit: str) -> None:
-    """Let an operator of Python take two vectors, or a vector and a number."""
+def define(function: Callable, kind: Vector, number: types.Type, emit: Callable) -> None:
+    """Let an operator of Python take two vectors, or a vector and a number.
+
+    emit: the instruction's operands and its builder to its result.
+    """
     pairs = [(kind, kind), (kind, number), (number, kind)]
 
     class Template(ConcreteTemplate):
         cases = [signature(kind, *pair) for pair in pairs]
 
     def lowered(context, builder, sig, args):
-        left, right = (_splat(builder, value, kind.lltype) for value in args)
-        if kind is ROWS:
-            return getattr(builder, emit)(left, right)
-        return getattr(builder, emit)(left, right, flags=_FAST)
+        return emit(builder, *(spread(builder, value, kind.lltype) for value in args))
 
     infer_global(function)(Template)
     for pair in pairs:
         lower_builtin(function, *pair)(lowered)
 
 
-_operator(operator.add, FLOATS, types.float32, "fadd")
-_operator(operator.sub, FLOATS, types.float32, "fsub")
-_operator(operator.mul, FLOATS, types.float32, "fmul")
-_operator(operator.truediv, FLOATS, types.float32, "fdiv")
-_operator(operator.and_, ROWS, types.uint64, "and_")
-_operator(operator.or_, ROWS, types.uint64, "or_")
+define(operator.add, FLOATS, types.float32, partial(ir.IRBuilder.fadd, flags=_FAST))
+define(operator.sub, FLOATS, types.float32, partial(ir.IRBuilder.fsub, flags=_FAST))
+define(operator.mul, FLOATS, types.float32, partial(ir.IRBuilder.fmul, flags=_FAST))
+define(operator.truediv, FLOATS, types.float32, ir.IRBuilder.fdiv)
 
 
-def _pointer(context, builder, array_type, array, index, lltype=_VECTOR):
+def pointer(context, builder, array_type, array, index, lltype=_VECTOR):
+    """To an LLVM vector that begins at an index of a flat array."""
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), lltype.as_pointer())
 
 
-def _call(builder, name, *args):
+def call(builder, name, *args):
+    """An intrinsic function of LLVM whose result is of its arguments' type."""
     kinds = [arg.type for arg in args]
     function = cgutils.get_or_insert_function(
         builder.module, ir.FunctionType(kinds[0], kinds), f"llvm.{name}"
@@ -96,7 +94,7 @@ def _call(builder, name, *args):
 def _unary(name: str):
     def function(typingctx, vector):
         def codegen(context, builder, signature, args):
-            return _call(builder, f"{name}.v{BLOCK}f32", *args)
+            return call(builder, f"{name}.v{BLOCK}f32", *args)
 
         return FLOATS(FLOATS), codegen
 
@@ -118,13 +116,13 @@ def ramp(typingctx):
 @intrinsic
 def splat(typingctx, value):
     """The same number in every place."""
-    return FLOATS(types.float32), lambda context, builder, signature, args: _splat(builder, args[0])
+    return FLOATS(types.float32), lambda context, builder, signature, args: spread(builder, args[0])
 
 
 def _choice(comparison: str):
     def function(typingctx, vector, other):
         def codegen(context, builder, signature, args):
-            left, right = (_splat(builder, value) for value in args)
+            left, right = (spread(builder, value) for value in args)
             return builder.select(builder.fcmp_ordered(comparison, left, right), left, right)
 
         return FLOATS(FLOATS, other), codegen
@@ -152,7 +150,7 @@ def load(typingctx, array, index):
     """BLOCK numbers of a flat array."""
 
     def codegen(context, builder, signature, args):
-        return builder.load(_pointer(context, builder, signature.args[0], *args), align=4)
+        return builder.load(pointer(context, builder, signature.args[0], *args), align=4)
 
     return FLOATS(array, types.intp), codegen
 
@@ -165,7 +163,7 @@ def store(typingctx, array, index, vector):
         array, index, vector = args
         if signature.args[0].dtype == types.int32:
             vector = builder.fptosi(vector, ir.VectorType(_INT, BLOCK))
-        at = _pointer(context, builder, signature.args[0], array, index, vector.type)
+        at = pointer(context, builder, signature.args[0], array, index, vector.type)
         builder.store(vector, at, align=4)
         return context.get_dummy_value()
 
@@ -200,7 +198,7 @@ def _root_estimate(context, builder, square):
     """
     features = context.codegen().magic_tuple()[-1].split(",")
     if "+avx512f" not in features:
-        return _call(builder, f"sqrt.v{BLOCK}f32", square)
+        return call(builder, f"sqrt.v{BLOCK}f32", square)
     mask = ir.IntType(BLOCK)
     estimate = cgutils.get_or_insert_function(
         builder.module,
@@ -216,7 +214,7 @@ def draw(typingctx, tile, index, t, plane, peak, slope, curve):
     """tile[index + j] = max(itself, plane + slope j + sqrt(peak - curve t_j^2)), t_j = t + j."""
 
     def codegen(context, builder, signature, args):
-        t, plane, peak, slope, curve = (_splat(builder, arg) for arg in args[2:])
+        t, plane, peak, slope, curve = (spread(builder, arg) for arg in args[2:])
         steps = ir.Constant(_VECTOR, [float(j) for j in range(BLOCK)])
         t = builder.fadd(t, steps)
         below = builder.fsub(
@@ -230,9 +228,9 @@ def draw(typingctx, tile, index, t, plane, peak, slope, curve):
             builder.bitcast(below, _NUMBERS), ir.Constant(_NUMBERS, [1 << 31] * BLOCK)
         )
         new = builder.or_(builder.bitcast(new, _NUMBERS), sign)
-        at = _pointer(context, builder, signature.args[0], *args[:2], _NUMBERS)
+        at = pointer(context, builder, signature.args[0], *args[:2], _NUMBERS)
         old = builder.load(at, align=4)
-        builder.store(_call(builder, f"smax.v{BLOCK}i32", new, old), at, align=4)
+        builder.store(call(builder, f"smax.v{BLOCK}i32", new, old), at, align=4)
         return context.get_dummy_value()
 
     return types.void(tile, types.intp, *(types.float32,) * 5), codegen
@@ -250,13 +248,13 @@ def compare(typingctx, tile, index, images, block, model, place, correct, false,
     def codegen(context, builder, sig, args):
         kinds = sig.args
         tile, index, images, block, model, place, *sums = args
-        at = _pointer(context, builder, kinds[0], tile, index)
+        at = pointer(context, builder, kinds[0], tile, index)
         u = builder.load(at, align=4)
         zero, one = (ir.Constant(_VECTOR, [value] * BLOCK) for value in (0.0, 1.0))
         builder.store(zero, at, align=4)
         middle, scale, occluder = (
             builder.load(
-                _pointer(context, builder, kinds[2], images, builder.add(block, _WORD(j * BLOCK))),
+                pointer(context, builder, kinds[2], images, builder.add(block, _WORD(j * BLOCK))),
                 align=4,
             )
             for j in range(3)
@@ -283,103 +281,3 @@ def compare(typingctx, tile, index, images, block, model, place, correct, false,
     sums = (FLOATS,) * 3
     given = (tile, types.intp, images, types.intp, model, types.intp)
     return types.Tuple(sums)(*given, *sums), codegen
-
-
-@intrinsic
-def load_rows(typingctx, array, column, row):
-    """WORDS words of one column of a (columns, rows) array."""
-
-    def codegen(context, builder, signature, args):
-        array, column, row = args
-        struct = context.make_array(signature.args[0])(context, builder, array)
-        pitch = builder.extract_value(struct.shape, 1)
-        index = builder.add(builder.mul(column, pitch), row)
-        at = builder.bitcast(builder.gep(struct.data, [index]), _ROWS.as_pointer())
-        return builder.load(at, align=8)
-
-    return ROWS(array, types.intp, types.intp), codegen
-
-
-@intrinsic
-def store_rows(typingctx, array, column, row, words):
-    """WORDS words of one column of a (columns, rows) array are set."""
-
-    def codegen(context, builder, signature, args):
-        array, column, row, words = args
-        struct = context.make_array(signature.args[0])(context, builder, array)
-        pitch = builder.extract_value(struct.shape, 1)
-        index = builder.add(builder.mul(column, pitch), row)
-        at = builder.bitcast(builder.gep(struct.data, [index]), _ROWS.as_pointer())
-        builder.store(words, at, align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.intp, ROWS), codegen
-
-
-@intrinsic
-def no_rows(typingctx):
-    """Words without a bit."""
-    return ROWS(), lambda context, builder, signature, args: ir.Constant(_ROWS, [0] * WORDS)
-
-
-@intrinsic
-def shifted(typingctx, words, after, count):
-    """Pixels from `count` (0 .. 63) on, of words and of those to their right."""
-
-    def codegen(context, builder, signature, args):
-        words, after, count = args
-        return _call(builder, f"fshr.v{WORDS}i64", after, words, _splat(builder, count, _ROWS))
-
-    return ROWS(ROWS, ROWS, types.uint64), codegen
-
-
-@intrinsic
-def widened(typingctx, left, words, right):
-    """Words with the pixels to both sides of theirs; left, right: the words beside them."""
-
-    def codegen(context, builder, signature, args):
-        left, words, right = args
-        one = ir.Constant(_ROWS, [1] * WORDS)
-        name = f".v{WORDS}i64"
-        higher = _call(builder, "fshl" + name, words, left, one)
-        lower = _call(builder, "fshr" + name, right, words, one)
-        return builder.or_(words, builder.or_(higher, lower))
-
-    return ROWS(ROWS, ROWS, ROWS), codegen
-
-
-@intrinsic
-def without(typingctx, words, others):
-    """The bits of the first that the second has not."""
-
-    def codegen(context, builder, signature, args):
-        return builder.and_(args[0], builder.not_(args[1]))
-
-    return ROWS(ROWS, ROWS), codegen
-
-
-@intrinsic
-def any_bit(typingctx, words):
-    """Whether a bit is set."""
-
-    def codegen(context, builder, signature, args):
-        some = builder.icmp_unsigned("!=", args[0], ir.Constant(_ROWS, [0] * WORDS))
-        return builder.icmp_unsigned(
-            "!=", builder.bitcast(some, ir.IntType(WORDS)), ir.IntType(WORDS)(0)
-        )
-
-    return types.boolean(ROWS), codegen
-
-
-@intrinsic
-def ones(typingctx, words):
-    """How many bits are set."""
-
-    def codegen(context, builder, signature, args):
-        counts = _call(builder, f"ctpop.v{WORDS}i64", *args)
-        sums = [builder.extract_element(counts, _INT(j)) for j in range(WORDS)]
-        while len(sums) > 1:
-            sums = [builder.add(a, b) for a, b in zip(sums[::2], sums[1::2], strict=True)]
-        return sums[0]
-
-    return types.int64(ROWS), codegen
