@@ -44,7 +44,7 @@ class Estimate:
     effective_sample_size: float
     """Of the weights, before resampling."""
     compute_s: float
-    """Wall seconds spent on the frame, capture and drawing excluded."""
+    """Wall seconds from the raw frame to the estimate, rectification included, drawing excluded."""
     confidence: float = math.nan
     """Probability that every joint is within 40 mm; NaN where nothing says."""
     outside_rad: float = math.nan

@@ -99,6 +99,7 @@ def test_description_is_json_and_says_what_was_replayed(recording: Path) -> None
 
 def test_realtime_waits_for_each_frames_time(recording: Path) -> None:
     device = Replay(recording, realtime=True)
+    assert device.live
     begin = time.monotonic()
     indices = [frame.index for frame in device]
     assert time.monotonic() - begin >= (T - 1) / 100
@@ -126,6 +127,7 @@ def test_realtime_drops_what_comes_too_late(
 
 def test_without_realtime_nothing_is_dropped(recording: Path) -> None:
     device = Replay(recording)
+    assert not device.live
     count = 0
     for _ in device:
         time.sleep(0.012)

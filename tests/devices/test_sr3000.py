@@ -285,6 +285,7 @@ def test_a_slow_consumer_gets_the_newest_frame_and_the_rest_is_counted() -> None
     counts = device.counts
     assert counts.delivered == len(indices)
     assert counts.delivered + counts.dropped == counts.received == device.emulator.served == 100
+    assert device.live and device.dropped == counts.dropped
 
 
 def test_a_slow_consumer_gets_every_frame_if_wanted_so() -> None:
@@ -293,7 +294,7 @@ def test_a_slow_consumer_gets_every_frame_if_wanted_so() -> None:
         for _ in device:
             count += 1
             time.sleep(0.002)
-    assert (count, device.counts.dropped) == (40, 0)
+    assert (count, device.counts.dropped, device.dropped, device.live) == (40, 0, 0, False)
 
 
 def test_stopping_delivers_what_was_received() -> None:

@@ -302,6 +302,18 @@ class _Entrances(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
+class _Generator(torch.Generator):
+    """One that says it is on the device, and draws the CPU's numbers."""
+
+    device = DEVICE
+
+
+def _generator(
+    device: Any = "cpu", make: Callable[[], torch.Generator] = torch.Generator
+) -> torch.Generator:
+    return _Generator() if _is_there(device) else make()
+
+
 _KEPT = (transfer.table, base._limits, overlap._tables)
 """What keeps tensors of a device."""
 
@@ -313,13 +325,12 @@ def pretended_device() -> Iterator[Counts]:
     Random numbers are the CPU's.
     """
     counts = Counts()
-    generator = torch.Generator
     with (
         patch("torch.cuda._lazy_init", lambda: None),
         patch("torch.cuda.is_available", lambda: True),
         # What torch does is seen in the thread that asks for it.
         patch("toftrack.compute.threads.threads", lambda: 1),
-        patch("torch.Generator", lambda device="cpu": generator()),
+        patch("torch.Generator", _generator),
         # A module's parameters cannot become another class in place.
         patch("torch.__future__._overwrite_module_params_on_conversion", True),
         _Entrances(),

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from toftrack.compute import rigid
 from toftrack.compute.backend import Motions
+from toftrack.compute.redraw import redraw_with
 from toftrack.hand.shape import HandShape
 from toftrack.render import scoring
 from toftrack.render.numba.scorer import NumbaScorer
@@ -35,11 +36,9 @@ def pretended_triton(counts: Counts) -> Iterator[None]:
     sys.modules.update(absent)
     try:
         scorer, motions = map(importlib.import_module, _THEIRS[:2])
-        moved = Motions(
-            _pretended_motion(motions.compose, rigid.compose),
-            _pretended_motion(motions.difference, rigid.difference),
-            rigid.mean,
-        )
+        compose = _pretended_motion(motions.compose, rigid.compose)
+        difference = _pretended_motion(motions.difference, rigid.difference)
+        moved = Motions(compose, difference, redraw_with(compose), rigid.mean)
         with (
             patch.multiple(scorer, **_kernels(scorer, counts)),
             patch.multiple(motions, MOTIONS=moved, **_kernels(motions, counts)),

@@ -63,8 +63,8 @@ def test_the_compiled_loops_find_what_the_reference_finds(shape: tuple[int, int]
     depth[draw.random(shape) < 0.1] = 0
     hand = (draw.random(shape) < 0.7) & (depth > 0)
     k = np.array([[200.0, 0, 44], [0, 210, 33], [0, 0, 1]], np.float32)
-    expected = seen_points_of.smooth_points(depth, hand, (3, 4), k)
-    found = seen_points_numba.smooth_points(depth, hand, (3, 4), k)
+    expected = seen_points_of.smooth_points(depth, hand, (3, 4), k, 0.03, 10.0)
+    found = seen_points_numba.smooth_points(depth, hand, (3, 4), k, 0.03, 10.0)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
     labels = np.zeros(shape, np.int32)
     labels[hand] = draw.permutation(np.count_nonzero(hand)) + 1

@@ -70,6 +70,15 @@ def test_other_fingers_that_are_a_little_better_must_stay_so() -> None:
     assert after(2, {0.2: gain})[1].contender is not None
 
 
+def test_after_a_pause_a_frame_speaks_for_those_that_were_dropped() -> None:
+    gain = CFG.drift + CFG.swap_gain / 3 + 0.001
+    for dt_s, mark in ((1.4 * FRAME_S, 0.0), (4 * FRAME_S, 0.2)):
+        now = track()
+        found = Alternatives(now.pose, torch.tensor([0.0]))
+        stands, _ = settled(found, some({0.2: gain}), now, dt_s, frame())
+        assert float(stands[0, 6]) == pytest.approx(mark)
+
+
 def test_a_tie_changes_nothing_however_long() -> None:
     stands, now = after(50, {0.2: CFG.drift})
     assert stands == 0 and now.contender is None

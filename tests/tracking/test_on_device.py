@@ -62,7 +62,7 @@ def test_a_frame_waits_for_the_device_a_few_times(
     # Where the other side is looked at, too, it is three times more.
     assert max(frame.waits for frame in asked) <= 10
     assert min(frame.waits for frame in asked) <= 7
-    assert max(frame.launches for frame in asked) <= 420
+    assert max(frame.launches for frame in asked) <= 400
 
 
 @pretended
@@ -111,12 +111,9 @@ def _passes(monkeypatch: pytest.MonkeyPatch, *overrides: str) -> Counts:
 def test_the_filter_s_passes_wait_for_nothing(
     overrides: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = _passes(monkeypatch, *overrides, "filter.passes=1")
-    monkeypatch.undo()
-    many = _passes(monkeypatch, *overrides, "filter.passes=4", "filter.particles=1000")
-    assert few.waits["passes"] == many.waits["passes"] == 0
-    each = (many.launches["passes"] - few.launches["passes"]) / 6
-    assert 20 < each < 100
+    asked = _passes(monkeypatch, *overrides, "filter.passes=4", "filter.particles=1000")
+    assert asked.waits["passes"] == 0
+    assert 20 < asked.launches["passes"] / 8 < 110
 
 
 @pretended

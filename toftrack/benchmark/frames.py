@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import cycle
 
@@ -67,21 +67,30 @@ class FrameRow:
 
 
 def frame_times(
-    seconds: float, device: torch.device, configurations: dict[str, tuple[str, ...]] | None = None
+    seconds: float,
+    device: torch.device,
+    configurations: dict[str, tuple[str, ...]] | None = None,
+    particles: Sequence[int] = (),
 ) -> list[FrameRow]:
     """Whole frames of the packaged recording, rectification included, capture and drawing not.
 
     seconds: how long to time each configuration.
     configurations: overrides by name; None = CONFIGURATIONS.
+    particles: numbers of them to time the first one with besides its own.
     Raises ToftrackError where the configuration files are not beside the package.
     """
     rows: list[FrameRow] = []
-    for name, overrides in (configurations or CONFIGURATIONS).items():
+    configurations = configurations or CONFIGURATIONS
+    for name, overrides in configurations.items():
         config = _config([*overrides, f"compute={device.type}"])
         enlarged = () if rows else SIZES
         rows += _times(name, config, seconds)
         for width, height in enlarged:
             rows += _times(f"{name}, {width}x{height}", config, seconds, (width, height))[:1]
+    name, overrides = next(iter(configurations.items()))
+    for number in particles:
+        config = _config([*overrides, f"filter.particles={number}", f"compute={device.type}"])
+        rows += _times(f"{name}, {number}", config, seconds)[:1]
     return rows
 
 

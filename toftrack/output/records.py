@@ -171,7 +171,8 @@ class Records:
             values = [line[name] for line in lines]
             if KINDS[name] is np.str_:
                 values = [self._number(word) for word in values]
-            array = np.array(values, self._kind[name].base)
+            with np.errstate(over="ignore"):  # what float32 cannot say is infinite
+                array = np.array(values, self._kind[name].base)
             if array.dtype.kind == "f":
                 array[np.isinf(array)] = np.nan  # as in the lines
             records[name] = array.reshape(len(lines), *self._kind[name].shape)

@@ -18,8 +18,7 @@ REACH_M = 0.16
 _MARGIN_PX = 24
 """Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
 _SQUARE = np.ones((3, 3), np.uint8)
-EDGE_M, FAR_M = 0.03, 10.0
-"""Depths of neighbours that differ by so much are an edge; where nothing is read it is so far."""
+_EDGE_M, _FAR_M = 0.03, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +77,8 @@ def seen_points(observation: Observation) -> SeenPoints:
     part = slice(top, bottom), slice(left, right)
     points_of, nearest_of = _loops()
     k = observation.k.cpu().numpy()
-    points = points_of(observation.depth_m.cpu().numpy()[part], hand[part], (top, left), k)
+    depth = observation.depth_m.cpu().numpy()[part]
+    points = points_of(depth, hand[part], (top, left), k, _EDGE_M, _FAR_M)
     nearest = np.zeros((0, 0, 2), np.float32)
     if solid[part].size:
         labels = cv2.distanceTransformWithLabels(
@@ -109,16 +109,22 @@ def _loops() -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
 
 
 def smooth_points(
-    depth_m: np.ndarray, hand: np.ndarray, corner: tuple[int, int], k: np.ndarray
+    depth_m: np.ndarray,
+    hand: np.ndarray,
+    corner: tuple[int, int],
+    k: np.ndarray,
+    edge_m: float,
+    far_m: float,
 ) -> np.ndarray:
     """(P, 3) float32 points of the hand's pixels that are on no depth edge, row by row.
 
     depth_m, hand: (h, w) of a crop whose first pixel is at `corner`, row and column.  k: (3, 3).
+    edge_m: depths of neighbours that differ by so much are one; where nothing is read it is far_m.
     """
     if not hand.any():
         return np.zeros((0, 3), np.float32)
-    far = np.where(depth_m > 0, depth_m, np.float32(FAR_M))
-    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < EDGE_M
+    far = np.where(depth_m > 0, depth_m, np.float32(far_m))
+    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < edge_m
     u, v = _pixels(hand & smooth)
     z = depth_m[v, u]
     x = (u + corner[1] - k[0, 2]) / k[0, 0] * z

@@ -5,21 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from toftrack.compute.compiling import called, entry_point
-from toftrack.refinement import seen_points as reference
 
-_cached = entry_point(__file__, reference.__file__)
+_cached = entry_point(__file__)
 _COMPILING = "refine: compiling what reads points (once, about 1 s)"
 
 
 def smooth_points(
-    depth_m: np.ndarray, hand: np.ndarray, corner: tuple[int, int], k: np.ndarray
+    depth_m: np.ndarray,
+    hand: np.ndarray,
+    corner: tuple[int, int],
+    k: np.ndarray,
+    edge_m: float,
+    far_m: float,
 ) -> np.ndarray:
     """See seen_points.smooth_points."""
     points = np.empty((depth_m.size, 3), np.float32)
     count = np.zeros(1, np.int64)
     depth = np.ascontiguousarray(depth_m, np.float32)
     k = np.ascontiguousarray(k, np.float32)
-    given = (depth, np.ascontiguousarray(hand), *corner, k, points, count)
+    limits = np.float32(edge_m), np.float32(far_m)
+    given = (depth, np.ascontiguousarray(hand), *corner, k, *limits, points, count)
     called(fill_points, _COMPILING, *given)
     return points[: count[0]]
 
@@ -33,10 +38,9 @@ def nearest_of_labels(labels: np.ndarray, solid: np.ndarray, corner: tuple[int, 
 
 
 @_cached
-def fill_points(depth, hand, top, left, k, points, count):
+def fill_points(depth, hand, top, left, k, edge, far, points, count):
     """points: (h * w, 3) and count: (1,), written."""
     height, width = depth.shape
-    edge, far = np.float32(reference.EDGE_M), np.float32(reference.FAR_M)
     found = 0
     for row in range(height):
         for column in range(width):

@@ -6,16 +6,17 @@ microseconds that every operation costs on a few numbers.
 
 from __future__ import annotations
 
+import functools
 import math
-from functools import lru_cache
 
 import numpy as np
 import torch
 
 from toftrack.compute import convolution_numba, rigid_numba
-from toftrack.compute.compiling import called, compiled, entry_point
+from toftrack.compute.compiling import called, compiled, entry_point, take
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rigid_numba import pose_hand, rotation_vector
+from toftrack.compute.threads import run_shared
 from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
@@ -66,9 +67,8 @@ def look(
     turns = np.stack([crop_rotation(centre) for centre in centres])
     out = _empty(len(centres))
     shape = mean_hand(side)
-    called(
+    task = functools.partial(
         look_at,
-        _COMPILING,
         np.ascontiguousarray(depth_m, np.float32),
         left,
         k,
@@ -81,11 +81,16 @@ def look(
             shape.bone_lengths_m.double().numpy(),
         ),
         tuple(out.values()),
+        np.zeros(1, np.int64),
     )
+    if look_at.signatures:
+        run_shared(task, len(centres))
+    else:
+        called(look_at, _COMPILING, *task.args)
     return Look(**{name: torch.from_numpy(array) for name, array in out.items()})
 
 
-@lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=2)
 def _packed(pose: PoseNet) -> PackedPoseNet:
     return pack_pose_net(pose)
 
@@ -109,14 +114,18 @@ def _empty(count: int) -> dict[str, np.ndarray]:
 
 
 @_cached
-def look_at(depth, mirror, k, centres, turns, net, hand, out):
+def look_at(depth, mirror, k, centres, turns, net, hand, out, counter):
     """Crops about centres (C, 3), turned by (C, 3, 3), through the network, into Look's arrays.
 
     mirror: the image is to be read as a mirror shows it; k and centres are those of the mirrored.
     net: PackedPoseNet.  hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
+    counter: (1,) int64 crops taken, by threads that share them.
     """
     image = np.empty((3, CROP, CROP), np.float32)
-    for c in range(len(centres)):
+    while True:
+        c = take(counter)
+        if c >= len(centres):
+            break
         _crop(depth, mirror, k, centres[c], turns[c], image)
         heads, votes = pose_outputs(image, net)
         _decode(heads, votes, image[0], turns[c], centres[c], mirror, hand, c, out)

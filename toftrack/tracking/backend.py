@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import TypedDict
 
@@ -75,15 +76,14 @@ class _Beside(TypedDict):
 
 def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
     """In torch on the CPU; on a device `there`, with compiled code on the CPU next to it."""
-    in_torch = _Beside(
-        motions=there, joints_penalty=penalty.joints_penalty, make_refiner=TorchRefiner
+    here = _Beside(
+        motions=rigid.MOTIONS, joints_penalty=penalty.joints_penalty, make_refiner=TorchRefiner
     )
     if device.type == "cpu":
-        return in_torch
-    try:
+        here["motions"] = there
+        return here
+    with suppress(ImportError):  # there may be no numba
         here = _compiled()
-    except ImportError:
-        here = in_torch
 
     def at(tensor: Tensor) -> Motions:
         return here["motions"] if tensor.device.type == "cpu" else there

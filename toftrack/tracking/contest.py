@@ -27,6 +27,8 @@ _SWAPPED = 2
 """So many poses with another finger are refined."""
 _OTHER_M = 0.025
 """Poses with a joint that is farther off are other ones."""
+_PAUSE_S = 0.06
+"""A time between two frames that is not the usual one."""
 _LEAST_CREDIT = 0.2
 """Of what a contender needs against a track that is believed, it needs so much against any."""
 
@@ -99,7 +101,7 @@ def settled(
         found = others.rows(same.argmax()[None])
     if not bool(other.any()):
         return found.poses, None
-    lead = (others.scores - found.scores) * min(1.0, dt_s / FRAME_S) - frame.model.refinement.drift
+    lead = (others.scores - found.scores) * _weight(dt_s) - frame.model.refinement.drift
     if track.pose is None or track.age_s == 0:
         lead = lead + torch.inf
     elif old is not None:
@@ -110,6 +112,11 @@ def settled(
         return others.poses[best][None], None
     ahead = float(lead[best])
     return found.poses, Contender(others.poses[best][None], ahead) if ahead > 0 else None
+
+
+def _weight(dt_s: float) -> float:
+    """Of a frame's word: after a pause it speaks for the frames that were dropped, too."""
+    return dt_s / FRAME_S if dt_s < FRAME_S or dt_s > _PAUSE_S else 1.0
 
 
 def _apart(joints_m: Tensor, from_m: Tensor) -> Tensor:

@@ -51,9 +51,9 @@ class Effort:
 LEVELS = (
     Effort(),
     Effort(threads=1),
-    Effort(1, every=2, search=2, places=2),
-    Effort(1, every=3, search=3, swaps=0.5, rivals=2, places=1),
-    Effort(1, every=4, search=5, swaps=0.25, rivals=1, places=1),
+    Effort(1, every=2, search=2),
+    Effort(1, every=3, search=3, swaps=0.5, rivals=2, places=2),
+    Effort(1, every=4, search=4, swaps=0.25, rivals=1, places=2),
 )
 """All effort first; each leaves out more than the one before. Fewer particles or passes save little
 and cost much of the accuracy: rather frames are dropped."""
