@@ -112,8 +112,8 @@ def build_model(config: DictConfig) -> TrackerModel:
     hand = instantiate(config.hand)
     relocaliser = instantiate(config.relocation)
     return TrackerModel(
-        shape=hand.shape.to(device),
-        space=instantiate(config.pose_space).to(device),
+        shape=hand.shape,
+        space=instantiate(config.pose_space),
         segmentation=instantiate(config.segmentation),
         likelihood=instantiate(config.likelihood),
         filter=instantiate(config.filter),
@@ -123,7 +123,7 @@ def build_model(config: DictConfig) -> TrackerModel:
         fit=hand.fit,
         gestures=instantiate(config.gestures),
         backend=choose_backend(config.renderer, device),
-        relocaliser=relocaliser,
+        relocaliser=None if relocaliser is None else relocaliser.to(device),
         adapt=None if relocaliser is None else hand.adapt,
         sides=hand.sides,
     )

@@ -165,11 +165,13 @@ class Camera:
         return np.sqrt(1.0 + (self._rays**2).sum(axis=-1)).astype(np.float32)
 
     @cached_property
-    def _undistortion_maps(self) -> tuple[np.ndarray, np.ndarray]:
+    def _undistortion_map(self) -> np.ndarray:
+        """(H, W, 2) int16: the nearest pixel of the measured image."""
         size = (self.width, self.height)
         fisheye = self.lens == "fisheye"
         make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
-        return make(self.K, self.distortion, np.eye(3), self.K, size, cv2.CV_32FC1)
+        maps = make(self.K, self.distortion, np.eye(3), self.K, size, cv2.CV_32FC1)
+        return cv2.convertMaps(*maps, cv2.CV_16SC2, nninterpolation=True)[0]
 
     def normalised_rays(self) -> np.ndarray:
         """(H, W, 2) float64: x and y at Z = 1 of each pixel's ray, after undistortion; cached."""
@@ -197,13 +199,19 @@ class Camera:
             ToftrackError: the image is not of the camera's size.
         """
         self._check_size(depth)
-        valid = (depth > 0) & (depth < np.inf)  # also false for NaN
-        z = np.where(valid, depth, 0).astype(np.float32, copy=False)
+        # A large image takes as long as memory does: nearly all are clean, and what follows is done
+        # in place.
+        if depth.min() >= 0 and depth.max() < np.inf:  # also false for NaN
+            z = np.array(depth, np.float32)
+        else:
+            z = np.where((depth > 0) & (depth < np.inf), depth, 0).astype(np.float32, copy=False)
         if self.depth_polynomial:
-            measured = z if radial else z * self._ray_lengths
-            z = self._correct(measured, valid) / self._ray_lengths
+            if not radial:
+                z *= self._ray_lengths
+            z = self._corrected(z)
+            z /= self._ray_lengths
         elif radial:
-            z = self.radial_to_z(z)
+            z /= self._ray_lengths
         return self._undistort(z) if self._distorted else z
 
     def undistort_amplitude(self, amplitude: np.ndarray | None) -> np.ndarray | None:
@@ -316,18 +324,24 @@ class Camera:
                 f"the camera file '{path}' has a width or height that is not a whole number"
             ) from None
 
-    def _correct(self, measured: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        correction = np.zeros_like(measured)
+    def _corrected(self, measured: np.ndarray) -> np.ndarray:
+        """Radial distances (H, W) float32 after the depth polynomial, 0 where there are none."""
         at = measured
         if self.depth_polynomial_range_m:
             at = np.clip(measured, *map(np.float32, self.depth_polynomial_range_m))
-        for coefficient in reversed(self.depth_polynomial):
-            correction = correction * at + np.float32(coefficient)
+        *lower, highest = self.depth_polynomial
+        corrected = np.full_like(measured, highest)
+        for coefficient in reversed(lower):
+            corrected *= at
+            corrected += np.float32(coefficient)
+        corrected += measured
         # A correction that pushes a reading behind the camera leaves no reading.
-        return np.where(valid, np.maximum(measured + correction, 0), 0)
+        np.maximum(corrected, 0, out=corrected)
+        np.copyto(corrected, 0, where=measured == 0)
+        return corrected
 
     def _undistort(self, image: np.ndarray) -> np.ndarray:
-        return cv2.remap(image, *self._undistortion_maps, cv2.INTER_NEAREST, borderValue=0)
+        return cv2.remap(image, self._undistortion_map, None, cv2.INTER_NEAREST, borderValue=0)
 
     def _check_size(self, image: np.ndarray) -> None:
         if image.shape != (self.height, self.width):

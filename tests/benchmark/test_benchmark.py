@@ -6,6 +6,8 @@ import json
 
 import pytest
 import torch
+from helpers.accelerator import pretended_device
+from helpers.pretended_triton import pretended_triton
 
 from toftrack.benchmark import frames as frame_timing
 from toftrack.benchmark import scoring as benchmark
@@ -51,7 +53,8 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
     assert result["largest_difference_px"]["numba"] <= 3
     frames = {row["configuration"]: row for row in result["frames"]}
     kinds = ("", ", start", ", searching")
-    assert set(frames) == {f"{name}{kind}" for name in ("default", "paper") for kind in kinds}
+    expected = {f"{name}{kind}" for name in ("default", "paper") for kind in kinds}
+    assert set(frames) == expected | {"default, 640x480", "default, 1280x720"}
     assert all(0 < row["min_ms"] <= row["median_ms"] for row in frames.values())
     assert all(set(row["parts"]) == set(frame_timing.PARTS) for row in frames.values())
     looked = {name: row["parts"]["relocaliser"] for name, row in frames.items()}
@@ -64,8 +67,25 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
     assert all(0 < row["min_ms"] <= row["median_ms"] for row in spaces.values())
     printed = capsys.readouterr().out
     assert "median ms" in printed and "numba" in printed
-    assert printed.count("frames/s") == 6 and "default, searching" in printed
+    assert printed.count("frames/s") == 8 and "default, searching" in printed
     assert printed.count("decoding latents") == 4 and "kernel_pca" in printed
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_device_s_run_times_whole_frames_at_each_number_of_particles(capsys, quick, monkeypatch):
+    monkeypatch.setattr(frame_timing, "CONFIGURATIONS", {"default": ()})
+    monkeypatch.setattr(frame_timing, "SIZES", ())
+    monkeypatch.setattr(frame_timing, "_FEWEST", 2)
+    monkeypatch.setattr(benchmark, "UPSAMPLED", ())
+    monkeypatch.setattr(benchmark, "decode_times", lambda **_: [])
+    monkeypatch.setattr("torch.cuda.synchronize", lambda *_: None)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "none at all")
+    arguments = ["--compute", "cuda", "--particles", "4", "6", "--seconds", "0", "--no-baselines"]
+    with pretended_device() as counts, pretended_triton(counts):
+        assert benchmark.main([*arguments, "--frames"]) == 0
+    printed = capsys.readouterr().out
+    assert "none at all" in printed and "triton: counts within" in printed
+    assert "default, 4 " in printed and "default, 6 " in printed
 
 
 def test_whole_frames_need_the_configuration(tmp_path, monkeypatch):

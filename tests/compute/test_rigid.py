@@ -12,6 +12,7 @@ from torch import Tensor
 
 from toftrack.compute import rigid, rigid_numba
 from toftrack.compute.compiling import entry_point
+from toftrack.compute.redraw import BOUNDS
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 
@@ -159,3 +160,34 @@ def test_the_mean_rotation_is_nearest_to_all() -> None:
     near_pi = torch.tensor([[math.pi - 0.1, 0.0, 0.0], [-math.pi + 0.1, 0.0, 0.0]])
     found = rigid.mean_rotation(near_pi, torch.tensor([0.5, 0.5], dtype=torch.float64))
     assert float(found.norm()) == pytest.approx(math.pi, abs=1e-5)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 3.0])
+def test_the_compiled_mean_is_that_of_the_reference(spread: float) -> None:
+    draw = torch.Generator().manual_seed(3)
+    rotvec = torch.tensor([2.0, -1.0, 0.5]) + spread * torch.randn(150, 3, generator=draw)
+    weights = torch.rand(150, generator=draw, dtype=torch.float64)
+    weights /= weights.sum()
+    particles = torch.cat((rotvec.roll(1, 1), rotvec, rotvec), 1)
+    found, expected = (module.mean(particles, weights)[0] for module in (rigid_numba, rigid))
+    off = roma.rotvec_geodesic_distance(found[3:6].double(), expected[3:6].double())
+    assert float(off) < 1e-5  # rad
+    torch.testing.assert_close(found[[0, 1, 2, 6, 7, 8]], expected[[0, 1, 2, 6, 7, 8]])
+
+
+@pytest.mark.parametrize("mode", BOUNDS)
+def test_the_compiled_redraw_is_that_of_the_reference(mode: str) -> None:
+    draw = torch.Generator().manual_seed(4)
+    lower, upper = torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([1.0, 2.0, 3.0])
+    before = torch.randn(80, 9, generator=draw)
+    weights = torch.rand(80, generator=draw, dtype=torch.float64) ** 3
+    weights[:2], weights[-3:] = 0.0, 0.0
+    positions = (torch.arange(150) + torch.rand(150, generator=draw, dtype=torch.float64)) / 150
+    positions[0], positions[-1] = 0.0, 1.0
+    tangents = 0.5 * torch.randn(150, 9, generator=draw)
+    given = (before, weights, positions, tangents, lower, upper, mode)
+    found, expected = rigid_numba.redraw(*given), rigid.MOTIONS.redraw(*given)
+    torch.testing.assert_close(found[:, 6:], expected[:, 6:], atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[:, :3], expected[:, :3], atol=1e-5, rtol=0)
+    turn = roma.rotvec_geodesic_distance(found[:, 3:6].double(), expected[:, 3:6].double())
+    assert float(turn.max()) < 1e-4  # rad

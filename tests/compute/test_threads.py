@@ -10,7 +10,7 @@ import torch
 
 from toftrack.compute import compiling
 from toftrack.compute.compiling import entry_point
-from toftrack.compute.threads import run_shared, small_operations, threads
+from toftrack.compute.threads import beside, run_shared, small_operations, threads
 
 
 @entry_point(__file__, compiling.__file__)
@@ -44,3 +44,25 @@ def test_what_fails_in_a_thread_fails_here() -> None:
 
     with pytest.raises(ValueError, match="no"):
         run_shared(task, 1)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_task_beside_is_waited_for_and_fails_where_it_is_waited_for(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("toftrack.compute.threads.threads", lambda: count)
+    assert beside(lambda: 7)() == 7
+    waits = beside(lambda: [][0])
+    with pytest.raises(IndexError):
+        waits()
+
+
+def test_without_another_thread_a_task_beside_is_done_when_it_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("toftrack.compute.threads.threads", lambda: 1)
+    done: list[int] = []
+    waits = beside(lambda: done.append(1))
+    assert not done
+    waits()
+    assert done == [1]

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 import toftrack.configuration.check as check
 from toftrack.configuration.compose import configuration
+from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
 WRONG = (
@@ -68,6 +69,41 @@ def test_what_a_part_of_somebody_else_s_accepts_is_not_judged(tmp_path) -> None:
     (tmp_path / "device" / "raw.yaml").write_text("_target_: mine.Raw\ngain: 1\n")
     (tmp_path / "config.yaml").write_text("defaults:\n  - device: raw\n  - _self_\n")
     assert configuration("device.gain=-0.5", config_dir=tmp_path).device.gain == -0.5
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: [",
+        "a: 1\na: 2\n",
+        "\ta",
+        "a: *b",
+        "defaults: 5",
+        "a: ${ 5://b}",
+        "seed: " + "9" * 5000,
+        "[" * 3000,
+        "1: 2",
+    ],
+)
+@pytest.mark.parametrize("name", ["config.yaml", "device/raw.yaml"])
+def test_a_configuration_that_is_damaged_is_one_sentence(tmp_path, name: str, text: str) -> None:
+    (tmp_path / "device").mkdir()
+    (tmp_path / "device" / "raw.yaml").write_text("gain: 1\n")
+    (tmp_path / "config.yaml").write_text("defaults:\n  - device: raw\n  - _self_\nseed: 0\n")
+    (tmp_path / name).write_text(text)
+    if (name, text) == ("device/raw.yaml", "1: 2"):
+        assert configuration("seed=1", config_dir=tmp_path).seed == 1
+        return
+    with pytest.raises(ToftrackError) as error:
+        configuration("seed=1", config_dir=tmp_path)
+    assert str(error.value) and "\n" not in str(error.value)
+
+
+def test_the_file_and_the_line_that_are_no_yaml_are_told() -> None:
+    with pytest.raises(yaml.YAMLError) as error:
+        yaml.safe_load("a: 1\nb: [")
+    told = sentence(error.value)
+    assert told.startswith("a file of the configuration is no YAML: ") and "line 2" in told
 
 
 def test_the_program_ends_without_torch_having_been_loaded(tmp_path) -> None:

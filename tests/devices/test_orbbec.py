@@ -49,10 +49,13 @@ def test_a_recording_gives_what_the_sdk_recorded(recording: Path, images: np.nda
     assert device.description["serial"] == "CL8042"
     frames = list(device)
     assert frames and frames[0].index == 0
+    # On a busy machine the SDK may begin with a later frame than the recording's first.
+    missed = round(30 * (frames[0].timestamp_s - 1))
     for frame in frames:
-        np.testing.assert_allclose(frame.depth, images[0, frame.index] / 1000, rtol=1e-6)
-        np.testing.assert_array_equal(frame.amplitude, images[1, frame.index])
-        assert frame.timestamp_s == pytest.approx(1 + frame.index / 30, abs=1e-5)
+        number = missed + frame.index
+        np.testing.assert_allclose(frame.depth, images[0, number] / 1000, rtol=1e-6)
+        np.testing.assert_array_equal(frame.amplitude, images[1, number])
+        assert frame.timestamp_s == pytest.approx(1 + number / 30, abs=1e-5)
 
 
 def test_a_start_behind_the_end_is_told(recording: Path) -> None:

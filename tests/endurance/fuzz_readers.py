@@ -41,11 +41,14 @@ _INSTRUMENTED = (
     "toftrack.gestures.files",
     "toftrack.hand.shape",
     "toftrack.json_text",
+    "toftrack.output.lines",
+    "toftrack.output.records",
     "toftrack.output.results",
     "toftrack.output.run_folder",
     "toftrack.pose_space.data",
     "toftrack.pose_space.files",
     "toftrack.recordings",
+    "toftrack.relocation.weights",
     "rosbags",
 )
 """Where libFuzzer sees what an input reaches."""
@@ -207,6 +210,11 @@ def mutated(random: np.random.Generator, suffix: str, content: bytes, plain: Any
                 return mutated_archive(random, content)
             if suffix == ".json":
                 return odd_json(random, content)
+            if suffix == ".jsonl":
+                lines = content.splitlines(keepends=True)
+                at = int(random.integers(len(lines)))
+                lines[at] = odd_json(random, lines[at]) + b"\n"
+                return b"".join(lines)
         except Exception:  # too damaged already for anything but bytes
             pass
         if suffix == ".npy":

@@ -4,9 +4,9 @@
 
 The tracker follows an emulated SR3000 at the camera's pace, in a process of its own. Each 50th
 request to the camera goes wrong, in all ways in turn; a visitor watches the page and comes anew
-after every 100 pictures; a listener takes the datagrams. At the end a table compares the first
-quarter with the last one, and the status is 1 if memory, threads or file handles grew, or if the
-run failed. Needs /proc, that is Linux.
+after every 100 pictures; a listener takes the datagrams. At the end a table tells of each tenth of
+the time, and how long the ending took. The status is 1 if memory, threads or file handles are more
+in the last quarter than in the first one, or if the run failed. Needs /proc, that is Linux.
 """
 
 from __future__ import annotations
@@ -86,13 +86,17 @@ class Observation:
     arrivals: tuple[Arrival, ...]
     pictures: int
     visits: int
-    status: int
-    """With which the program ended after Ctrl-C; 130 is as it should be."""
+    status: int | None
+    """With which the program ended; 143 is as it should be. None: it did not end."""
+    ending_s: float
+    """How long that took."""
+    written_mb: float
+    """Size of the run's files at the end."""
 
-    def quarter(self, number: int) -> tuple[list[Sample], list[Arrival]]:
-        """Number 0 is the first."""
+    def part(self, number: int, of: int) -> tuple[list[Sample], list[Arrival]]:
+        """One of so many equal parts of the time; number 0 is the first."""
         begin, end = self.samples[0].time_s, self.samples[-1].time_s
-        low, high = (begin + (end - begin) * k / 4 for k in (number, number + 1))
+        low, high = (begin + (end - begin) * k / of for k in (number, number + 1))
         return (
             [sample for sample in self.samples if low <= sample.time_s <= high],
             [arrival for arrival in self.arrivals if low <= arrival.time_s <= high],
@@ -115,11 +119,16 @@ def grown(first: Sequence[Sample], last: Sequence[Sample]) -> list[str]:
     ]
 
 
-def table(observation: Observation) -> str:
-    """The first quarter against the last one."""
-    columns = [_figures(*observation.quarter(number)) for number in (0, 3)]
-    lines = [f"{'':44}{'first quarter':>16}{'last quarter':>16}"]
-    lines += [f"{name:44}{columns[0][name]:>16}{columns[1][name]:>16}" for name in columns[0]]
+def table(observation: Observation, parts: int = 10) -> str:
+    """A row for each part of the time."""
+    length_s = (observation.samples[-1].time_s - observation.samples[0].time_s) / parts
+    rows = [_figures(*observation.part(number, parts)) for number in range(parts)]
+    widths = {name: max(len(name), *(len(row[name]) for row in rows)) + 2 for name in rows[0]}
+    lines = ["minutes     " + "".join(f"{name:>{width}}" for name, width in widths.items())]
+    for number, row in enumerate(rows):
+        begin, end = (k * length_s / 60 for k in (number, number + 1))
+        cells = "".join(f"{row[name]:>{width}}" for name, width in widths.items())
+        lines.append(f"{begin:4.1f} - {end:4.1f} {cells}")
     return "\n".join(lines)
 
 
@@ -127,19 +136,21 @@ def _figures(samples: Sequence[Sample], arrivals: Sequence[Arrival]) -> dict[str
     def spread(values: Sequence[float], parts: Sequence[float]) -> str:
         return " / ".join(f"{value:.0f}" for value in np.percentile(values, parts))
 
+    def most(values: Sequence[int]) -> str:
+        return str(max(values, default=0))
+
+    parts = (50, 95, 99)
     indices = [arrival.index for arrival in arrivals]
     late = [1e3 * (arrival.time_s - arrival.frame_s) for arrival in arrivals]
-    of_all = (0, 50, 100)
+    compute = [1e3 * arrival.compute_s for arrival in arrivals]
     return {
-        "memory, MB (least / median / most)": spread([s.memory_mb for s in samples], of_all),
-        "threads": spread([s.threads for s in samples], of_all),
-        "file handles": spread([s.handles for s in samples], of_all),
-        "compute_s, ms (50 / 95 / 99 %)": spread(
-            [1e3 * arrival.compute_s for arrival in arrivals], (50, 95, 99)
-        ),
-        "time stamp to arrival, ms (50 / 95 / 99 %)": spread(late, (50, 95, 99)),
-        "frames tracked": str(len(arrivals)),
-        "frames dropped or damaged": str(indices[-1] - indices[0] + 1 - len(arrivals)),
+        "MB": f"{max((sample.memory_mb for sample in samples), default=0):.1f}",
+        "threads": most([sample.threads for sample in samples]),
+        "handles": most([sample.handles for sample in samples]),
+        "compute ms, 50 / 95 / 99 %": spread(compute, parts) if compute else "-",
+        "stamp to arrival ms, 50 / 95 / 99 %": spread(late, parts) if late else "-",
+        "frames": str(len(arrivals)),
+        "missed": str(indices[-1] - indices[0] + 1 - len(arrivals)) if indices else "-",
     }
 
 
@@ -157,15 +168,32 @@ def soak(minutes: float, folder: Path, told: Callable[[str], None] = print) -> O
             start(lambda: _watch(url, pictures, ended))
             _until(lambda: len(arrivals) > _WARM_FRAMES, program)
             samples = _samples(program, 60 * minutes, arrivals, told)
-            program.send_signal(signal.SIGINT)
-            status = program.wait(_ENDING_S)
+            asked_s = time.monotonic()
+            status = _ended(program)
+            ending_s = time.monotonic() - asked_s
     seen = tuple(arrival for arrival in arrivals if arrival.time_s >= samples[0].time_s)
-    return Observation(tuple(samples), seen, *pictures, status)
+    written_mb = sum(file.stat().st_size for file in (folder / "run").iterdir()) / 1e6
+    return Observation(tuple(samples), seen, *pictures, status, ending_s, written_mb)
+
+
+def _ended(program: subprocess.Popen) -> int | None:
+    """The status; of a program that does not end, err.txt tells then where it is.
+
+    Not by Ctrl-C, which shells let programs in the background ignore.
+    """
+    program.terminate()
+    try:
+        return program.wait(_ENDING_S)
+    except subprocess.TimeoutExpired:
+        program.send_signal(signal.SIGABRT)
+        program.wait()
+        return None
 
 
 @contextmanager
 def _program(folder: Path, port: int) -> Iterator[subprocess.Popen]:
-    command = [sys.executable, str(ROOT / "track.py"), *OVERRIDES, f"stream.port={port}"]
+    tracker = [sys.executable, "-X", "faulthandler", str(ROOT / "track.py")]
+    command = [*tracker, *OVERRIDES, f"stream.port={port}"]
     with open(folder / "err.txt", "wb") as words:
         program = subprocess.Popen(
             [*command, "hydra.run.dir=run"], cwd=folder, stdout=words, stderr=words
@@ -275,12 +303,13 @@ def main() -> int:
         words = (Path(folder) / "err.txt").read_text()
     print(table(observation))
     print(f"{observation.pictures} pictures were seen in {observation.visits} visits")
+    print(f"the ending took {observation.ending_s:.1f} s; {observation.written_mb:.0f} MB of files")
     print(*re.findall(r"sr3000: frames: .*", words)[-1:])
     problems = [
-        f"{name} grew" for name in grown(observation.quarter(0)[0], observation.quarter(3)[0])
+        f"{name} grew" for name in grown(observation.part(0, 4)[0], observation.part(3, 4)[0])
     ]
-    if observation.status != 130:
-        problems.append(f"the tracker ended with status {observation.status}\n{words[-2000:]}")
+    if observation.status != 143:
+        problems.append(f"the tracker ended with status {observation.status}\n{words[-5000:]}")
     print("; ".join(problems) or "nothing grew")
     return 1 if problems else 0
 

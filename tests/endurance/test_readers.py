@@ -122,11 +122,8 @@ def test_any_stack(readers: list[Reader], array: np.ndarray, data: st.DataObject
     _reads_or_refuses(reader, target.getvalue())
 
 
-@_PATIENT
-@given(data=st.data())
-def test_any_json(readers: list[Reader], data: st.DataObject) -> None:
-    reader = data.draw(st.sampled_from(_of(readers, ".json")))
-    content = json.loads(reader.file.read_bytes())
+def _with_another_value(data: st.DataObject, content: Any) -> Any:
+    """JSON of which one value, or all, is another."""
     holder: Any = {"": content}
     key: Any = ""
     while isinstance(holder[key], (dict, list)) and holder[key] and data.draw(st.booleans()):
@@ -134,8 +131,25 @@ def test_any_json(readers: list[Reader], data: st.DataObject) -> None:
         keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
         holder, key = inner, data.draw(st.sampled_from(keys))
     holder[key] = data.draw(_JSON)
-    whole = content if key != "" else holder[key]
-    _reads_or_refuses(reader, json.dumps(whole).encode())
+    return content if key != "" else holder[key]
+
+
+@_PATIENT
+@given(data=st.data())
+def test_any_json(readers: list[Reader], data: st.DataObject) -> None:
+    reader = data.draw(st.sampled_from(_of(readers, ".json")))
+    changed = _with_another_value(data, json.loads(reader.file.read_bytes()))
+    _reads_or_refuses(reader, json.dumps(changed).encode())
+
+
+@_PATIENT
+@given(data=st.data())
+def test_any_line(readers: list[Reader], data: st.DataObject) -> None:
+    (reader,) = _of(readers, ".jsonl")
+    lines = [json.loads(line) for line in reader.file.read_text().splitlines()]
+    at = data.draw(st.integers(0, len(lines) - 1))
+    lines[at] = _with_another_value(data, lines[at])
+    _reads_or_refuses(reader, "".join(json.dumps(line) + "\n" for line in lines).encode())
 
 
 @_PATIENT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -15,20 +16,27 @@ from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
 from helpers.tracking import run
 
 from toftrack.camera import Camera
+from toftrack.configuration.compose import configuration, configuration_folder
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
+from toftrack.errors import ToftrackError
 from toftrack.gestures.files import NamedPose, read_poses, save_poses
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES
+from toftrack.output.files import LINES
 from toftrack.output.run_folder import Run, read_run
 from toftrack.pose_space.data.leap import leap_data
 from toftrack.pose_space.data.pose_files import file_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
+from toftrack.programs.recover import recover
+from toftrack.programs.report import read_runs
 from toftrack.recordings.datasets import icvl, msra, nyu, open_data_set
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
+from toftrack.relocation.network import Finder, PoseNet
+from toftrack.relocation.weights import _checksum, load_weights, save_weights
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 3
 _MOST_FRAMES = 4
@@ -97,7 +105,7 @@ def write_readers(folder: Path, whole: bool = True) -> list[Reader]:
 
     whole: also what takes seconds to make: a run, a bag where rosbags is installed, data sets.
     """
-    readers = [*_recordings(folder), *_small_files(folder)]
+    readers = [*_recordings(folder), *_small_files(folder), *_configurations(folder)]
     if whole:
         readers += [*_runs(folder), *_data_sets(folder)]
         if find_spec("rosbags") is not None:
@@ -175,6 +183,10 @@ def _small_files(folder: Path) -> list[Reader]:
         seq_name=["a.json.lz", "b.json.lz"],
         seq_len=[3, 3],
     )
+    networks = PoseNet(4), Finder(4)
+    for parameter in (one for network in networks for one in network.parameters()):
+        parameter.data.zero_()  # takes hardly any room
+    save_weights(small / "weights.npz", *networks, {"steps": 1})
     readers: dict[str, Callable[[Path], object]] = {
         "gestures.json": read_poses,
         "gestures.csv": read_poses,
@@ -184,8 +196,47 @@ def _small_files(folder: Path) -> list[Reader]:
         "hand_shape.json": HandShape.load,
         "camera.json": Camera.load,
         "leap.npz": lambda path: leap_data(str(path), None, 1e3),
+        "weights.npz": read_weights,
     }
     return [_alone(name, small / name, read) for name, read in readers.items()]
+
+
+def _configurations(folder: Path) -> list[Reader]:
+    """Composed only: what they name is executed by whoever uses them."""
+    own, job = folder / "conf", _new(folder, "sweep") / "0"
+    shutil.copytree(configuration_folder(), own)
+    (job / ".hydra").mkdir(parents=True)
+    (job / ".hydra" / "overrides.yaml").write_text("- filter.particles=100\n- seed=1\n")
+    (job / "summary.json").write_text('{"frames": 3, "metrics": {"mean_mm": 5.5}}')
+    return [
+        Reader("config.yaml", own / "config.yaml", own, compose),
+        Reader("group: a .yaml", own / "segmentation" / "nearest.yaml", own, compose),
+        Reader("overrides.yaml", job / ".hydra" / "overrides.yaml", job.parent, read_runs),
+    ]
+
+
+def compose(folder: Path) -> None:
+    """A configuration of one's own."""
+    configuration("seed=1", config_dir=folder)
+
+
+def read_weights(path: Path) -> None:
+    """Weights as they are, and with the checksum set right, which anybody can do."""
+    try:
+        load_weights(path)
+    except ToftrackError as error:
+        if "checksum" not in str(error):
+            raise
+        try:
+            with np.load(path, allow_pickle=False) as content:
+                arrays = dict(content)
+        except Exception:  # it is damaged in another way, too
+            raise error from None
+        metadata = json.loads(arrays.pop("metadata").item())
+        metadata["sha256"] = _checksum(arrays)
+        right = path.with_name("right.npz")
+        np.savez(right, metadata=np.array(json.dumps(metadata)), **arrays)
+        load_weights(right)
 
 
 def _runs(folder: Path) -> list[Reader]:
@@ -193,16 +244,22 @@ def _runs(folder: Path) -> list[Reader]:
     there = _new(folder, "run")
     with Sample(stop=2) as device:
         run(there, device, *quick, "view=none")
+    killed = folder / "killed"
+    shutil.copytree(there, killed)
     files = ("track.npz", "run.json", "summary.json", "hand_shape.json")
-    return [Reader(f"run: {name}", there / name, there, read_whole_run) for name in files]
+    return [
+        *(Reader(f"run: {name}", there / name, there, read_whole_run) for name in files),
+        *(Reader(f"killed run: {n}", killed / n, killed, recover) for n in (LINES, "run.json")),
+    ]
 
 
 def _data_sets(folder: Path) -> list[Reader]:
+    write_msra(folder / "msra14" / "Subject1", scene(msra._CAMERA, 2), boxed=False)
     write_msra(folder / "msra" / "P0" / "TIP", scene(msra._CAMERA, 2), boxed=True)
     write_icvl(folder / "icvl" / "Testing", scene(icvl._CAMERA, 2))
     write_nyu(folder / "nyu" / "test", scene(nyu._CAMERA, 2))
     readers = []
-    for name, there in (("MSRA15", "msra"), ("ICVL", "icvl"), ("NYU", "nyu")):
+    for name, there in (("MSRA14", "msra14"), ("MSRA15", "msra"), ("ICVL", "icvl"), ("NYU", "nyu")):
         first = {path.suffix: path for path in sorted((folder / there).rglob("*.*"))}
         for suffix, file in first.items():
             reader = read_data_set(name)

@@ -19,6 +19,7 @@ from toftrack.relocation.pictures import RANGE, SENSOR_TERMS, Lens, take_picture
 from toftrack.relocation.relocaliser import Glance
 from toftrack.relocation.scenes import HAND, Dice, Hands, Scenes, posed_hands
 from toftrack.relocation.shapes import ShapeBank, shape_bank
+from toftrack.relocation.weights import make_ready
 
 FARTHEST_M = 7.9
 """Nothing is drawn beyond 8 m."""
@@ -38,7 +39,9 @@ def small_networks() -> tuple[PoseNet, Finder]:
     """Untrained ones, ready for use."""
     torch.manual_seed(0)
     pose, finder = PoseNet(4), Finder(8)
-    return pose.eval().requires_grad_(False), finder.eval().requires_grad_(False)
+    make_ready(pose)
+    make_ready(finder)
+    return pose, finder
 
 
 def one_hand(seed: int, pivot_m: tuple[float, float, float], left: bool = False) -> Hands:

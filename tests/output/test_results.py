@@ -20,6 +20,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Truth
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output import records
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate, metrics_table
 from toftrack.output.files import save_whole, write_whole
@@ -349,6 +350,41 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
     assert many - few < 600 * 200  # a frame's numbers alone are 1100 bytes
 
 
+def test_the_end_of_a_run_does_not_wait_for_its_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise AssertionError("a run's lines take long to read")
+
+    monkeypatch.setattr(records, "read_lines", refuse)
+    write(tmp_path, [estimate(i) for i in range(records._PIECE + 2)])
+    assert len(read_results(tmp_path / "track.npz")["lost"]) == records._PIECE + 2
+
+
+def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
+    odd = estimate(4, score=math.inf, gesture="", joints_m=np.full((21, 3), -np.inf))
+    many = [no_estimate(0, 0.0, "searching", 4, 0.01), *(estimate(i) for i in range(1, 4)), odd]
+    write(tmp_path, many)
+    before = read_results(tmp_path / "track.npz")
+    recover(tmp_path)
+    after = read_results(tmp_path / "track.npz")
+    for name in LINE_FIELDS:
+        np.testing.assert_array_equal(after[name], before[name])
+
+
+def test_what_takes_long_shows_how_far_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path, [estimate(i) for i in range(6)])
+    recover(tmp_path)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(records, "_SOON_S", 0)
+    recover(tmp_path)
+    told = capsys.readouterr().err
+    assert "reading the lines" in told
+    assert "writing the results" in told
+
+
 def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])
     path = tmp_path / "track.jsonl"
@@ -357,6 +393,58 @@ def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
         path.write_text("".join([lines[0], bad, *lines[2:]]))
         with pytest.raises(ToftrackError, match=words):
             recover(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"metadata": []},
+        {"metadata": {"camera": [1]}},
+        {"metadata": {"hand_shape": ["right"]}},
+        {"metadata": {"pose_space": {"dims": 10**9}}},
+        {"metadata": {"config": {"hands": 3}}},
+        {"metadata": {"config": {"device": 3}}, "truth": True},
+        {"metadata": {"camera": {"K": 1}}},
+        {"joint_names": None},
+    ],
+    ids=str,
+)
+def test_a_run_json_that_is_damaged_is_told(tmp_path: Path, changes: dict[str, Any]) -> None:
+    write(tmp_path, [estimate(i) for i in range(3)])
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    with pytest.raises(ToftrackError) as error:
+        recover(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "told"),
+    [
+        ("index", None, "has no 'index'"),
+        ("joints_m", [[0, 0, 0]], "shape"),
+        ("lost", [True], "shape"),
+        ("state", [[1, 2], [3]], "line 1 of"),
+        ("index", 10**19, "line 1 of"),
+    ],
+)
+def test_a_first_line_that_is_damaged_is_named(
+    tmp_path: Path, field: str, value: object, told: str
+) -> None:
+    write(tmp_path, [estimate(0)])
+    path = tmp_path / "track.jsonl"
+    line = json.loads(path.read_text())
+    line[field] = value
+    path.write_text(json.dumps({k: v for k, v in line.items() if v is not None or k != field}))
+    with open(path, "a") as stream:
+        stream.write("\n")
+    with pytest.raises(ToftrackError, match=told):
+        recover(tmp_path)
+
+
+def test_a_number_far_beyond_the_others_fills_no_disk(tmp_path: Path) -> None:
+    write(tmp_path, [estimate(0), dataclasses.replace(estimate(1), index=10**15)])
+    assert read_results(tmp_path / "track.npz")["index"].tolist() == [0, 10**15]
 
 
 @pytest.mark.parametrize("rest", [b'{"index":9,"jo', b"\0\0\0\0", b""])

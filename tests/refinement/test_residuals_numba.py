@@ -42,10 +42,11 @@ _cached = entry_point(
 # What an entry point calls cannot be called from Python: one that calls it.
 _choose = _cached(lambda *a: compiled.choose_points(*a))
 _nearest = _cached(lambda *a: compiled.nearest_ellipsoids(*a))
-_add_row = _cached(lambda *a: compiled.add_row(*a))
+_add_wrench = _cached(lambda *a: compiled.add_wrench(*a))
 _add_points = _cached(lambda *a: compiled.add_points(*a))
 _add_silhouette = _cached(lambda *a: compiled.add_silhouette(*a))
 _add_landmarks = _cached(lambda *a: compiled.add_landmarks(*a))
+_assemble = _cached(lambda *a: compiled.assemble(*a))
 _solve = _cached(lambda *a: solve(*a))
 
 
@@ -93,8 +94,15 @@ def points_near(posed: Posed, n: int, seed: int) -> Tensor:
     return (joints + 0.012 * torch.randn(n, 3, generator=g)).float()
 
 
-def empty_sums() -> tuple[np.ndarray, ...]:
-    return np.empty(11), np.zeros((27, 27)), np.zeros(27)
+def no_wrenches() -> np.ndarray:
+    return np.zeros((16, 7, 6))
+
+
+def assembled(wrenches: np.ndarray, posed: Posed) -> tuple[np.ndarray, np.ndarray]:
+    """The normal equations that the sums of the frames make."""
+    sums = np.empty((27, 27)), np.empty(27)
+    _assemble(wrenches, posed.hand, np.empty((27, 6)), sums)
+    return sums
 
 
 def check_sums(sums: tuple[np.ndarray, ...], expected: Residuals, rtol: float) -> None:
@@ -102,9 +110,9 @@ def check_sums(sums: tuple[np.ndarray, ...], expected: Residuals, rtol: float) -
     rows, values = expected.rows[0].numpy(), expected.values[0].numpy()
     normal, gradient = rows.T @ rows, rows.T @ values
     assert np.abs(normal).max() > 0, "something is compared"
-    off = np.abs(np.tril(sums[1]) - np.tril(normal)).max() / np.abs(normal).max()
+    off = np.abs(np.tril(sums[0]) - np.tril(normal)).max() / np.abs(normal).max()
     assert off < rtol
-    assert np.abs(sums[2] - gradient).max() < rtol * max(np.abs(gradient).max(), 1e-9)
+    assert np.abs(sums[1] - gradient).max() < rtol * max(np.abs(gradient).max(), 1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 40, 1000])
@@ -116,7 +124,7 @@ def test_points_are_chosen_as_by_the_reference(count: int) -> None:
     middle = posed.pose.joints_m.mean(1).float()
     expected, there = seen.around(middle, count)
     chosen = np.zeros((3, min(count, 400)), np.float32)
-    found = _choose(points.numpy(), posed.hand[1], count, chosen)
+    found = _choose(points.numpy(), posed.hand[1], count, np.empty(401, np.int32), chosen)
     assert found == int(there.sum())
     assert 0 < found <= count
     np.testing.assert_array_equal(chosen[:, :found].T, expected[0, there[0]].numpy())
@@ -142,14 +150,15 @@ def test_rows_are_those_of_the_jacobian(side: str) -> None:
     g = np.random.default_rng(5)
     for frame in range(16):
         x, n = 0.1 * g.normal(size=3) + posed.hand[1][0], g.normal(size=3)
-        sums = empty_sums()
+        wrenches = no_wrenches()
         # With a weight and a residual of 1 the gradient is the row itself.
-        _add_row(frame, tuple(x), tuple(n), 1.0, 1.0, posed.hand, sums)
+        _add_wrench(frame, tuple(x), tuple(n), 1.0, 1.0, wrenches)
+        normal, gradient = assembled(wrenches, posed)
         as_tensor = (torch.from_numpy(a)[None, None] for a in (x, n))
         expected = point_jacobian(posed.pose, posed.shape, *as_tensor, torch.tensor([frame]))
         row = expected[0, 0].numpy()
-        np.testing.assert_allclose(sums[2], row, atol=1e-6)  # metres a radian
-        np.testing.assert_allclose(np.tril(sums[1]), np.tril(np.outer(row, row)), atol=1e-6)
+        np.testing.assert_allclose(gradient, row, atol=1e-6)  # metres a radian
+        np.testing.assert_allclose(np.tril(normal), np.tril(np.outer(row, row)), atol=1e-6)
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -161,13 +170,15 @@ def test_seen_points_add_up_as_in_the_reference(side: str, z: float) -> None:
     matched = xyz, np.empty(500, np.float32), np.zeros(500, np.int32)
     _nearest(xyz, 500, posed.ellipsoids, *matched[1:])
     numbers = (5, 500, SETTINGS.reach_m, SETTINGS.point_m, 1.0, 1.0, 1.0)
-    sums, index = empty_sums(), posed.refiner._surface[0]
-    _add_points(matched, 500, index, posed.ellipsoids, posed.hand, numbers, sums)
+    wrenches, index = no_wrenches(), posed.refiner._surface[0]
+    _add_points(matched, 500, index, posed.ellipsoids, posed.hand, numbers, wrenches)
     there = torch.ones(1, 500, dtype=torch.bool)
     expected = point_residuals(
         posed.pose, points.double()[None], there, posed.shape, posed.surface, SETTINGS
     )
-    check_sums(sums, expected, 0.01)  # points that are as near to two bones go to either
+    check_sums(
+        assembled(wrenches, posed), expected, 0.01
+    )  # points that are as near to two bones go to either
 
 
 def silhouette(seed: int, height: int, width: int) -> SeenPoints:
@@ -192,11 +203,11 @@ def test_the_silhouette_adds_up_as_in_the_reference(side: str, z: float, cut: in
     inner = seen.nearest_px[cut : 144 - cut, cut : 176 - cut].contiguous()
     seen = replace(seen, nearest_px=inner, corner=(cut, cut))
     arguments = (seen.points_m.numpy(), inner.numpy(), seen.corner, seen.size, K)
-    sums = empty_sums()
-    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.5, sums)
+    wrenches = no_wrenches()
+    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.5, wrenches)
     settings = refinement(silhouette_px=1.5)
     expected = silhouette_residuals(posed.pose, seen, posed.shape, settings)
-    check_sums(sums, expected, 1e-4)
+    check_sums(assembled(wrenches, posed), expected, 1e-4)
 
 
 @pytest.mark.parametrize("size", [(0, 0), (1, 1), (144, 176)])
@@ -206,9 +217,9 @@ def test_a_silhouette_that_no_bone_is_in_adds_nothing(size: tuple[int, int]) -> 
     k = K + [[0.0, 0.0, 9e3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     seen = SeenPoints(torch.zeros(0, 3), nearest, torch.from_numpy(k), size)
     arguments = (seen.points_m.numpy(), nearest.numpy(), seen.corner, seen.size, k)
-    sums = empty_sums()
-    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.0, sums)
-    assert not sums[1].any() and not sums[2].any()
+    wrenches = no_wrenches()
+    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.0, wrenches)
+    assert not wrenches.any()
     assert not silhouette_residuals(posed.pose, seen, posed.shape, SETTINGS).values.any()
 
 
@@ -219,10 +230,11 @@ def test_landmarks_add_up_as_in_the_reference(side: str) -> None:
     points = posed.pose.joints_m + 0.02 * torch.randn(1, 21, 3, generator=g)
     sigma = 0.003 + 0.02 * torch.rand(1, 21, generator=g, dtype=torch.float64)
     sigma[0, 5], points[0, 9] = torch.inf, torch.nan
-    marks = Landmarks(points, sigma).of_each(1)
-    sums = empty_sums()
-    _add_landmarks(marks.points_m[0].numpy(), marks.sigma_m[0].numpy(), posed.hand, sums)
-    check_sums(sums, landmark_residuals(posed.pose, marks, posed.shape), 1e-5)
+    marks = Landmarks(points, sigma)
+    wrenches = no_wrenches()
+    _add_landmarks(points[0].numpy(), sigma[0].numpy(), posed.hand, wrenches)
+    expected = landmark_residuals(posed.pose, marks.of_each(1), posed.shape)
+    check_sums(assembled(wrenches, posed), expected, 1e-5)
 
 
 def test_the_normal_equations_are_solved() -> None:

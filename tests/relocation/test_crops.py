@@ -10,6 +10,7 @@ import torch
 from helpers.relocating import alone, clean_picture, intrinsics, one_hand, small_networks
 from helpers.tracking import sample
 
+from toftrack.relocation import proposals, proposals_numba
 from toftrack.relocation.crops import (
     CROP,
     CROP_M,
@@ -19,9 +20,11 @@ from toftrack.relocation.crops import (
     crop_rotation,
     wide,
 )
-from toftrack.relocation.proposals import Look, find_hands, look, mirrored
+from toftrack.relocation.proposals import Look, find_hands, mirrored
+from toftrack.relocation.weights import load_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+look = proposals_numba.look
 
 K = intrinsics(200.0, 144, 176)
 AHEAD = np.array([[0.0, 0.0, 0.45]])
@@ -117,11 +120,27 @@ def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int
     turn = torch.tensor([1.0, -1.0, -1.0])
     for name, value in right.items():
         told = left[name]
-        if name in ("pivot_m", "joints_m"):
+        if name in ("pivot_m", "joints_m", "votes_m"):
             told = told * torch.from_numpy(flip).float()
         elif name == "rotvec":
             told = told * turn
         assert torch.allclose(told, value, atol=1e-5), name
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("network", ["trained", "random"])
+def test_the_compiled_look_says_what_the_reference_says(side: str, network: str) -> None:
+    """Of hands, of places at the border, and of places beside the image."""
+    pose = load_weights()[0] if network == "trained" else small_networks()[0]
+    for frame in (0, 30, 60):
+        scene = sample().cut(frame)
+        centres = np.concatenate((scene.joints_m[0, [0, 9]], [[0.2, 0.0, 0.45], [2.0, 0.1, 0.3]]))
+        told = look(pose, scene.depth_m[0], scene.k, centres, side)
+        expected = proposals.look(pose, scene.depth_m[0], scene.k, centres, side)
+        for name, value in numbers(expected).items():
+            # The file's weights hold the limits of the angles and the cells' places in half
+            # precision, which only the reference uses.
+            assert torch.allclose(numbers(told)[name], value, atol=1e-3, rtol=1e-3), name
 
 
 def test_a_mirror_twice_is_the_image() -> None:
@@ -194,4 +213,3 @@ def test_the_hypotheses_are_sorted_and_within_what_a_hand_can() -> None:
     assert (seen.log_probability.diff(dim=1) <= 0).all()
     assert 0 < float(seen.log_probability.exp().sum()) < 1 + 1e-5
     assert (seen.error_m > 0).all() and (seen.sigma_m > 0).all()
-    assert torch.allclose(seen.parts.sum(1), torch.ones(1, 32, 32), atol=1e-5)

@@ -141,6 +141,12 @@ def test_weights_of_networks_of_another_size(file: Path) -> None:
     refused(file, "holds weights of another network")
 
 
+@pytest.mark.parametrize("width", [0, 10**6, "24", None, [24], 1e3, True])
+def test_a_width_that_would_fill_the_memory_is_refused(file: Path, width: object) -> None:
+    rewritten(file, pose_width=width)
+    refused(file, "holds weights of another network")
+
+
 def test_a_missing_file(tmp_path: Path) -> None:
     refused(tmp_path / "gone.npz", "there are no weights of the relocaliser at")
     refused(tmp_path, "is no file of the relocaliser's weights")

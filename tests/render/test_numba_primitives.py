@@ -15,34 +15,47 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.render.closed_form import project
 from toftrack.render.disc import disc_steps
-from toftrack.render.numba import hand, kernel, vector
+from toftrack.render.numba import hand, missed, vector, words
 from toftrack.render.numba.hand import LANES, TERMS
 from toftrack.render.numba.kernel import pack_evidence
 from toftrack.render.numba.scorer import NumbaScorer
-from toftrack.render.numba.vector import WORDS
+from toftrack.render.numba.vector import BLOCK
+from toftrack.render.numba.words import WORDS
 from toftrack.render.reference import dilate_disc
 from toftrack.render.torch_scorer import Outlines, outlines
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-# In the order of the compiled table; the inverse of the squared half height stands in row IY.
-ROWS = (hand.X, hand.Y, hand.U, hand.HY, hand.HX, hand.XY, hand.DX, hand.UY, hand.UX, hand.DU)
+# Of the compiled table; the inverse of the squared half height stands in row IY.
+ROWS = {
+    "x": hand.X,
+    "y": hand.Y,
+    "u": hand.U,
+    "high": hand.HY,
+    "shear": hand.XY,
+    "dx": hand.DX,
+    "slope_y": hand.UY,
+    "slope_x": hand.UX,
+    "du": hand.DU,
+}
+WIDTH, HEIGHT = 176, 144
 K = torch.tensor([[170.0, 0.0, 88.2], [0.0, 175.0, 71.8], [0.0, 0.0, 1.0]])
 
-_cached = entry_point(__file__, *(module.__file__ for module in (hand, kernel, vector)))
+_cached = entry_point(__file__, *(module.__file__ for module in (hand, missed, vector, words)))
 
 
 @_cached
-def _pose_and_project(states, slots, base, lengths, mirror, index, surface, k, frames, valid, out):
+def _pose_and_project(
+    states, slots, base, lengths, mirror, index, surface, k, size, frames, valid, out, boxes
+):
     x = np.empty(27 * LANES, np.float32)
-    sines, cosines = np.empty((2, 25 * LANES), np.float32)
-    hand.pose_hands(states, 0, slots, base, lengths, mirror, x, sines, cosines, frames, valid)
-    hand.project_hands(frames, index, surface, k[0], k[1], k[2], k[3], out)
+    hand.pose_hands(states, 0, slots, base, lengths, mirror, x, frames, valid)
+    hand.project_hands(frames, index, surface, k[0], k[1], k[2], k[3], size[0], size[1], out, boxes)
 
 
 @_cached
 def _count_missed(model, words, rows, reach, steps, wanted, buffer):
-    return kernel.count_missed(model, words, rows, reach, steps, wanted, buffer)
+    return missed.count_missed(model, words, rows, reach, steps, wanted, buffer)
 
 
 def states(seed: int) -> Tensor:
@@ -56,23 +69,22 @@ def states(seed: int) -> Tensor:
     return rows
 
 
-def compiled(side: str, rows: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frames (16, 12, LANES), which are valid, and the table (E + 1, TERMS, LANES)."""
+def compiled(side: str, rows: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frames (16, 12, LANES), valid, the table (E + 1, TERMS, LANES) and boxes (4, LANES)."""
     scorer = NumbaScorer(default_hand_shape(side=side))
-    slots, base, lengths, mirror, index, surface = scorer._hand
     frames, valid = np.empty((16, 12 * LANES), np.float32), np.empty(LANES, np.uint8)
-    out = np.empty((len(index), TERMS * LANES), np.float32)
+    out = np.empty((len(scorer._hand[4]), TERMS * LANES), np.float32)
     k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
-    _pose_and_project(
-        rows.numpy(), slots, base, lengths, mirror, index, surface, k, frames, valid, out
-    )
-    return frames.reshape(16, 12, LANES), valid, out.reshape(-1, TERMS, LANES)
+    size, boxes = np.array([WIDTH, HEIGHT], np.float32), np.empty(4 * LANES, np.float32)
+    _pose_and_project(rows.numpy(), *scorer._hand, k, size, frames, valid, out, boxes)
+    table = out.reshape(-1, TERMS, LANES)
+    return frames.reshape(16, 12, LANES), valid, table, boxes.reshape(4, LANES)
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_frames_are_those_of_the_skeleton(side: str) -> None:
     rows = states(0)
-    frames, valid, _ = compiled(side, rows)
+    frames, valid, _, _ = compiled(side, rows)
     pose = forward_kinematics(rows.double(), default_hand_shape(side=side).to(torch.float64))
     assert valid.all()
     turns = frames[:, :9].reshape(16, 3, 3, LANES).transpose(3, 0, 1, 2)
@@ -84,7 +96,7 @@ def test_frames_are_those_of_the_skeleton(side: str) -> None:
 def test_states_that_are_no_numbers_are_not_valid() -> None:
     rows = states(1)
     rows[0, 0], rows[1, 5], rows[2, 26], rows[3, 4] = math.nan, math.inf, -math.inf, 1e30
-    frames, valid, table = compiled("right", rows[: LANES - 2])
+    frames, valid, table, _ = compiled("right", rows[: LANES - 2])
     assert valid.tolist() == [0] * 4 + [1] * (LANES - 6) + [0] * 2, "nor those past the end"
     assert np.isfinite(frames).all()
     # What is not valid is drawn nowhere, whatever stands in its lane: its hand is at the camera.
@@ -112,13 +124,31 @@ def test_ellipsoids_on_the_screen_are_those_of_the_reference(side: str) -> None:
     assert (drawn == (table[:, hand.HY].T > 0)).mean() > 0.995
     assert drawn.any() and not drawn[:4].any(), "those behind the camera are not drawn"
     far = (rows[:, 2] > 0.35).numpy()[:, None] & drawn & (table[:, hand.HY].T > 0)
-    tolerances = dict(x=0.01, y=0.01, high=0.01, wide=0.01, u=1e-4)  # pixels, 1/m
-    for name, row in zip(Outlines._fields, ROWS, strict=True):
+    tolerances = dict(x=0.01, y=0.01, high=0.01, u=1e-4)  # pixels, 1/m
+    for name, row in ROWS.items():
         found, expected = table[:, row].T[far], getattr(reference, name).numpy()[far]
         atol = tolerances.get(name, 1e-3 * np.abs(expected).max())
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=atol, err_msg=name)
     inverse = table[:, hand.IY].T[far]
     np.testing.assert_allclose(inverse, high[far] ** -2.0, rtol=1e-3)
+
+
+def test_boxes_hold_all_ellipsoids_within_the_image() -> None:
+    rows = states(2)
+    _, _, table, boxes = compiled("right", rows)
+    reference = of_reference("right", rows)
+    for i in range(LANES):
+        drawn = table[:-1, hand.HY, i] > 0
+        for axis, size in ((0, WIDTH), (1, HEIGHT)):
+            middle = (reference.x, reference.y)[axis][i, :-1].numpy()[drawn]
+            half = (reference.wide, reference.high)[axis][i, :-1].numpy()[drawn]
+            first = np.clip(np.ceil(middle - half), 0, size).min(initial=size)
+            end = np.clip(np.floor(middle + half) + 1, 0, size).max(initial=0)
+            if first < end:
+                # An outline that just touches a pixel may take it in or not.
+                np.testing.assert_allclose(boxes[[axis, axis + 2], i], [first, end], atol=1)
+            else:
+                assert not boxes[axis, i] < boxes[axis + 2, i]
 
 
 def test_outlines_are_those_of_the_dual_conics() -> None:
@@ -159,7 +189,7 @@ def test_the_compiled_dilation_is_the_disc_s(radius_px: float, size: tuple[int, 
         model[1:-1, reach : reach + height] = bits_of(mask, words)
         rows = np.zeros((words, height + WORDS), np.uint64)
         rows[:, :height] = bits_of(wanted & ~mask, words)
-        buffer = np.empty(2 * (words + 2) * WORDS, np.uint64)
+        buffer = np.empty((2, (words + 2) * WORDS), np.uint64)
         found = _count_missed(model, words, height, reach, steps, rows, buffer)
         near = dilate_disc(torch.from_numpy(mask[None]), radius_px)[0].numpy()
         assert found == (near & wanted & ~mask).sum()
@@ -169,10 +199,21 @@ def test_the_compiled_dilation_is_the_disc_s(radius_px: float, size: tuple[int, 
 def test_evidence_is_packed_with_nothing_beyond_its_edge(size: tuple[int, int]) -> None:
     g = np.random.default_rng(0)
     height, width = size
-    images = g.random((3, *size), np.float32)
+    low, occluder = g.random((2, *size), np.float32) + 1
     mask = g.random(size) < 0.5
-    packed, bits = pack_evidence(*images, mask)
-    np.testing.assert_array_equal(packed[:, :, :width], images)
-    low, high, occluder = packed[:, :, width:]
-    assert (low == np.inf).all() and (high == -np.inf).all() and (occluder == np.inf).all()
-    np.testing.assert_array_equal(bits, bits_of(mask, len(bits)))
+    high = np.where(mask, low + np.float32(0.5), -np.inf).astype(np.float32)
+    low = np.where(mask, low, np.inf).astype(np.float32)
+    packed, bits = pack_evidence(low, high, occluder, mask)
+    middle, scale, hidden = packed.reshape(height, -1, 3, BLOCK).transpose(2, 0, 1, 3)
+    middle, scale, hidden = (image.reshape(height, -1) for image in (middle, scale, hidden))
+    assert middle.shape[1] >= width + BLOCK - 1, "a block may begin at the last pixel"
+    for edge, where in ((low, -1), (high, 1)):
+        off = (edge - middle[:, :width])[mask] * scale[:, :width][mask]
+        np.testing.assert_allclose(off, where, rtol=1e-5)
+    nowhere = np.ones(middle.shape, bool)
+    nowhere[:, :width] = ~mask
+    assert (scale[nowhere] == np.inf).all(), "no depth is within a band without width"
+    np.testing.assert_array_equal(hidden[:, :width], occluder)
+    assert (hidden[:, width:] == np.inf).all()
+    np.testing.assert_array_equal(bits[:, :height], bits_of(mask, len(bits)))
+    assert not bits[:, height:].any()

@@ -6,6 +6,7 @@ import pytest
 import roma
 import torch
 
+from toftrack.compute.redraw import bound, pick
 from toftrack.compute.rigid import MOTIONS, PIVOT_M, mean_rotation
 from toftrack.tracking import particle_filter as sir
 
@@ -29,7 +30,7 @@ def test_resampling_is_unbiased(scheme: str, n: int) -> None:
     g, draws = generator(2), 400
     counts = torch.zeros(50, dtype=torch.float64)
     for _ in range(draws):
-        counts += torch.bincount(sir.RESAMPLERS[scheme](weights, n, g), minlength=50)
+        counts += torch.bincount(pick(weights, sir.RESAMPLERS[scheme](n, g)), minlength=50)
     # Each draw's variance is at most the multinomial one, so 5 of its standard deviations hold
     # every one of the 50 means with a probability above 0.9999.
     sigma = (n * weights * (1 - weights) / draws).sqrt()
@@ -40,14 +41,16 @@ def test_systematic_resampling_gives_each_particle_its_share_rounded() -> None:
     weights = torch.rand(40, generator=generator(3)).double()
     weights /= weights.sum()
     for seed in range(20):
-        indices = sir.resample_systematic(weights, 100, generator(seed))
+        indices = pick(weights, sir.systematic_positions(100, generator(seed)))
         counts = torch.bincount(indices, minlength=40)
         assert ((counts - 100 * weights).abs() < 1).all()
 
 
 @pytest.mark.parametrize("scheme", sorted(sir.RESAMPLERS))
 def test_resampling_survives_degenerate_weights(scheme: str) -> None:
-    resample = sir.RESAMPLERS[scheme]
+    def resample(weights: torch.Tensor, n: int, g: torch.Generator) -> torch.Tensor:
+        return pick(weights, sir.RESAMPLERS[scheme](n, g))
+
     one = torch.zeros(8, dtype=torch.float64)
     one[3] = 1.0
     assert (resample(one, 20, generator()) == 3).all()
@@ -128,8 +131,8 @@ def test_reflection_does_not_push_a_particle_at_the_bound_inwards_as_truncation_
     None
 ):
     latent = UPPER.expand(10_000, 4) + 0.1 * torch.randn(10_000, 4, generator=generator())
-    truncated = sir.bound(latent, LOWER, UPPER, "truncate")
-    reflected = sir.bound(latent, LOWER, UPPER, "reflect")
+    truncated = bound(latent, LOWER, UPPER, "truncate")
+    reflected = bound(latent, LOWER, UPPER, "reflect")
     assert 0.4 < (truncated == UPPER).float().mean() < 0.6
     assert (reflected == UPPER).float().mean() < 0.01
 
@@ -157,7 +160,7 @@ def test_mean_and_covariance_of_particles_are_the_weighted_ones() -> None:
     x[:, 3:6] *= 0.1
     weights = torch.rand(200, generator=generator(1)).double()
     weights /= weights.sum()
-    mean = sir.mean_particle(x, weights)
+    mean = MOTIONS.mean(x, weights)
     torch.testing.assert_close(mean[0, 6:], (weights.float() @ x)[6:])
     tangents = MOTIONS.difference(x, mean)
     expected = torch.cov(tangents.double().T, aweights=weights, correction=0)

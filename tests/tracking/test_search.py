@@ -21,7 +21,6 @@ from toftrack.pose_space.files import make_pose_space
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.backend import make_scorer
 from toftrack.tracking.palm_places import arm_exits, palm_centres
-from toftrack.tracking.particle_filter import mean_particle
 from toftrack.tracking.search import (
     LastSeen,
     LogScores,
@@ -77,7 +76,7 @@ def first_error_mm(start: Start, scene: Scene, seed: int, side: str = "right") -
     seen = observed(scene)
     scores = log_scores_of(seen, shape)
     particles = start(sought(seen, scores), 50, generator(seed))
-    mean = mean_particle(particles, torch.full((50,), 0.02))
+    mean = MOTIONS.mean(particles, torch.full((50,), 0.02))
     joints = forward_kinematics(states_of(mean), shape).joints_m[0].numpy()
     return 1e3 * float(np.linalg.norm(joints - scene.joints_m[0], axis=-1).mean())
 
@@ -147,7 +146,7 @@ def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     middle = (x[:, :3] + rotated_pivot(x[:, 3:6])).mean(0).numpy()
     true_palm = scene.joints_m[0, PALM].mean(0)
     assert np.linalg.norm(middle - true_palm) < 0.06
-    mean = mean_particle(x, torch.full((300,), 1 / 300))
+    mean = MOTIONS.mean(x, torch.full((300,), 1 / 300))
     joints = forward_kinematics(states_of(mean), default_hand_shape()).joints_m[0]
     tips = joints[[8, 12, 16, 20]]
     assert (tips[:, 1] < joints[0, 1] - 0.1).all(), "the fingers point up"

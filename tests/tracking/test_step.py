@@ -75,6 +75,15 @@ def test_a_recording_replayed_from_a_saved_state_gives_the_same_estimates(
     assert all(map(same, first, tracked(other, scene, range(kept, kept + 4))))
 
 
+def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The networks look beside the filter where there is another thread, and after it if not."""
+    found = []
+    for count in (1, 2):
+        monkeypatch.setattr("toftrack.compute.threads.threads", lambda count=count: count)
+        found.append(tracked(networked("hand.side=right"), sample(), range(8)))
+    assert all(same(one, two) for one, two in zip(*found, strict=True))
+
+
 def test_states_that_are_stepped_in_turn_do_not_disturb_each_other() -> None:
     right, left = sample(), sample().mirrored()
     alone = tracked(quick(), right, range(6)), tracked(quick("hand.side=left"), left, range(6))

@@ -17,7 +17,14 @@ from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
 from toftrack.views.base import NoView, TrackedFrame
-from toftrack.views.overlay import VideoView, draw_panel, panel_scale
+from toftrack.views.overlay import (
+    CAPTION_PX,
+    VideoView,
+    draw_panel,
+    film_tile,
+    filmstrip,
+    panel_scale,
+)
 from toftrack.views.skeleton import SLOT_RGB, side_words
 
 W, H = 176, 144
@@ -199,15 +206,42 @@ def test_lost_is_red_and_tracking_is_not() -> None:
         assert (colour_share(right[:, -3:], red) > 0.9) == lost
 
 
-def test_caption_stays_in_the_left_half_and_changes_with_the_frame() -> None:
-    one = dataclasses.replace(hand(), index=123456, state_name="initialising", gesture="pointing")
-    first = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[0]
-    second = sides(
-        draw_panel(DEPTH, AMPLITUDE, CAMERA, (dataclasses.replace(one, index=654321),), (None,), 3)
-    )[0]
-    assert (first != second).any()
-    assert len(np.unique(first[:, 3 * W :])) == 1
-    assert len(np.unique(first[:, : 3 * W])) > 1
+def test_the_caption_changes_with_the_frame() -> None:
+    one, other = (dataclasses.replace(hand(), index=index) for index in (123456, 654321))
+    first, second = (
+        sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (told,), (None,), 3))[0] for told in (one, other)
+    )
+    assert (first[:, : 3 * W] != second[:, : 3 * W]).any()
+    assert (first[:, 3 * W :] == second[:, 3 * W :]).all()
+
+
+LONG = {"gesture": "pointing_thumb", "pinching": True, "confidence": 0.99, "index": 12345}
+TOLD: dict[str, tuple[Estimate, ...]] = {
+    "tracking": (dataclasses.replace(hand(), **LONG),),
+    "searching": (dataclasses.replace(lost_hand(), state_name="searching", index=12345),),
+    "doubted": (dataclasses.replace(hand(lost=True), **LONG),),
+    "two": (present(**LONG, side_probability=0.5), other_hand(**LONG)),
+    "one of two": (present(lost=True), lost_hand()),
+}
+
+
+@pytest.mark.parametrize("told", TOLD.values(), ids=TOLD)
+def test_captions_can_be_read_in_a_filmstrip_of_1280_px(told: tuple[Estimate, ...]) -> None:
+    panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, told, (None,) * len(told), 3)
+    strip = filmstrip([film_tile(panel)] * 10)
+    small = cv2.resize(strip, (1280, round(strip.shape[0] * 1280 / strip.shape[1])))
+    scale = small.shape[1] / strip.shape[1]
+    tile_px, gap = 320 * scale, 8 * scale
+    body = round(film_tile(panel).shape[0] * scale / 2)
+    for top in (gap, gap + body):
+        caption = small[round(top) + 1 :, round(gap) + 1 : round(gap + tile_px) - 1]
+        caption = caption[: round(CAPTION_PX / (3 * W) * tile_px) - 2].min(-1) > 150
+        if len(told) > 1:
+            caption[:, :18] = False  # the slot's mark
+        rows, columns = np.flatnonzero(caption.any(1)), np.flatnonzero(caption.any(0))
+        assert rows[-1] - rows[0] + 1 >= 9
+        assert rows[0] > 0
+        assert columns[-1] < caption.shape[1] - 1
 
 
 def test_images_without_any_reading_are_black() -> None:
@@ -218,7 +252,7 @@ def test_images_without_any_reading_are_black() -> None:
         assert (right == 255).all()
 
 
-def panel_of(value: int, size: tuple[int, int] = (36 + 60, 160)) -> np.ndarray:
+def panel_of(value: int, size: tuple[int, int] = (CAPTION_PX + 50, 160)) -> np.ndarray:
     return np.full((*size, 3), value, np.uint8)
 
 
@@ -267,7 +301,7 @@ def test_panels_of_other_and_odd_sizes_share_one_even_size(tmp_path: Path) -> No
 def test_filmstrip_is_ten_evenly_spread_panels(tmp_path: Path, count: int, known: bool) -> None:
     with VideoView(tmp_path, 25, count if known else None) as view:
         for i in range(count):
-            view.add(panel_of(round(250 * i / count), (36 + 10, 32)))
+            view.add(panel_of(round(250 * i / count), (CAPTION_PX + 4, 32)))
     strip = cv2.imread(str(tmp_path / "overlay.png"))
     height, width = strip.shape[0] // 2, strip.shape[1] // 5
     shown = [
@@ -280,7 +314,7 @@ def test_filmstrip_is_ten_evenly_spread_panels(tmp_path: Path, count: int, known
 
 def test_filmstrip_shows_the_left_side_above_the_right(tmp_path: Path) -> None:
     panel = panel_of(100)
-    panel[36:, :80], panel[36:, 80:] = 50, 200
+    panel[CAPTION_PX:, :80], panel[CAPTION_PX:, 80:] = 50, 200
     with VideoView(tmp_path, 25, 1) as view:
         view.add(panel)
     strip = cv2.imread(str(tmp_path / "overlay.png"))
@@ -291,7 +325,7 @@ def test_filmstrip_shows_the_left_side_above_the_right(tmp_path: Path) -> None:
 def test_memory_is_bounded_when_the_length_is_unknown(tmp_path: Path) -> None:
     view = VideoView(tmp_path, 25, None)
     for _ in range(700):
-        view.add(panel_of(9, (36 + 4, 8)))
+        view.add(panel_of(9, (CAPTION_PX + 4, 8)))
         assert len(view._tiles) <= 64
     view.close()
 

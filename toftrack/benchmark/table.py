@@ -6,6 +6,8 @@ import platform
 import sys
 from pathlib import Path
 
+from toftrack.benchmark.frames import BUDGET_MS
+
 
 def peak_memory_gb() -> float:
     """The most main memory this process has held so far."""
@@ -48,7 +50,10 @@ def show(result: dict) -> str:
             f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}"
             f"   {1e3 / row['median_ms']:.1f} frames/s"
         )
-        lines += [f"    {part:<56}{row['parts'][part]:>15.3f}" for part in row["parts"]]
+        aims = BUDGET_MS if row["configuration"] == "default" else {}
+        for part, took in row["parts"].items():
+            aim = f"   (budget: {aims[part]:g})" if part in aims else ""
+            lines.append(f"    {part:<56}{took:>15.3f}{aim}")
     for row in result["decoding"]:
         aim = "" if row["aim_ms"] is None else f"   (aim: at most {row['aim_ms']:g})"
         lines.append(

@@ -10,14 +10,20 @@ the hand, so that turning the hand does not also carry it away, as turning about
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Motions
+from toftrack.compute.redraw import redraw_with
 from toftrack.compute.rotations import rotvec_composition, unitquat_to_rotvec
+from toftrack.compute.transfer import on_host, table
 
 PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
+_X, _Y, _Z = PIVOT_M
 
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
@@ -36,17 +42,29 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return torch.cat((move, turn, particles[:, 6:] - reference[:, 6:]), 1)
 
 
-MOTIONS = Motions(compose, difference)
-
-
 def rotated_pivot(rotvec: Tensor) -> Tensor:
     """The pivot's offset from the wrist, by Rodrigues' formula, (N, 3) to (N, 3)."""
-    p = rotvec.new_tensor(PIVOT_M).expand_as(rotvec)
+    p = table(PIVOT_M, rotvec.dtype, rotvec.device).expand_as(rotvec)
     square = rotvec.square().sum(1, keepdim=True)
     angle = square.clamp(min=1e-12).sqrt()
     cross = torch.linalg.cross(rotvec, p)
     along = torch.linalg.cross(rotvec, cross)
     return p + angle.sin() / angle * cross + (1 - angle.cos()) / angle.square() * along
+
+
+def pivot_offset(rotvec: np.ndarray) -> np.ndarray:
+    """The same on the CPU, (N, 3) to (N, 3), where torch's operations take longer than this."""
+    out = np.empty_like(rotvec)
+    for row, (a, b, c) in enumerate(rotvec.tolist()):
+        square = max(a * a + b * b + c * c, 1e-12)
+        angle = math.sqrt(square)
+        first, second = math.sin(angle) / angle, (1 - math.cos(angle)) / square
+        along = second * (a * _X + b * _Y + c * _Z)
+        cosine = math.cos(angle)
+        out[row, 0] = cosine * _X + first * (b * _Z - c * _Y) + a * along
+        out[row, 1] = cosine * _Y + first * (c * _X - a * _Z) + b * along
+        out[row, 2] = cosine * _Z + first * (a * _Y - b * _X) + c * along
+    return out
 
 
 def _pivot(particles: Tensor) -> Tensor:
@@ -59,11 +77,30 @@ def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
     The rotation nearest to the mean matrix (chordal L2 mean; Hartley et al., "Rotation averaging",
     IJCV 2013).
     """
+    return main_rotation(rotation_scatter(rotvec, weights)).to(rotvec.dtype)
+
+
+def rotation_scatter(rotvec: Tensor, weights: Tensor) -> Tensor:
+    """What `main_rotation` needs to know of (N, 3) rotations of (N,) weights, (4, 4) float64."""
     half = 0.5 * rotvec.double()
     angle = half.norm(dim=1, keepdim=True)
     q = torch.cat((half * (angle / torch.pi).sinc(), angle.cos()), 1)
     # The nearest rotation's quaternion is the main axis of all quaternions (Markley et al., JGCD
     # 2007), whatever their signs.
-    scatter = (q * weights[:, None]).mT @ q
-    main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
-    return unitquat_to_rotvec(main).to(rotvec.dtype)
+    return (q * weights[:, None]).mT @ q
+
+
+def main_rotation(scatter: Tensor) -> Tensor:
+    """The mean rotation (3,) of what `rotation_scatter` has summed up, float64."""
+    return unitquat_to_rotvec(torch.linalg.eigh(scatter).eigenvectors[:, -1])
+
+
+def mean(particles: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d) on the CPU, the rotation's on SO(3)."""
+    found = (weights.to(particles.dtype) @ particles)[None]
+    found, scatter = on_host(found, rotation_scatter(particles[:, 3:6], weights))
+    found[0, 3:6] = main_rotation(scatter).to(found.dtype)
+    return found
+
+
+MOTIONS = Motions(compose, difference, redraw_with(compose), mean)

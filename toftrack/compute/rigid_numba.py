@@ -7,7 +7,6 @@ operation costs on a few numbers. Quaternions are (x, y, z, w); everything is co
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -19,6 +18,8 @@ from toftrack.compute.rigid import PIVOT_M
 
 _cached = entry_point(__file__)
 _PIVOT = np.array(PIVOT_M)
+_SWEEPS = 8
+"""Of Jacobi's method, which doubles the number of exact digits in each."""
 
 
 @compiled
@@ -64,22 +65,53 @@ def turned(q, x, y, z):
     )
 
 
+@compiled
+def compose_row(r, t, pivot, out):
+    """One row of compose_rows."""
+    before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
+    turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
+    after = product(turn, before)
+    old = turned(before, pivot[0], pivot[1], pivot[2])
+    new = turned(after, pivot[0], pivot[1], pivot[2])
+    vector = rotation_vector(after)
+    for j in range(3):
+        out[j] = r[j] + old[j] + t[j] - new[j]
+        out[3 + j] = vector[j]
+    for j in range(6, len(out)):
+        out[j] = r[j] + t[j]
+
+
 @_cached
 def compose_rows(reference, tangent, pivot, out):
     """See rigid.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
     for i in range(len(out)):
-        r, t = reference[i], tangent[i]
-        before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
-        turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
-        after = product(turn, before)
-        old = turned(before, pivot[0], pivot[1], pivot[2])
-        new = turned(after, pivot[0], pivot[1], pivot[2])
-        vector = rotation_vector(after)
-        for j in range(3):
-            out[i, j] = r[j] + old[j] + t[j] - new[j]
-            out[i, 3 + j] = vector[j]
-        for j in range(6, out.shape[1]):
-            out[i, j] = r[j] + t[j]
+        compose_row(reference[i], tangent[i], pivot, out[i])
+
+
+@_cached
+def redraw_rows(particles, weights, positions, tangents, lower, upper, reflect, pivot, out):
+    """See redraw.redraw_with; weights, positions, pivot: float64, the others float32."""
+    last, total = 0, 0.0
+    for i in range(len(weights)):
+        total += weights[i]
+        if weights[i] > 0:
+            last = i
+    at, reached = 0, weights[0]
+    for n in range(len(out)):
+        while at < last and reached <= positions[n] * total:
+            at += 1
+            reached += weights[at]
+        compose_row(particles[at], tangents[n], pivot, out[n])
+        for j in range(len(lower)):
+            value = out[n, 6 + j]
+            if reflect:
+                # As numpy's remainder, which is never below 0.
+                wide = upper[j] - lower[j]
+                folded = (value - lower[j]) % (2 * wide)
+                value = lower[j] + min(folded, 2 * wide - folded)
+            else:
+                value = min(max(value, lower[j]), upper[j])
+            out[n, 6 + j] = value
 
 
 @_cached
@@ -157,27 +189,115 @@ def mix_columns(frame, column, angle):
 
 @_cached
 def joints_of(states, base_frames, base, lengths, mirror, joints):
-    """The joints of N hands alone, see pose_hand; states: (N, 27).  joints: (N, 21, 3)."""
-    frames = np.empty((16, 3, 3))
+    """The joints of N hands alone, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32."""
+    frames, posed = np.empty((16, 3, 3)), np.empty((21, 3))
     for i in range(len(states)):
-        pose_hand(states[i], base_frames, base, lengths, mirror, frames, joints[i])
+        pose_hand(states[i].astype(np.float64), base_frames, base, lengths, mirror, frames, posed)
+        joints[i] = posed
+
+
+@_cached
+def mean_of_rows(particles, weights, out):
+    """See rigid.mean; particles: (N, 6 + d), out: (1, 6 + d), float32.  weights: (N,) float64."""
+    scatter, total = np.zeros((4, 4)), np.zeros(out.shape[1])
+    for n in range(len(particles)):
+        p = particles[n]
+        for j in range(len(total)):
+            total[j] += weights[n] * p[j]
+        q = quaternion(np.float64(p[3]), np.float64(p[4]), np.float64(p[5]))
+        for i in range(4):
+            for j in range(4):
+                scatter[i, j] += weights[n] * q[i] * q[j]
+    main = main_axis(scatter)
+    vector = rotation_vector((main[0], main[1], main[2], main[3]))
+    for j in range(len(total)):
+        out[0, j] = total[j]
+    for i in range(3):
+        out[0, 3 + i] = vector[i]
+
+
+@compiled
+def main_axis(symmetric):
+    """The eigenvector (4,) of the largest eigenvalue of (4, 4), by Jacobi's rotations; overwrites.
+
+    Golub and Van Loan, "Matrix computations", section 8.5.
+    """
+    axes = np.eye(4)
+    for _ in range(_SWEEPS):
+        for p in range(3):
+            for q in range(p + 1, 4):
+                if symmetric[p, q] == 0.0:
+                    continue
+                tau = (symmetric[q, q] - symmetric[p, p]) / (2 * symmetric[p, q])
+                t = 1 / (abs(tau) + math.sqrt(1 + tau * tau))
+                t = t if tau >= 0 else -t
+                cosine = 1 / math.sqrt(1 + t * t)
+                sine = t * cosine
+                for k in range(4):
+                    a, b = symmetric[k, p], symmetric[k, q]
+                    symmetric[k, p], symmetric[k, q] = cosine * a - sine * b, sine * a + cosine * b
+                for k in range(4):
+                    a, b = symmetric[p, k], symmetric[q, k]
+                    symmetric[p, k], symmetric[q, k] = cosine * a - sine * b, sine * a + cosine * b
+                    a, b = axes[k, p], axes[k, q]
+                    axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
+    largest = 0
+    for i in range(1, 4):
+        if symmetric[i, i] > symmetric[largest, largest]:
+            largest = i
+    return axes[:, largest]
 
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """See rigid.compose; on the CPU, in float32."""
-    return _called(compose_rows, *torch.broadcast_tensors(reference, tangent))
+    left, right = np.broadcast_arrays(_rows(reference), _rows(tangent))
+    out = torch.empty(left.shape)
+    compose_rows(np.ascontiguousarray(left), np.ascontiguousarray(right), _PIVOT, out.numpy())
+    return out
 
 
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
     """See rigid.difference; on the CPU, in float32."""
-    return _called(difference_rows, particles, reference)
-
-
-def _called(kernel: Callable[..., None], left: Tensor, right: Tensor) -> Tensor:
-    out = torch.empty(left.shape)
-    left, right = (t.detach().to("cpu", torch.float32).contiguous() for t in (left, right))
-    kernel(left.numpy(), right.numpy(), _PIVOT, out.numpy())
+    out = torch.empty(particles.shape)
+    difference_rows(_rows(particles), _rows(reference), _PIVOT, out.numpy())
     return out
+
+
+def redraw(
+    particles: Tensor,
+    weights: Tensor,
+    positions: Tensor,
+    tangents: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    mode: str,
+) -> Tensor:
+    """See redraw.redraw_with; on the CPU, in float32."""
+    out = torch.empty(tangents.shape)
+    redraw_rows(
+        _rows(particles),
+        np.ascontiguousarray(weights.numpy(), np.float64),
+        np.ascontiguousarray(positions.numpy(), np.float64),
+        _rows(tangents),
+        _rows(lower),
+        _rows(upper),
+        mode == "reflect",
+        _PIVOT,
+        out.numpy(),
+    )
+    return out
+
+
+def mean(particles: Tensor, weights: Tensor) -> Tensor:
+    """See rigid.mean; on the CPU, in float32."""
+    out = torch.empty(1, particles.shape[1])
+    mean_of_rows(_rows(particles), np.ascontiguousarray(weights.numpy(), np.float64), out.numpy())
+    return out
+
+
+def _rows(tensor: Tensor) -> np.ndarray:
+    # numpy's conversions take a tenth of the time of torch's.
+    return np.ascontiguousarray(tensor.numpy(), np.float32)
 
 
 def motions() -> Motions:
@@ -186,4 +306,7 @@ def motions() -> Motions:
         with announced("filter: compiling its numba kernels (once, about 1 s)"):
             row = torch.zeros(1, 7)
             difference(compose(row, row), row)
-    return Motions(compose, difference)
+            one, none = row[:, 0] + 1, row[0, 6:]
+            redraw(row, one, row[:, 0], row, none, none, "reflect")
+            mean(row, one)
+    return Motions(compose, difference, redraw, mean)

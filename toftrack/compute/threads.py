@@ -11,9 +11,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from threading import Lock
+from typing import TypeVar
 
 import torch
 
+Result = TypeVar("Result")
 _given: ContextVar[int | None] = ContextVar("toftrack_threads", default=None)
 _most: ContextVar[int | None] = ContextVar("toftrack_most_threads", default=None)
 
@@ -82,12 +84,25 @@ def run_shared(task: Callable[[], object], parts: int) -> None:
     Plain threads, not numba's own: these are one choice for a whole process and some of them do not
     allow calls from two threads at once. One part is done without any.
     """
+    if parts <= 1:
+        task()
+        return
     others = [_pool(os.getpid()).submit(task) for _ in range(min(threads(), parts) - 1)]
     task()
     for other in others:
         # A helper that has not begun has nothing left to do.
         if not other.cancel():
             other.result()
+
+
+def beside(task: Callable[[], Result]) -> Callable[[], Result]:
+    """Begin a task in another thread, if there may be one; what is returned waits for its result.
+
+    The task must not need the interpreter's lock for long, or the threads wait for each other.
+    """
+    if threads() == 1:
+        return task
+    return _pool(os.getpid()).submit(task).result
 
 
 @functools.cache

@@ -49,7 +49,15 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
             )
     with one_sentence(), _own_hydra(), initialize_config_dir(str(folder), version_base="1.3"):
         name = _ROOT.removesuffix(".yaml")
-        config = compose(name, overrides=list(overrides))
+        try:
+            config = compose(name, overrides=list(overrides))
+        except (HydraException, OmegaConfBaseException):
+            raise
+        except Exception as error:  # whatever the readers of YAML say of somebody's file
+            raise ToftrackError(
+                f"the configuration in '{folder}' cannot be read ({' '.join(str(error).split())}); "
+                "mend its YAML, or give a folder laid out as toftrack's conf/"
+            ) from error
         check_overrides(config, name, overrides)
         return config
 

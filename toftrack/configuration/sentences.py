@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterator
 
+import yaml
 from hydra.errors import HydraException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -28,13 +29,16 @@ def sentence(error: BaseException) -> str:
         # Some of Hydra's errors are OSErrors too, without being of the system.
         if isinstance(cause, OSError) and not isinstance(cause, HydraException):
             return _of_system(cause)
+        if isinstance(cause, yaml.YAMLError):
+            return f"a file of the configuration is no YAML: {_one_line(str(cause))}; mend it there"
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
         return (
             f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "
             "name, and that its module lies beside the program or on PYTHONPATH"
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
-        return better_sentence(chain) or _of_config(error)
+        told = next((cause for cause in chain if str(cause).strip()), error)
+        return better_sentence(chain) or _of_config(told) or type(error).__name__
     text = _one_line(str(error))
     name = type(error).__name__
     return f"unexpected {name}{f': {text}' if text else ''} ({FULL_ERROR}=1 shows the traceback)"

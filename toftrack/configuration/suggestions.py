@@ -90,11 +90,12 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
 
 def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:
     """Every group and setting of a configuration, dotted."""
-    for name in map(str, config):
+    for name in config:
         if name == "_target_":
             continue
-        yield f"{prefix}{name}"
+        key = prefix + str(name)
+        yield key
         if not OmegaConf.is_missing(config, name):
             node = config._get_node(name)
             if isinstance(node, DictConfig) and not node._is_none():
-                yield from _keys(node, f"{prefix}{name}.")
+                yield from _keys(node, f"{key}.")

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -89,25 +90,33 @@ class Gestures:
         values: (13,), see features.  score: 0..1; below `doubtful_score` all classes are equally
         probable.  off_rad: rms distance of the angles from the pose space; NaN says nothing.
         """
-        cfg, widths = self.settings, self.settings.widths
+        cfg, (widths, most, members) = self.settings, self._tables
         # Logarithms of densities, in parts of the uniform density of "other".
         beyond = np.maximum(np.maximum(self.low - values, values - self.high), 0.0) / widths
-        extent = self.high - self.low + widths * math.sqrt(2 * math.pi)
-        ranges = np.maximum(features.RANGES, extent)
-        log_poses = np.nansum(np.log(ranges / extent) - 0.5 * beyond**2, axis=1)
+        log_poses = np.nansum(most - 0.5 * beyond**2, axis=1)
         if cfg.off_rad is not None and math.isfinite(off_rad):
             near = math.log(_OFF_RANGE_RAD * 2 / (cfg.off_rad * math.sqrt(2 * math.pi)))
             log_poses += np.where(self.own, 0.0, near - 0.5 * (off_rad / cfg.off_rad) ** 2)
         log_poses = np.append(log_poses, 0.0)
-        log_classes = np.empty(len(self.names))
-        for number in range(len(self.names)):
-            own = log_poses[np.append(self.classes, len(self.names) - 1) == number]
-            log_classes[number] = np.logaddexp.reduce(own) - math.log(len(own))
+        log_classes = np.logaddexp.reduce(log_poses + members, axis=1)
         log_classes[-1] += math.log(cfg.other)
         trust = (score - cfg.doubtful_score) / (cfg.sure_score - cfg.doubtful_score)
         log_classes *= min(max(trust, 0.0), 1.0)
-        parts = np.exp(log_classes - log_classes.max())
+        parts: np.ndarray = np.exp(log_classes - log_classes.max())
         return parts / parts.sum()
+
+    @cached_property
+    def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Widths (13,), log densities (M, 13) within the ranges, and of each class (C, M + 1)
+        which definitions it is: minus the log of their number, or -inf. "other" comes last.
+        """
+        widths = self.settings.widths
+        extent = self.high - self.low + widths * math.sqrt(2 * math.pi)
+        most = np.log(np.maximum(features.RANGES, extent) / extent)
+        count = len(self.names)
+        own = np.append(self.classes, count - 1) == np.arange(count)[:, None]
+        with np.errstate(divide="ignore"):
+            return widths, most, np.log(own / own.sum(1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,14 +10,19 @@ from torch import Tensor
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.hand.surface import BONE_RADII_MM
 
-_PAIRS = [(a, b) for a in range(5) for b in range(a + 1, 5)]
-_SQUEEZED = 0.6
+PAIRS = [(a, b) for a in range(5) for b in range(a + 1, 5)]
+SQUEEZED = 0.6
 """Bent fingers, and the thumb, lie so much closer to others than their radii say: flesh gives."""
-_STRICT = 4.0
+STRICT = 4.0
 """How much more it counts when a finger is straight: nothing squeezes it."""
-_BENT, _STRAIGHT = 0.7, 0.9
+BENT, STRAIGHT = 0.7, 0.9
 """Knuckle to tip, in parts of the finger's length: below the first it is bent, above the other it
 is straight."""
+RADII_MM = [
+    ((proximal + middle) / 2, (middle + last) / 2, last, middle, last)
+    for proximal, middle, last in BONE_RADII_MM
+]
+"""Of the points that are compared: middle joint, last joint, tip, two bones' middles."""
 
 
 def finger_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
@@ -46,16 +51,16 @@ def pairs_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
     fingers = joints_m[:, 1:].unflatten(1, (5, 4))
     steps = fingers[:, :, 1:] - fingers[:, :, :-1]
     chord = steps.sum(2).norm(dim=-1)
-    straight = (chord / steps.norm(dim=-1).sum(2) - _BENT) / (_STRAIGHT - _BENT)
+    straight = (chord / steps.norm(dim=-1).sum(2) - BENT) / (STRAIGHT - BENT)
     straight = straight.clamp(0, 1)
     # The thumb crosses the others, straight or not.
     either = torch.maximum(straight[:, first], straight[:, second]) * crossing
     ends = fingers[:, :, 1:]  # (N, 5, 3, 3)
     points = torch.cat((ends, (ends[:, :, 1:] + ends[:, :, :-1]) / 2), 2)  # (N, 5, 5, 3)
     gap = torch.cdist(points[:, first], points[:, second])  # (N, pairs, 5, 5)
-    share = (_SQUEEZED + (1 - _SQUEEZED) * either) * (hand_length_m / DEFAULT_HAND_LENGTH_M)
+    share = (SQUEEZED + (1 - SQUEEZED) * either) * (hand_length_m / DEFAULT_HAND_LENGTH_M)
     depth = (1 - gap / (apart * share[:, :, None, None])).clamp(min=0)
-    return (1 + (_STRICT - 1) * either) * depth.amax(3).square().sum(2)
+    return (1 + (STRICT - 1) * either) * depth.amax(3).square().sum(2)
 
 
 @functools.cache
@@ -63,10 +68,7 @@ def _tables(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, T
     """Of the pairs: their fingers (10,), (10,); how far apart the points of fingers that touch are
     (10, 5, 5), metres of the mean adult; and whether none of them is the thumb (10,), 1 or 0.
     """
-    first, second = torch.tensor(_PAIRS, device=device).unbind(1)
-    bones = torch.tensor(BONE_RADII_MM, device=device, dtype=dtype) / 1e3
-    proximal, middle, last = bones.unbind(1)
-    # Of the points that are compared: middle joint, last joint, tip, two bones' middles.
-    radii = torch.stack(((proximal + middle) / 2, (middle + last) / 2, last, middle, last), 1)
+    first, second = torch.tensor(PAIRS, device=device).unbind(1)
+    radii = torch.tensor(RADII_MM, device=device, dtype=dtype) / 1e3
     apart = radii[first][:, :, None] + radii[second][:, None]
     return first, second, apart, (first > 0).to(dtype)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,7 @@ class HandShape:
             bone_lengths_m=self.bone_lengths_m.to(*args, **kwargs),
         )
 
-    @property
+    @cached_property
     def hand_length_m(self) -> float:
         """Wrist to the middle finger's tip when the finger is straight."""
         return float(self.base_m[2].norm() + self.bone_lengths_m[2].sum())

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.rotations import rotvec_to_rotmat
+from toftrack.compute.transfer import table
 from toftrack.hand.shape import HandShape
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
@@ -108,7 +109,7 @@ def forward_kinematics(state: Tensor, shape: HandShape) -> HandPose:
     """
     n = state.shape[0]
     slots = state.new_zeros(n, 25)
-    slots[:, list(CHAIN_SLOTS)] = state[:, 6:]
+    slots[:, table(CHAIN_SLOTS, torch.int64, state.device)] = state[:, 6:]
     abduction_1, flexion_1, abduction_2, flexion_2, flexion_3 = slots.view(n, 5, 5).unbind(-1)
 
     r1 = shape.base_frames @ _turn(abduction_1, flexion_1)
@@ -122,7 +123,7 @@ def forward_kinematics(state: Tensor, shape: HandShape) -> HandPose:
 
     rotation = rotvec_to_rotmat(state[:, 3:6])
     if shape.side == "left":
-        rotation = rotation * rotation.new_tensor([-1.0, 1.0, 1.0])
+        rotation = rotation * table((-1.0, 1.0, 1.0), rotation.dtype, rotation.device)
     translation = state[:, None, :3]
     joints = points.flatten(1, 2) @ rotation.mT + translation
     frames = torch.cat((rotation[:, None], rotation[:, None] @ local.flatten(1, 2)), 1)

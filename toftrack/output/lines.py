@@ -50,6 +50,26 @@ LINE_FIELDS = (*_FIRST, *(name for name in KINDS if name not in _FIRST))
 FRAME_FIELDS = ("index", "timestamp_s", "compute_s")
 """What is said of a frame, not of each hand in it."""
 HAND_FIELDS = tuple(name for name in LINE_FIELDS if name not in FRAME_FIELDS)
+FROM_THE_START = (
+    "joints_m",
+    "lost",
+    "state",
+    "latent",
+    "score",
+    "covariance",
+    "effective_sample_size",
+    "gesture",
+    "gesture_probability",
+    "timestamp_s",
+    "compute_s",
+)
+"""What every run says; older ones without the other fields are results as well."""
+SHAPES: dict[str, tuple[int, ...]] = {
+    "joints_m": (21, 3),
+    "state": (27,),
+    **dict.fromkeys(NUMBERS, ()),
+}
+"""Of the fields of a hand whose shape does not depend on the run."""
 
 
 def json_line(estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS) -> str:

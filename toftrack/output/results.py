@@ -1,8 +1,8 @@
 """The result files of a run: run.json, track.jsonl, track.npz and summary.json.
 
 `run.json` is written at the start, `track.jsonl` grows by a line as each frame is done. The two
-others are made of these when the writer is closed, also after an interruption, for the frames that
-were done until then; or later, by `finish`, if it never was.
+others are made when the writer is closed, also after an interruption, for the frames that were done
+until then; or later, of the lines, if it never was.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, LineFile, write_whole
-from toftrack.output.lines import HAND_FIELDS, KINDS, NUMBERS, json_line, strict
+from toftrack.output.lines import FROM_THE_START, HAND_FIELDS, KINDS, SHAPES, json_line, strict
 from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.realtime import RealTime
 from toftrack.output.records import Records, write_archive
@@ -31,23 +31,11 @@ from toftrack.output.summary import run_metrics, summarise
 
 RUN_FORMAT = "toftrack-run"
 _VERSION = 1
-
-_FROM_THE_START = (
-    "joints_m",
-    "lost",
-    "state",
-    "latent",
-    "score",
-    "covariance",
-    "effective_sample_size",
-    "gesture",
-    "gesture_probability",
-    "timestamp_s",
-    "compute_s",
-)
-"""Arrays that every track.npz has; older files without the others are results as well."""
-
-_SHAPES = {"joints_m": (21, 3), "state": (27,)}
+_MOST_HELD = 10_000_000
+"""Dropped frames between others, 4 days of them; more are none, but a damaged number."""
+_MOST_DIMS = 100
+_PARTS = ("camera", "config", "device", "hand_shape", "pose_space")
+"""Of the metadata: what is told of each."""
 
 
 class ResultWriter:
@@ -105,6 +93,7 @@ class ResultWriter:
         except OSError as error:
             self._lines.close()
             raise _unwritable(self.folder, error) from error
+        self._records: Records | None = None
         self._closed = False
 
     def append(self, estimates: Sequence[Estimate]) -> None:
@@ -114,6 +103,9 @@ class ResultWriter:
         """
         try:
             self._lines.append(json_line(estimates))
+            if self._records is None:
+                self._records = Records(self.folder, vars(estimates[0]), len(estimates))
+            self._records.append(estimates)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         self.frames += 1
@@ -127,7 +119,8 @@ class ResultWriter:
             return
         self._closed = True
         try:
-            self.summary = finish(self.folder, self._facts, self._truth, self.realtime)
+            with self._records or records_of(self.folder, self._facts) as records:
+                self.summary = finish(self.folder, self._facts, self._truth, records, self.realtime)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         finally:
@@ -145,37 +138,53 @@ class ResultWriter:
         self.close()
 
 
+def records_of(folder: Path, facts: dict[str, Any]) -> Records:
+    """The records of a run's lines, which take a while to read.
+
+    folder, facts: as for `finish`.  Raises ToftrackError for damaged lines, OSError.
+    """
+    metadata = facts["metadata"]
+    latent_size = (metadata.get("pose_space") or {}).get("dims", 4)
+    slots = (metadata.get("config") or {}).get("hands", 1)
+    if latent_size not in range(1, _MOST_DIMS + 1) or slots not in (1, 2):
+        raise ToftrackError(
+            f"'{folder / 'run.json'}' is damaged: a run does not follow {slots} hands in "
+            f"{latent_size} dimensions"
+        )
+    return Records.of_lines(folder / LINES, latent_size, slots)
+
+
 def finish(
-    folder: Path, facts: dict[str, Any], truth: Truth | None, realtime: RealTime | None = None
+    folder: Path,
+    facts: dict[str, Any],
+    truth: Truth | None,
+    records: Records,
+    realtime: RealTime | None = None,
 ) -> dict[str, Any]:
-    """Make track.npz and summary.json of a run's lines; returns the summary.
+    """Make track.npz and summary.json of a run's frames; returns the summary.
 
     folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
     realtime: of a live run; the lines do not tell it.
 
-    Raises ToftrackError for damaged lines, OSError when something cannot be read or written.
+    Raises OSError when something cannot be read or written.
     """
     metadata = facts["metadata"]
-    latent_size = int((metadata.get("pose_space") or {}).get("dims", 4))
-    slots = int((metadata.get("config") or {}).get("hands", 1))
-    with Records(folder / LINES, latent_size, slots) as records:
-        rows, changed, held = _every_frame(records)
-        if held:
-            metadata = metadata | {"held_frames": held}
-        small = {
-            "joint_names": np.array(facts["joint_names"], np.str_),
-            "metadata": np.array(json.dumps(metadata)),
-        } | facts_for_readers(metadata)
-        summary = summarise(records, len(rows), len(held), folder, metadata)
-        if realtime is not None:
-            summary["realtime"] = realtime.summary()
-        if truth is not None and len(rows):
-            metrics = run_metrics(records, rows, changed["index"], truth)
-            summary |= {"metrics": metrics} if metrics else {}
-        write_whole(
-            folder / "track.npz",
-            lambda stream: write_archive(stream, records, rows, changed, small),
-        )
+    rows, changed, held = _every_frame(records)
+    if held:
+        metadata = metadata | {"held_frames": held}
+    small = {
+        "joint_names": np.array(facts["joint_names"], np.str_),
+        "metadata": np.array(json.dumps(metadata)),
+    } | facts_for_readers(metadata)
+    summary = summarise(records, len(rows), len(held), folder, metadata)
+    if realtime is not None:
+        summary["realtime"] = realtime.summary()
+    if truth is not None and len(rows):
+        metrics = run_metrics(records, rows, changed["index"], truth)
+        summary |= {"metrics": metrics} if metrics else {}
+    write_whole(
+        folder / "track.npz", lambda stream: write_archive(stream, records, rows, changed, small)
+    )
     _write_json(folder / "summary.json", summary)
     return summary
 
@@ -187,7 +196,8 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray], l
     """
     names = ("index", "timestamp_s", "compute_s")
     index, times, seconds = (records.column(name) for name in names)
-    if not len(index) or (np.diff(index) < 1).any():
+    counts_on = bool(len(index)) and bool((np.diff(index) >= 1).all())
+    if not counts_on or int(index[-1]) - int(index[0]) > _MOST_HELD:
         # Where the device counts anew there is nothing to fill in.
         changed = dict(zip(names, (index, times, seconds), strict=True))
         return np.arange(len(index)), changed, []
@@ -216,8 +226,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path).expanduser()
     try:
-        arrays = read_archive(path, {*_FROM_THE_START, *KINDS, "joint_names", "metadata"})
-        known = (*_FROM_THE_START, *(name for name in KINDS if name in arrays))
+        arrays = read_archive(path, {*FROM_THE_START, *KINDS, "joint_names", "metadata"})
+        known = (*FROM_THE_START, *(name for name in KINDS if name in arrays))
         names = (*dict.fromkeys(known), "joint_names", "metadata")
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
@@ -249,7 +259,7 @@ def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:
         raise ValueError(f"'lost' has the shape {slots}")
     for name, array in arrays.items():
         of_hand = slots if name in HAND_FIELDS else slots[:1]
-        end = _SHAPES.get(name, () if name in NUMBERS else array.shape[len(of_hand) :])
+        end = SHAPES.get(name, array.shape[len(of_hand) :])
         if array.shape != (*of_hand, *end):
             raise ValueError(f"{name!r} has the shape {array.shape}")
         known = np.dtype(KINDS.get(name, np.float32)).kind
@@ -269,7 +279,7 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
         ) from None
     except (OSError, ValueError) as error:
         raise ToftrackError(f"'{path}' cannot be read ({error}); track again") from None
-    if not isinstance(facts, dict) or facts.get("format") != RUN_FORMAT:
+    if not isinstance(facts, dict) or facts.get("format") != RUN_FORMAT or not _is_whole(facts):
         raise ToftrackError(f"'{path}' does not describe a run; give another folder")
     if facts.get("version") != _VERSION:
         raise ToftrackError(
@@ -277,6 +287,15 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
             f"{_VERSION}; use the toftrack that wrote it"
         )
     return facts
+
+
+def _is_whole(facts: dict[str, Any]) -> bool:
+    """Whether what a run.json tells of a run is of the kinds that it should be."""
+    metadata, names = facts.get("metadata"), facts.get("joint_names")
+    if not isinstance(metadata, dict) or not isinstance(names, list):
+        return False
+    parts = (metadata.get(name) or {} for name in _PARTS)
+    return all(isinstance(part, dict) for part in parts)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from typing import Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
+from toftrack.compute.transfer import table
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
 
@@ -88,7 +89,7 @@ def clamp_to_joint_limits(angles: Tensor) -> Tensor:
 @functools.cache
 def _limits(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """The lower and the upper joint limits, each (21,)."""
-    return torch.tensor(ANGLE_LIMITS, device=device, dtype=dtype).T.contiguous().unbind(0)
+    return table(ANGLE_LIMITS, dtype, device).T.contiguous().unbind(0)
 
 
 def clamped_share(space: TensorSpace, latent: Tensor, slack_rad: float = 1e-3) -> float:

@@ -38,7 +38,7 @@ class LatentDensity:
         A particle filter adds it to a log weight: log w = exponent log score + strength * this.
         """
         log_kernel = _log_kernel(latent * self.scale, self.centres) - self.log_peak
-        return torch.logaddexp(log_kernel, log_kernel.new_tensor(math.log(self.floor)))
+        return torch.logaddexp(log_kernel, log_kernel.new_full((), math.log(self.floor)))
 
 
 def latent_density(space: PoseSpace, bandwidth: float = 1.0, floor: float = 1e-3) -> LatentDensity:

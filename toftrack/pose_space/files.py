@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 import toftrack.pose_space
 from toftrack.archives import read_archive
@@ -76,7 +77,9 @@ def fit_pose_space(
         raise ToftrackError(
             f"the {len(data)} training poses are all the same; a pose space needs poses that differ"
         )
-    return module.fit(data.angles_rad, data.labels, dims, **settings)
+    # Matrices of some hundred rows: a second thread only waits for the first, four times as long.
+    with threadpool_limits(1, "blas"):
+        return module.fit(data.angles_rad, data.labels, dims, **settings)
 
 
 def save_pose_space(

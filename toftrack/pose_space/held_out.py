@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -95,6 +96,7 @@ def spaces_to_learn(data: PoseData) -> int:
     return 1 + sum(1 for _ in clip_folds(data.clips))
 
 
+@small_operations()
 def evaluate_space(
     kind: str,
     dims: int,

@@ -16,7 +16,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.output.evaluation import metrics_table
 from toftrack.output.files import LINES, LineFile
-from toftrack.output.results import finish, read_run_facts
+from toftrack.output.results import finish, read_run_facts, records_of
 from toftrack.output.run_folder import found_again, open_tracked
 from toftrack.recordings.store import open_source
 from toftrack.views.overlay import VIDEO
@@ -54,9 +54,16 @@ def recover(folder: Path, recording: str | Path | None = None) -> dict[str, Any]
         try:
             if (folder / VIDEO).is_file():
                 cut_to_whole(folder / VIDEO)
-            return finish(folder, facts, _truth(facts, recording))
+            truth = _truth(facts, recording)
+            with records_of(folder, facts) as records:
+                return finish(folder, facts, truth, records)
         finally:
             lines.close()
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ToftrackError(
+            f"'{folder / 'run.json'}' is damaged ({' '.join(repr(error).split())}); put that of "
+            "another run with the same settings in its place, or track again"
+        ) from error
     except OSError as error:
         raise ToftrackError(
             f"'{folder}' cannot be read or written ({error.strerror or error}); make room, or copy "

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import yaml
 
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
@@ -84,8 +84,8 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _read_run(path: Path, folder: Path) -> Run:
     name = path.relative_to(folder).as_posix()
     try:
-        lines: Any = OmegaConf.to_container(OmegaConf.load(path / ".hydra" / "overrides.yaml"))
-        overrides = dict(_split(str(line)) for line in lines)
+        lines = yaml.safe_load((path / ".hydra" / "overrides.yaml").read_text("utf-8"))
+        overrides = dict(_split(line) for line in lines)
     except Exception as error:  # whatever a YAML reader may say about a damaged file
         return Run(name, {}, {}, f"its overrides cannot be read ({type(error).__name__})")
     try:

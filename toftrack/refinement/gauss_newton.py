@@ -25,6 +25,7 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.rotations import rotvec_composition
+from toftrack.compute.transfer import table
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
@@ -40,23 +41,20 @@ _JOINTS = [
 ]
 # Rows of the table of axes that `point_jacobian` builds: the x axes of the 15 bones (flexion), the
 # z axes of the 5 base frames (abduction of the first joint), the z axis of the thumb's first bone.
-_AXIS_ROW = [
+_AXIS_ROW = tuple(
     3 * finger + bone if not abduction else 15 + finger if bone == 0 else 20
     for finger, bone, abduction in _JOINTS
-]
-_ORIGIN_ROW = [1 + 3 * finger + bone for finger, bone, _ in _JOINTS]
+)
+_ORIGIN_ROW = tuple(1 + 3 * finger + bone for finger, bone, _ in _JOINTS)
 # (16, 21) which angles move a point that is attached to a frame.
-_MOVES = [
-    [
-        frame > 0 and finger == (frame - 1) // 3 and bone <= (frame - 1) % 3
-        for finger, bone, _ in _JOINTS
-    ]
-    for frame in range(16)
-]
-JOINT_FRAME = [
+_MOVES = tuple(
+    tuple(f > 0 and finger == (f - 1) // 3 and bone <= (f - 1) % 3 for finger, bone, _ in _JOINTS)
+    for f in range(16)
+)
+JOINT_FRAME = (
     0,
     *(0 if bone == 0 else 3 * finger + bone for finger in range(5) for bone in range(4)),
-]
+)
 """The frame that each of the 21 joints moves with: that of the bone which ends there."""
 
 FACING_M = 0.005
@@ -84,6 +82,8 @@ class Refinement:
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     swaps: other poses of single fingers that are tried; the log scores by which one is better must
         sum up to `swap_gain` over frames, of each of which `drift` is taken off.
+    sure: probability of a hand from which on the networks' poses and single other fingers are tried
+        in turn, and not both in every frame.
     overlap: of the log score, for fingers that are in one another (see finger_overlap).
     keep_gain: by how much the log score of another pose must exceed the last frame's.
     steadying: how much of a change from frame to frame is believed.
@@ -99,6 +99,7 @@ class Refinement:
     damping: float
     swaps: int
     swap_gain: float
+    sure: float
     drift: float
     overlap: float
     keep_gain: float
@@ -114,6 +115,7 @@ class Refinement:
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
         for name in ("damping", "swap_gain", "drift", "keep_gain", "overlap"):
             check_number(f"refine.{name}", getattr(self, name), 0)
+        check_number("refine.sure", self.sure, 0.5, 1)
         check_number("refine.carry", self.carry, 0, 1)
 
 
@@ -199,14 +201,15 @@ def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame
     Returns (N, P, 27): translation, small rotation about the wrist in the camera frame, angles.
     """
     frames, origins = pose.frames, pose.origins_m
+    axis_row, origin_row = table((_AXIS_ROW, _ORIGIN_ROW), torch.int64, x.device)
     base = (frames[:, 0] @ shape.base_frames[:, :, 2].mT).mT
-    axes = torch.cat((frames[:, 1:, :, 0], base, frames[:, 1:2, :, 2]), 1)[:, _AXIS_ROW]
+    axes = torch.cat((frames[:, 1:, :, 0], base, frames[:, 1:2, :, 2]), 1)[:, axis_row]
     if shape.side == "left":  # a mirror turns the sense of rotation round
         axes = -axes
     # n.(a x (X - o)) = (n x a).(o - X) = a.((X - o) x n)
     arm_moment = torch.linalg.cross(x, n)
-    turning = arm_moment @ axes.mT - n @ torch.linalg.cross(axes, origins[:, _ORIGIN_ROW]).mT
-    by_angle = turning * torch.tensor(_MOVES, device=x.device)[frame]
+    turning = arm_moment @ axes.mT - n @ torch.linalg.cross(axes, origins[:, origin_row]).mT
+    by_angle = turning * table(_MOVES, torch.bool, x.device)[frame]
     by_rotation = torch.linalg.cross(x - origins[:, :1], n)
     return torch.cat((n, by_rotation, by_angle), -1)
 
@@ -264,9 +267,9 @@ def _step(rows: Tensor, values: Tensor, off_prior: Tensor, settings: Refinement)
 
 def _moved(states: Tensor, step: Tensor) -> Tensor:
     """States after a step of translation, rotation in the camera frame and angles, in limits."""
-    limits = states.new_tensor(ANGLE_LIMITS)
+    low, high = table(ANGLE_LIMITS, states.dtype, states.device).unbind(1)
     turned = rotvec_composition(step[:, 3:6], states[:, 3:6])
-    bent = (states[:, 6:] + step[:, 6:]).clamp(limits[:, 0], limits[:, 1])
+    bent = (states[:, 6:] + step[:, 6:]).clamp(low, high)
     return torch.cat((states[:, :3] + step[:, :3], turned, bent), 1)
 
 
@@ -322,7 +325,7 @@ def silhouette_residuals(
     (top, left), (high, wide) = seen.corner, seen.nearest_px.shape[:2]
     if high == 0:
         return Residuals(frames.new_zeros(len(frames), 0, 27), frames.new_zeros(len(frames), 0))
-    parts = origins.new_tensor(ALONG_BONE)
+    parts = table(ALONG_BONE, origins.dtype, origins.device)
     along = -frames[..., 1] * shape.bone_lengths_m.flatten()[:, None]
     x = (origins[:, :, None] + parts[:, None] * along[:, :, None]).flatten(1, 2)
     frame = torch.arange(1, 16, device=x.device).repeat_interleave(len(parts))
@@ -355,6 +358,6 @@ def landmark_residuals(pose: HandPose, landmarks: Landmarks, shape: HandShape) -
     weight = (1 / ((1 + away) * sigma)).repeat_interleave(3, 1)
     x = pose.joints_m.repeat_interleave(3, 1)
     n = torch.eye(3, dtype=x.dtype, device=x.device).repeat(21, 1).expand_as(x)
-    frame = torch.tensor(JOINT_FRAME, device=x.device).repeat_interleave(3)
+    frame = table(JOINT_FRAME, torch.int64, x.device).repeat_interleave(3)
     rows = point_jacobian(pose, shape, x, n, frame)
     return Residuals(rows * weight[..., None], gap.flatten(1) * weight)

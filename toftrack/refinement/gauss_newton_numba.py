@@ -25,6 +25,7 @@ from toftrack.refinement.residuals_numba import (
     add_landmarks,
     add_points,
     add_silhouette,
+    assemble,
     choose_points,
     joint_axes,
     nearest_ellipsoids,
@@ -63,7 +64,7 @@ def solve(normal, gradient):
 @compiled
 def _move(state, prior, settings, sums):
     """One damped step of a state, see gauss_newton.refine."""
-    _, normal, gradient = sums
+    normal, gradient = sums
     _, _, _, _, _, angle_rad, damping = settings
     trust, mean = angle_rad**-2, 0.0
     for j in range(_FREE):
@@ -90,38 +91,46 @@ def _refine(state, prior, landmarks, seen, shape, surface, settings, work):
     base_frames, base, lengths, mirror = shape
     index, centres, semi_axes = surface
     iterations, points, _, _, deviation, _, _ = settings
-    hand, posed, matched, sums = work
+    hand, posed, matched, within, wrenches, twists, sums = work
     frames, joints, axes = hand
     xyz, distance, nearest = matched
+    known = landmarks[1]
     pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
-    count = choose_points(seen[0], joints, points, xyz)
-    if count == 0 and not (landmarks[1] < np.inf).any():
+    count = choose_points(seen[0], joints, points, within, xyz)
+    informed = count > 0
+    for j in range(len(known)):
+        informed |= known[j] > 0 and known[j] < np.inf
+    if not informed:
         return
     for _ in range(iterations):
         pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
         pose_ellipsoids(frames, joints, index, centres, semi_axes, posed)
         joint_axes(frames, base_frames, mirror, axes)
-        sums[1][:], sums[2][:] = 0.0, 0.0
+        wrenches[:] = 0.0
         nearest_ellipsoids(xyz, count, posed, distance, nearest)
-        add_points(matched, count, index, posed, hand, settings, sums)
-        add_silhouette(seen, lengths, hand, deviation, sums)
-        add_landmarks(landmarks[0], landmarks[1], hand, sums)
+        add_points(matched, count, index, posed, hand, settings, wrenches)
+        add_silhouette(seen, lengths, hand, deviation, wrenches)
+        add_landmarks(landmarks[0], landmarks[1], hand, wrenches)
+        assemble(wrenches, hand, twists, sums)
         _move(state, prior, settings, sums)
 
 
 @compiled
-def scratch(ellipsoids, points):
+def scratch(ellipsoids, points, seen):
     """What one thread works in.
 
     Of the hand: frames (16, 3, 3), joints (21, 3), axes of the angles (21, 3).  Its ellipsoids
-    (E, 12), see pose_ellipsoids.  The matched points, see add_points.  Of the normal equations:
-    a row (11,), the matrix (27, 27), of which the lower triangle counts, and the gradient (27,).
+    (E, 12), see pose_ellipsoids.  The matched points, see add_points, and which they are.  The
+    wrenches (16, 7, 6) of the frames, the twists (27, 6) of the degrees of freedom, and the normal
+    equations, see assemble.
     """
     hand = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty((21, 3))
     posed = np.empty((ellipsoids, 12), np.float32)
     distance, nearest = np.empty(points, np.float32), np.zeros(points, np.int32)
     matched = np.empty((3, points), np.float32), distance, nearest
-    return hand, posed, matched, (np.empty(11), np.empty((_FREE, _FREE)), np.empty(_FREE))
+    sums = np.empty((_FREE, _FREE)), np.empty(_FREE)
+    within = np.empty(seen + 1, np.int32)
+    return hand, posed, matched, within, np.empty((16, 7, 6)), np.empty((_FREE, 6)), sums
 
 
 @_cached
@@ -129,7 +138,7 @@ def refine_hands(states, priors, landmarks, seen, shape, surface, settings, coun
     """Refine hands as long as `counter` has any; called from several threads.
 
     states: (N, 27) float64, overwritten.  priors: (N, 21).
-    landmarks: (N, 21, 3) and (N, 21), inf = none.
+    landmarks: (N, 21, 3) and (N, 21), or one for all; inf = none.
     seen: points (P, 3) float32, nearest_px (h, w, 2) and its corner (top, left) in an image of
         size (height, width), k (3, 3).
     shape: base_frames, base, lengths, mirror, see pose_hand.
@@ -137,12 +146,13 @@ def refine_hands(states, priors, landmarks, seen, shape, surface, settings, coun
     settings: iterations, points, reach_m, point_m, silhouette_px, angle_rad, damping.
     counter: (1,) int64 hands taken.
     """
-    mine = scratch(len(surface[0]), min(settings[1], len(seen[0])))
+    mine = scratch(len(surface[0]), min(settings[1], len(seen[0])), len(seen[0]))
     while True:
         i = take(counter)
         if i >= len(states):
             break
-        known = landmarks[0][i], landmarks[1][i]
+        row = i % max(1, len(landmarks[0]))
+        known = landmarks[0][row], landmarks[1][row]
         _refine(states[i], priors[i], known, seen, shape, surface, settings, mine)
 
 
@@ -175,9 +185,10 @@ class CompiledRefiner:
 
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
-        joints = np.empty((len(states), 21, 3))
-        joints_of(_array(states), *self._shape, joints)
-        return torch.from_numpy(joints.astype(np.float32))
+        joints = torch.empty(len(states), 21, 3)
+        states_read = np.ascontiguousarray(states.numpy(), np.float32)
+        joints_of(states_read, *self._shape, joints.numpy())
+        return joints
 
     def __call__(
         self,
@@ -203,10 +214,11 @@ class CompiledRefiner:
     ) -> Tensor:
         n = len(states)
         if landmarks is None:
-            known = np.empty((n, 21, 3)), np.full((n, 21), np.inf)
+            known = np.empty((1, 21, 3)), np.full((1, 21), np.inf)
         else:
-            landmarks = landmarks.of_each(n)
-            known = _array(landmarks.points_m), _array(landmarks.sigma_m)
+            points = _array(landmarks.points_m).reshape(-1, 21, 3)
+            sigma = np.broadcast_to(_array(landmarks.sigma_m), (len(points), 21))
+            known = points, np.ascontiguousarray(sigma)
         refined = _array(states)
         task = functools.partial(
             refine_hands,
@@ -231,4 +243,4 @@ class CompiledRefiner:
 
 def _array(tensor: Tensor) -> np.ndarray:
     """A float64 copy."""
-    return tensor.detach().numpy().astype(np.float64, order="C")
+    return tensor.numpy().astype(np.float64, order="C")

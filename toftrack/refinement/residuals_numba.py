@@ -1,13 +1,14 @@
 """What is seen of one hand as normal equations, compiled; see gauss_newton_numba.py.
 
-The formulas and their names are those of gauss_newton.py, which is the reference. A point only
-touches the wrist's six degrees of freedom and those of its finger up to its bone, so its part of
-the normal equations is small. Distances to the ellipsoids are float32 over all points side by side;
-everything else is float64.
+The formulas and their names are those of gauss_newton.py, which is the reference. What a residual
+says of a point, it says of the frame that carries it: the force w = (n, x cross n) along its
+derivative n. So w w' and w times the residual are first summed up frame by frame, and the degrees
+of freedom come in once for all of them. Distances to the ellipsoids are float32 over all points
+side by side; everything else is float64.
 
 Throughout, `hand` is what gauss_newton_numba.scratch says of a posed hand: its frames (16, 3, 3),
-joints (21, 3) and the axes of its angles (21, 3); `sums` is a row (11,), the normal matrix
-(27, 27), of which the lower triangle counts, and the gradient (27,).
+joints (21, 3) and the axes of its angles (21, 3); `wrenches` (16, 7, 6) are the sums of each frame,
+those with the residuals in the last row.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ _REACH = np.float32(REACH_M**2)
 
 
 @compiled
-def choose_points(points, joints, count, chosen):
+def choose_points(points, joints, count, within, chosen):
     """Points of one hypothesis, see SeenPoints.around; returns how many there are.
 
-    points: (P, 3) float32.  joints: (21, 3).  chosen: (3, count), its first columns are set.
+    points: (P, 3) float32.  joints: (21, 3).  within: (P + 1,) int32 scratch.
+    chosen: (3, count), its first columns are set.
     """
     middle = np.zeros(3, np.float32)
     for i in range(3):
@@ -47,16 +49,15 @@ def choose_points(points, joints, count, chosen):
         middle[i] = np.float32(total / 21)
     near = 0
     for p in range(len(points)):
+        # One after the other, without a branch: what is not near is overwritten.
+        within[near] = p
         near += _within(points[p], middle)
     stride = max(1, (near + count - 1) // count)
-    rank, found = 0, 0
-    for p in range(len(points)):
-        if _within(points[p], middle):
-            if rank % stride == 0:
-                for i in range(3):
-                    chosen[i, found] = points[p, i]
-                found += 1
-            rank += 1
+    found = 0
+    for rank in range(0, near, stride):
+        for i in range(3):
+            chosen[i, found] = points[within[rank], i]
+        found += 1
     return found
 
 
@@ -107,9 +108,9 @@ def nearest_ellipsoids(xyz, count, posed, distance, nearest):
             n0 = a * q0 + d * q1 + g * q2
             n1 = b * q0 + e0 * q1 + h * q2
             n2 = c * q0 + f * q1 + i * q2
-            length = math.sqrt(q0 * q0 + q1 * q1 + q2 * q2)
-            steepness = max(math.sqrt(n0 * n0 + n1 * n1 + n2 * n2), np.float32(1e-6))
-            found = (length - _ONE) * length / steepness
+            square = q0 * q0 + q1 * q1 + q2 * q2
+            steep = max(n0 * n0 + n1 * n1 + n2 * n2, np.float32(1e-12))
+            found = (square - math.sqrt(square)) / math.sqrt(steep)
             closer = found < distance[p]
             distance[p] = found if closer else distance[p]
             nearest[p] = which if closer else nearest[p]
@@ -137,45 +138,23 @@ def joint_axes(frames, base_frames, mirror, axes):
 
 
 @compiled
-def add_row(frame, x, n, weight, residual, hand, sums):
-    """Add n.X's derivative at X = x, which moves with a frame, to the normal equations.
+def add_wrench(frame, x, n, weight, residual, wrenches):
+    """Add n.X's derivative at X = x, which moves with a frame, to what is known of the frame.
 
-    weight: of the derivative.  residual: weighted.  hand, sums: see the module's text.
+    weight: of the derivative.  residual: weighted.  wrenches: see the module's text.
     """
-    _, joints, axes = hand
-    row, normal, gradient = sums
-    # (X - O) x n = X x n - O x n, whatever the origin O.
-    m0, m1, m2 = x[1] * n[2] - x[2] * n[1], x[2] * n[0] - x[0] * n[2], x[0] * n[1] - x[1] * n[0]
-    o = joints[0]
-    row[0], row[1], row[2] = weight * n[0], weight * n[1], weight * n[2]
-    row[3] = weight * (m0 - o[1] * n[2] + o[2] * n[1])
-    row[4] = weight * (m1 - o[2] * n[0] + o[0] * n[2])
-    row[5] = weight * (m2 - o[0] * n[1] + o[1] * n[0])
-    first, count = 0, 0
-    if frame > 0:
-        finger, bone = (frame - 1) // 3, (frame - 1) % 3
-        first = 4 * finger + (1 if finger > 0 else 0)
-        # The first joint turns twice, and so does the thumb's second one.
-        count = bone + 2 + (1 if finger == 0 and bone > 0 else 0)
-        for j in range(count):
-            joint = j // 2 if finger == 0 else max(j - 1, 0)
-            o, a = joints[1 + 4 * finger + joint], axes[first + j]
-            row[6 + j] = weight * (
-                a[0] * (m0 - o[1] * n[2] + o[2] * n[1])
-                + a[1] * (m1 - o[2] * n[0] + o[0] * n[2])
-                + a[2] * (m2 - o[0] * n[1] + o[1] * n[0])
-            )
-    for i in range(6 + count):
-        to = i if i < 6 else first + i
-        gradient[to] += row[i] * residual
-        for j in range(min(i + 1, 6)):
-            normal[to, j] += row[i] * row[j]
-        for j in range(6, i + 1):
-            normal[to, first + j] += row[i] * row[j]
+    w0, w1, w2 = weight * n[0], weight * n[1], weight * n[2]
+    w3, w4, w5 = x[1] * w2 - x[2] * w1, x[2] * w0 - x[0] * w2, x[0] * w1 - x[1] * w0
+    w = (w0, w1, w2, w3, w4, w5)
+    sums = wrenches[frame]
+    for i in range(6):
+        for j in range(6):
+            sums[i, j] += w[i] * w[j]
+        sums[6, i] += residual * w[i]
 
 
 @compiled
-def add_points(matched, count, index, posed, hand, settings, sums):
+def add_points(matched, count, index, posed, hand, settings, wrenches):
     """The seen points' part of the normal equations, see gauss_newton.point_residuals.
 
     matched: points (3, P), their distances (P,) and their ellipsoids (P,), of which `count` count.
@@ -195,8 +174,8 @@ def add_points(matched, count, index, posed, hand, settings, sums):
         n0 = w[0] * q0 + w[3] * q1 + w[6] * q2
         n1 = w[1] * q0 + w[4] * q1 + w[7] * q2
         n2 = w[2] * q0 + w[5] * q1 + w[8] * q2
-        steepness = max(math.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-6)
-        n = (n0 / steepness, n1 / steepness, n2 / steepness)
+        steepness = 1 / max(math.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-6)
+        n = (n0 * steepness, n1 * steepness, n2 * steepness)
         beyond = 0.0
         for i in range(3):
             beyond += ((x, y, z)[i] - joints[0, i]) * frames[0, i, 1]
@@ -204,11 +183,11 @@ def add_points(matched, count, index, posed, hand, settings, sums):
             continue
         weight = 1 / ((1 + (d / (POINT_REACH * reach)) ** 2) * point)
         at = (x - d * n[0], y - d * n[1], z - d * n[2])
-        add_row(index[nearest[p]], at, n, -weight, d * weight, hand, sums)
+        add_wrench(index[nearest[p]], at, n, -weight, d * weight, wrenches)
 
 
 @compiled
-def add_silhouette(seen, lengths, hand, deviation, sums):
+def add_silhouette(seen, lengths, hand, deviation, wrenches):
     """The silhouette's part of the normal equations, see gauss_newton.silhouette_residuals."""
     _, nearest_px, corner, size, k = seen
     frames, joints, _ = hand
@@ -235,24 +214,92 @@ def add_silhouette(seen, lengths, hand, deviation, sums):
                 continue
             weight = 1 / ((1 + (outside / SILHOUETTE_PX) ** 2) * deviation)
             n = (k[0, 0] / z, 0.0, -k[0, 0] * x[0] / (z * z))
-            add_row(frame, x, n, weight, gap_u * weight, hand, sums)
+            add_wrench(frame, x, n, weight, gap_u * weight, wrenches)
             n = (0.0, k[1, 1] / z, -k[1, 1] * x[1] / (z * z))
-            add_row(frame, x, n, weight, gap_v * weight, hand, sums)
+            add_wrench(frame, x, n, weight, gap_v * weight, wrenches)
 
 
 @compiled
-def add_landmarks(points, sigmas, hand, sums):
+def add_landmarks(points, sigmas, hand, wrenches):
     """The landmarks' part of the normal equations, see gauss_newton.landmark_residuals."""
     joints = hand[1]
     for j in range(21):
         sigma = sigmas[j]
-        if not sigma < np.inf:
-            continue
         x = (joints[j, 0], joints[j, 1], joints[j, 2])
         gap = (x[0] - points[j, 0], x[1] - points[j, 1], x[2] - points[j, 2])
         away = (gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2) / (LANDMARK_SIGMAS * sigma) ** 2
+        if not (sigma > 0 and sigma < np.inf and away < np.inf):
+            continue  # what is no number is a joint that was not found
         weight = 1 / ((1 + away) * sigma)
-        frame = _JOINT_FRAME[j]
-        add_row(frame, x, (1.0, 0.0, 0.0), weight, gap[0] * weight, hand, sums)
-        add_row(frame, x, (0.0, 1.0, 0.0), weight, gap[1] * weight, hand, sums)
-        add_row(frame, x, (0.0, 0.0, 1.0), weight, gap[2] * weight, hand, sums)
+        for i in range(3):
+            n = (1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0)
+            add_wrench(_JOINT_FRAME[j], x, n, weight, gap[i] * weight, wrenches)
+
+
+@compiled
+def assemble(wrenches, hand, twists, sums):
+    """The normal equations from what is known of each frame, whose sums it overwrites.
+
+    A degree of freedom moves a point x by its twist (l, g): by l + g x X. It moves all frames from
+    its own to the finger's end, so these are added up from there (the composite-rigid-body
+    algorithm, Featherstone, "Rigid body dynamics algorithms", 2008, section 6.2).
+    twists: (27, 6) and sums: the matrix (27, 27), of which the lower triangle counts, and the
+    gradient (27,); all written.
+    """
+    _, joints, axes = hand
+    normal, gradient = sums
+    normal[:], twists[:6] = 0.0, 0.0
+    for i in range(3):
+        twists[i, i], twists[3 + i, 3 + i] = 1.0, 1.0
+        # -(e x o), o being the wrist.
+        j, k = (i + 1) % 3, (i + 2) % 3
+        twists[3 + i, j], twists[3 + i, k] = joints[0, k], -joints[0, j]
+    dof = 6
+    for finger in range(5):
+        for bone in range(3):
+            o = joints[1 + 4 * finger + bone]
+            # The first joint turns twice, and so does the thumb's second one.
+            for _ in range(2 if bone == 0 or (bone == 1 and finger == 0) else 1):
+                a = axes[dof - 6]
+                for i in range(3):
+                    j, k = (i + 1) % 3, (i + 2) % 3
+                    twists[dof, i], twists[dof, 3 + i] = a[k] * o[j] - a[j] * o[k], a[i]
+                dof += 1
+        for bone in range(2, -1, -1):
+            wrenches[0 if bone == 0 else 3 * finger + bone] += wrenches[3 * finger + bone + 1]
+    dof = 6
+    for finger in range(5):
+        first = dof
+        for bone in range(3):
+            for _ in range(2 if bone == 0 or (bone == 1 and finger == 0) else 1):
+                _couple(dof, first, wrenches[3 * finger + bone + 1], twists, normal, gradient)
+                dof += 1
+    for dof in range(6):
+        _couple(dof, dof + 1, wrenches[0], twists, normal, gradient)
+
+
+@compiled
+def _couple(dof, first, wrench, twists, normal, gradient):
+    """What a degree of freedom has in common with the wrist's six and with those from `first` on.
+
+    wrench: (7, 6) of all that it moves.
+    """
+    s = twists[dof]
+    force = (
+        _along(wrench[0], s),
+        _along(wrench[1], s),
+        _along(wrench[2], s),
+        _along(wrench[3], s),
+        _along(wrench[4], s),
+        _along(wrench[5], s),
+    )
+    gradient[dof] = _along(wrench[6], s)
+    for other in range(min(dof + 1, 6)):
+        normal[dof, other] = _along(force, twists[other])
+    for other in range(first, dof + 1):
+        normal[dof, other] = _along(force, twists[other])
+
+
+@compiled
+def _along(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]

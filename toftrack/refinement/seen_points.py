@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +18,7 @@ REACH_M = 0.16
 _MARGIN_PX = 24
 """Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
 _SQUARE = np.ones((3, 3), np.uint8)
+_EDGE_M, _FAR_M = 0.03, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,44 +75,71 @@ def seen_points(observation: Observation) -> SeenPoints:
     if wide == 0:
         left = top = right = bottom = 0
     part = slice(top, bottom), slice(left, right)
-    points = _smooth_points(observation, hand[part], part)
+    points_of, nearest_of = _loops()
+    k = observation.k.cpu().numpy()
+    depth = observation.depth_m.cpu().numpy()[part]
+    points = points_of(depth, hand[part], (top, left), k, _EDGE_M, _FAR_M)
+    nearest = np.zeros((0, 0, 2), np.float32)
+    if solid[part].size:
+        labels = cv2.distanceTransformWithLabels(
+            (~solid[part]).view(np.uint8),
+            cv2.DIST_L2,
+            cv2.DIST_MASK_5,
+            labelType=cv2.DIST_LABEL_PIXEL,
+        )[1]
+        nearest = nearest_of(labels, solid[part], (top, left))
     device = observation.depth_m.device
     return SeenPoints(
         torch.from_numpy(points).to(device),
-        torch.from_numpy(_nearest_pixels(solid[part], top, left)).to(device),
+        torch.from_numpy(nearest).to(device),
         observation.k,
         (observation.hand.shape[0], observation.hand.shape[1]),
         (top, left),
     )
 
 
-def _smooth_points(
-    observation: Observation, hand: np.ndarray, part: tuple[slice, slice]
+@functools.cache
+def _loops() -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
+    """The loops over pixels: compiled ones, or those below where there is no numba."""
+    try:
+        from toftrack.refinement import seen_points_numba
+    except ImportError:
+        return smooth_points, nearest_of_labels
+    return seen_points_numba.smooth_points, seen_points_numba.nearest_of_labels
+
+
+def smooth_points(
+    depth_m: np.ndarray,
+    hand: np.ndarray,
+    corner: tuple[int, int],
+    k: np.ndarray,
+    edge_m: float,
+    far_m: float,
 ) -> np.ndarray:
-    """(P, 3) float32 points of the crop's hand pixels that are on no depth edge."""
+    """(P, 3) float32 points of the hand's pixels that are on no depth edge, row by row.
+
+    depth_m, hand: (h, w) of a crop whose first pixel is at `corner`, row and column.  k: (3, 3).
+    edge_m: depths of neighbours that differ by so much are one; where nothing is read it is far_m.
+    """
     if not hand.any():
         return np.zeros((0, 3), np.float32)
-    depth = observation.depth_m.cpu().numpy()[part]
-    far = np.where(depth > 0, depth, np.float32(10.0))
-    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < 0.03
+    far = np.where(depth_m > 0, depth_m, np.float32(far_m))
+    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < edge_m
     u, v = _pixels(hand & smooth)
-    z = depth[v, u]
-    k = observation.k.cpu().numpy()
-    x = (u + part[1].start - k[0, 2]) / k[0, 0] * z
-    y = (v + part[0].start - k[1, 2]) / k[1, 1] * z
+    z = depth_m[v, u]
+    x = (u + corner[1] - k[0, 2]) / k[0, 0] * z
+    y = (v + corner[0] - k[1, 2]) / k[1, 1] * z
     return np.stack((x, y, z), 1).astype(np.float32)
 
 
-def _nearest_pixels(solid: np.ndarray, top: int, left: int) -> np.ndarray:
-    """(h, w, 2) float32: the image's column and row of the nearest solid pixel of a crop."""
-    if solid.size == 0:
-        return np.zeros((0, 0, 2), np.float32)
-    _, labels = cv2.distanceTransformWithLabels(
-        (~solid).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
+def nearest_of_labels(labels: np.ndarray, solid: np.ndarray, corner: tuple[int, int]) -> np.ndarray:
+    """(h, w, 2) float32: the image's column and row of the nearest solid pixel of a crop.
+
+    labels: (h, w) numbers of these pixels, of OpenCV's distance transform.  solid: (h, w) bool.
+    """
     u, v = _pixels(solid)
     lookup = np.zeros((len(u) + 1, 2), np.float32)
-    lookup[labels[v, u]] = np.stack((u + left, v + top), 1)
+    lookup[labels[v, u]] = np.stack((u + corner[1], v + corner[0]), 1)
     return lookup.take(np.asarray(labels), 0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,6 +12,9 @@ from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
 from toftrack.compute.pace import FRAME_S
 from toftrack.refinement.proposals import FINGER_OF_ANGLE
+
+_GROUP = np.array([5, 5, 5, 6, 6, 6, *FINGER_OF_ANGLE])
+"""Of each degree of freedom: the fingers, translation, rotation."""
 
 
 @dataclass(frozen=True)
@@ -52,28 +56,29 @@ def steadied(
     two apart (a tracking signal as Trigg's, Oper. Res. Q. 15(3), 1964): while it is small in all
     groups together the hand rests, and s grows.
 
+    Everything is on the CPU.
+
     state, before: (1, 27) this frame's pose and the last one's.
     trend: (27,) mean change a second as of the last frame; None at the start.
     dt_s: from the last frame to this one.
     Returns the (1, 27) pose to believe and the trend.
     """
-    change = motions.difference(state, before)[0]
-    speed = change / dt_s
-    keep = settings.memory ** (dt_s / FRAME_S)
-    trend = speed if trend is None else torch.lerp(speed, trend, keep)
-    of_angle = torch.tensor(FINGER_OF_ANGLE, device=state.device)
-    group = torch.cat((of_angle.new_tensor([5, 5, 5, 6, 6, 6]), of_angle))
-
-    def size_squared(values: Tensor) -> Tensor:
-        return values.new_zeros(7).index_add(0, group, values.square())
-
-    noise = change.new_tensor(
-        [settings.finger_rad] * 5 + [settings.translation_m, settings.rotation_rad]
-    )
-    noise = noise.clamp(min=1e-9).square()
-    moving = (size_squared(trend * FRAME_S) / noise).sum()
+    # In numpy: on 27 numbers each of torch's operations takes longer than its arithmetic.
+    change = motions.difference(state, before)[0].numpy()
+    speed = change / np.float32(dt_s)
+    keep = np.float32(settings.memory ** (dt_s / FRAME_S))
+    mean = speed if trend is None else speed + keep * (trend.numpy() - speed)
+    noise = np.array([settings.finger_rad] * 5 + [settings.translation_m, settings.rotation_rad])
+    noise = np.square(np.maximum(noise, 1e-9))
+    moving = (_size_squared(mean * FRAME_S) / noise).sum()
     # Steep: a still hand's signal stays below 1 in nine frames of ten, a slow movement's above.
     noise = noise * (1 + settings.calm / (1 + moving**6)) ** 2
-    square = size_squared(change)
+    square = _size_squared(change)
     part = square / (square + noise)
-    return motions.compose(before, (change * part[group])[None]), trend
+    taken = torch.from_numpy((change * part[_GROUP]).astype(np.float32))
+    return motions.compose(before, taken[None]), torch.from_numpy(mean)
+
+
+def _size_squared(values: np.ndarray) -> np.ndarray:
+    """(27,) to (7,), of the groups."""
+    return np.bincount(_GROUP, np.square(values), minlength=7)

@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toftrack.compute.rotations import special_gramschmidt
+from toftrack.compute.transfer import table
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.relocation.crops import CROP_M
 
@@ -28,11 +29,12 @@ STRIDE = 4
 """Pixels of the finder's image to a cell of its map."""
 ANGLES = 21
 JOINTS = 21
-_OFFSET_M = 0.15
-_LOG_SIZE = 0.3
-_JOINT_M = 0.05
+OFFSET_M = 0.15
+LOG_SIZE = 0.3
+JOINT_M = 0.05
 """The scales in which places, sizes and offsets of joints are predicted."""
-_SIGMA_M = 0.01
+SIGMA_M, LEAST_SIGMA_M = 0.01, 0.001
+ERROR_M, LEAST_ERROR_M = 0.02, 0.003
 
 
 def cube_rotations() -> Tensor:
@@ -150,16 +152,16 @@ class PoseNet(nn.Module):
         present, right = heads[:, -2], heads[:, -1]
         each = heads[:, :-2].unflatten(1, (len(self.anchors), -1))
         turn, angles, size, pivot, chance, error = each.split((6, ANGLES, 1, 3, 1, 1), 2)
-        unit = turn.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+        unit = table((1.0, 0.0, 0.0, 0.0, 1.0, 0.0), turn.dtype, turn.device)
         turned = special_gramschmidt((0.5 * turn + unit).unflatten(2, (2, 3)).mT)
         low, high = self.limits.unbind(1)
         return Proposed(
             rotation=turned @ self.anchors,
             angles=low + (high - low) * torch.sigmoid(angles),
-            log_size=_LOG_SIZE * size[..., 0],
-            pivot_m=_OFFSET_M * pivot,
+            log_size=LOG_SIZE * size[..., 0],
+            pivot_m=OFFSET_M * pivot,
             log_probability=chance[..., 0].log_softmax(1),
-            error_m=0.02 * F.softplus(error[..., 0]) + 0.003,
+            error_m=ERROR_M * F.softplus(error[..., 0]) + LEAST_ERROR_M,
             joints_m=joints,
             sigma_m=sigma,
             right=right,
@@ -174,9 +176,9 @@ class PoseNet(nn.Module):
         across, down = self.cells.flatten(1)
         # Depth is voted for about the surface that the cell sees.
         seen = F.avg_pool2d(depth, depth.shape[-1] // 16).flatten(2) * (CROP_M / 2)
-        at = torch.stack((across + _JOINT_M * x, down + _JOINT_M * y, seen + _JOINT_M * z), 3)
+        at = torch.stack((across + JOINT_M * x, down + JOINT_M * y, seen + JOINT_M * z), 3)
         joints = (weight[..., None] * at).sum(2)
-        sigma = _SIGMA_M * F.softplus((weight * spread).sum(2)) + 0.001
+        sigma = SIGMA_M * F.softplus((weight * spread).sum(2)) + LEAST_SIGMA_M
         return joints, sigma
 
 

@@ -7,20 +7,28 @@ mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rotations import rotmat_to_rotvec
+from toftrack.compute.transfer import on_device, on_host
+from toftrack.hand.overlap import overlap_of_each
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
 from toftrack.relocation.crops import crop, wide
-from toftrack.relocation.network import STRIDE, Finder, PoseNet
+from toftrack.relocation.network import STRIDE, Finder, Found, PoseNet, Proposed
 
-_KEPT = 12
+KEPT = 12
 """Hypotheses of a crop that are looked at further."""
-_MIRROR = torch.tensor([-1.0, 1.0, 1.0])
-_MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
+DOUBT_M = 0.06
+"""How far off a finger's outer joints may be that lies in another one, by the votes."""
+MIRROR = torch.tensor([-1.0, 1.0, 1.0])
+MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,9 @@ class Look:
     pivot_m: (C, H, 3) middle of the palm.  rotvec: (C, H, 3).  angles: (C, H, 21).
     log_size: (C, H) of the hand's length in units of the mean adult's.
     log_probability, error_m: (C, H).  Hypotheses are sorted by probability.
-    joints_m: (C, 21, 3) by the cells' votes.  sigma_m: (C, 21).
+    joints_m: (C, H, 21, 3) of mean hands of these sizes.
+    votes_m: (C, 21, 3) joints by the cells' votes.  sigma_m: (C, 21) their deviations.
     present, right: (C,) logits; `right` is of the side that was looked for.
-    parts: (C, SEGMENTS, PARTS, PARTS) probabilities, in the crop.
     """
 
     pivot_m: Tensor
@@ -53,10 +61,10 @@ class Look:
     log_probability: Tensor
     error_m: Tensor
     joints_m: Tensor
+    votes_m: Tensor
     sigma_m: Tensor
     present: Tensor
     right: Tensor
-    parts: Tensor
 
 
 def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +83,7 @@ def find_hands(
     depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
     """
     image, wide_k = wide(depth_m, k)
-    found = finder(image)
+    found = Found(*on_host(*finder(on_device(image, finder.heads.weight.device))))
     heat = found.heat.sigmoid()
     peaks = (heat == F.max_pool2d(heat, 3, 1, 1)) & (heat >= least)
     places = {}
@@ -101,32 +109,65 @@ def look(
     centres_m = np.asarray(centres_m, np.float64).reshape(-1, 3)
     if side == "left":
         depth_m, k = mirrored(depth_m, k)
-        centres_m = centres_m * _MIRROR.numpy()
+        centres_m = centres_m * MIRROR.numpy()
     crops, turns = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
     image = torch.from_numpy(np.stack(crops)).to(memory_format=torch.channels_last)
-    p = pose(image)
+    p = Proposed(*on_host(*pose(on_device(image, pose.anchors.device))))
     turn = torch.from_numpy(np.stack(turns)).float()  # (C, 3, 3)
     centre = torch.from_numpy(centres_m).float()
-    order = p.log_probability.argsort(1, descending=True)[:, :_KEPT]
+    order = p.log_probability.argsort(1, descending=True)[:, :KEPT]
 
     def ordered(values: Tensor) -> Tensor:
         return values[torch.arange(len(order))[:, None], order]
 
     pivot = ordered(p.pivot_m) @ turn.mT + centre[:, None]
     rotvec = rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))
-    joints = p.joints_m @ turn.mT + centre[:, None]
+    votes = p.joints_m @ turn.mT + centre[:, None]
     if side == "left":
-        pivot, joints, rotvec = pivot * _MIRROR, joints * _MIRROR, rotvec * _MIRROR_TURN
+        pivot, votes, rotvec = pivot * MIRROR, votes * MIRROR, rotvec * MIRROR_TURN
+    angles, log_size = ordered(p.angles), ordered(p.log_size)
     return Look(
         pivot_m=pivot,
         rotvec=rotvec,
-        angles=ordered(p.angles),
-        log_size=ordered(p.log_size),
+        angles=angles,
+        log_size=log_size,
         log_probability=ordered(p.log_probability),
         error_m=ordered(p.error_m),
-        joints_m=joints,
-        sigma_m=p.sigma_m,
+        joints_m=_joints(pivot, rotvec, angles, log_size, side),
+        votes_m=votes,
+        sigma_m=_sigma_m(votes, p.sigma_m, log_size[:, 0]),
         present=p.present,
         right=p.right,
-        parts=p.parts.softmax(1),
     )
+
+
+def _sigma_m(votes_m: Tensor, sigma_m: Tensor, log_size: Tensor) -> Tensor:
+    """(C, 21) deviations of the votes: larger where two fingers are voted for in one place.
+
+    Of a single finger that is seen the cells do not know which one it is, and say surely that it is
+    either.
+    """
+    length = DEFAULT_HAND_LENGTH_M * log_size.exp()
+    each = zip(votes_m, length.tolist(), strict=True)
+    overlap = torch.cat([overlap_of_each(votes[None], size) for votes, size in each])
+    doubt = DOUBT_M * overlap.clamp(max=1)  # (C, 5)
+    outer = torch.cat((doubt.new_zeros(len(doubt), 5, 1), doubt[..., None].expand(-1, -1, 3)), 2)
+    added = torch.cat((doubt.new_zeros(len(doubt), 1), outer.flatten(1)), 1)
+    return torch.hypot(sigma_m, added)
+
+
+def _joints(pivot_m: Tensor, rotvec: Tensor, angles: Tensor, log_size: Tensor, side: str) -> Tensor:
+    """(C, H, 21, 3) of mean hands scaled about the middle of the palm."""
+    flat = rotvec.flatten(0, 1), angles.flatten(0, 1)
+    states = torch.cat((torch.zeros_like(flat[0]), *flat), 1)
+    pose = forward_kinematics(states, mean_hand(side))
+    # A mirror changes nothing on the palm's middle line.
+    middle = pose.frames[:, 0] @ rotvec.new_tensor(PIVOT_M)
+    joints = (pose.joints_m - middle[:, None]).unflatten(0, log_size.shape)
+    return pivot_m[:, :, None] + joints * log_size.exp()[..., None, None]
+
+
+@lru_cache
+def mean_hand(side: str) -> HandShape:
+    """The mean adult's of a side."""
+    return default_hand_shape(side=side)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,22 +12,22 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.rigid import PIVOT_M
-from toftrack.compute.rotations import rotvec_to_rotmat
-from toftrack.hand.overlap import overlap_of_each
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
-from toftrack.hand.skeleton import forward_kinematics
+from toftrack.compute.rigid import pivot_offset
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.network import Finder, PoseNet
-from toftrack.relocation.proposals import Look, find_hands, look
+from toftrack.relocation.proposals import Look, find_hands
 from toftrack.relocation.weights import load_weights
+
+try:
+    from toftrack.relocation.proposals_numba import look
+except ImportError:  # there is no numba
+    from toftrack.relocation.proposals import look
 
 SAME_PLACE_M = 0.06
 """Places that lie closer together are one."""
 _AGAIN = 2.0
 """Places whose merit is so much lower than the best are not looked at again."""
-_DOUBT_M = 0.06
-"""How far off a finger's outer joints may be that lies in another one, by the votes."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
@@ -93,9 +92,10 @@ class Glance:
 
     def states(self, ratio: float) -> Tensor:
         """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
-        pivot = self.pivot_m.new_tensor(PIVOT_M) * ratio
-        wrist = self.pivot_m - rotvec_to_rotmat(self.rotvec) @ pivot
-        return torch.cat((wrist, self.rotvec, self.angles), 1)
+        states = np.zeros((len(self.rotvec), 27), np.float32)
+        states[:, 3:6], states[:, 6:] = self.rotvec.numpy(), self.angles.numpy()
+        states[:, :3] = self.pivot_m.numpy() - np.float32(ratio) * pivot_offset(states[:, 3:6])
+        return torch.from_numpy(states)
 
     @property
     def length_m(self) -> float:
@@ -127,11 +127,15 @@ class Glance:
 
 @dataclass(frozen=True, eq=False)
 class Relocaliser:
-    """Both networks and how they are used; on the CPU."""
+    """Both networks and how they are used; images are read, and answers given, on the CPU."""
 
     pose: PoseNet
     finder: Finder
     settings: RelocationSettings
+
+    def to(self, device: torch.device) -> Relocaliser:
+        """The same with the networks on a device, where they are moved."""
+        return replace(self, pose=self.pose.to(device), finder=self.finder.to(device))
 
     def glance(
         self, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
@@ -143,8 +147,7 @@ class Relocaliser:
         if len(centres_m) == 0:
             return []
         seen = look(self.pose, depth_m, k, centres_m, side)
-        joints, sigma = _joints(seen, side), _sigma_m(seen)
-        return [_glance(seen, joints, sigma, row) for row in range(len(seen.present))]
+        return [_glance(seen, row) for row in range(len(seen.present))]
 
     def search(
         self,
@@ -205,49 +208,19 @@ def _apart(centres_m: np.ndarray) -> list[int]:
     return kept
 
 
-def _glance(seen: Look, joints_m: Tensor, sigma_m: Tensor, row: int) -> Glance:
+def _glance(seen: Look, row: int) -> Glance:
     return Glance(
         pivot_m=seen.pivot_m[row],
         rotvec=seen.rotvec[row],
         angles=seen.angles[row],
-        joints_m=joints_m[row],
+        joints_m=seen.joints_m[row],
         log_size=seen.log_size[row],
         log_probability=seen.log_probability[row],
         error_m=seen.error_m[row],
-        landmarks=Landmarks(seen.joints_m[row], sigma_m[row]),
+        landmarks=Landmarks(seen.votes_m[row], seen.sigma_m[row]),
         present=float(seen.present[row].sigmoid()),
         right_side=float(seen.right[row].sigmoid()),
     )
-
-
-def _sigma_m(seen: Look) -> Tensor:
-    """(C, 21) deviations of the votes: larger where two fingers are voted for in one place.
-
-    Of a single finger that is seen the cells do not know which one it is, and say surely that it is
-    either.
-    """
-    length = DEFAULT_HAND_LENGTH_M * float(seen.log_size[:, 0].mean().exp())
-    doubt = _DOUBT_M * overlap_of_each(seen.joints_m, length).clamp(max=1)  # (C, 5)
-    outer = torch.cat((doubt.new_zeros(len(doubt), 5, 1), doubt[..., None].expand(-1, -1, 3)), 2)
-    added = torch.cat((doubt.new_zeros(len(doubt), 1), outer.flatten(1)), 1)
-    return torch.hypot(seen.sigma_m, added)
-
-
-def _joints(seen: Look, side: str) -> Tensor:
-    """(C, H, 21, 3) of mean hands scaled about the middle of the palm."""
-    rotvec, angles = seen.rotvec.flatten(0, 1), seen.angles.flatten(0, 1)
-    pose = forward_kinematics(
-        torch.cat((torch.zeros_like(rotvec), rotvec, angles), 1), _mean_hand(side)
-    )
-    # A mirror changes nothing on the palm's middle line.
-    middle = pose.frames[:, 0] @ rotvec.new_tensor(PIVOT_M)
-    joints = (pose.joints_m - middle[:, None]).unflatten(0, seen.log_size.shape)
-    return seen.pivot_m[:, :, None] + joints * seen.log_size.exp()[..., None, None]
-
-
-@lru_cache
-def _mean_hand(side: str) -> HandShape:
-    return default_hand_shape(side=side)
 
 
 def make_relocaliser(weights: str | None = None, **settings: Any) -> Relocaliser:

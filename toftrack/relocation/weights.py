@@ -21,6 +21,8 @@ FORMAT = "toftrack-relocaliser"
 VERSION = 1
 DEFAULT_FILE = Path(__file__).parent.parent / "data" / "relocaliser.npz"
 _LARGEST_BYTES = 64 << 20
+_WIDEST = 256
+"""Channels; ten times those of the package's networks."""
 _AGAIN = "train them anew with python -m toftrack.programs.train_relocaliser, or install again"
 
 
@@ -52,7 +54,8 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
     """
     arrays, metadata = _read(DEFAULT_FILE if path is None else Path(path))
     try:
-        pose, finder = PoseNet(int(metadata["pose_width"])), Finder(int(metadata["finder_width"]))
+        pose = PoseNet(_width(metadata, "pose"))
+        finder = Finder(_width(metadata, "finder"))
         for name, network in (("pose", pose), ("finder", finder)):
             network.load_state_dict(_tensors(arrays, name))
     except (KeyError, TypeError, ValueError, RuntimeError):
@@ -74,6 +77,14 @@ def trained_weights(path: str | Path, name: str, width: int) -> dict[str, Tensor
             f" train is {width}; give the same"
         )
     return _tensors(arrays, name)
+
+
+def _width(metadata: dict[str, Any], name: str) -> int:
+    """Of a network; ValueError for one that would take all memory before its weights are seen."""
+    width = metadata[f"{name}_width"]
+    if type(width) is not int or not 1 <= width <= _WIDEST:
+        raise ValueError(f"a width of {width}")
+    return width
 
 
 def _tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:

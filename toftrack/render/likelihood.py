@@ -9,7 +9,9 @@ or two neighbours: 5.1 mm with and without, and at twice the noise 7.0 instead o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +20,7 @@ from toftrack.errors import ToftrackError
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.segmentation import Observation
 
+Values = TypeVar("Values", Tensor, np.ndarray)
 NAMINGS = ("printed", "standard")
 
 
@@ -80,22 +83,40 @@ class FMeasure:
         coverage: instead of the likelihood's own, for a search that compares very different poses.
         """
         coverage = self.coverage if coverage is None else coverage
+        if counts.correct.device.type == "cpu":
+            return torch.from_numpy(self._log_score(counts, coverage))
         score = self.score(counts).log()
         # 0 times the logarithm of no correct pixel would be NaN, and the largest of all.
         return score + coverage * counts.correct.log() if coverage else score
+
+    def _log_score(self, counts: Counts, coverage: float) -> np.ndarray:
+        host = _host(counts)
+        with np.errstate(divide="ignore"):
+            score: np.ndarray = np.log(self._f_measure(*host))
+            return score + np.float32(coverage) * np.log(host[0]) if coverage else score
 
     def _distance(self, observation: Observation) -> float:
         return observation.nearest_m if not observation.empty else 1.0
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
-        correct = counts.correct - self.residual_weight * counts.residual
-        # What the residual takes from correct, it does not give to false: F only falls.
-        false = counts.false + (counts.correct - correct)
-        b2 = self.beta**2
-        if self.naming == "printed":
-            rest = b2 * false + counts.missed
-        else:
-            rest = false + b2 * counts.missed
+        if counts.correct.device.type == "cpu":
+            return torch.from_numpy(self._f_measure(*_host(counts)))
+        return self._f_measure(*counts)
+
+    def _f_measure(
+        self, correct: Values, false: Values, missed: Values, residual: Values
+    ) -> Values:
+        taken, b2 = self.residual_weight * residual, self.beta**2
+        # What the residual takes from correct, it gives to false: F only falls.
+        correct, false = correct - taken, false + taken
+        printed = self.naming == "printed"
+        rest = b2 * false + missed if printed else false + b2 * missed
         weighted = (1 + b2) * correct
-        return weighted / (weighted + rest).clamp(min=1e-9)
+        return weighted / (weighted + rest).clip(min=1e-9)
+
+
+def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    # On the CPU each of torch's operations takes longer than its arithmetic.
+    correct, false, missed, residual = (count.float().numpy() for count in counts)
+    return correct, false, missed, residual

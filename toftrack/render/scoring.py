@@ -10,7 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import torch
 from torch import Tensor
+
+from toftrack.compute.transfer import on_device
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,14 @@ class Evidence:
     hand: Tensor
     k: Tensor
     radius_px: float
+
+    def to(self, device: torch.device) -> Evidence:
+        """The same on a device, from the CPU."""
+        if device.type == "cpu":
+            return self
+        given = self.low, self.high, self.occluder, self.hand, self.k
+        low, high, occluder, hand, k = (on_device(image, device) for image in given)
+        return Evidence(low, high, occluder, hand, k, self.radius_px)
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Evidence:
         """The part [top, bottom) x [left, right) with intrinsics to match."""

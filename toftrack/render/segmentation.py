@@ -13,6 +13,15 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 
+try:
+    from toftrack.render.numba.median import thinned
+except ImportError:  # there is no numba
+
+    def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
+        """As toftrack.render.numba.median.thinned."""
+        return cv2.medianBlur(image, 5)[offset::factor, offset::factor]
+
+
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""
 
@@ -200,9 +209,11 @@ def reduce_image(
     factor = int(np.ceil(np.sqrt(depth_m.size / max_pixels)))
     if factor <= 1:
         return np.require(depth_m, np.float32, ("C", "W")), k
-    filtered = cv2.medianBlur(np.ascontiguousarray(depth_m, dtype=np.float32), 3 + 2 * (factor > 2))
-    offset = (factor - 1) // 2
-    small = filtered[offset::factor, offset::factor]
+    depth_m, offset = np.ascontiguousarray(depth_m, dtype=np.float32), (factor - 1) // 2
+    if factor == 2:
+        small = cv2.medianBlur(depth_m, 3)[offset::factor, offset::factor]
+    else:
+        small = thinned(depth_m, factor, offset)
     k = k.copy()
     k[0] /= factor
     k[1] /= factor

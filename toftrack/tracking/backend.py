@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import TypedDict
 
 import torch
+from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.backend import Backend
+from toftrack.compute.backend import Backend, Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
-from toftrack.refinement.gauss_newton import TorchRefiner
+from toftrack.hand.surface import hand_surface
+from toftrack.refinement.gauss_newton import Refiner, TorchRefiner
 from toftrack.render.scoring import Scorer
 from toftrack.render.torch_scorer import TorchScorer
+from toftrack.tracking import penalty
 
 log = logging.getLogger(__name__)
 
@@ -55,39 +61,74 @@ def _torch(device: torch.device) -> Backend:
     return Backend(
         "torch",
         device,
-        rigid.MOTIONS,
-        make_scorer=lambda shape: TorchScorer(shape.to(device)),
-        make_refiner=lambda shape: TorchRefiner(shape.to(device)),
+        **_beside(device),
+        make_scorer=lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
+    )
+
+
+class _Beside(TypedDict):
+    """What a back end has beside its scorer."""
+
+    motions: Motions
+    joints_penalty: Callable[..., Tensor]
+    make_refiner: Callable[[HandShape], Refiner]
+
+
+def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
+    """In torch on the CPU; on a device `there`, with compiled code on the CPU next to it."""
+    here = _Beside(
+        motions=rigid.MOTIONS, joints_penalty=penalty.joints_penalty, make_refiner=TorchRefiner
+    )
+    if device.type == "cpu":
+        here["motions"] = there
+        return here
+    with suppress(ImportError):  # there may be no numba
+        here = _compiled()
+
+    def at(tensor: Tensor) -> Motions:
+        return here["motions"] if tensor.device.type == "cpu" else there
+
+    motions = Motions(
+        compose=lambda reference, tangent: at(reference).compose(reference, tangent),
+        difference=lambda particles, reference: at(particles).difference(particles, reference),
+        redraw=there.redraw,
+        mean=there.mean,
+    )
+    return _Beside(
+        motions=motions,
+        joints_penalty=here["joints_penalty"],
+        make_refiner=here["make_refiner"],
+    )
+
+
+def _compiled() -> _Beside:
+    from toftrack.compute import rigid_numba
+    from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+    from toftrack.tracking import penalty_numba
+
+    return _Beside(
+        motions=rigid_numba.motions(),
+        joints_penalty=penalty_numba.joints_penalty,
+        make_refiner=CompiledRefiner,
     )
 
 
 def _numba(device: torch.device) -> Backend:
     """Compiled code on the CPU; particles elsewhere are scored by it, and moved where they are."""
-    from toftrack.compute import rigid_numba
-    from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.render.numba.scorer import NumbaScorer
 
-    here = device.type == "cpu"
-    return Backend(
-        "numba",
-        device,
-        rigid_numba.motions() if here else rigid.MOTIONS,
-        make_scorer=lambda shape: NumbaScorer(shape.to(device)),
-        make_refiner=lambda shape: (CompiledRefiner if here else TorchRefiner)(shape.to(device)),
-    )
+    beside = _compiled() if device.type == "cpu" else _beside(device)
+    return Backend("numba", device, **beside, make_scorer=NumbaScorer)
 
 
 def _triton(device: torch.device) -> Backend:
+    from toftrack.compute import rigid_triton
     from toftrack.render.triton.scorer import TritonScorer, require_device
 
     require_device()
-    return Backend(
-        "triton",
-        device,
-        rigid.MOTIONS,
-        make_scorer=lambda shape: TritonScorer(shape.to(device)),
-        make_refiner=lambda shape: TorchRefiner(shape.to(device)),
-    )
+    beside = _beside(device, rigid_triton.MOTIONS)
+    make_scorer = partial(TritonScorer, device=device)
+    return Backend("triton", device, **beside, make_scorer=make_scorer)
 
 
 _MAKERS: dict[str, Callable[[torch.device], Backend]] = {

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S
+from toftrack.compute.transfer import on_device
 from toftrack.render.segmentation import Expected
 from toftrack.tracking import particle_filter
 from toftrack.tracking.belief import CalibratedBelief
@@ -17,7 +18,7 @@ from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.particle_filter import FilterSettings
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.spans import Spans
-from toftrack.tracking.state import Track
+from toftrack.tracking.state import Track, generator_on
 
 _MOVEMENT_S = 0.3
 """How long a movement goes on (to 1/e)."""
@@ -42,16 +43,21 @@ def young(track: Track, settings: LostSettings) -> bool:
 def filtered(
     track: Track, dt_s: float, frame: ObservedFrame, generator: torch.Generator, spans: Spans
 ) -> tuple[Tensor, Tensor]:
-    """The filter's particles (N, 6 + d) and weights (N,) of a frame."""
-    model = frame.model
+    """The filter's particles (N, 6 + d) and weights (N,) of a frame.
+
+    Nothing within waits for the device, so that it is not held up between passes.
+    """
+    model, space = frame.model, frame.model.space_of(track.particles)
+    offset = on_device(track.offset, model.device)
 
     def log_scores(particles: Tensor) -> Tensor:
-        states = model.decode(particles, track.offset)
+        states = model.decode(particles, offset)
         with spans("filter: scoring"):
             return frame.log_scores(states)
 
     ahead = displacement(track, dt_s, model.filter)
-    particles = model.backend.motions.compose(track.particles, ahead[None])
+    there = on_device(ahead[None], model.device)
+    particles = model.backend.motions.compose(track.particles, there)
     # A hand that was nearly lost is looked for farther away, but not ever farther.
     width = 1.0 + (track.bad_s / FRAME_S if model.lost.patience else 0.0)
     sigmas = width * particle_filter.widened(
@@ -60,14 +66,14 @@ def filtered(
     return particle_filter.annealed(
         particles,
         track.weights,
-        sigmas,
+        on_device(sigmas, model.device),
         log_scores,
         model.log_prior,
-        model.space.lower,
-        model.space.upper,
+        space.lower,
+        space.upper,
         model.filter,
-        model.backend.motions,
-        generator,
+        model.backend.motions.redraw,
+        generator_on(model.device, generator),
     )
 
 
@@ -75,7 +81,8 @@ def filtered(
 class Found:
     """What a frame's filter and refinement found.
 
-    particles, weights: the filter's, (N, 6 + d) and (N,).  mean: (1, 6 + d) of them.
+    particles, weights: the filter's, (N, 6 + d) and (N,), on the model's device.
+    mean: (1, 6 + d) of them.
     pose: (1, 27) refined.  trend: (27,) see steadying.
     refined: (1, 6 + d) the pose in the pose space.  offset: (21,) rad, how far the pose lies off.
     """
@@ -107,14 +114,15 @@ def advanced(
     expected: where the hand was looked for, if something hides part of it.
     """
     cfg, motions = model.filter, model.backend.motions
-    lower, upper = model.space.lower, model.space.upper
+    space = model.space_of(found.particles)
     particles, mean, offset = found.particles, found.mean, track.offset
     if model.refinement is not None:
         # The particles follow the refined estimate, and what the space cannot say of its pose
         # is remembered beside them.
         change = motions.difference(found.refined, mean)
-        particles = motions.compose(particles, change)
-        particles[:, 6:] = particle_filter.bound(particles[:, 6:], lower, upper, "truncate")
+        particles = motions.compose(particles, on_device(change, model.device))
+        latent = particle_filter.bound(particles[:, 6:], space.lower, space.upper, "truncate")
+        particles[:, 6:] = latent
         mean, offset = found.refined, model.refinement.carry * found.offset
     velocity = torch.zeros_like(track.velocity)
     if track.age_s > 0:

@@ -53,6 +53,11 @@ class Belief:
     log_odds: float | None = None
 
 
+def log_odds(probability: float) -> float:
+    """Of a probability in 0 .. 1, both excluded."""
+    return math.log(probability / (1 - probability))
+
+
 def lasted(seconds: float, frames: float) -> bool:
     """Whether something has gone on for so many frames of FRAME_S; half a frame is forgiven."""
     return seconds > (frames - 0.5) * FRAME_S

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.backend import Backend
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import ToftrackError
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand.shape import HandShape
@@ -21,7 +22,7 @@ from toftrack.pose_space.density import LatentDensity, latent_density
 from toftrack.refinement.gauss_newton import Refinement, Refiner
 from toftrack.relocation.relocaliser import Glance, Relocaliser
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import Evidence, Scorer
+from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.effort import Effort
@@ -63,7 +64,7 @@ class SizedHand:
 
 @dataclass(frozen=True, eq=False)
 class TrackerModel:
-    """The parts of a tracker; shape and pose space on the device that everything is computed on.
+    """The parts of a tracker, on the CPU but for those that the back end makes.
 
     shape: the hand as configured, before any of its size was fitted.
     refinement: None leaves the filter's estimate as it is.
@@ -98,8 +99,16 @@ class TrackerModel:
 
     @property
     def device(self) -> torch.device:
-        """Where everything is computed."""
+        """Where the particles are."""
         return self.backend.device
+
+    def space_of(self, particles: Tensor) -> PoseSpace:
+        """The pose space where particles are."""
+        return self.space if particles.device.type == "cpu" else self._space_there
+
+    @cached_property
+    def _space_there(self) -> PoseSpace:
+        return self.space.to(self.device)
 
     def spending(self, effort: Effort) -> TrackerModel:
         """The same tracker with less effort; itself where nothing is left out."""
@@ -132,12 +141,13 @@ class TrackerModel:
 
     @cached_property
     def _density(self) -> LatentDensity | None:
-        return latent_density(self.space) if self.filter.density else None
+        space = self.space if self.device.type == "cpu" else self._space_there
+        return latent_density(space) if self.filter.density else None
 
     @cached_property
     def poses(self) -> Tensor:
         """(M, 21) rad, natural poses, to take single fingers from."""
-        return natural_poses().to(self.device)
+        return natural_poses()
 
     def hand(self, side: str, belief: SizeBelief | ShapeBelief | None) -> SizedHand:
         """The hand of a side in the size or the shape that is believed in."""
@@ -152,7 +162,8 @@ class TrackerModel:
 
     def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
         """(N, 6 + d) particles to (N, 27) hand states, all displaced by `offset` (21,) rad."""
-        angles = clamp_to_joint_limits(self.space.decode(particles[:, 6:]) + offset)
+        decoded = self.space_of(particles).decode(particles[:, 6:])
+        angles = clamp_to_joint_limits(decoded + offset)
         return torch.cat((particles[:, :6], angles), 1)
 
     def encode(self, states: Tensor) -> Tensor:
@@ -205,6 +216,7 @@ def _sized_hand(
 class ObservedFrame:
     """A frame that may show a hand, and the hand looked for: the judge of hypotheses.
 
+    evidence: on the model's device.
     glance: what the networks say of the hand.  seen: the hand as it was last believed.
     other: another hand that is tracked as well.
     """
@@ -225,13 +237,24 @@ class ObservedFrame:
             return bool(occluder.any())
         return int(occluder.sum()) > _HIDDEN * int(self.observation.hand.sum())
 
+    def counts(self, states: Tensor, evidence: Evidence | None = None) -> Counts:
+        """(N, 27) hands, on the CPU or the model's device, counted there and told where they are.
+
+        evidence: instead of the frame's own, on the model's device.
+        """
+        evidence = evidence or self.evidence
+        if states.device.type != "cpu":
+            return self.hand.scorer(states, evidence)
+        there = on_device(states, self.model.device)
+        return Counts(*on_host(*self.hand.scorer(there, evidence)))
+
     def log_scores(self, states: Tensor, coverage: float | None = None) -> Tensor:
         """(N, 27) hands to (N,) what they are weighed by, see FMeasure.log_score."""
-        return self.model.likelihood.log_score(self.hand.scorer(states, self.evidence), coverage)
+        return self.model.likelihood.log_score(self.counts(states), coverage)
 
     def score(self, state: Tensor) -> float:
         """(1, 27) to the likelihood head's score, 0..1."""
-        return float(self.model.likelihood.score(self.hand.scorer(state, self.evidence)))
+        return float(self.model.likelihood.score(self.counts(state)))
 
 
 def observed(
@@ -242,7 +265,6 @@ def observed(
     seen: LastSeen | None = None,
     other: OtherHand | None = None,
 ) -> ObservedFrame:
-    """A segmented frame on the model's device, which is not empty."""
-    observation = observation.to(model.device)
-    evidence = model.likelihood.evidence(observation)
+    """A segmented frame, which is not empty; its evidence is on the model's device."""
+    evidence = model.likelihood.evidence(observation).to(model.device)
     return ObservedFrame(observation, evidence, hand, model, glance, seen, other)

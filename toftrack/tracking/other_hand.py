@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.rigid import rotated_pivot
+from toftrack.compute.rigid import pivot_offset
 from toftrack.frames import DepthImage
 
 _TOLERANCE_M = 0.02
@@ -43,7 +43,9 @@ class OtherHand:
 
 def palm_centre_m(state: Tensor) -> np.ndarray:
     """(3,) middle of the palm of a hand (1, 27)."""
-    return (state[0, :3] + rotated_pivot(state[:, 3:6])[0]).cpu().numpy()
+    hand = state.numpy()
+    centre: np.ndarray = hand[0, :3] + pivot_offset(hand[:, 3:6])[0]
+    return centre
 
 
 def explained(depth_m: np.ndarray, theirs_m: np.ndarray, mine_m: np.ndarray | None) -> np.ndarray:

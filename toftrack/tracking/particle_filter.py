@@ -11,12 +11,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
-from toftrack.compute.rigid import mean_rotation
+from toftrack.compute.redraw import BOUNDS, Redraw, bound
 from toftrack.errors import ToftrackError
 
 
@@ -104,10 +105,22 @@ def normalise(log_weights: Tensor) -> Tensor:
     NaN counts as impossible. When no particle is possible, all are equally likely: the filter then
     diffuses on without evidence instead of failing.
     """
+    if log_weights.device.type == "cpu":
+        return torch.from_numpy(_normalised(log_weights.numpy()))
     w = log_weights.double().nan_to_num(nan=-math.inf, neginf=-math.inf, posinf=1e300)
     top = w.max()
     w = torch.where(top.isfinite(), (w - top).exp(), torch.ones_like(w))
     return w / w.sum()
+
+
+def _normalised(log_weights: np.ndarray) -> np.ndarray:
+    """The same on the CPU, where each of torch's operations takes longer than its arithmetic."""
+    w = np.where(np.isnan(log_weights), -np.inf, log_weights.astype(np.float64))
+    w = np.minimum(w, 1e300)
+    top = w.max()
+    w = np.exp(w - top) if math.isfinite(top) else np.ones_like(w)
+    found: np.ndarray = w / w.sum()
+    return found
 
 
 def effective_sample_size(weights: Tensor) -> Tensor:
@@ -115,51 +128,28 @@ def effective_sample_size(weights: Tensor) -> Tensor:
     return 1.0 / weights.square().sum()
 
 
-def resample_systematic(weights: Tensor, n: int, generator: torch.Generator) -> Tensor:
-    """n indices drawn with one uniform offset and equal steps; index i comes up floor or ceil(n
-    w_i)
-    times (Arulampalam et al. 2002, algorithm 2). Returns (n,) int64, ascending.
+def systematic_positions(n: int, generator: torch.Generator) -> Tensor:
+    """(n,) float64, ascending in 0 .. 1: equal steps from one uniform offset on.
+
+    A particle of weight w then comes up floor or ceil(n w) times (Arulampalam et al. 2002,
+    algorithm 2).
     """
-    offset = torch.rand(1, generator=generator, device=weights.device, dtype=torch.float64)
-    return _pick(weights, torch.arange(n, device=weights.device) + offset, n)
+    device = generator.device
+    offset = torch.rand(1, generator=generator, device=device, dtype=torch.float64)
+    return (torch.arange(n, device=device) + offset) / n
 
 
-def resample_stratified(weights: Tensor, n: int, generator: torch.Generator) -> Tensor:
-    """n indices, one draw in each n-th of the unit interval. Returns (n,) int64, ascending."""
-    offset = torch.rand(n, generator=generator, device=weights.device, dtype=torch.float64)
-    return _pick(weights, torch.arange(n, device=weights.device) + offset, n)
+def stratified_positions(n: int, generator: torch.Generator) -> Tensor:
+    """(n,) float64, ascending in 0 .. 1: one in each n-th of it."""
+    device = generator.device
+    offset = torch.rand(n, generator=generator, device=device, dtype=torch.float64)
+    return (torch.arange(n, device=device) + offset) / n
 
 
-def _pick(weights: Tensor, positions: Tensor, n: int) -> Tensor:
-    total = weights.double().cumsum(0)
-    # Relative to the sum that was really reached, so that rounding cannot leave a gap at the end.
-    indices = torch.searchsorted(total, positions / n * total[-1], right=True)
-    # The last index that has weight: one past the end is only ever a rounding.
-    last = torch.searchsorted(total, total[-1:])
-    return torch.minimum(indices, last)
-
-
-RESAMPLERS: dict[str, Callable[[Tensor, int, torch.Generator], Tensor]] = {
-    "systematic": resample_systematic,
-    "stratified": resample_stratified,
+RESAMPLERS: dict[str, Callable[[int, torch.Generator], Tensor]] = {
+    "systematic": systematic_positions,
+    "stratified": stratified_positions,
 }
-
-
-BOUNDS = ("truncate", "reflect")
-
-
-def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
-    """Keep latent coordinates in their box, (N, d).
-
-    mode: of BOUNDS. "truncate" moves what is outside onto the bound, as the paper, which draws
-        estimates near a bound away from where they should be and piles particles up on it;
-        "reflect" folds it back.
-    """
-    if mode == "truncate":
-        return torch.minimum(torch.maximum(latent, lower), upper)
-    width = upper - lower
-    folded = torch.remainder(latent - lower, 2 * width)
-    return lower + torch.minimum(folded, 2 * width - folded)
 
 
 def diffuse(
@@ -192,7 +182,7 @@ def annealed(
     lower: Tensor,
     upper: Tensor,
     settings: FilterSettings,
-    motions: Motions,
+    redraw: Redraw,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Resample - diffuse - observe, in passes of shrinking diffusion and sharper weights.
@@ -203,28 +193,18 @@ def annealed(
     log_prior: what else speaks for particles, (N,), in every pass alike; may say None.
     Returns (N, 6 + d) and (N,).
     """
+    n, device = settings.particles, particles.device
     for number in range(settings.passes):
-        chosen = RESAMPLERS[settings.resampling](weights, settings.particles, generator)
-        particles = diffuse(
-            particles[chosen],
-            sigmas * settings.shrink**number,
-            lower,
-            upper,
-            settings.bounds,
-            motions,
-            generator,
-        )
+        positions = RESAMPLERS[settings.resampling](n, generator)
+        size = n, particles.shape[1]
+        noise = torch.randn(size, generator=generator, device=device, dtype=particles.dtype)
+        tangents = noise * (sigmas * settings.shrink**number)
+        bounds = lower, upper, settings.bounds
+        particles = redraw(particles, weights, positions, tangents, *bounds)
         log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
         prior = log_prior(particles)
         weights = normalise(log_weights if prior is None else log_weights + prior)
     return particles, weights
-
-
-def mean_particle(particles: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d), the rotation averaged on SO(3)."""
-    mean = (weights.to(particles.dtype) @ particles)[None]
-    mean[0, 3:6] = mean_rotation(particles[:, 3:6], weights)
-    return mean
 
 
 def covariance(tangents: Tensor, weights: Tensor) -> Tensor:

@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from toftrack.compute.pace import FRAME_S
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.contest import rivals_of, scored, settled, with_other_fingers
+from toftrack.tracking.life_cycle import log_odds
 from toftrack.tracking.model import ObservedFrame
 from toftrack.tracking.relocating import candidates, landmarks_of
 from toftrack.tracking.signs import out_of_sight
@@ -90,18 +92,34 @@ def _onto_points(
         starts.append(torch.cat((state[:, :6], track.contender.pose[:, 6:]), 1))
     mine = len(starts)
     likely = state[:0] if glance is None else candidates(glance, frame, frame.model.rivals)
-    tried = scored(onto_points(torch.cat((*starts, likely))), frame)
+    hears, swaps = turns(track, cfg.sure)
+    heard = likely if hears else likely[:0]
+    tried = scored(onto_points(torch.cat((*starts, heard))), frame)
     first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[own - 1] else own - 1
     rows = torch.arange(len(tried.scores), device=state.device)
     found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[own:mine]), None
-    if len(likely):
+    if len(heard):
         near, rival = rivals_of(found, tried.rows(rows[mine:]), frame)
         others = others.and_(near)
-    swapped = with_other_fingers(found, likely[:_EXCHANGED, 6:], frame, cfg, generator)
+    swapped = state[:0]
+    if swaps:
+        swapped = with_other_fingers(found, likely[:_EXCHANGED, 6:], frame, cfg, generator)
     if len(swapped):
         others = others.and_(scored(torch.cat((swapped, onto_points(swapped))), frame))
     pose, contender = settled(found, others, track, dt_s, frame)
     return Refined(pose, None, rival, contender)
+
+
+def turns(track: Track, sure: float) -> tuple[bool, bool]:
+    """Whether the networks' poses are heard in a frame, and whether other fingers are tried.
+
+    Both, but in turn where a track is believed and nothing challenges it.
+    """
+    calm = track.challenged_s == 0 and track.pose is not None
+    if not calm or sure == 1 or track.log_odds is None or track.log_odds < log_odds(sure):
+        return True, True
+    first = round(track.age_s / FRAME_S) % 2 == 0
+    return first, not first
 
 
 def _covered(state: Tensor, frame: ObservedFrame) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -10,20 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.rigid import rotated_pivot
+from toftrack.compute.rigid import pivot_offset
+from toftrack.compute.threads import beside
+from toftrack.compute.transfer import on_device
 from toftrack.frames import DepthImage
-from toftrack.hand.overlap import finger_overlap
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance, RelocationSettings
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
-from toftrack.tracking.life_cycle import lasted
+from toftrack.tracking.life_cycle import lasted, log_odds
 from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
 from toftrack.tracking.other_hand import OtherHand, touching
 from toftrack.tracking.search import LastSeen
-from toftrack.tracking.side_belief import OTHER_SIDE
+from toftrack.tracking.side_belief import OTHER_SIDE, look_due
 from toftrack.tracking.state import Track, TrackerState
 
 _UNLIKELY = 0.03
@@ -31,8 +32,6 @@ _UNLIKELY = 0.03
 _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
 """How many hypotheses are bent to the votes, in how many steps; how sure the votes are at best, and
 how far an angle may go."""
-_FAR_SIGMAS = 3.0
-"""Farther off, a joint is as wrong as it can be."""
 _AS_WELL = 1.3
 """Hands are seen about as well when their expected errors differ by less than this factor."""
 _IN_OTHER = 4.0
@@ -77,13 +76,38 @@ def glanced(
         return None, best
     if not track.doubted and _sure(track, relocaliser.settings, dt_s):
         return track, None
-    moved = displacement(track, dt_s, model.filter)[None]
-    ahead = model.backend.motions.compose(track.mean, moved)
-    centre = (ahead[:, :3] + rotated_pivot(ahead[:, 3:6])).cpu().numpy()
-    centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
+    centre = _expected_centre(track, dt_s, model)
     if best is not None and np.linalg.norm(best.centre_m.numpy() - centre[0]) > SAME_PLACE_M:
         return None, best
     return track, relocaliser.glance(image.depth_m, image.k, centre, side)[0]
+
+
+def glancing(
+    state: TrackerState, dt_s: float, image: DepthImage, model: TrackerModel
+) -> Callable[[], Glance] | None:
+    """The look at a hand that is followed, begun beside whatever does not need it; see `glanced`.
+
+    What is returned waits for it. None where a frame's first question is what the networks say: is
+    there a hand, is it this one, of which side; or where they need not look.
+    """
+    relocaliser, track = model.relocaliser, state.track
+    if relocaliser is None or track is None or track.doubted:
+        return None
+    if _sure(track, relocaliser.settings, dt_s) or look_due(state.sides, model.sides, True, dt_s):
+        return None
+    centre = _expected_centre(track, dt_s, model)
+    look = partial(relocaliser.glance, image.depth_m, image.k, centre, state.side)
+    wait = beside(look)
+    return lambda: wait()[0]
+
+
+def _expected_centre(track: Track, dt_s: float, model: TrackerModel) -> np.ndarray:
+    """(1, 3) middle of the palm, dt_s after the last frame, camera frame."""
+    moved = displacement(track, dt_s, model.filter)[None]
+    ahead = model.backend.motions.compose(track.mean, moved).numpy()
+    centre: np.ndarray = ahead[:, :3] + pivot_offset(ahead[:, 3:6])
+    centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
+    return centre
 
 
 def search_due(state: TrackerState, model: TrackerModel) -> bool:
@@ -112,13 +136,9 @@ def _chosen(found: Sequence[Glance]) -> Glance | None:
 
 def _sure(track: Track, settings: RelocationSettings, dt_s: float) -> bool:
     """Whether a track is believed so much that the networks need not look in this frame."""
-    believed = track.log_odds is not None and track.log_odds > _logit(settings.sure)
+    believed = track.log_odds is not None and track.log_odds > log_odds(settings.sure)
     due = lasted(track.unlooked_s + dt_s, settings.every)
     return believed and not due and track.challenged_s == 0
-
-
-def _logit(probability: float) -> float:
-    return float(np.log(probability / (1 - probability)))
 
 
 def _reachable(
@@ -135,8 +155,9 @@ def _reachable(
         return -np.inf
     if seen is None:
         return 0.0
-    before = seen.particle[:, :3] + rotated_pivot(seen.particle[:, 3:6])
-    away = float(np.linalg.norm(before[0].cpu().numpy() - centre_m))
+    particle = seen.particle.numpy()
+    before = particle[0, :3] + pivot_offset(particle[:, 3:6])[0]
+    away = float(np.linalg.norm(before - centre_m))
     off = away / (_STEP_M + _SPEED_M_S * seen.age_s)
     return -0.5 * off**2 if seen.age_s < _FORGOTTEN_S else 0.0
 
@@ -153,7 +174,7 @@ def landmarks_of(glance: Glance, model: TrackerModel) -> Landmarks:
     assert model.relocaliser is not None
     cfg, found = model.relocaliser.settings, glance.landmarks
     sigma = (cfg.landmark_sigmas * found.sigma_m).clamp(min=cfg.landmark_m)
-    return Landmarks(found.points_m.to(model.device), sigma.to(model.device))
+    return Landmarks(found.points_m, sigma)
 
 
 def hypotheses(glance: Glance, hand: SizedHand, count: int) -> tuple[Tensor, Tensor]:
@@ -178,8 +199,7 @@ def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
     nothing = SeenPoints(
         states.new_zeros(0, 3), states.new_zeros(0, 0, 2), frame.observation.k, (0, 0)
     )
-    sigma = glance.landmarks.sigma_m.clamp(min=_BENT_M).to(model.device)
-    votes = Landmarks(glance.landmarks.points_m.to(model.device), sigma)
+    votes = Landmarks(glance.landmarks.points_m, glance.landmarks.sigma_m.clamp(min=_BENT_M))
     freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
     return torch.cat((frame.hand.refiner(bent, bent[:, 6:], nothing, freely, votes), states))
 
@@ -191,18 +211,15 @@ def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
     votes are.
     """
     model, glance = frame.model, frame.glance
-    word = joints_m.new_zeros(len(joints_m))
+    overlap = 0.0 if model.refinement is None else model.refinement.overlap
+    votes, weight = None, 0.0
+    if model.relocaliser is not None and glance is not None:
+        votes, weight = landmarks_of(glance, model), model.relocaliser.settings.votes
+    length = frame.hand.shape.hand_length_m
+    word = -model.backend.joints_penalty(joints_m, length, overlap, votes, weight)
     if frame.other is not None and frame.other.pixels is not None:
         word = word - _IN_OTHER * touching(joints_m, frame.other)
-    if model.refinement is not None and model.refinement.overlap:
-        length = frame.hand.shape.hand_length_m
-        word = word - model.refinement.overlap * finger_overlap(joints_m, length)
-    if model.relocaliser is None or glance is None:
-        return word
-    votes = landmarks_of(glance, model)
-    off = ((joints_m - votes.points_m).norm(dim=-1) / votes.sigma_m).square()
-    far = (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
-    return word - model.relocaliser.settings.votes * far
+    return word
 
 
 def known_scores(
@@ -248,8 +265,8 @@ def track_of(pose: Tensor, model: TrackerModel) -> Track:
     """A track that begins with a pose (1, 27)."""
     particle, off = model.nearest(pose)
     n = model.filter.particles
-    particles = particle.repeat(n, 1)
+    particles = on_device(particle, model.device).repeat(n, 1)
     weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)
     carry = 0.0 if model.refinement is None else model.refinement.carry
-    still = particles.new_zeros(particles.shape[1])
+    still = particle.new_zeros(particle.shape[1])
     return Track(particles, weights, particle, still, carry * off, pose)

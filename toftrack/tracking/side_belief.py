@@ -84,3 +84,11 @@ def probability(belief: SideBelief | None, side: str) -> float:
         return 1.0
     log_odds = belief.log_odds if side == "right" else -belief.log_odds
     return 1 / (1 + math.exp(-log_odds))
+
+
+def look_due(belief: SideBelief | None, fit: SideFit | None, tracked: bool, dt_s: float) -> bool:
+    """Whether both sides are to be compared in a frame, dt_s after the last, if a hand is seen."""
+    if fit is None or belief is None:
+        return False
+    sure = max(probability(belief, side) for side in OTHER_SIDE) > fit.sure
+    return not tracked or belief.unlooked_s + dt_s >= (fit.sure_s if sure else fit.unsure_s)

@@ -20,7 +20,7 @@ from toftrack.tracking.model import TrackerModel, observed
 from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.relocating import best_start, expected_of
 from toftrack.tracking.shape_fit import ShapeBelief
-from toftrack.tracking.side_belief import OTHER_SIDE, probability
+from toftrack.tracking.side_belief import OTHER_SIDE, look_due, probability
 from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.state import Track, TrackerState
 
@@ -52,11 +52,10 @@ def sided(
     fit, belief = model.sides, state.sides
     if fit is None or belief is None:
         return state, track, glance
+    due = look_due(belief, fit, track is not None, dt_s)
     if track is None and (state.seen is None or state.seen.age_s > _GONE_S):
         belief = belief.left(fit)  # what comes may be the other hand
     belief = replace(belief, unlooked_s=belief.unlooked_s + dt_s)
-    sure = max(probability(belief, side) for side in OTHER_SIDE) > fit.sure
-    due = track is None or belief.unlooked_s >= (fit.sure_s if sure else fit.unsure_s)
     if glance is None or not due or glance.present < _LEAST_PRESENT:
         return replace(state, sides=belief), track, glance
     assert model.relocaliser is not None

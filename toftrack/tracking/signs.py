@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S
@@ -59,9 +60,10 @@ def read_signs(
     age_s: seconds since its track began.
     """
     joints = joints_m.cpu()
-    votes = (joints - glance.landmarks.points_m).norm(dim=1)
-    off = (joints - glance.joints_m).norm(dim=-1).mean(1)
-    likely = off[glance.log_probability > math.log(_LIKELY)]
+    at = joints.numpy()
+    votes = np.linalg.norm(at - glance.landmarks.points_m.numpy(), axis=1)
+    off = np.linalg.norm(at - glance.joints_m.numpy(), axis=-1).mean(1)
+    likely = off[glance.log_probability.numpy() > math.log(_LIKELY)]
     unseen, hidden = out_of_sight(joints, depth_m, k)
     return Signs(
         log_score=math.log(max(score, _LEAST)),
@@ -70,7 +72,7 @@ def read_signs(
         pose_off=_log_cm(float(likely.min()) if len(likely) else float(off.min())),
         likeliest_off=_log_cm(float(off[0])),
         expected_error=_log_cm(float(glance.error_m[0])),
-        unsure=_log_cm(float(glance.landmarks.sigma_m.mean())),
+        unsure=_log_cm(float(glance.landmarks.sigma_m.numpy().mean())),
         absent=_log_odds(1 - glance.present),
         other_side=_log_odds(1 - glance.right_side),
         unseen=unseen,
@@ -95,12 +97,14 @@ def _log_odds(probability: float) -> float:
 
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
     """Shares of the joints (21, 3) outside of the image (H, W), and of those behind something."""
-    depth, k = depth_m.cpu(), k.cpu()
-    z = joints[:, 2].clamp(min=0.05)
-    u = (k[0, 0] * joints[:, 0] / z + k[0, 2]).round()
-    v = (k[1, 1] * joints[:, 1] / z + k[1, 2]).round()
+    depth, k_px, at = depth_m.cpu().numpy(), k.cpu().numpy(), joints.numpy()
+    z = np.maximum(at[:, 2], np.float32(0.05))
+    u = np.rint(k_px[0, 0] * at[:, 0] / z + k_px[0, 2])
+    v = np.rint(k_px[1, 1] * at[:, 1] / z + k_px[1, 2])
     height, width = depth.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    seen = depth[v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
-    behind = inside & (seen > 0) & (seen < z - 0.04)
-    return float((~inside).float().mean()), float(behind.float().mean())
+    column, row = np.where(inside, u, 0).astype(np.int64), np.where(inside, v, 0).astype(np.int64)
+    seen = depth[row, column]
+    behind = inside & (seen > 0) & (seen < z - np.float32(0.04))
+    count = len(at)
+    return 1 - np.count_nonzero(inside) / count, np.count_nonzero(behind) / count

@@ -8,6 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.tracking.following import displacement, young
 from toftrack.tracking.life_cycle import LostSettings, lasted, longer
 from toftrack.tracking.model import ObservedFrame, TrackerModel
@@ -83,13 +84,13 @@ def started(track: Track | None, proposals: Proposals, dt_s: float, model: Track
     particles = proposals.particles
     if track is not None and isinstance(model.lost, LostSettings):
         ahead = displacement(track, dt_s, model.filter)
-        now = model.backend.motions.compose(track.particles, ahead[None])
+        (before,) = on_host(track.particles)
+        now = model.backend.motions.compose(before, ahead[None])
         log_scores = proposals.log_scores
         # The search has seen this frame and the track has not, so a little better is no better.
         if log_scores(particles, 1.0).max() - log_scores(now, 1.0).max() < model.lost.rival_gain:
             return track
     n, size = particles.shape
-    weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)
-    return Track(
-        particles, weights, particles[:1], particles.new_zeros(size), particles.new_zeros(21)
-    )
+    there = on_device(particles, model.device)
+    weights = there.new_full((n,), 1.0 / n, dtype=torch.float64)
+    return Track(there, weights, particles[:1], particles.new_zeros(size), particles.new_zeros(21))

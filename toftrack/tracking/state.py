@@ -35,7 +35,8 @@ class Contender:
 class Track:
     """A hand that is followed.
 
-    particles: (N, 6 + d), after the last observation.  weights: (N,) normalised.
+    particles: (N, 6 + d), after the last observation.  weights: (N,) normalised. Both are on the
+        model's device; all else is on the CPU.
     mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a second.
     offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
         displaced by it.
@@ -108,10 +109,10 @@ class TrackerState:
 
 @dataclass(frozen=True, eq=False)
 class StepInfo:
-    """What a step saw and believed, on its own device; for those who watch it.
+    """What a step saw and believed; for those who watch it.
 
     particles: (N, 6 + d) before the estimate was refined; none where nothing can be a hand.
-    weights: (N,) normalised.
+    weights: (N,) normalised. Both are on the model's device.
     seconds: wall seconds of each stage.
     signs, joint_signs: what the beliefs were formed from; None where there are no networks.
     """
@@ -124,8 +125,19 @@ class StepInfo:
     joint_signs: np.ndarray | None = None
 
 
-def resumed(generator: Tensor, device: torch.device) -> torch.Generator:
-    """The random generator of a state."""
-    made = torch.Generator(device)
+def resumed(generator: Tensor) -> torch.Generator:
+    """The random generator of a state, on the CPU."""
+    made = torch.Generator()
     made.set_state(generator)
     return made
+
+
+def generator_on(device: torch.device, generator: torch.Generator) -> torch.Generator:
+    """The generator to draw particles with on a device; on the CPU it is the given one itself.
+
+    Elsewhere the given one seeds it, so that nothing but the CPU's is carried between frames.
+    """
+    if device.type == "cpu":
+        return generator
+    seed = int(torch.randint(2**62, (1,), generator=generator))
+    return torch.Generator(device).manual_seed(seed)

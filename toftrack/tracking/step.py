@@ -11,10 +11,10 @@ from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S, elapsed_s
 from toftrack.compute.threads import small_operations
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
-from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.relocaliser import Glance
 from toftrack.render.scoring import Evidence
 from toftrack.render.segmentation import Observation
@@ -34,7 +34,7 @@ from toftrack.tracking.life_cycle import Belief, LostSettings, believe
 from toftrack.tracking.model import ObservedFrame, TrackerModel, observed
 from toftrack.tracking.other_hand import OtherHand, without
 from toftrack.tracking.refining import refined
-from toftrack.tracking.relocating import expected_of, glanced, landmarks_of, search_due
+from toftrack.tracking.relocating import expected_of, glanced, glancing, landmarks_of, search_due
 from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.side_belief import SideBelief, probability
 from toftrack.tracking.sides import sided
@@ -47,7 +47,7 @@ from toftrack.tracking.state import StepInfo, Track, TrackerState, resumed
 
 def first_state(model: TrackerModel, seed: int) -> TrackerState:
     """Before any frame."""
-    generator = torch.Generator(model.device).manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     size: SizeBelief | ShapeBelief | None = None
     if model.adapt is not None:
         size = shape_fit.first_belief()
@@ -67,15 +67,18 @@ def step(
 
     other: another hand that is tracked as well; it is not taken for this one.
     """
-    spans, generator = Spans(), resumed(state.generator, model.device)
+    spans, generator = Spans(), resumed(state.generator)
     dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
     state = at(state, image)
     with spans("relocaliser"):
         alone = without(image, other)
-        track, glance = glanced(state, dt_s, alone, model, other)
-        state = replace(state, unsearched_s=0.0) if search_due(state, model) else state
-        state, track, glance = sided(state, track, glance, dt_s, alone, model, other)
-        state = replace(state, size=_hand_told(state, track, glance, model))
+        coming = glancing(state, dt_s, alone, model)
+        if coming is None:
+            track, glance = glanced(state, dt_s, alone, model, other)
+            state = replace(state, unsearched_s=0.0) if search_due(state, model) else state
+            state, track, glance = _told(state, track, glance, dt_s, alone, model, other)
+        else:
+            track, glance = state.track, None
     hand = model.hand(state.side, state.size)
     with spans("segmentation and evidence"):
         expected = expected_depths(track, dt_s, hand, model)
@@ -85,13 +88,19 @@ def step(
         observation = model.segmentation(image.depth_m, image.k, expected, theirs)
         nowhere = model.relocaliser is not None and glance is None and track is None
         if observation.empty or nowhere:
+            if coming is not None:
+                state = _told(state, track, coming(), dt_s, alone, model, other)[0]
             return _without_hand(state, image, observation, model, spans)
         frame = observed(observation, hand, model, glance, state.seen, other)
     with spans("start"):
         track = begin(track, state, dt_s, frame, generator)
     with spans("filter: rest"):
         particles, weights = filtered(track, dt_s, frame, generator, spans)
-        mean = particle_filter.mean_particle(particles, weights)
+        mean = model.backend.motions.mean(particles, weights)
+    if coming is not None:
+        with spans("relocaliser"):
+            state, _, glance = _told(state, track, coming(), dt_s, alone, model, other)
+            frame = replace(frame, glance=glance)
     with spans("refinement"):
         outcome = refined(track, mean, dt_s, frame, generator)
         track, pose, trend = challenged(track, outcome, dt_s, frame)
@@ -129,6 +138,20 @@ def step(
     )
     info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs, seen_signs)
     return after, info, estimate
+
+
+def _told(
+    state: TrackerState,
+    track: Track | None,
+    glance: Glance | None,
+    dt_s: float,
+    image: DepthImage,
+    model: TrackerModel,
+    other: OtherHand | None,
+) -> tuple[TrackerState, Track | None, Glance | None]:
+    """What a look at the hand says of its side and its size."""
+    state, track, glance = sided(state, track, glance, dt_s, image, model, other)
+    return replace(state, size=_hand_told(state, track, glance, model)), track, glance
 
 
 def _worth_keeping(last: Estimate | None, estimate: Estimate) -> Estimate:
@@ -240,7 +263,7 @@ def _sized(
         likelihood = replace(model.likelihood, beta=model.fit.beta)
 
         def log_scores(states: Tensor, evidence: Evidence) -> Tensor:
-            return likelihood.log_score(frame.hand.scorer(states, evidence))
+            return likelihood.log_score(frame.counts(states, evidence))
 
         motions, evidence = model.backend.motions, frame.evidence
         size = size_fit.update(
@@ -258,10 +281,8 @@ def _shape_learned(belief: ShapeBelief, found: Found, frame: ObservedFrame) -> S
     if model.adapt is None or glance is None or frame.hidden:
         return belief
     votes = landmarks_of(glance, model)
-    votes = Landmarks(votes.points_m.cpu(), votes.sigma_m.cpu())
-    shape, state = hand.shape.to("cpu"), found.pose.cpu()
     return shape_fit.learned(
-        belief, state, shape, hand.derivatives, glance, votes, model.adapt, hand.first
+        belief, found.pose, hand.shape, hand.derivatives, glance, votes, model.adapt, hand.first
     )
 
 
@@ -270,9 +291,13 @@ def _estimate(
 ) -> Estimate:
     """What is told of a frame, but for its gesture and the time that it took."""
     model, mean, particles = frame.model, found.mean, found.particles
+    mean = on_device(mean, model.device)
     tangents = model.backend.motions.difference(particles, mean)
     tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
-    covariance = particle_filter.covariance(tangents, found.weights)
+    covariance, effective = on_host(
+        particle_filter.covariance(tangents, found.weights),
+        particle_filter.effective_sample_size(found.weights),
+    )
     return Estimate(
         index=image.index,
         timestamp_s=image.timestamp_s,
@@ -285,7 +310,7 @@ def _estimate(
         latent=_host(model.space.encode(found.pose[:, 6:])[0]),
         score=score,
         covariance=_host(covariance + torch.diag(model.model_variance)),
-        effective_sample_size=float(particle_filter.effective_sample_size(found.weights)),
+        effective_sample_size=float(effective),
         compute_s=math.nan,
     )
 
@@ -324,10 +349,10 @@ def _spread(joints_m: np.ndarray, found: Found, frame: ObservedFrame) -> np.ndar
         moved = motions.compose(found.refined.repeat(len(tangents), 1), tangents)
         return frame.hand.refiner.joints(model.decode(moved, found.offset))
 
-    around = motions.difference(found.particles, found.mean)
-    covariance = particle_filter.covariance(around, found.weights)
+    around = motions.difference(found.particles, on_device(found.mean, model.device))
+    (covariance,) = on_host(particle_filter.covariance(around, found.weights))
     return propagated_sigma(joints_m, covariance + torch.diag(model.model_variance), joints_of)
 
 
 def _host(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().astype(np.float32)
+    return tensor.detach().numpy().astype(np.float32)

@@ -31,8 +31,10 @@ from toftrack.views.video import VideoFile, unwritable, video_library
 
 _RED = (40, 40, 220)
 _WHITE = (255, 255, 255)
-_FONT, _SMALL = cv2.FONT_HERSHEY_SIMPLEX, 0.45
-CAPTION_PX = 36
+_FONT, _GAP = cv2.FONT_HERSHEY_SIMPLEX, "   "
+_LARGEST, _LEAST = 1.1, 0.9
+"""Of the text. The least can be read in a filmstrip that is 1280 px wide."""
+CAPTION_PX = 46
 """Height of the caption above a panel's two sides."""
 _TINT = 0.5
 """How much of its slot's colour is mixed into the range image of one of two hands."""
@@ -60,9 +62,9 @@ def draw_panel(
 ) -> np.ndarray:
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
-    Above both, a caption with frame number, score, confidence, state and gesture. A red caption and
-    frame mark an estimate that is lost, of two hands that both are. The skeleton is missing where
-    the estimate is NaN; see draw_hands for the rest.
+    Above the left, frame number, gesture and confidence; above the right, state and score. A red
+    caption and frame mark an estimate that is lost, of two hands that both are. The skeleton is
+    missing where the estimate is NaN; see draw_hands for the rest.
 
     Args:
         depth_m: (H, W) metres, 0 = no reading; shown without amplitude, nearer is brighter.
@@ -230,55 +232,66 @@ def _model_picture(surfaces: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
-    """A strip of text as wide as the panel, a line for each slot; the text fits into its left half,
-    for the filmstrip.
+    """A strip of text above the panel, half of it above each side: so few words that they can be
+    read in the filmstrip, where the halves lie one below the other. Of two hands a half each.
     """
     colour = _RED if all(estimate.lost for estimate in estimates) else (48, 48, 48)
-    strip = np.full((CAPTION_PX, 2 * half_width, 3), colour, np.uint8)
-    if len(estimates) == 1:
-        facts = (f"frame {estimates[0].index}", f"score {_score(estimates[0])}")
-        _write_line(strip, "   ".join((*facts, _words(estimates[0]))), 8, CAPTION_PX - 11, 0.8)
-        return strip
+    halves = [np.full((CAPTION_PX, half_width, 3), colour, np.uint8) for _ in range(2)]
     number = f"frame {estimates[0].index}"
-    (indent, _), _ = cv2.getTextSize(f"{number}  ", _FONT, _SMALL, 1)
-    for slot, estimate in enumerate(estimates):
-        base = CAPTION_PX // 2 * (slot + 1) - 5
-        if slot == 0:
-            _write_line(strip, number, 8, base, _SMALL)
-        mark = (8 + indent, base - 10), (18 + indent, base)
-        cv2.rectangle(strip, *mark, SLOT_RGB[slot][::-1], -1)
-        cv2.rectangle(strip, *mark, _WHITE, 1)
-        words = "   ".join(filter(None, (side_words(estimate), _words(estimate))))
-        text = "no hand" if is_vacant(estimate) else words
-        _write_line(strip, text, 26 + indent, base, _SMALL)
-    return strip
+    if len(estimates) == 1:
+        one = estimates[0]
+        _write_line(halves[0], (number, gesture_words(one)), 8)
+        facts = [_state(one), confidence_words(one.confidence), f"score {_score(one)}"]
+        _write_line(halves[1], facts, 8)
+        return np.hstack(halves)
+    for slot, (one, half) in enumerate(zip(estimates, halves, strict=True)):
+        cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), SLOT_RGB[slot][::-1], -1)
+        cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), _WHITE, 1)
+        told = _state(one) if one.lost else gesture_words(one) or _state(one)
+        facts = [told, side_words(one), confidence_words(one.confidence)]
+        facts = ["no hand"] if is_vacant(one) else facts
+        _write_line(half, facts if slot else [number, *facts], 38)
+    return np.hstack(halves)
 
 
 def _score(estimate: Estimate) -> str:
     return f"{estimate.score:.2f}" if math.isfinite(estimate.score) else "-"
 
 
-def _words(estimate: Estimate) -> str:
-    """Confidence, state and gesture."""
-    state = ("LOST: " if estimate.lost else "") + state_words(estimate)
-    facts = (confidence_words(estimate.confidence), state, gesture_words(estimate))
-    return "   ".join(filter(None, facts))
+def _state(estimate: Estimate) -> str:
+    return ("LOST: " if estimate.lost else "") + state_words(estimate)
 
 
-def _write_line(strip: np.ndarray, text: str, x: int, base: int, size: float) -> None:
-    """White text, in place, from x on, smaller where it does not fit into the strip's half."""
-    room = strip.shape[1] // 2 - x - 8
+def _write_line(half: np.ndarray, facts: Sequence[str], x: int) -> None:
+    """White text, in place, from x on. Where it does not fit it is smaller, but first the last
+    facts are left out.
+    """
+    room = half.shape[1] - x - 8
+    facts = [fact for fact in facts if fact]
+    while len(facts) > 1 and _text_size(facts, _LEAST)[0] > room:
+        facts.pop()
+    size = _LARGEST
     # Step by step, because not every OpenCV's text grows in proportion.
-    while size > 0.2 and cv2.getTextSize(text, _FONT, size, 2 if size > 0.5 else 1)[0][0] > room:
+    while size > 0.2 and _text_size(facts, size)[0] > room:
         size -= 0.02
-    thick = 2 if size > 0.5 else 1
-    cv2.putText(strip, text, (x, base), _FONT, size, _WHITE, thick, cv2.LINE_AA)
+    place = (x, (CAPTION_PX + _text_size(facts, size)[1]) // 2)
+    text, thick = _GAP.join(facts), _thickness(size)
+    cv2.putText(half, text, place, _FONT, size, _WHITE, thick, cv2.LINE_AA)
+
+
+def _text_size(facts: Sequence[str], size: float) -> tuple[int, int]:
+    (width, height), _ = cv2.getTextSize(_GAP.join(facts), _FONT, size, _thickness(size))
+    return width, height
+
+
+def _thickness(size: float) -> int:
+    return 2 if size > 0.5 else 1
 
 
 def film_tile(panel: np.ndarray) -> np.ndarray:
-    """A panel with its right side below its left, small."""
+    """A panel with its right side below its left, small; each has its half of the caption."""
     half = panel.shape[1] // 2
-    tile = np.vstack([panel[:, :half], panel[CAPTION_PX:, half : 2 * half]])
+    tile = np.vstack([panel[:, :half], panel[:, half : 2 * half]])
     factor = _STRIP_TILE_PX / half
     size = (_STRIP_TILE_PX, round(tile.shape[0] * factor))
     return cv2.resize(tile, size, interpolation=cv2.INTER_AREA)

@@ -13,13 +13,16 @@ import numpy as np
 
 from toftrack.compute.compiling import compiled, entry_point, take
 from toftrack.render.numba.hand import (
+    BOTTOM,
     DU,
     DX,
-    HX,
     HY,
     IY,
     LANES,
+    LEFT,
+    RIGHT,
     TERMS,
+    TOP,
     UX,
     UY,
     XY,
@@ -29,246 +32,189 @@ from toftrack.render.numba.hand import (
     pose_hands,
     project_hands,
 )
+from toftrack.render.numba.missed import clipped, count_missed, find_wanted, run
 from toftrack.render.numba.vector import (
     BLOCK,
-    WORDS,
-    count,
+    compare,
+    down,
     draw,
-    merge,
-    near,
-    ones,
-    widen,
+    larger,
+    load,
+    ramp,
+    root,
+    smaller,
+    splat,
+    store,
+    total,
+    up,
+    where_above,
 )
+from toftrack.render.numba.words import WORDS, no_rows, store_rows
 
-_cached = entry_point(
-    *(Path(__file__).with_name(f"{part}.py") for part in ("hand", "kernel", "vector"))
-)
+_PARTS = ("hand", "kernel", "missed", "vector", "words")
+_cached = entry_point(*(Path(__file__).with_name(f"{part}.py") for part in _PARTS))
 
-_ROWS = 16
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_FIELD = np.uint64((1 << BLOCK) - 1)
-
-
-@compiled
-def _run(first, last):
-    """A word with bits first .. last set, as far as they lie within it."""
-    first, last = max(first, 0), min(last, 63)
-    if last < first:
-        return np.uint64(0)
-    return (~np.uint64(0) >> np.uint64(63 - (last - first))) << np.uint64(first)
-
-
-@compiled
-def _clip(value, size):
-    """A float as an integer in 0 .. size; 0 for NaN."""
-    if not value > _ZERO:
-        return 0
-    return size if value >= size else int(value)
+_ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+_LAST = 8
+"""Particles of a task near the end."""
+_LISTED = 256
+"""How many blocks are listed before they are drawn."""
+_FAR = np.float32(1e-30)
+"""Inverse depth of what is farther than any surface, but nearer than what is not drawn."""
+_BITS = 4
+"""Of a column, that say where in its block it is."""
+_IMAGES = 3
+"""Of the evidence, by blocks: the band's middle, 1 / its half-width, the occluder."""
 
 
 @compiled
-def _box(conics, i, width, height):
-    """First and one-past-last column and row of all ellipsoids but the wrist's, in the image."""
-    left, top, right, bottom = width, height, 0, 0
-    for e in range(conics.shape[0] - 1):
-        high = conics[e, HY * LANES + i]
-        if high > _ZERO:
-            x, wide, y = (
-                conics[e, X * LANES + i],
-                conics[e, HX * LANES + i],
-                conics[e, Y * LANES + i],
-            )
-            left = min(left, _clip(np.ceil(x - wide), width))
-            right = max(right, _clip(np.floor(x + wide) + _ONE, width))
-            top = min(top, _clip(np.ceil(y - high), height))
-            bottom = max(bottom, _clip(np.floor(y + high) + _ONE, height))
-    return left, top, right, bottom
+def blocks(width):
+    """Blocks of a row of evidence; the last block that is drawn may reach past the image's edge."""
+    return (width + 2 * BLOCK - 1) >> _BITS
 
 
 @compiled
-def _render(conics, i, box, origin, stride, tile, spans, lines):
-    """The largest inverse depth of each pixel of the box, 0 = none.
+def _zeros(size):
+    """A flat array of float32 that begins where a line of the cache does."""
+    numbers = np.zeros(size + BLOCK, np.float32)
+    skip = (-numbers.ctypes.data >> 2) & (BLOCK - 1)
+    return numbers[skip : skip + size]
+
+
+@compiled
+def _render(conics, i, box, origin, stride, tile, spans, lines, places):
+    """The largest inverse depth of each pixel of the box, drawn into a tile of zeros.
+
+    What each row of each ellipsoid has of its own is listed, several rows at once, then drawn in
+    one loop, whose length does not depend on the ellipsoids', so that it is foreseen.
 
     tile: flat, rows of `stride` pixels from row `top` and column `origin` of the image.
-    spans: (2, rows), set to the first and last tile column drawn in each row.
-    lines: (5 * _ROWS,) scratch.
+    spans: flat; one half is set to the first, the other to the last tile column drawn in each row.
+    lines: (5 * _LISTED,) float32, places: (_LISTED,) int32 scratch.
     """
     left, top, right, bottom = box
-    # Whole blocks, and one more that the last drawn block may reach into.
-    begin = (left - origin) // BLOCK * BLOCK
-    end = ((right - origin) // BLOCK + 2) * BLOCK
-    for row in range(bottom - top):
-        spans[0, row], spans[1, row] = stride, -1
-        line = tile[row * stride + begin : row * stride + end]
-        for column in range(end - begin):
-            line[column] = _ZERO
+    lasts = spans.shape[0] // 2
+    for row in range(0, bottom - top, BLOCK):
+        store(spans, row, splat(np.float32(stride)))
+        store(spans, lasts + row, splat(-_ONE))
     left_most, right_most = np.float32(left - origin), np.float32(right - 1 - origin)
+    # The last block that is drawn may reach so far.
+    utmost = right_most + np.float32(BLOCK - 1)
+    listed = 0
     for e in range(conics.shape[0] - 1):
         conic = conics[e]
-        high = conic[HY * LANES + i]
+        high, dx = conic[HY * LANES + i], conic[DX * LANES + i]
         if not high > _ZERO:
             continue
         x, y = conic[X * LANES + i] - np.float32(origin), conic[Y * LANES + i]
         shear, inverse = conic[XY * LANES + i], conic[IY * LANES + i]
-        dx, du = conic[DX * LANES + i], conic[DU * LANES + i]
-        u, slope_y, slope_x = conic[U * LANES + i], conic[UY * LANES + i], conic[UX * LANES + i]
-        curve = du / dx
-        first = max(_clip(np.ceil(y - high), bottom), top)
-        rows = _clip(y + high + _ONE, bottom) - first
-        for row in range(0, rows, _ROWS):
-            lead = np.float32(first + row) - y
-            for j in range(_ROWS):  # vectorised: what the rows have of their own
-                dy = lead + np.float32(j)
-                rest = max(_ONE - dy * dy * inverse, _ZERO)
-                middle, half = x + shear * dy, math.sqrt(dx * rest)
-                # Written so that NaN stays inside, too.
-                low = np.ceil(middle - half)
-                low = low if low > left_most else left_most
-                low = low if low < right_most else right_most
-                last = np.floor(middle + half)
-                lines[j] = low
-                lines[_ROWS + j] = last if last < right_most else right_most
-                lines[2 * _ROWS + j] = low - middle
-                lines[3 * _ROWS + j] = u + slope_y * dy
-                lines[4 * _ROWS + j] = du * rest
-            for j in range(min(_ROWS, rows - row)):
-                low, high = int(lines[j]), int(lines[_ROWS + j])
-                if low > high:
-                    continue
-                line = first - top + row + j
-                spans[0, line] = min(spans[0, line], low)
-                spans[1, line] = max(spans[1, line], high)
-                at, t = line * stride + low, lines[2 * _ROWS + j]
-                plane, peak = lines[3 * _ROWS + j], lines[4 * _ROWS + j]
-                draw(tile, at, t, plane, slope_x, peak, curve)
-                for _ in range(low + BLOCK, high + 1, BLOCK):
-                    at += BLOCK
-                    t += np.float32(BLOCK)
-                    draw(tile, at, t, plane, slope_x, peak, curve)
+        du, u = conic[DU * LANES + i], conic[U * LANES + i]
+        slope_y, slope = conic[UY * LANES + i], conic[UX * LANES + i]
+        curve, widest = splat(du / dx), min(_TWO * math.sqrt(dx), right_most - left_most)
+        first = max(clipped(np.ceil(y - high), bottom), top)
+        rows = clipped(y + high + _ONE, bottom) - first
+        for row in range(0, rows, BLOCK):
+            dy = (np.float32(first + row) - y) + ramp()
+            rest = _ONE - dy * dy * inverse
+            middle, half = x + shear * dy, root(dx * rest)
+            # NaN, as in a row beside the ellipsoid, stays inside, too.
+            low = smaller(larger(up(middle - half), left_most), right_most)
+            last = larger(down(middle + half), low)
+            line = first - top + row
+            before, after = load(spans, line), load(spans, lasts + line)
+            # Rounding may let a pixel more be drawn.
+            end = larger(smaller(last + _ONE, utmost), after)
+            store(spans, line, where_above(rest, smaller(low, before), before))
+            store(spans, lasts + line, where_above(rest, end, after))
+            t, peak, last = low - middle, du * rest, smaller(last, right_most)
+            plane = u + slope_y * dy + slope * t
+            at = (np.float32(line) + ramp()) * np.float32(stride) + low
+            for column in range(0, int(widest) + 1, BLOCK):
+                beyond = np.float32(column)
+                store(places, listed, at + beyond)
+                store(lines, listed, t + beyond)
+                store(lines, _LISTED + listed, plane + slope * beyond)
+                there = where_above(last - low - beyond + _ONE, peak, splat(-_ONE))
+                store(lines, 2 * _LISTED + listed, there)
+                store(lines, 3 * _LISTED + listed, splat(slope))
+                store(lines, 4 * _LISTED + listed, curve)
+                listed += min(BLOCK, rows - row)
+                if listed > _LISTED - BLOCK:
+                    _draw(lines, places, listed, tile)
+                    listed = 0
+    _draw(lines, places, listed, tile)
 
 
 @compiled
-def _compare(tile, stride, spans, box, origin, images, model, above, residuals):
-    """Counts of correct and false pixels of a tile, and the silhouette as bits.
+def _draw(lines, places, listed, tile):
+    """The rows that are listed: t, plane, peak, slope and curve of `draw`, and where it begins."""
+    for j in range(listed):
+        t, plane, peak = lines[j], lines[_LISTED + j], lines[2 * _LISTED + j]
+        draw(tile, places[j], t, plane, peak, lines[3 * _LISTED + j], lines[4 * _LISTED + j])
 
-    images: (3, H, >= W + BLOCK) low, high, occluder, such that nothing beyond W counts.
+
+@compiled
+def _compare(tile, stride, spans, box, origin, images, width, model, above):
+    """Counts of correct and false pixels and the residual of a tile, the silhouette as bits.
+
+    The tile is left empty.
+    images: of pack_evidence, for `width` columns.
     model: (words + 2, R) zeros; the box's bits go to rows from `above` on, words from 1 on.
-    residuals: (BLOCK,) sums to add to.
     """
     left, top, right, bottom = box
-    _, height, pitch = images.shape
-    correct, false = 0, 0
+    lasts, pitch = spans.shape[0] // 2, blocks(width)
+    correct, false, residual = splat(_ZERO), splat(_ZERO), splat(_ZERO)
     for row in range(bottom - top):
-        for block in range(spans[0, row] // BLOCK, spans[1, row] // BLOCK + 1):
-            pixel = (top + row) * pitch + origin + block * BLOCK
-            bits = count(
+        begin = (top + row) * pitch + (origin >> _BITS)
+        for block in range(int(spans[row]) >> _BITS, (int(spans[lasts + row]) >> _BITS) + 1):
+            correct, false, residual = compare(
                 tile,
-                row * stride + block * BLOCK,
+                row * stride + (block << _BITS),
                 images,
-                pixel,
-                pixel + height * pitch,
-                pixel + 2 * height * pitch,
-                residuals,
+                (begin + block) * (_IMAGES * BLOCK),
+                model,
+                # Four blocks to a word, and words of one column one after the other.
+                (((block >> 2) + 1) * model.shape[1] + above + row << 2) + (block & 3),
+                correct,
+                false,
+                residual,
             )
-            correct += ones((bits >> np.uint64(BLOCK)) & _FIELD)
-            false += ones(bits >> np.uint64(2 * BLOCK))
-            column = block * BLOCK
-            # A block may reach past the image's edge.
-            inside = bits & _FIELD & _run(0, right - 1 - origin - column)
-            model[1 + (column >> 6), above + row] |= inside << np.uint64(column & 63)
-    return correct, false
-
-
-@compiled
-def _wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted):
-    """Bits of the hand's pixels outside of the silhouette and of the wrist's ellipsoid.
-
-    hand: (words of a row + 1, H) bits of the evidence.  wanted: (words, rows + WORDS) is set.
-    """
-    shift = np.uint64(origin & 63)
-    back = np.uint64(63) - shift
-    for w in range(words):
-        here = hand[(origin >> 6) + w, first_row : first_row + rows]
-        after = hand[(origin >> 6) + w + 1, first_row : first_row + rows]
-        covered, line = model[w + 1, reach : reach + rows], wanted[w]
-        for r in range(rows):
-            line[r] = ((here[r] >> shift) | (after[r] << np.uint64(1) << back)) & ~covered[r]
-        for r in range(rows, rows + WORDS):
-            line[r] = np.uint64(0)
-    conic = conics[conics.shape[0] - 1]
-    high, y = conic[HY * LANES + i], conic[Y * LANES + i] - np.float32(first_row)
-    if high > _ZERO:
-        x, shear = conic[X * LANES + i] - np.float32(origin), conic[XY * LANES + i]
-        inverse, dx = conic[IY * LANES + i], conic[DX * LANES + i]
-        for r in range(_clip(np.ceil(y - high), rows), _clip(y + high + _ONE, rows)):
-            dy = np.float32(r) - y
-            middle = x + shear * dy
-            half = math.sqrt(dx * max(_ONE - dy * dy * inverse, _ZERO))
-            first = _clip(np.ceil(middle - half), 64 * words)
-            last = _clip(np.floor(middle + half) + _ONE, 64 * words) - 1
-            for w in range(words):
-                wanted[w, r] &= ~_run(first - 64 * w, last - 64 * w)
-
-
-@compiled
-def count_missed(model, words, rows, reach, steps, wanted, buffer):
-    """How many wanted pixels lie within a disc of the silhouette: an exact Euclidean dilation.
-
-    A disc is a horizontal run for each row offset. Taken from the longest run to the shortest, each
-    step widens all that came before by the difference of the runs (Horner's scheme). WORDS rows
-    at once, 64 columns to a word.
-
-    model: (words + 2, R) bit rows by word with empty words around, the first at row `reach`.
-    steps: (S, 2) pairs of: widen by a pixel to both sides or not, and the row offset to add or 0.
-    wanted: (words, rows + WORDS).  buffer: (2 * (parts + 2) * WORDS,) scratch.
-    """
-    pitch, half = model.shape[1], buffer.shape[0] // 2
-    missed = 0
-    for first in range(0, rows, WORDS):
-        some = np.uint64(0)
-        for w in range(words):
-            for r in range(first, first + WORDS):
-                some |= wanted[w, r]
-        if not some:
-            continue
-        for r in range(WORDS):
-            for w in range(words + 2):
-                buffer[w * WORDS + r] = model[w, reach + first + r]
-                buffer[half + w * WORDS + r] = np.uint64(0)
-        here, there = 0, half
-        for step in range(steps.shape[0]):
-            dy = steps[step, 1]
-            for w in range(1, words + 1):
-                # The empty word 0 of the model is what a step adds that only widens.
-                middle = w * pitch + reach + first if dy else 0
-                at = here + w * WORDS
-                if steps[step, 0]:
-                    widen(buffer, at, there + w * WORDS, model, middle - dy, middle + dy)
-                else:
-                    merge(buffer, at, model, middle - dy, middle + dy)
-            if steps[step, 0]:
-                here, there = there, here
-        for w in range(words):
-            missed += near(buffer, here + (w + 1) * WORDS, wanted, w * wanted.shape[1] + first)
-    return missed
+    if right == width:
+        # A block may reach past the image's edge.
+        word, inside = 1 + (right - 1 - origin) // 64, run(0, (right - 1 - origin) % 64)
+        for row in range(above, above + bottom - top):
+            model[word, row] &= inside
+            model[word + 1, row] = np.uint64(0)
+    return total(correct), total(false), total(residual)
 
 
 @_cached
 def pack_evidence(low, high, occluder, hand):
-    """Evidence as (3, H, W + padding) float32 images and (words + 1, H) bits of the hand."""
+    """Evidence as flat float32 blocks of three images and (words + 1, H + WORDS) bits of the hand.
+
+    Each block of BLOCK columns of a row has the band's middle, 1 / its half-width and the occluder,
+    such that nothing is correct where there is no band, and nothing counts beyond the last column.
+    """
     height, width = hand.shape
-    pitch = (width + 2 * BLOCK - 1) // BLOCK * BLOCK
-    images = np.empty((3, height, pitch), np.float32)
-    bits = np.zeros(((width + 63) // 64 + 1, height), np.uint64)
+    pitch = blocks(width)
+    images = _zeros(height * pitch * _IMAGES * BLOCK)
+    bits = np.zeros((((width + 63) >> 6) + 1, height + WORDS), np.uint64)
     for v in range(height):
-        for u in range(width):
-            images[0, v, u] = low[v, u]
-            images[1, v, u] = high[v, u]
-            images[2, v, u] = occluder[v, u]
-        for u in range(width, pitch):
-            images[0, v, u] = np.inf
-            images[1, v, u] = -np.inf
-            images[2, v, u] = np.inf
+        for block in range(pitch):
+            at = (v * pitch + block) * _IMAGES * BLOCK
+            for j in range(BLOCK):
+                u = block * BLOCK + j
+                middle, scale, hidden = _ZERO, np.float32(np.inf), np.float32(np.inf)
+                if u < width:
+                    hidden = max(occluder[v, u], _FAR)
+                    if high[v, u] > low[v, u]:
+                        # What is not drawn is 0, and must not be correct.
+                        least = max(low[v, u], np.float32(1e-6) * high[v, u])
+                        middle = np.float32(0.5) * (high[v, u] + least)
+                        scale = _TWO / (high[v, u] - least)
+                images[at + j] = middle
+                images[at + BLOCK + j] = scale
+                images[at + 2 * BLOCK + j] = hidden
         for u in range(width):
             bits[u >> 6, v] |= np.uint64(hand[v, u]) << np.uint64(u & 63)
     return images, bits
@@ -280,6 +226,7 @@ def score_hands(
     k,
     images,
     hand,
+    height,
     width,
     steps,
     slots,
@@ -291,50 +238,74 @@ def score_hands(
     counter,
     out,
 ):
-    """Score tasks of LANES particles as long as `counter` has any; called from several threads.
+    """Score particles as long as `counter` has any; called from several threads.
+
+    A task is LANES of them, the last ones fewer, so that no thread waits long for another.
 
     states: (N, 27).  k: fx, fy, cx, cy.  images, hand: of pack_evidence, for `width` columns.
     steps: of disc_steps.  slots .. surface: see NumbaScorer.
     counter: (1,) int64 tasks taken.  out: (4, N) correct, false, missed, residual.
     """
-    height, reach, parts = images.shape[1], steps[:, 1].max(), hand.shape[0] - 1
+    reach, parts = steps[:, 1].max(), hand.shape[0] - 1
+    whole = max(states.shape[0] // LANES - 2, 0)
     x = np.empty(27 * LANES, np.float32)
-    sines, cosines = np.empty((2, 25 * LANES), np.float32)
     frames = np.empty((16, 12 * LANES), np.float32)
     valid = np.empty(LANES, np.uint8)
     conics = np.empty((index.shape[0], TERMS * LANES), np.float32)
-    tile = np.empty(height * (64 * parts + 2 * BLOCK), np.float32)
-    spans = np.empty((2, height), np.int64)
-    lines = np.empty(5 * _ROWS, np.float32)
-    residuals = np.empty(BLOCK, np.float32)
-    model = np.empty((parts + 2, height + 2 * reach + WORDS), np.uint64)
-    wanted = np.empty((parts, height + WORDS), np.uint64)
-    buffer = np.empty(2 * (parts + 2) * WORDS, np.uint64)
+    boxes = np.empty(4 * LANES, np.float32)
+    tile = _zeros(0)
+    spans = np.empty(2 * (height + BLOCK), np.float32)
+    lines, places = np.empty(5 * _LISTED, np.float32), np.empty(_LISTED, np.int32)
+    model = np.empty((parts + 3, height + 2 * (reach + WORDS)), np.uint64)
+    wanted = np.empty((parts + 1, height + WORDS), np.uint64)
+    buffer = np.empty((2, (parts + 3) * WORDS), np.uint64)
     while True:
-        first = take(counter) * LANES
+        task, count = take(counter), LANES
+        first = task * LANES
+        if task >= whole:
+            first, count = whole * LANES + (task - whole) * _LAST, _LAST
         if first >= states.shape[0]:
             break
-        pose_hands(states, first, slots, base, lengths, mirror, x, sines, cosines, frames, valid)
-        project_hands(frames, index, surface, k[0], k[1], k[2], k[3], conics)
-        for i in range(min(LANES, states.shape[0] - first)):
+        pose_hands(states, first, slots, base, lengths, mirror, x, frames, valid)
+        project_hands(
+            frames,
+            index,
+            surface,
+            k[0],
+            k[1],
+            k[2],
+            k[3],
+            np.float32(width),
+            np.float32(height),
+            conics,
+            boxes,
+        )
+        for i in range(min(count, states.shape[0] - first)):
             for j in range(4):
                 out[j, first + i] = _ZERO
-            box = _box(conics, i, width, height)
-            left, top, right, bottom = box
+            left, top = int(boxes[LEFT * LANES + i]), int(boxes[TOP * LANES + i])
+            right, bottom = int(boxes[RIGHT * LANES + i]), int(boxes[BOTTOM * LANES + i])
             if not valid[i] or right <= left or bottom <= top:
                 continue
-            origin, first_row = max(0, left - reach), max(0, top - reach)
+            # Blocks of the tile are blocks of the evidence.
+            origin, first_row = max(0, left - reach) & -BLOCK, max(0, top - reach)
             rows = min(height, bottom + reach) - first_row
             words = (min(width, right + reach) - origin + 63) >> 6
-            stride = 64 * words + 2 * BLOCK
-            _render(conics, i, box, origin, stride, tile, spans, lines)
-            residuals[:] = _ZERO
-            model[: words + 2, : rows + 2 * reach + WORDS] = np.uint64(0)
+            stride = ((right - origin + 2 * BLOCK - 1) >> _BITS) << _BITS
+            # What is listed may begin a row farther than it is drawn.
+            if (bottom - top + 1) * stride > tile.shape[0]:
+                tile = _zeros((bottom - top + BLOCK) * (stride + 2 * BLOCK))
+            box = left, top, right, bottom
+            _render(conics, i, box, origin, stride, tile, spans, lines, places)
             above = reach + top - first_row
-            correct, false = _compare(
-                tile, stride, spans, box, origin, images, model, above, residuals
+            for w in range(words + 2):
+                for row in range(0, rows + 2 * reach + WORDS, WORDS):
+                    store_rows(model, w, row, no_rows())
+            correct, false, residual = _compare(
+                tile, stride, spans, box, origin, images, width, model, above
             )
-            out[0, first + i], out[1, first + i] = correct, false
-            _wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted)
+            out[0, first + i], out[1, first + i], out[3, first + i] = correct, false, residual
+            find_wanted(
+                conics, i, model, words, first_row, rows, origin, hand, reach, wanted, places
+            )
             out[2, first + i] = count_missed(model, words, rows, reach, steps, wanted, buffer)
-            out[3, first + i] = residuals.sum()

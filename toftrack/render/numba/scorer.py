@@ -47,7 +47,7 @@ class NumbaScorer:
             surface.frame_index.contiguous().numpy(),
             torch.cat((surface.centres_m, covariances[:, rows, columns]), 1).numpy(),
         )
-        self._frame: tuple = (None, None)
+        self._frame: tuple = (None, ())
         self._compile()
 
     def _compile(self) -> None:
@@ -60,34 +60,33 @@ class NumbaScorer:
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""
-        images, hand = self._packed(evidence)
-        height, width = evidence.hand.shape
-        k = _array(evidence.k, torch.float32)
         x = _array(states, torch.float32)
-        counts = torch.empty(4, len(x))
-        task = functools.partial(
-            score_hands,
-            x,
-            np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
-            images,
-            hand,
-            width,
-            disc_steps(evidence.radius_px, height, width),
-            *self._hand,
-            np.zeros(1, np.int64),
-            counts.numpy(),
-        )
-        run_shared(task, -(-len(x) // LANES))
-        return Counts(*counts.to(states.device))
+        counts = np.empty((4, len(x)), np.float32)
+        tasks = np.zeros(1, np.int64)
+        given = x, *self._packed(evidence), *self._hand, tasks, counts
+        # A second thread is not worth waking for less than a task of its own.
+        run_shared(functools.partial(score_hands, *given), len(x) // LANES)
+        return Counts(*torch.from_numpy(counts).to(states.device).unbind())
 
-    def _packed(self, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    def _packed(self, evidence: Evidence) -> tuple:
         """The evidence as the kernel wants it, once for all calls of a frame."""
         before, packed = self._frame
         if before is not evidence:
-            tensors = (evidence.low, evidence.high, evidence.occluder)
-            packed = pack_evidence(
-                *(_array(tensor, torch.float32) for tensor in tensors),
+            height, width = evidence.hand.shape
+            k = _array(evidence.k, torch.float32)
+            images, hand = pack_evidence(
+                _array(evidence.low, torch.float32),
+                _array(evidence.high, torch.float32),
+                _array(evidence.occluder, torch.float32),
                 _array(evidence.hand, torch.bool),
+            )
+            packed = (
+                np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+                images,
+                hand,
+                height,
+                width,
+                disc_steps(evidence.radius_px, height, width),
             )
             self._frame = evidence, packed
         return packed

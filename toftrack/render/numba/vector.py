@@ -1,169 +1,283 @@
-"""Vector instructions of the CPU kernel that numba does not reach from plain Python.
+"""Vectors of the CPU kernel: values of a compiled function that hold sixteen pixels at once.
 
-Written as LLVM vectors, which every processor has or gets split into what it has; they are inlined.
+Written as LLVM vectors, which every processor has or gets split into what it has. Numba keeps them
+in registers as it does a number.
 """
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable
+from functools import partial
+
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
+from numba.core.typing import signature
+from numba.core.typing.templates import ConcreteTemplate, infer_global
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
-BLOCK = 8
-"""Pixels of a row that are worked on at once; images need this much padding on the right."""
+BLOCK = 16
+"""Pixels of a row that are worked on at once; images need as much padding on the right."""
 
-WORDS = 8
-"""Words of 64 pixels, one above the other, that are worked on at once."""
+_FLOAT, _INT, _WORD = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_NUMBERS = ir.VectorType(_INT, BLOCK)
+_VECTOR = ir.VectorType(_FLOAT, BLOCK)
+# A product and a sum may be one operation, as everywhere in compiling.OPTIONS.
+_FAST = ("contract",)
 
-_VECTOR = ir.VectorType(ir.FloatType(), BLOCK)
-_WORDS = ir.VectorType(ir.IntType(64), WORDS)
+
+class Vector(types.Type):
+    """A numba type of a plain LLVM vector."""
+
+    def __init__(self, name: str, lltype: ir.VectorType) -> None:
+        self.lltype = lltype
+        super().__init__(name)
 
 
-def _pointer(context, builder, array_type, array, index, lltype=None):
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, dmm, fe_type) -> None:
+        super().__init__(dmm, fe_type, fe_type.lltype)
+
+
+FLOATS = Vector("toftrack_floats", _VECTOR)
+
+
+def spread(builder, value, lltype=_VECTOR):
+    """A number in every place of an LLVM vector; a vector as it is."""
+    if value.type == lltype:
+        return value
+    one = builder.insert_element(ir.Constant(lltype, ir.Undefined), value, _INT(0))
+    zeros = ir.Constant(ir.VectorType(_INT, lltype.count), [0] * lltype.count)
+    return builder.shuffle_vector(one, ir.Constant(lltype, ir.Undefined), zeros)
+
+
+def define(function: Callable, kind: Vector, number: types.Type, emit: Callable) -> None:
+    """Let an operator of Python take two vectors, or a vector and a number.
+
+    emit: the instruction's operands and its builder to its result.
+    """
+    pairs = [(kind, kind), (kind, number), (number, kind)]
+
+    class Template(ConcreteTemplate):
+        cases = [signature(kind, *pair) for pair in pairs]
+
+    def lowered(context, builder, sig, args):
+        return emit(builder, *(spread(builder, value, kind.lltype) for value in args))
+
+    infer_global(function)(Template)
+    for pair in pairs:
+        lower_builtin(function, *pair)(lowered)
+
+
+define(operator.add, FLOATS, types.float32, partial(ir.IRBuilder.fadd, flags=_FAST))
+define(operator.sub, FLOATS, types.float32, partial(ir.IRBuilder.fsub, flags=_FAST))
+define(operator.mul, FLOATS, types.float32, partial(ir.IRBuilder.fmul, flags=_FAST))
+define(operator.truediv, FLOATS, types.float32, ir.IRBuilder.fdiv)
+
+
+def pointer(context, builder, array_type, array, index, lltype=_VECTOR):
+    """To an LLVM vector that begins at an index of a flat array."""
     data = context.make_array(array_type)(context, builder, array).data
-    at = builder.gep(data, [index])
-    return at if lltype is None else builder.bitcast(at, lltype.as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), lltype.as_pointer())
 
 
-def _load(context, builder, array_type, array, index, lltype=_VECTOR):
-    align = 4 if lltype is _VECTOR else 8
-    return builder.load(_pointer(context, builder, array_type, array, index, lltype), align=align)
+def call(builder, name, *args):
+    """An intrinsic function of LLVM whose result is of its arguments' type."""
+    kinds = [arg.type for arg in args]
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(kinds[0], kinds), f"llvm.{name}"
+    )
+    return builder.call(function, args)
 
 
-def _splat(builder, value):
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.IntType(32)(0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), BLOCK), [0] * BLOCK)
-    return builder.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), zeros)
+def _unary(name: str):
+    def function(typingctx, vector):
+        def codegen(context, builder, signature, args):
+            return call(builder, f"{name}.v{BLOCK}f32", *args)
+
+        return FLOATS(FLOATS), codegen
+
+    return intrinsic(function)
+
+
+root, up, down = _unary("sqrt"), _unary("ceil"), _unary("floor")
+"""Square root (NaN below 0), and the next whole numbers."""
 
 
 @intrinsic
-def draw(typingctx, tile, index, t, u, slope, peak, curve):
-    """tile[index + j] = max(itself, u + slope t_j + sqrt(peak - curve t_j^2)), t_j = t + j."""
+def ramp(typingctx):
+    """0, 1, 2 ..: the columns of a block."""
+    return FLOATS(), lambda context, builder, signature, args: ir.Constant(
+        _VECTOR, [float(j) for j in range(BLOCK)]
+    )
+
+
+@intrinsic
+def splat(typingctx, value):
+    """The same number in every place."""
+    return FLOATS(types.float32), lambda context, builder, signature, args: spread(builder, args[0])
+
+
+def _choice(comparison: str):
+    def function(typingctx, vector, other):
+        def codegen(context, builder, signature, args):
+            left, right = (spread(builder, value) for value in args)
+            return builder.select(builder.fcmp_ordered(comparison, left, right), left, right)
+
+        return FLOATS(FLOATS, other), codegen
+
+    return intrinsic(function)
+
+
+larger, smaller = _choice(">"), _choice("<")
+"""The larger or smaller of two; the second where the first is NaN."""
+
+
+@intrinsic
+def where_above(typingctx, condition, vector, otherwise):
+    """The second where the first is above 0, elsewhere the third."""
 
     def codegen(context, builder, signature, args):
-        tile, index, *numbers = args
-        t, u, slope, peak, curve = (_splat(builder, number) for number in numbers)
-        fast = ("contract",)
+        yes = builder.fcmp_ordered(">", args[0], ir.Constant(_VECTOR, [0.0] * BLOCK))
+        return builder.select(yes, args[1], args[2])
+
+    return FLOATS(FLOATS, FLOATS, FLOATS), codegen
+
+
+@intrinsic
+def load(typingctx, array, index):
+    """BLOCK numbers of a flat array."""
+
+    def codegen(context, builder, signature, args):
+        return builder.load(pointer(context, builder, signature.args[0], *args), align=4)
+
+    return FLOATS(array, types.intp), codegen
+
+
+@intrinsic
+def store(typingctx, array, index, vector):
+    """BLOCK numbers into a flat array, as whole numbers where it is one of int32."""
+
+    def codegen(context, builder, signature, args):
+        array, index, vector = args
+        if signature.args[0].dtype == types.int32:
+            vector = builder.fptosi(vector, ir.VectorType(_INT, BLOCK))
+        at = pointer(context, builder, signature.args[0], array, index, vector.type)
+        builder.store(vector, at, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, FLOATS), codegen
+
+
+@intrinsic
+def total(typingctx, vector):
+    """The sum of all places."""
+
+    def codegen(context, builder, signature, args):
+        (vector,) = args
+        count = BLOCK
+        while count > 1:
+            count //= 2
+            halves = [
+                ir.Constant(ir.VectorType(_INT, count), list(range(first, first + count)))
+                for first in (0, count)
+            ]
+            undefined = ir.Constant(vector.type, ir.Undefined)
+            low, high = (builder.shuffle_vector(vector, undefined, half) for half in halves)
+            vector = builder.fadd(low, high)
+        return builder.extract_element(vector, _INT(0))
+
+    return types.float32(FLOATS), codegen
+
+
+def _root_estimate(context, builder, square):
+    """Square root to four digits where the processor has such an instruction, else in full.
+
+    Of a surface's thickness these are microns, and the root is what drawing waits for most.
+    """
+    features = context.codegen().magic_tuple()[-1].split(",")
+    if "+avx512f" not in features:
+        return call(builder, f"sqrt.v{BLOCK}f32", square)
+    mask = ir.IntType(BLOCK)
+    estimate = cgutils.get_or_insert_function(
+        builder.module,
+        ir.FunctionType(_VECTOR, [_VECTOR, _VECTOR, mask]),
+        "llvm.x86.avx512.rsqrt14.ps.512",
+    )
+    none = ir.Constant(_VECTOR, [0.0] * BLOCK)
+    return builder.fmul(square, builder.call(estimate, [square, none, mask(-1)]), flags=_FAST)
+
+
+@intrinsic
+def draw(typingctx, tile, index, t, plane, peak, slope, curve):
+    """tile[index + j] = max(itself, plane + slope j + sqrt(peak - curve t_j^2)), t_j = t + j."""
+
+    def codegen(context, builder, signature, args):
+        t, plane, peak, slope, curve = (spread(builder, arg) for arg in args[2:])
         steps = ir.Constant(_VECTOR, [float(j) for j in range(BLOCK)])
         t = builder.fadd(t, steps)
-        below = builder.fsub(peak, builder.fmul(curve, builder.fmul(t, t), fast), flags=fast)
-        sqrt = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), f"llvm.sqrt.v{BLOCK}f32"
+        below = builder.fsub(
+            peak, builder.fmul(curve, builder.fmul(t, t), flags=_FAST), flags=_FAST
         )
-        plane = builder.fadd(u, builder.fmul(slope, t, flags=fast), flags=fast)
-        new = builder.fadd(plane, builder.call(sqrt, [below]))
-        at = _pointer(context, builder, signature.args[0], tile, index, _VECTOR)
+        plane = builder.fadd(plane, builder.fmul(slope, steps, flags=_FAST), flags=_FAST)
+        new = builder.fadd(plane, _root_estimate(context, builder, below), flags=_FAST)
+        # As whole numbers, floats from 0 on are in the same order, and what misses, whose square is
+        # negative, is made so. A choice between floats would become a masked store.
+        sign = builder.and_(
+            builder.bitcast(below, _NUMBERS), ir.Constant(_NUMBERS, [1 << 31] * BLOCK)
+        )
+        new = builder.or_(builder.bitcast(new, _NUMBERS), sign)
+        at = pointer(context, builder, signature.args[0], *args[:2], _NUMBERS)
         old = builder.load(at, align=4)
-        # An ordered comparison: the NaN of a missed pixel loses.
-        builder.store(builder.select(builder.fcmp_ordered(">", new, old), new, old), at, align=4)
+        builder.store(call(builder, f"smax.v{BLOCK}i32", new, old), at, align=4)
         return context.get_dummy_value()
 
     return types.void(tile, types.intp, *(types.float32,) * 5), codegen
 
 
 @intrinsic
-def count(typingctx, tile, index, images, low, high, occluder, residuals):
-    """Bits of model, correct and false in the lowest 3 * BLOCK bits; adds to `residuals`."""
+def compare(typingctx, tile, index, images, block, model, place, correct, false, residual):
+    """A block of the tile against the evidence: its silhouette's bits, and what is summed up.
 
-    def codegen(context, builder, signature, args):
-        kinds = signature.args
-        u = _load(context, builder, kinds[0], args[0], args[1])
-        low, high, occluder = (_load(context, builder, kinds[2], args[2], i) for i in args[3:6])
-        zero, half = (ir.Constant(_VECTOR, [value] * BLOCK) for value in (0.0, 0.5))
-        model = builder.fcmp_ordered(">", u, zero)
-        correct = builder.and_(
-            builder.fcmp_ordered(">=", u, low), builder.fcmp_ordered("<=", u, high)
-        )
-        correct = builder.and_(model, correct)
-        false = builder.and_(model, builder.fcmp_ordered(">=", u, occluder))
-        false = builder.and_(false, builder.not_(correct))
-        middle = builder.fmul(builder.fadd(low, high), half)
-        width = builder.fmul(builder.fsub(high, low), half)
-        part = builder.fdiv(builder.fsub(u, middle), width)
-        part = builder.select(correct, builder.fmul(part, part), zero)
-        at = _pointer(context, builder, kinds[6], args[6], ir.IntType(64)(0), _VECTOR)
-        builder.store(builder.fadd(builder.load(at, align=4), part), at, align=4)
-        word, packed = ir.IntType(64), ir.IntType(64)(0)
-        for shift, bits in ((0, model), (BLOCK, correct), (2 * BLOCK, false)):
-            bits = builder.zext(builder.bitcast(bits, ir.IntType(BLOCK)), word)
-            packed = builder.or_(packed, builder.shl(bits, word(shift)))
-        return packed
-
-    indices = (types.intp,) * 3
-    return types.uint64(tile, types.intp, images, *indices, residuals), codegen
-
-
-@intrinsic
-def widen(typingctx, buffer, at, to, model, over, under):
-    """Words from `at` widened by a bit to both sides, and two of the model's, are stored at `to`.
-
-    The words to the left and right are WORDS before and after.
+    The block is then cleared. images: see pack_evidence; block: its index there, times 3 * BLOCK.
+    model: words of bits; place: which of their quarters, in the order of memory, is set.
+    Returns correct, false and residual (FLOATS) with the block's added.
     """
 
-    def codegen(context, builder, signature, args):
-        kinds, (buffer, at, to, model, over, under) = signature.args, args
-        one, top = (ir.Constant(_WORDS, [value] * WORDS) for value in (1, 63))
-        step = ir.IntType(64)(WORDS)
-        left, middle, right = (
-            _load(context, builder, kinds[0], buffer, i, _WORDS)
-            for i in (builder.sub(at, step), at, builder.add(at, step))
-        )
-        parts = (
-            builder.shl(middle, one),
-            builder.lshr(middle, one),
-            builder.lshr(left, top),
-            builder.shl(right, top),
-            _load(context, builder, kinds[3], model, over, _WORDS),
-            _load(context, builder, kinds[3], model, under, _WORDS),
-        )
-        for part in parts:
-            middle = builder.or_(middle, part)
-        builder.store(middle, _pointer(context, builder, kinds[0], buffer, to, _WORDS), align=8)
-        return context.get_dummy_value()
-
-    indices = (types.intp,) * 2
-    return types.void(buffer, *indices, model, *indices), codegen
-
-
-@intrinsic
-def merge(typingctx, buffer, at, model, over, under):
-    """Two times WORDS words of the model are added to those at `at`."""
-
-    def codegen(context, builder, signature, args):
-        kinds, (buffer, at, model, over, under) = signature.args, args
-        words = _load(context, builder, kinds[0], buffer, at, _WORDS)
-        for index in (over, under):
-            words = builder.or_(words, _load(context, builder, kinds[2], model, index, _WORDS))
-        builder.store(words, _pointer(context, builder, kinds[0], buffer, at, _WORDS), align=8)
-        return context.get_dummy_value()
-
-    return types.void(buffer, types.intp, model, types.intp, types.intp), codegen
-
-
-@intrinsic
-def near(typingctx, buffer, at, wanted, index):
-    """How many bits WORDS words of both have in common."""
-
-    def codegen(context, builder, signature, args):
-        words = builder.and_(
-            _load(context, builder, signature.args[0], args[0], args[1], _WORDS),
-            _load(context, builder, signature.args[2], args[2], args[3], _WORDS),
-        )
-        total = ir.IntType(64)(0)
-        for j in range(WORDS):
-            total = builder.add(
-                total, builder.ctpop(builder.extract_element(words, ir.IntType(32)(j)))
+    def codegen(context, builder, sig, args):
+        kinds = sig.args
+        tile, index, images, block, model, place, *sums = args
+        at = pointer(context, builder, kinds[0], tile, index)
+        u = builder.load(at, align=4)
+        zero, one = (ir.Constant(_VECTOR, [value] * BLOCK) for value in (0.0, 1.0))
+        builder.store(zero, at, align=4)
+        middle, scale, occluder = (
+            builder.load(
+                pointer(context, builder, kinds[2], images, builder.add(block, _WORD(j * BLOCK))),
+                align=4,
             )
-        return total
+            for j in range(3)
+        )
+        off = builder.fmul(builder.fsub(u, middle), scale)
+        square = builder.fmul(off, off, flags=_FAST)
+        drawn = builder.fcmp_ordered(">", u, zero)
+        right = builder.fcmp_ordered("<=", square, one)
+        wrong = builder.and_(
+            builder.fcmp_unordered(">", square, one), builder.fcmp_ordered(">=", u, occluder)
+        )
+        quarter = ir.IntType(BLOCK)
+        words = context.make_array(kinds[4])(context, builder, model).data
+        quarters = builder.bitcast(words, quarter.as_pointer())
+        builder.store(builder.bitcast(drawn, quarter), builder.gep(quarters, [place]))
+        found = [
+            builder.select(which, builder.fadd(before, more, flags=_FAST), before)
+            for which, before, more in zip(
+                (right, wrong, right), sums, (one, one, square), strict=True
+            )
+        ]
+        return context.make_tuple(builder, sig.return_type, found)
 
-    return types.int64(buffer, types.intp, wanted, types.intp), codegen
-
-
-@intrinsic
-def ones(typingctx, word):
-    """How many bits are set."""
-
-    def codegen(context, builder, signature, args):
-        return builder.ctpop(args[0])
-
-    return types.int64(types.uint64), codegen
+    sums = (FLOATS,) * 3
+    given = (tile, types.intp, images, types.intp, model, types.intp)
+    return types.Tuple(sums)(*given, *sums), codegen

@@ -13,6 +13,7 @@ import torch
 import triton
 from torch import Tensor
 
+from toftrack.compute.transfer import on_device
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
@@ -46,17 +47,26 @@ class TritonScorer:
 
     name = "triton"
 
-    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """shape: on the CUDA device.  surface: instead of the shape's own.
+    def __init__(
+        self,
+        shape: HandShape,
+        surface: HandSurface | None = None,
+        device: torch.device | None = None,
+    ) -> None:
+        """surface: instead of the shape's own.  device: of the states to come; None = the shape's.
 
         Raises ImportError where it cannot run.
         """
         require_device()
-        surface = surface or hand_surface(shape)
-        self._large = TorchScorer(shape, surface)
-        device = shape.base_m.device
-        numbers, slots = _tables(shape.to("cpu"), surface.to("cpu"))
-        self._numbers, self._slots = numbers.to(device), slots.to(device)
+        self._device = device or shape.base_m.device
+        self._shape = shape.to("cpu")
+        self._surface = hand_surface(self._shape) if surface is None else surface.to("cpu")
+        tables = _tables(self._shape, self._surface)
+        self._numbers, self._slots = (on_device(part, self._device) for part in tables)
+
+    @functools.cached_property
+    def _large(self) -> TorchScorer:
+        return TorchScorer(self._shape.to(self._device), self._surface.to(self._device))
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""
@@ -140,7 +150,7 @@ class TritonScorer:
 def _steps(radius_px: float, height: int, width: int, device: torch.device) -> tuple[Tensor, int]:
     """Steps of the disc on the device, and its reach; kept, a copy to the device takes time."""
     steps = torch.from_numpy(disc_steps(radius_px, height, width)).int()
-    return steps.to(device), int(steps[:, 1].max())
+    return on_device(steps, device), int(steps[:, 1].max())
 
 
 def _tables(shape: HandShape, surface: HandSurface) -> tuple[Tensor, Tensor]:

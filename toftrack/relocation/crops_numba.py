@@ -1,0 +1,62 @@
+"""Reading a crop from an image in compiled code; the same as crops.crop."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from toftrack.compute.compiling import compiled
+
+_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_LEAST_SLOPE = np.float32(0.05)
+
+
+@compiled
+def read_crop(depth, flip, mapping, slope, scale, distance, image):
+    """The channels of a crop, see crops.channels, from the pixels nearest to its samples.
+
+    depth: (H, W) float32, Z in metres; read as a mirror shows it where flip is true.
+    mapping: (3, 3) float32 from the crop's samples to pixels.
+    slope: (3,) float32, of a sample: its Z over its z along the crop's axis.
+    scale: from metres to half cubes.  distance: of the crop's centre, metres.
+    image: (3, CROP, CROP) float32, written.
+    """
+    size = image.shape[1]
+    samples = 2 * size
+    places, share = np.empty(samples, np.int64), np.empty(samples, np.float32)
+    for row in range(size):
+        image[:, row] = _ZERO
+        for line in range(2 * row, 2 * row + 2):
+            _place(depth.shape, flip, mapping, slope, np.float32(line), places, share)
+            for sample in range(samples):
+                if places[sample] < 0:
+                    continue
+                z = depth.flat[places[sample]] * share[sample]
+                if z > _ZERO:
+                    relative = (z - distance) * scale
+                    column = sample // 2
+                    image[0, row, column] += min(max(relative, -_ONE), _ONE)
+                    image[1, row, column] += np.float32(0.25) * (abs(relative) < _ONE)
+                    image[2, row, column] += np.float32(0.25)
+        for column in range(size):
+            share_read = image[2, row, column]
+            mean = np.float32(0.25) * image[0, row, column] / max(share_read, np.float32(0.25))
+            image[0, row, column] = mean if share_read > _ZERO else _ONE
+            image[2, row, column] = _ONE - share_read
+
+
+@compiled
+def _place(shape, flip, mapping, slope, line, places, share):
+    """Of a line's samples: the flat places of their pixels, -1 for none, and z over Z."""
+    height, width = np.float32(shape[0]), np.float32(shape[1])
+    for sample in range(len(places)):  # vectorised
+        a = np.float32(sample)
+        w = _ONE / (mapping[2, 0] * a + mapping[2, 1] * line + mapping[2, 2])
+        u = np.floor((mapping[0, 0] * a + mapping[0, 1] * line + mapping[0, 2]) * w + _HALF)
+        v = np.floor((mapping[1, 0] * a + mapping[1, 1] * line + mapping[1, 2]) * w + _HALF)
+        s = slope[0] * a + slope[1] * line + slope[2]
+        seen = (w > _ZERO) & (s > _LEAST_SLOPE)
+        seen = seen & (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
+        column = width - _ONE - u if flip else u
+        place = np.int64(v if seen else _ZERO) * shape[1] + np.int64(column if seen else _ZERO)
+        places[sample] = place if seen else -1
+        share[sample] = _ONE / s

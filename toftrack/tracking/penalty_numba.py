@@ -1,0 +1,65 @@
+"""The same as penalty.py, compiled: for the few hands that are compared in every frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.compute.compiling import called, entry_point
+from toftrack.hand import overlap, overlap_numba
+from toftrack.hand.overlap_numba import add_overlaps
+from toftrack.refinement.gauss_newton import Landmarks
+from toftrack.tracking import penalty
+from toftrack.tracking.penalty import FAR_SIGMAS
+
+_cached = entry_point(__file__, *(m.__file__ for m in (overlap, overlap_numba, penalty)))
+
+
+def joints_penalty(
+    joints_m: Tensor,
+    hand_length_m: float,
+    overlap_weight: float,
+    votes: Landmarks | None,
+    votes_weight: float,
+) -> Tensor:
+    """See penalty.joints_penalty; on the CPU, in float32."""
+    out = torch.empty(len(joints_m))
+    called(
+        penalise,
+        "tracker: compiling what compares joints (once, about 1 s)",
+        joints_m.to("cpu", torch.float32).contiguous().numpy(),
+        hand_length_m,
+        float(overlap_weight),
+        _NONE if votes is None else votes.points_m.float().contiguous().numpy(),
+        _NO_SIGMA if votes is None else votes.sigma_m.float().contiguous().numpy(),
+        float(votes_weight),
+        out.numpy(),
+    )
+    return out
+
+
+_NONE, _NO_SIGMA = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+
+
+@_cached
+def penalise(joints, hand_length_m, overlap_weight, points, sigma, votes_weight, out):
+    """joints: (N, 21, 3), points: (21, 3) and sigma: (21,), or both empty, out: (N,); float32."""
+    hand = np.empty((21, 3))
+    for n in range(len(joints)):
+        of_finger, away = np.zeros(5), 0.0
+        for j in range(21):
+            for i in range(3):
+                hand[j, i] = joints[n, j, i]
+        if overlap_weight > 0:
+            add_overlaps(hand, hand_length_m, of_finger)
+        for j in range(len(points)):
+            off = 0.0
+            for i in range(3):
+                gap = hand[j, i] - points[j, i]
+                off += gap * gap
+            off /= np.float64(sigma[j]) * sigma[j]
+            # Of a sigma that is infinite nothing is known.
+            away += off / (1 + off / FAR_SIGMAS**2) / 21
+        # Every finger's overlap with all others holds each pair twice.
+        out[n] = 0.5 * overlap_weight * of_finger.sum() + votes_weight * away
