@@ -12,6 +12,7 @@ from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
 from toftrack.output.evaluation import TIPS
+from toftrack.render.numba.median import SIDE, thinned
 from toftrack.render.segmentation import Expected, NearestSurface, reduce_image
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 100.0
@@ -323,3 +324,13 @@ def test_a_hand_that_is_expected_behind_the_camera_is_no_error(z: float) -> None
     depth, k = np.full((144, 176), 0.5, np.float32), np.diag([200.0, 200.0, 1.0])
     expected = Expected(z, z + 0.1, (0.0, 0.0, z))
     nearest_surface()(depth, k, expected)
+
+
+@pytest.mark.parametrize("factor", [3, 4, 5, 7])
+@pytest.mark.parametrize("size", [(1, 1), (4, 5), (61, 130), (240, 323)])
+def test_a_large_image_is_filtered_only_where_it_is_read(size, factor):
+    g = np.random.default_rng(factor)
+    image = np.where(g.random(size) < 0.3, 0, g.random(size)).astype(np.float32)
+    offset = (factor - 1) // 2
+    everywhere = cv2.medianBlur(image, SIDE)[offset::factor, offset::factor]
+    np.testing.assert_array_equal(thinned(image, factor, offset), everywhere)

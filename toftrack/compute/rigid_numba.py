@@ -190,10 +190,14 @@ def mix_columns(frame, column, angle):
 @_cached
 def joints_of(states, base_frames, base, lengths, mirror, joints):
     """The joints of N hands alone, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32."""
-    frames, posed = np.empty((16, 3, 3)), np.empty((21, 3))
+    frames, posed, state = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty(27)
     for i in range(len(states)):
-        pose_hand(states[i].astype(np.float64), base_frames, base, lengths, mirror, frames, posed)
-        joints[i] = posed
+        for j in range(27):
+            state[j] = states[i, j]
+        pose_hand(state, base_frames, base, lengths, mirror, frames, posed)
+        for j in range(21):
+            for k in range(3):
+                joints[i, j, k] = posed[j, k]
 
 
 @_cached

@@ -1,7 +1,8 @@
 """Before the first frame: kernels that were never compiled here are, by two processes at once.
 
 numba compiles one kernel after the other in a process, and keeps the code on the disk for all.
-`python -m toftrack.programs.ahead` is the second process; it compiles the refinement's.
+`python -m toftrack.programs.ahead` is the second process; it compiles the refinement's, and what
+else takes a second.
 """
 
 from __future__ import annotations
@@ -13,11 +14,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from omegaconf import DictConfig
 
 import toftrack
 from toftrack.api import build_hands_tracker, compute_device
+from toftrack.hand.openxr import openxr_rig
 from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
 from toftrack.tracking.hands import HandsTracker
 
 _log = logging.getLogger(__name__)
@@ -30,6 +35,10 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
         tracker = build_hands_tracker(config)
         if helper is not None:
             tracker.model.backend.make_scorer(tracker.model.shape)
+            if tracker.model.relocaliser is not None:
+                from toftrack.relocation.proposals_numba import compile_look
+
+                compile_look()
             helper.wait()
     finally:
         if helper is not None:
@@ -72,9 +81,19 @@ def must_be_compiled(kernel: Any) -> bool:
 
 def main() -> None:
     """What the second process does."""
+    from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+    from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
+    from toftrack.tracking.penalty_numba import joints_penalty
 
-    CompiledRefiner(default_hand_shape())
+    shape = default_hand_shape()
+    CompiledRefiner(shape)
+    pixel, hand = np.ones((1, 1), np.float32), np.ones((1, 1), bool)
+    smooth_points(pixel, hand, (0, 0), np.eye(3, dtype=np.float32), 1.0, 1.0)
+    nearest_of_labels(np.ones((1, 1), np.int32), hand, (0, 0))
+    joints = forward_kinematics(torch.zeros(1, 27), shape).joints_m
+    joints_penalty(joints, shape.hand_length_m, 1.0, None, 0.0)
+    openxr_hand_compiled(joints[0].numpy(), np.zeros(27), openxr_rig(shape))
 
 
 if __name__ == "__main__":

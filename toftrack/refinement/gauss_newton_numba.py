@@ -27,6 +27,7 @@ from toftrack.refinement.residuals_numba import (
     add_silhouette,
     assemble,
     choose_points,
+    clear,
     joint_axes,
     nearest_ellipsoids,
     pose_ellipsoids,
@@ -106,7 +107,7 @@ def _refine(state, prior, landmarks, seen, shape, surface, settings, work):
         pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
         pose_ellipsoids(frames, joints, index, centres, semi_axes, posed)
         joint_axes(frames, base_frames, mirror, axes)
-        wrenches[:] = 0.0
+        clear(wrenches)
         nearest_ellipsoids(xyz, count, posed, distance, nearest)
         add_points(matched, count, index, posed, hand, settings, wrenches)
         add_silhouette(seen, lengths, hand, deviation, wrenches)
@@ -218,7 +219,7 @@ class CompiledRefiner:
         else:
             points = _array(landmarks.points_m).reshape(-1, 21, 3)
             sigma = np.broadcast_to(_array(landmarks.sigma_m), (len(points), 21))
-            known = points, np.ascontiguousarray(sigma)
+            known = points, sigma.copy()  # which may be written to, as the kernel was compiled for
         refined = _array(states)
         task = functools.partial(
             refine_hands,

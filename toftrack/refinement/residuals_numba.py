@@ -248,7 +248,10 @@ def assemble(wrenches, hand, twists, sums):
     """
     _, joints, axes = hand
     normal, gradient = sums
-    normal[:], twists[:6] = 0.0, 0.0
+    clear(normal)
+    for i in range(6):
+        for j in range(6):
+            twists[i, j] = 0.0
     for i in range(3):
         twists[i, i], twists[3 + i, 3 + i] = 1.0, 1.0
         # -(e x o), o being the wrist.
@@ -266,7 +269,10 @@ def assemble(wrenches, hand, twists, sums):
                     twists[dof, i], twists[dof, 3 + i] = a[k] * o[j] - a[j] * o[k], a[i]
                 dof += 1
         for bone in range(2, -1, -1):
-            wrenches[0 if bone == 0 else 3 * finger + bone] += wrenches[3 * finger + bone + 1]
+            to, of = wrenches[0 if bone == 0 else 3 * finger + bone], 3 * finger + bone + 1
+            for i in range(7):
+                for j in range(6):
+                    to[i, j] += wrenches[of, i, j]
     dof = 6
     for finger in range(5):
         first = dof
@@ -276,6 +282,13 @@ def assemble(wrenches, hand, twists, sums):
                 dof += 1
     for dof in range(6):
         _couple(dof, dof + 1, wrenches[0], twists, normal, gradient)
+
+
+@compiled
+def clear(array):
+    """Zeros; a slice that is written to takes numba seconds to compile."""
+    for i in range(array.size):
+        array.flat[i] = 0.0
 
 
 @compiled

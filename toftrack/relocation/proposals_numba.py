@@ -39,6 +39,7 @@ from toftrack.relocation.network import (
 )
 from toftrack.relocation.network_numba import PackedPoseNet, pack_pose_net, pose_outputs
 from toftrack.relocation.proposals import DOUBT_M, KEPT, MIRROR, Look, mean_hand
+from toftrack.relocation.weights import make_ready
 
 _SOURCES = (rigid_numba, overlap, overlap_numba, crops, crops_numba, network, network_numba)
 _cached = entry_point(__file__, *(module.__file__ for module in (*_SOURCES, convolution_numba)))
@@ -57,11 +58,10 @@ def look(
     """See proposals.look, which it is where the network is on another device."""
     if pose.anchors.device.type != "cpu":
         return proposals.look(pose, depth_m, k, centres_m, side)
-    centres = np.asarray(centres_m, np.float64).reshape(-1, 3)
+    # Copies: numba compiles once more for arrays that must not be written to.
+    centres, k = np.array(centres_m, np.float64).reshape(-1, 3), np.array(k, np.float64)
     left = side == "left"
-    k = np.asarray(k, np.float64)
     if left:
-        k = k.copy()
         k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
         centres = centres * MIRROR.numpy()
     turns = np.stack([crop_rotation(centre) for centre in centres])
@@ -88,6 +88,15 @@ def look(
     else:
         called(look_at, _COMPILING, *task.args)
     return Look(**{name: torch.from_numpy(array) for name, array in out.items()})
+
+
+def compile_look() -> None:
+    """Compile the kernels of `look`, if need be."""
+    if not look_at.signatures:
+        pose = PoseNet(1)
+        make_ready(pose)
+        ahead = np.array([[0.0, 0.0, 0.5]])
+        look(pose, np.ones((2, 2), np.float32), np.eye(3), ahead, "right")
 
 
 @functools.lru_cache(maxsize=2)
@@ -168,7 +177,7 @@ def _decode(heads, votes, depth, turn, centre, mirror, hand, c, out):
         _into_camera(p, turn, centre, mirror, joints[c, j])
     of_finger = np.zeros(5)
     length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
-    add_overlaps(joints[c].astype(np.float64), length, of_finger)
+    add_overlaps(joints[c], length, of_finger)
     for finger in range(5):
         doubt = DOUBT_M * min(of_finger[finger], 1.0)
         for joint in range(2 + 4 * finger, 5 + 4 * finger):
@@ -183,13 +192,14 @@ def _decode_hypotheses(told, turn, centre, mirror, hand, c, out):
     chance = np.empty(count)
     for h in range(count):
         chance[h] = told[h * _EACH + _EACH - 2]
-    top, total = chance.max(), 0.0
+    first, total = _largest(chance), 0.0
+    top = chance[first]
     for h in range(count):
         total += math.exp(chance[h] - top)
     matrix, state = np.empty((3, 3)), np.zeros(27)
     frames, posed = np.empty((16, 3, 3)), np.empty((JOINTS, 3))
     for kept in range(KEPT):
-        h = chance.argmax()
+        h = _largest(chance)
         log_probability[c, kept] = chance[h] - top - math.log(total)
         chance[h] = -np.inf
         one = told[h * _EACH : (h + 1) * _EACH]
@@ -217,6 +227,15 @@ def _decode_hypotheses(told, turn, centre, mirror, hand, c, out):
                 middle += frames[0, i, k] * _PIVOT[k]
             for j in range(JOINTS):
                 joints[c, kept, j, i] = pivot[c, kept, i] + size * (posed[j, i] - middle)
+
+
+@compiled
+def _largest(values):
+    found = 0
+    for i in range(len(values)):
+        if values[i] > values[found]:
+            found = i
+    return found
 
 
 @compiled

@@ -55,6 +55,8 @@ _PARTS = ("hand", "kernel", "missed", "vector", "words")
 _cached = entry_point(*(Path(__file__).with_name(f"{part}.py") for part in _PARTS))
 
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+_LAST = 8
+"""Particles of a task near the end."""
 _LISTED = 256
 """How many blocks are listed before they are drawn."""
 _FAR = np.float32(1e-30)
@@ -236,13 +238,16 @@ def score_hands(
     counter,
     out,
 ):
-    """Score tasks of LANES particles as long as `counter` has any; called from several threads.
+    """Score particles as long as `counter` has any; called from several threads.
+
+    A task is LANES of them, the last ones fewer, so that no thread waits long for another.
 
     states: (N, 27).  k: fx, fy, cx, cy.  images, hand: of pack_evidence, for `width` columns.
     steps: of disc_steps.  slots .. surface: see NumbaScorer.
     counter: (1,) int64 tasks taken.  out: (4, N) correct, false, missed, residual.
     """
     reach, parts = steps[:, 1].max(), hand.shape[0] - 1
+    whole = max(states.shape[0] // LANES - 2, 0)
     x = np.empty(27 * LANES, np.float32)
     frames = np.empty((16, 12 * LANES), np.float32)
     valid = np.empty(LANES, np.uint8)
@@ -255,7 +260,10 @@ def score_hands(
     wanted = np.empty((parts + 1, height + WORDS), np.uint64)
     buffer = np.empty((2, (parts + 3) * WORDS), np.uint64)
     while True:
-        first = take(counter) * LANES
+        task, count = take(counter), LANES
+        first = task * LANES
+        if task >= whole:
+            first, count = whole * LANES + (task - whole) * _LAST, _LAST
         if first >= states.shape[0]:
             break
         pose_hands(states, first, slots, base, lengths, mirror, x, frames, valid)
@@ -272,7 +280,7 @@ def score_hands(
             conics,
             boxes,
         )
-        for i in range(min(LANES, states.shape[0] - first)):
+        for i in range(min(count, states.shape[0] - first)):
             for j in range(4):
                 out[j, first + i] = _ZERO
             left, top = int(boxes[LEFT * LANES + i]), int(boxes[TOP * LANES + i])

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from toftrack.compute.compiling import announced, compiled, entry_point, take
-from toftrack.compute.threads import run_shared
+from toftrack.compute.compiling import announced, compiled, entry_point
 from toftrack.render.numba import vector
 from toftrack.render.numba.vector import BLOCK, FLOATS, store
 
 SIDE = 5
 """Rows and columns of the window."""
-_TASKS = 4
-"""Parts of the image that threads take."""
 
 
 def exchanges(count: int) -> list[tuple[int, int]]:
@@ -82,8 +77,8 @@ def _take_every(source, start, factor, line, count):
 
 
 @entry_point(__file__, vector.__file__)
-def _thinned(image, factor, offset, counter, tasks, out):
-    """Rows of `out` as long as `counter` has any of the tasks; called from several threads."""
+def _thinned(image, factor, offset, out):
+    """See `thinned`."""
     height, (rows, columns) = image.shape[0], out.shape
     pitch = (columns + 1 + BLOCK) // BLOCK * BLOCK + BLOCK
     # Of the last SIDE rows of the image: every `factor`-th pixel, from SIDE first ones on. What
@@ -92,45 +87,37 @@ def _thinned(image, factor, offset, counter, tasks, out):
     lines = np.zeros(SIDE * phases * pitch, np.float32)
     held, starts = np.full(SIDE, -1), np.empty(SIDE * SIDE, np.int64)
     found = np.empty(pitch, np.float32)
-    while True:
-        task = take(counter)
-        if task >= tasks:
-            break
-        for row in range(task * rows // tasks, (task + 1) * rows // tasks):
-            for j in range(SIDE):
-                source = min(max(row * factor + offset + j - SIDE // 2, 0), height - 1)
-                slot = source % SIDE
-                for i in range(SIDE):
-                    starts[j * SIDE + i] = (slot * phases + i % phases) * pitch + i // phases
-                if held[slot] == source:
-                    continue
-                held[slot] = source
-                for i in range(phases):
-                    line = lines[(slot * phases + i) * pitch : (slot * phases + i + 1) * pitch]
-                    start = offset + i - SIDE // 2
-                    _take_every(image[source], start, factor, line, columns + 1)
-            for column in range(0, columns, BLOCK):
-                store(found, column, _median(lines, starts, column))
-            for column in range(columns):
-                out[row, column] = found[column]
+    for row in range(rows):
+        for j in range(SIDE):
+            source = min(max(row * factor + offset + j - SIDE // 2, 0), height - 1)
+            slot = source % SIDE
+            for i in range(SIDE):
+                starts[j * SIDE + i] = (slot * phases + i % phases) * pitch + i // phases
+            if held[slot] == source:
+                continue
+            held[slot] = source
+            for i in range(phases):
+                line = lines[(slot * phases + i) * pitch : (slot * phases + i + 1) * pitch]
+                _take_every(image[source], offset + i - SIDE // 2, factor, line, columns + 1)
+        for column in range(0, columns, BLOCK):
+            store(found, column, _median(lines, starts, column))
+        for column in range(columns):
+            out[row, column] = found[column]
 
 
 def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
     """Every `factor`-th pixel from `offset` on of an image filtered by the median of SIDE x SIDE.
 
-    image: (H, W) float32 without NaN; at its edge, the last pixels are repeated. The same as
-    cv2.medianBlur(image, SIDE)[offset::factor, offset::factor], without the pixels between.
+    image: (H, W) float32 without NaN; at its edge, the last pixels are repeated.
+    factor: 3 or more.
+    The same as cv2.medianBlur(image, SIDE)[offset::factor, offset::factor], without the pixels
+    between. On one thread, for meanwhile the networks have the others.
     """
     rows, columns = (len(range(offset, size, factor)) for size in image.shape)
     out = np.empty((rows, columns), np.float32)
-
-    def call() -> None:
-        counter = np.zeros(1, np.int64)
-        run_shared(functools.partial(_thinned, image, factor, offset, counter, _TASKS, out), _TASKS)
-
     if _thinned.signatures:
-        call()
+        _thinned(image, factor, offset, out)
     else:
         with announced("segmentation: compiling the numba kernel (once, about 2 s)"):
-            call()
+            _thinned(image, factor, offset, out)
     return out

@@ -64,7 +64,8 @@ class NumbaScorer:
         counts = np.empty((4, len(x)), np.float32)
         tasks = np.zeros(1, np.int64)
         given = x, *self._packed(evidence), *self._hand, tasks, counts
-        run_shared(functools.partial(score_hands, *given), -(-len(x) // LANES))
+        # A second thread is not worth waking for less than a task of its own.
+        run_shared(functools.partial(score_hands, *given), len(x) // LANES)
         return Counts(*torch.from_numpy(counts).to(states.device).unbind())
 
     def _packed(self, evidence: Evidence) -> tuple:
