@@ -84,6 +84,7 @@ def main() -> None:
     from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
+    from toftrack.render.numba.median import thinned
     from toftrack.tracking.penalty_numba import joints_penalty
 
     shape = default_hand_shape()
@@ -94,6 +95,7 @@ def main() -> None:
     joints = forward_kinematics(torch.zeros(1, 27), shape).joints_m
     joints_penalty(joints, shape.hand_length_m, 1.0, None, 0.0)
     openxr_hand_compiled(joints[0].numpy(), np.zeros(27), openxr_rig(shape))
+    thinned(np.zeros((3, 3), np.float32), 3, 1)  # of images that are reduced
 
 
 if __name__ == "__main__":
