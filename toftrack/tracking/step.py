@@ -278,8 +278,8 @@ def _sized(
 def _shape_learned(belief: ShapeBelief, found: Found, frame: ObservedFrame) -> ShapeBelief:
     """What is believed of the hand's shape after a believed estimate."""
     model, hand, glance = frame.model, frame.hand, frame.glance
-    if model.adapt is None or glance is None or frame.hidden:
-        return belief
+    if model.adapt is None or glance is None or frame.hidden or belief.worn != hand.worn:
+        return belief  # of a hand that was given up in this very frame nothing is learned
     votes = landmarks_of(glance, model)
     return shape_fit.learned(
         belief, found.pose, hand.shape, hand.derivatives, glance, votes, model.adapt, hand.first
