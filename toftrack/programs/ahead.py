@@ -13,12 +13,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 
 import toftrack
 from toftrack.api import build_hands_tracker, compute_device
 from toftrack.hand.shape import default_hand_shape
 from toftrack.tracking.hands import HandsTracker
+from toftrack.tracking.model import TrackerModel
 
 _log = logging.getLogger(__name__)
 
@@ -29,13 +31,22 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
     try:
         tracker = build_hands_tracker(config)
         if helper is not None:
-            tracker.model.backend.make_scorer(tracker.model.shape)
+            _compile_here(tracker.model)
             helper.wait()
     finally:
         if helper is not None:
             helper.kill()
             helper.wait()
     return tracker
+
+
+def _compile_here(model: TrackerModel) -> None:
+    """The large kernels but for the one that the second process compiles."""
+    model.backend.make_scorer(model.shape)
+    if model.relocaliser is not None:
+        nothing = np.zeros((72, 88), np.float32)
+        k = np.array([[110.0, 0, 44], [0, 110.0, 36], [0, 0, 1]])
+        model.relocaliser.glance(nothing, k, np.array([[0.0, 0.0, 0.5]]), model.shape.side)
 
 
 def _helper(config: DictConfig) -> subprocess.Popen | None:

@@ -218,7 +218,7 @@ class CompiledRefiner:
         else:
             points = _array(landmarks.points_m).reshape(-1, 21, 3)
             sigma = np.broadcast_to(_array(landmarks.sigma_m), (len(points), 21))
-            known = points, np.ascontiguousarray(sigma)
+            known = points, np.array(sigma, order="C")  # of read-only ones numba compiles others
         refined = _array(states)
         task = functools.partial(
             refine_hands,

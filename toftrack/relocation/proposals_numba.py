@@ -59,9 +59,8 @@ def look(
         return proposals.look(pose, depth_m, k, centres_m, side)
     centres = np.asarray(centres_m, np.float64).reshape(-1, 3)
     left = side == "left"
-    k = np.asarray(k, np.float64)
+    k = np.array(k, np.float64)  # of a read-only one numba would compile another kernel
     if left:
-        k = k.copy()
         k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
         centres = centres * MIRROR.numpy()
     turns = np.stack([crop_rotation(centre) for centre in centres])
