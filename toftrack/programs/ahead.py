@@ -24,6 +24,7 @@ from toftrack.hand.openxr import openxr_rig
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.tracking.hands import HandsTracker
+from toftrack.tracking.model import TrackerModel
 
 _log = logging.getLogger(__name__)
 
@@ -34,17 +35,22 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
     try:
         tracker = build_hands_tracker(config)
         if helper is not None:
-            tracker.model.backend.make_scorer(tracker.model.shape)
-            if tracker.model.relocaliser is not None:
-                from toftrack.relocation.proposals_numba import compile_look
-
-                compile_look()
+            _compile_here(tracker.model)
             helper.wait()
     finally:
         if helper is not None:
             helper.kill()
             helper.wait()
     return tracker
+
+
+def _compile_here(model: TrackerModel) -> None:
+    """The large kernels but for the one that the second process compiles."""
+    model.backend.make_scorer(model.shape)
+    if model.relocaliser is not None:
+        nothing = np.zeros((72, 88), np.float32)
+        k = np.array([[110.0, 0, 44], [0, 110.0, 36], [0, 0, 1]])
+        model.relocaliser.glance(nothing, k, np.array([[0.0, 0.0, 0.5]]), model.shape.side)
 
 
 def _helper(config: DictConfig) -> subprocess.Popen | None:

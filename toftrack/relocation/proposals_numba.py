@@ -39,7 +39,6 @@ from toftrack.relocation.network import (
 )
 from toftrack.relocation.network_numba import PackedPoseNet, pack_pose_net, pose_outputs
 from toftrack.relocation.proposals import DOUBT_M, KEPT, MIRROR, Look, mean_hand
-from toftrack.relocation.weights import make_ready
 
 _SOURCES = (rigid_numba, overlap, overlap_numba, crops, crops_numba, network, network_numba)
 _cached = entry_point(__file__, *(module.__file__ for module in (*_SOURCES, convolution_numba)))
@@ -88,15 +87,6 @@ def look(
     else:
         called(look_at, _COMPILING, *task.args)
     return Look(**{name: torch.from_numpy(array) for name, array in out.items()})
-
-
-def compile_look() -> None:
-    """Compile the kernels of `look`, if need be."""
-    if not look_at.signatures:
-        pose = PoseNet(1)
-        make_ready(pose)
-        ahead = np.array([[0.0, 0.0, 0.5]])
-        look(pose, np.ones((2, 2), np.float32), np.eye(3), ahead, "right")
 
 
 @functools.lru_cache(maxsize=2)
