@@ -92,7 +92,7 @@ def _onto_points(
         starts.append(torch.cat((state[:, :6], track.contender.pose[:, 6:]), 1))
     mine = len(starts)
     likely = state[:0] if glance is None else candidates(glance, frame, frame.model.rivals)
-    hears, swaps = turns(track, cfg.sure)
+    hears, swaps = (True, True) if frame.hidden else turns(track, cfg.sure)
     heard = likely if hears else likely[:0]
     tried = scored(onto_points(torch.cat((*starts, heard))), frame)
     first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[own - 1] else own - 1
