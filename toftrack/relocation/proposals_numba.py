@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from toftrack.compute import convolution_numba, rigid_numba
 from toftrack.compute.compiling import called, compiled, entry_point, take
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rigid_numba import pose_hand, rotation_vector
-from toftrack.compute.threads import run_shared
+from toftrack.compute.threads import beside, run_shared
 from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
@@ -57,6 +58,41 @@ def look(
     """See proposals.look, which it is where the network is on another device."""
     if pose.anchors.device.type != "cpu":
         return proposals.look(pose, depth_m, k, centres_m, side)
+    task, out = _prepared(pose, depth_m, k, centres_m, side)
+    if look_at.signatures:
+        run_shared(task, len(centres_m))
+    else:
+        called(look_at, _COMPILING, *task.args)
+    return _told(out)
+
+
+def looking(
+    pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
+) -> Callable[[], Look]:
+    """The same, begun in another thread if there may be one; what is returned waits for it.
+
+    That thread has nothing to do but the kernel, so that it hardly needs the interpreter's lock.
+    """
+    if pose.anchors.device.type != "cpu" or not look_at.signatures:
+        return functools.partial(look, pose, depth_m, k, centres_m, side)
+    task, out = _prepared(pose, depth_m, k, centres_m, side)
+    wait = beside(task)
+
+    def told() -> Look:
+        wait()
+        return _told(out)
+
+    return told
+
+
+def _told(out: dict[str, np.ndarray]) -> Look:
+    return Look(**{name: torch.from_numpy(array) for name, array in out.items()})
+
+
+def _prepared(
+    pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
+) -> tuple[functools.partial[None], dict[str, np.ndarray]]:
+    """The kernel's call, and the arrays that it writes."""
     # Copies: numba compiles once more for arrays that must not be written to.
     centres, k = np.array(centres_m, np.float64).reshape(-1, 3), np.array(k, np.float64)
     left = side == "left"
@@ -65,7 +101,6 @@ def look(
         centres = centres * MIRROR.numpy()
     turns = np.stack([crop_rotation(centre) for centre in centres])
     out = _empty(len(centres))
-    shape = mean_hand(side)
     task = functools.partial(
         look_at,
         np.ascontiguousarray(depth_m, np.float32),
@@ -74,19 +109,18 @@ def look(
         centres,
         turns,
         _packed(pose),
-        (
-            shape.base_frames.double().numpy(),
-            shape.base_m.double().numpy(),
-            shape.bone_lengths_m.double().numpy(),
-        ),
+        _mean_hand(side),
         tuple(out.values()),
         np.zeros(1, np.int64),
     )
-    if look_at.signatures:
-        run_shared(task, len(centres))
-    else:
-        called(look_at, _COMPILING, *task.args)
-    return Look(**{name: torch.from_numpy(array) for name, array in out.items()})
+    return task, out
+
+
+@functools.lru_cache
+def _mean_hand(side: str) -> tuple[np.ndarray, ...]:
+    shape = mean_hand(side)
+    parts = shape.base_frames, shape.base_m, shape.bone_lengths_m
+    return tuple(part.double().numpy() for part in parts)
 
 
 @functools.lru_cache(maxsize=2)

@@ -20,9 +20,9 @@ from toftrack.relocation.proposals import Look, find_hands
 from toftrack.relocation.weights import load_weights
 
 try:
-    from toftrack.relocation.proposals_numba import look
+    from toftrack.relocation.proposals_numba import look, looking
 except ImportError:  # there is no numba
-    from toftrack.relocation.proposals import look
+    from toftrack.relocation.proposals import look, looking
 
 SAME_PLACE_M = 0.06
 """Places that lie closer together are one."""
@@ -148,6 +148,13 @@ class Relocaliser:
             return []
         seen = look(self.pose, depth_m, k, centres_m, side)
         return [_glance(seen, row) for row in range(len(seen.present))]
+
+    def glancing(
+        self, depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, side: str
+    ) -> Callable[[], Glance]:
+        """The same at one place (3,), begun beside whatever does not need it; see looking."""
+        wait = looking(self.pose, depth_m, k, centre_m[None], side)
+        return lambda: _glance(wait(), 0)
 
     def search(
         self,

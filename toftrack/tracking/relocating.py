@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.rigid import pivot_offset
-from toftrack.compute.threads import beside
 from toftrack.compute.transfer import on_device
 from toftrack.frames import DepthImage
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
@@ -96,9 +95,7 @@ def glancing(
     if _sure(track, relocaliser.settings, dt_s) or look_due(state.sides, model.sides, True, dt_s):
         return None
     centre = _expected_centre(track, dt_s, model)
-    look = partial(relocaliser.glance, image.depth_m, image.k, centre, state.side)
-    wait = beside(look)
-    return lambda: wait()[0]
+    return relocaliser.glancing(image.depth_m, image.k, centre[0], state.side)
 
 
 def _expected_centre(track: Track, dt_s: float, model: TrackerModel) -> np.ndarray:
