@@ -136,6 +136,7 @@ def test_a_recording_is_thinned_to_poses_that_cover_it(recorded: Path) -> None:
         ({"seq_len": np.array([120, -10, 0, 0])}, "110 frames together"),
         ({"seq_len": np.full(4, np.inf)}, "not a readable"),
         ({"joints_mm": np.zeros((110, 5, 3, 3), np.float32)}, "not a file of recorded joints"),
+        ({"joints_mm": np.zeros((110, 5, 4, 3), np.complex64)}, "no real numbers"),
         ({"joints_mm": np.full((110, 5, 4, 3), np.nan, np.float32)}, "NaN"),
         ({"seq_name": np.array([{}] * 4, dtype=object)}, "not a readable"),
     ],

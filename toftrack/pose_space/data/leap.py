@@ -121,7 +121,10 @@ def _longest(family: list[int], lengths: list[int], number: int) -> int:
 def _read(path: str) -> tuple[np.ndarray, np.ndarray, list[str], list[int]]:
     try:
         content = read_archive(path)
-        joints = np.asarray(content["joints_mm"], np.float32)
+        joints = np.asarray(content["joints_mm"])
+        if joints.dtype.kind not in "fiu":
+            raise ValueError(f"joints_mm is of type {joints.dtype}, and no real numbers")
+        joints = joints.astype(np.float32)
         left = np.asarray(content["is_left"], bool)
         names = [str(name) for name in content["seq_name"]]
         lengths = [int(length) for length in content["seq_len"]]
