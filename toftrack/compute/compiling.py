@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numba
 from llvmlite import ir
@@ -20,12 +21,6 @@ OPTIONS = {"fastmath": {"contract", "arcp", "nsz"}, "nogil": True, "error_model"
 """nnan and ninf stay off: NaN is how a kernel learns that a square root missed."""
 compiled = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 """Decorator of the functions that entry points call."""
-approximately = numba.njit(
-    **{**OPTIONS, "fastmath": {"contract", "arcp", "nsz", "afn", "reassoc"}},
-    no_cpython_wrapper=True,
-    no_cfunc_wrapper=True,
-)
-"""The same where the last bits do not matter: roots and quotients by an estimate and a step."""
 
 _SILENT_S = 1.0
 """Taking a kernel from numba's cache is faster than this, compiling it is slower."""
@@ -98,9 +93,9 @@ def _tell(message: str) -> None:
         log.info(_HINT)
 
 
-def called(kernel: Callable, message: str, *arguments: object) -> None:
+def called(kernel: Any, message: str, *arguments: object) -> None:
     """Call an entry point; the message is logged if it must be compiled before."""
-    if kernel.signatures:  # type: ignore[attr-defined]
+    if kernel.signatures:
         kernel(*arguments)
         return
     with announced(message):
