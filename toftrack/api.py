@@ -82,17 +82,21 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
 def build_tracker(config: DictConfig) -> Tracker:
     """The tracker of one hand of a configuration (conf/config.yaml composed)."""
     # These take seconds: an override's error comes before.
+    from toftrack.compute.threads import small_operations
     from toftrack.tracking.tracker import Tracker
 
-    return Tracker(build_model(config), config.seed, pace=_pace(config))
+    with small_operations():
+        return Tracker(build_model(config), config.seed, pace=_pace(config))
 
 
 def build_hands_tracker(config: DictConfig) -> HandsTracker:
     """The tracker of as many hands as a configuration says."""
+    from toftrack.compute.threads import small_operations
     from toftrack.tracking.hands import HandsTracker
 
     hands = config.get("hands", 1)
-    return HandsTracker(build_model(config), config.seed, hands, pace=_pace(config))
+    with small_operations():
+        return HandsTracker(build_model(config), config.seed, hands, pace=_pace(config))
 
 
 def _pace(config: DictConfig) -> Pace:
