@@ -17,7 +17,9 @@ import torch
 from helpers.programs import QUICK
 from helpers.tracking import ROOT, make_tracker, sample
 
+from toftrack.api import compute_device
 from toftrack.compute import compiling
+from toftrack.errors import ToftrackError
 from toftrack.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs /proc")
@@ -143,3 +145,13 @@ def test_a_program_that_forks_goes_on_in_both_processes(when: str) -> None:
             process.wait()
     assert told.splitlines() == ["child tracking", "parent tracking 0"]
     assert process.returncode == 0
+
+
+@pytest.mark.parametrize("name", ["auto", "cuda"])
+def test_after_a_fork_of_a_process_with_a_gpu_it_is_refused(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "_is_in_bad_fork", lambda: True)
+    with pytest.raises(ToftrackError, match="multiprocessing's spawn, or give compute=cpu"):
+        compute_device(name)
+    assert compute_device("cpu").type == "cpu"

@@ -137,6 +137,11 @@ def compute_device(name: str) -> torch.device:
     """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
     import torch
 
+    if name != "cpu" and torch.cuda._is_in_bad_fork():
+        raise ToftrackError(
+            f"compute={name}: the process that this one was forked from has used the GPU, which "
+            "CUDA does not allow; start it by multiprocessing's spawn, or give compute=cpu"
+        )
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():

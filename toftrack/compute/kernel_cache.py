@@ -114,8 +114,9 @@ def can_be_kept() -> bool:
 
 def cache_folder() -> Path | None:
     """Where the user's kernels are; None where the user has no home."""
-    if numba.config.CACHE_DIR:
-        return Path(numba.config.CACHE_DIR).absolute() / "toftrack"
+    own = getattr(numba.config, "CACHE_DIR", "")
+    if own:
+        return Path(own).absolute() / "toftrack"
     given = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME", "")
     try:
         if sys.platform == "darwin":
