@@ -12,7 +12,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -63,6 +62,8 @@ def _helper(config: DictConfig) -> subprocess.Popen | None:
         from toftrack.refinement.gauss_newton_numba import refine_hands
     except ImportError:  # without numba everything is done by torch
         return None
+    from toftrack.compute.compiling import must_be_compiled
+
     if not must_be_compiled(refine_hands):
         return None
     _log.info("compiling kernels (once on a machine, about 10 s)")
@@ -75,14 +76,6 @@ def _helper(config: DictConfig) -> subprocess.Popen | None:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-
-
-def must_be_compiled(kernel: Any) -> bool:
-    """Whether an entry point's code is not on the disk, but can be kept there."""
-    folder = kernel.stats.cache_path
-    if folder is None or kernel.signatures:
-        return False
-    return not any(Path(folder).glob(f"*.{kernel.py_func.__qualname__}-*.nbi"))
 
 
 def main() -> None:

@@ -62,10 +62,10 @@ def _contents(run: Run, kind: str) -> dict[str, bytes]:
     """What each file is to hold, by its name."""
     if kind == "csv":
         return {"hand.csv": csv_of(run.results).encode()}
-    motions = motions_of(run.results, (run.shape,))
+    motions = motions_of(run.results, run.shapes)
     if kind == "glb":
         return {"hand.glb": glb_of(motions)}
-    if len(motions) == 1:
+    if len(run.shapes) == 1:
         return {"hand.bvh": bvh_of(motions[0]).encode()}
     # A file has one skeleton.
-    return {f"hand{slot}.bvh": bvh_of(motion).encode() for slot, motion in enumerate(motions, 1)}
+    return {f"hand{motion.slot + 1}.bvh": bvh_of(motion).encode() for motion in motions}
