@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import logging
+import pkgutil
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+from numba.core.dispatcher import Dispatcher
+from numba.core.extending import _Intrinsic
 
+import toftrack
 from toftrack.compute import compiling
 from toftrack.compute.compiling import announced
 
@@ -38,3 +46,29 @@ def test_where_the_code_cannot_be_kept_it_is_said_to_be_compiled_in_every_run(
         while not caplog.messages and time.monotonic() < deadline:
             time.sleep(0.01)
     assert caplog.messages == ["compiling (in every run, about 6 s)"]
+
+
+def _made_of(function: Callable, seen: set[Callable]) -> set[Callable]:
+    """All that a kernel calls, itself included, through any number of others."""
+    if function not in seen:
+        seen.add(function)
+        captured = inspect.getclosurevars(function)
+        for value in (*captured.globals.values(), *captured.nonlocals.values()):
+            if isinstance(value, Dispatcher):
+                _made_of(value.py_func, seen)
+            elif isinstance(value, _Intrinsic):
+                seen.add(value._defn)
+    return seen
+
+
+def test_a_change_in_any_file_that_a_kernel_is_made_of_compiles_it_anew() -> None:
+    kernels: dict[Callable, frozenset[str]] = {}
+    for found in pkgutil.walk_packages(toftrack.__path__, "toftrack."):
+        if "numba" in found.name or found.name == "toftrack.relocation.pictures":
+            for value in vars(importlib.import_module(found.name)).values():
+                if isinstance(value, Dispatcher) and hasattr(value, "sources"):
+                    kernels[value.py_func] = value.sources
+    assert len(kernels) > 10
+    for kernel, sources in kernels.items():
+        files = {str(Path(inspect.getfile(part)).resolve()) for part in _made_of(kernel, set())}
+        assert files <= sources, f"{kernel.__qualname__} is also made of {files - sources}"

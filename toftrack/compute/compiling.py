@@ -43,6 +43,7 @@ def entry_point(*sources: str | Path | None) -> Callable:
         function.__qualname__ += f"_{checksum:08x}"
         kernel = numba.njit(**OPTIONS)(function)
         kernel._cache = KernelCache(f"{function.__module__}.{function.__qualname__}")
+        kernel.sources = frozenset(str(Path(file).resolve()) for file in files)
         return kernel
 
     return decorator
