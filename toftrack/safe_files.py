@@ -124,6 +124,18 @@ def remove_partial(path: Path) -> None:
                 found.unlink()
 
 
+def let_links_go(path: Path) -> None:
+    """Remove, under a name that another library will write, a link, a second name or a pipe.
+
+    What they lead to stays. Raises OSError.
+    """
+    with suppress(FileNotFoundError):
+        status = os.lstat(path)
+        alone = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+        if not alone and not stat.S_ISDIR(status.st_mode):
+            path.unlink()
+
+
 def make_folder(path: str | Path) -> None:
     """Make a folder within one that may be somebody else's; one that is there is no link.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +22,7 @@ LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""
 
 
+_BLOCK = 65536
 RUN_FORMAT = "toftrack-run"
 """What the run.json of a run's folder says that it is."""
 
@@ -84,6 +87,31 @@ def locked_lines(folder: Path) -> Iterator[None]:
     with open_to_read(folder / LINES) as file:
         _lock(file, folder)
         yield
+
+
+def cut_unfinished_line(folder: Path) -> None:
+    """Take from the growing file's end the line that was not finished; one of its lines is ours.
+
+    A file with a second name elsewhere stays as it is. Raises OSError.
+    """
+    if (folder / LINES).stat().st_nlink > 1:
+        return
+    with open_in_place(folder / LINES, make=False) as file:
+        if whole := _size_of_lines(file):
+            file.truncate(whole)
+
+
+def _size_of_lines(file: io.FileIO) -> int:
+    """Bytes up to the end of the last whole line."""
+    end = file.seek(0, os.SEEK_END)
+    while end > 0:
+        begin = max(0, end - _BLOCK)
+        file.seek(begin)
+        found = file.read(end - begin).rfind(b"\n")
+        if found >= 0:
+            return begin + found + 1
+        end = begin
+    return 0
 
 
 def _lock(file: IO[bytes], folder: Path) -> None:

@@ -183,6 +183,8 @@ def finish(
     metadata = facts["metadata"]
     rows, changed = _every_frame(records)
     dropped = changed[DROPPED]
+    if dropped.any():
+        metadata = metadata | {"held_frames": changed["index"][dropped].tolist()}
     small = {
         "joint_names": np.array(facts["joint_names"], np.str_),
         "metadata": np.array(json.dumps(metadata)),
