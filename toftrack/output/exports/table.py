@@ -45,7 +45,7 @@ def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
             seconds = f"{results['timestamp_s'][row]:.6f}"
             cells = [number, seconds, *([slot] if several else [])]
             # A frame is dropped for all of its hands.
-            cells += [results[name][here[: np.ndim(results[name])]] for name in plain]
+            cells += [np.asarray(results[name])[here[: np.ndim(results[name])]] for name in plain]
             for name in (*points, "joints_m"):
                 cells += results[name][here].ravel().tolist()
             yield [_cell(value) for value in cells]
