@@ -2,8 +2,8 @@
 
 Within the first second nothing is written yet, and an exception would end in whatever is being
 imported: so the process ends at once, with status 130. `programs.endings` takes over when the
-program has begun. What comes before the first line of toftrack is Python's own. Once the program is done
-Ctrl-C does nothing any more: its status is known.
+program has begun. What comes before the first line of toftrack is Python's own. Once the program
+is done Ctrl-C does nothing any more: its status is known.
 """
 
 import atexit

@@ -17,6 +17,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, is_vacant
 from toftrack.json_text import parse_json
+from toftrack.regular_files import open_regular
 
 _KINDS: dict[type, type] = {
     bool: np.bool_,
@@ -109,7 +110,7 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
 
     Raises ToftrackError when another one is damaged, OSError when the file cannot be read.
     """
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         for number, line in enumerate(stream, 1):
             if not line.endswith(b"\n"):
                 return  # the run was killed, or the machine went down, while it was written
