@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import replace
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
@@ -35,7 +35,6 @@ from helpers.settings import browser_view
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import no_estimate, state_words
-from toftrack.views.browser import server
 from toftrack.views.browser import view as browser
 from toftrack.views.browser.view import BrowserView, LivePicture
 from toftrack.views.overlay import CAPTION_PX, draw_tracked
@@ -296,30 +295,6 @@ def test_ten_visitors_and_one_who_never_reads_all_get_on(view) -> None:
         assert counts == [5] * 10
         view.close()  # although one is still connected
         assert ours() == []
-
-
-@pytest.mark.parametrize("words", [b"", b"GET / HTTP/1.1\r\nHost: local"])
-def test_connections_that_ask_nothing_are_few_and_keep_nobody_out(view, words: bytes) -> None:
-    with ExitStack() as opened:
-        for number in range(3 * server._MOST_CONNECTIONS):
-            if number % 20 == 0:  # what the system has no room for yet would wait for a second
-                time.sleep(0.02)
-            opened.enter_context(raw(view)).sendall(words)
-        assert urlopen(view.url, timeout=PATIENCE_S).status == 200
-        assert len(ours()) <= server._MOST_CONNECTIONS + 4
-        view.close()
-        assert ours() == []
-
-
-def test_who_sends_a_request_bit_by_bit_is_cut_off(view, monkeypatch) -> None:
-    monkeypatch.setattr(server, "_PATIENCE_S", 0.3)
-    with raw(view) as slow:
-        slow.sendall(b"GET / HTTP/1.1\r\nX: ")
-        with pytest.raises(OSError):  # it is closed
-            for _ in range(100 * PATIENCE_S):
-                slow.sendall(b"x")
-                time.sleep(0.01)
-    eventually(lambda: "browser-visitor" not in ours())
 
 
 def test_a_tab_closed_in_the_middle_is_no_error(view, capfd) -> None:
