@@ -25,13 +25,27 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 """Opening a pipe otherwise waits for its other end."""
 _PARTIAL = ".part"
+_KINDS = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+class _NoFileError(OSError):
+    """What is named is a pipe, a device or a socket."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
 
 
 def open_to_read(path: str | Path) -> BinaryIO:
-    """Open a file, also through a link.
+    """Open a file, also through a link; a pipe is never waited for.
 
     Raises OSError: it cannot be opened, or is a folder, a pipe or a device.
     """
+    _refuse(path, os.stat(path))  # before it is opened, which does something to some devices
     descriptor = os.open(path, os.O_RDONLY | _BINARY | _NO_WAIT)
     try:
         _refuse(path, os.fstat(descriptor))
@@ -39,6 +53,19 @@ def open_to_read(path: str | Path) -> BinaryIO:
     except BaseException:
         os.close(descriptor)
         raise
+
+
+def check_readable(path: str | Path) -> None:
+    """For those who open a file by themselves, or all files in a folder: raise OSError for what is
+    no file, or is not there.
+    """
+    status = os.stat(path)
+    if not stat.S_ISDIR(status.st_mode):
+        _refuse(path, status)
+        return
+    for entry in os.scandir(path):
+        if not entry.is_dir():
+            _refuse(entry.path, entry.stat())
 
 
 def open_new(path: str | Path, replace: bool = False, buffered: bool = True) -> BinaryIO:
@@ -161,4 +188,5 @@ def _refuse(path: str | Path, status: os.stat_result) -> None:
     if stat.S_ISLNK(status.st_mode):
         why = "it is a symbolic link, and nothing is written through one; take it away"
         raise OSError(errno.ELOOP, why, str(path))
-    raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, no file", str(path))
+    kind = _KINDS.get(stat.S_IFMT(status.st_mode), "no file")
+    raise _NoFileError(errno.EINVAL, f"it is {kind}, and only files are read or written", str(path))

@@ -52,7 +52,8 @@ _ABOVE_ZERO = frozenset(
     view.most_fps view.quality
     """.split()
 )
-_AT_MOST = {"hands": 2}
+_AT_MOST = {"hands": 2, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
+"""More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset(
     {"lost.outside_rad", "segmentation.reach_m", "view.linger_s", "view.wait_s"}
 )

@@ -20,6 +20,7 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.json_text import read_json
-from toftrack.safe_files import write_whole
+from toftrack.safe_files import open_to_read, write_whole
 
 _SLACK_DEGREES = 10.0
 _UNITS = ("degrees", "radians")
@@ -217,7 +218,7 @@ def _by_name(path: Path, number: int, key: str, given: object) -> dict[str, Any]
 
 def _read_csv(path: Path) -> _Content:
     units, lines = None, []
-    with open(path, encoding="utf-8-sig", newline="") as stream:
+    with TextIOWrapper(open_to_read(path), "utf-8-sig", newline="") as stream:
         for line in stream:
             if line.lstrip().startswith("#"):
                 key, _, value = line.lstrip("# \t").partition(":")

@@ -29,6 +29,7 @@ from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording, open_source
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
+from toftrack.safe_files import open_to_read
 
 FILES = ("track.npz", "track.jsonl", "summary.json", "hand_shape.json")
 """What a folder must hold to be a run's."""
@@ -227,7 +228,8 @@ def found_again(path: str | Path, ran_in: str | None) -> Path:
 def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
     """Frame numbers and state names for the rows of track.npz, which also has dropped frames."""
     try:
-        told = [parse_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        with open_to_read(path) as stream:
+            told = [parse_json(line) for line in stream.read().decode("utf-8").splitlines()]
         index = np.array([int(line["index"]) for line in told])
         names = [str(line["state_name"]) for line in told]
     except (OSError, ValueError, KeyError, TypeError) as error:

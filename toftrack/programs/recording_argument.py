@@ -40,6 +40,8 @@ def with_recording(
             files.append(argument)
     if not files:
         return others
+    if "" in files:
+        raise ToftrackError("the recording's name is empty; give that of a file")
     if len(files) > 1:
         raise ToftrackError(
             f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"

@@ -40,7 +40,7 @@ from toftrack.frames import (
 from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
 from toftrack.recordings.streamed_images import Images, StreamedImages
-from toftrack.safe_files import whole_file
+from toftrack.safe_files import open_to_read, whole_file
 
 DEFAULT_FPS = 25.0
 LOADED_BYTES = MOST_BYTES
@@ -156,7 +156,7 @@ def _read_members(path: Path) -> dict[str, Images]:
     if path.is_dir():
         raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.npz)")
     try:
-        with open(path, "rb") as stream:
+        with open_to_read(path) as stream:
             if not zipfile.is_zipfile(stream):
                 raise ToftrackError(
                     f"'{path}' is not an .npz archive, or it was cut off; give a recording as "

@@ -30,7 +30,7 @@ from toftrack.json_text import read_json
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.png import LARGEST_PIXELS, SIGNATURE, decoded_png
-from toftrack.safe_files import open_new, write_whole
+from toftrack.safe_files import open_new, open_to_read, write_whole
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
 
@@ -76,7 +76,8 @@ class PngFolder:
 
     def _read(self, path: Path) -> np.ndarray:
         try:
-            content = path.read_bytes()
+            with open_to_read(path) as stream:
+                content = stream.read()
         except OSError as error:
             raise ToftrackError(
                 f"the image '{path}' cannot be read ({error.strerror}); check its permissions"
@@ -273,7 +274,9 @@ def _timestamps(path: Path, count: int) -> np.ndarray | None:
     if not path.exists():
         return None
     try:
-        times = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
+        with open_to_read(path) as stream:
+            text = stream.read().decode("utf-8")
+        times = np.array([float(word) for word in text.split()])
     except OSError as error:
         raise ToftrackError(f"'{path}' cannot be read ({error.strerror})") from error
     except ValueError:
@@ -289,7 +292,7 @@ def _timestamps(path: Path, count: int) -> np.ndarray | None:
 def _png_size(path: Path) -> tuple[int, int]:
     """Columns and rows of a 16-bit grey PNG, from its header."""
     try:
-        with open(path, "rb") as stream:
+        with open_to_read(path) as stream:
             start = stream.read(26)
     except OSError as error:
         raise ToftrackError(f"the image '{path}' cannot be read ({error.strerror})") from error
