@@ -1,8 +1,7 @@
 """The result files of a run: run.json, track.jsonl, track.npz and summary.json.
 
 `run.json` is written at the start, `track.jsonl` grows by a line as each frame is done. The two
-others are made when the writer is closed, also after an interruption, for the frames that were done
-until then; or later, of the lines, if it never was.
+others are made when the writer is closed, or later, of the lines, if it never was.
 """
 
 from __future__ import annotations
