@@ -23,6 +23,11 @@ LINES = "track.jsonl"
 
 
 _BLOCK = 65536
+WHOLE_FILES = (
+    *("run.json", "track.npz", "summary.json", "overlay.png"),
+    *("hand_shape.json", "hand_shape_2.json"),
+)
+"""Those that take their place when they are done, and of which a kill may leave a part."""
 RUN_FORMAT = "toftrack-run"
 """What the run.json of a run's folder says that it is."""
 
@@ -144,7 +149,7 @@ def make_way(folder: Path) -> None:
     for name in ends:
         check_replaceable(folder / name)
         (folder / name).unlink(missing_ok=True)
-        remove_partial(folder / name)
+    remove_partial(folder, WHOLE_FILES)
 
 
 def _has_run(folder: Path) -> bool:

@@ -1,8 +1,7 @@
 """The result files of a run: run.json, track.jsonl, track.npz and summary.json.
 
 `run.json` is written at the start, `track.jsonl` grows by a line as each frame is done. The two
-others are made when the writer is closed, also after an interruption, for the frames that were done
-until then; or later, of the lines, if it never was.
+others are made when the writer is closed, or later, of the lines, if it never was.
 """
 
 from __future__ import annotations
@@ -279,19 +278,19 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 
 def _dropped(arrays: dict[str, np.ndarray], content: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Which frames were dropped, (T,), and the states' names where older versions do not say so."""
+    """Which frames were dropped, (T,), and the names of states where older files do not say so."""
     count = len(content["lost"])
     if DROPPED in arrays:
         if arrays[DROPPED].dtype != bool or arrays[DROPPED].shape != (count,):
-            raise ValueError(f"{DROPPED!r} has the shape {arrays[DROPPED].shape}")
+            raise ValueError(f"{DROPPED!r} does not fit")
         return {DROPPED: arrays[DROPPED]}
     held = content["metadata"].get("held_frames")
     if "index" not in content or not isinstance(held, list) or not held:
         return {DROPPED: np.zeros(count, bool)}
     dropped = np.isin(content["index"], np.array(held, np.int64))
-    if "state_name" not in content:
-        return {DROPPED: dropped}
-    return {DROPPED: dropped, "state_name": _told_dropped(content["state_name"], dropped)}
+    names = content.get("state_name")
+    told = {} if names is None else {"state_name": _told_dropped(names, dropped)}
+    return {DROPPED: dropped} | told
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:
