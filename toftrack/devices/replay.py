@@ -17,7 +17,6 @@ from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
 from toftrack.recordings.doubts import doubts
-from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording
 
@@ -78,13 +77,14 @@ class Replay(BaseDevice):
         damage = getattr(store, "damage", None)
         if damage:
             _log.warning("%s: %s; its %d whole frames are used", path, damage, len(store))
-        if isinstance(store, Recording) and (doubt := doubts(store.depth)):
-            _log.warning("%s: %s", path, doubt)
         self._range = _checked_range(start, stop, len(self._recording), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         camera = store.camera
         if camera_file is not None:
             camera = Camera.load_for(camera_file, camera.width, camera.height, f"'{path}'")
+        found = doubts(store, camera)
+        for doubt in found:
+            _log.warning("%s: %s", path, doubt)
         truth = None if self._repeat else store.truth
         super().__init__(
             camera,
@@ -102,6 +102,7 @@ class Replay(BaseDevice):
             "realtime": self._realtime,
             "repeat": self._repeat,
             "camera_file": None if camera_file is None else str(camera_file),
+            "doubts": list(found),
         }
 
     def close(self) -> None:
