@@ -50,7 +50,7 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     assert "device.intrinsics=[FX,FY,CX,CY]" in capsys.readouterr().err
     assert main(["track", str(folder), LENS, "device.fps=50", *words]) == 0
     run = read_run(tmp_path / "run")
-    np.testing.assert_array_equal(run.results["K"], K)
+    np.testing.assert_array_equal(run.results["metadata"]["camera"]["K"], K)
     np.testing.assert_allclose(run.results["timestamp_s"], [0, 0.02])
     footage = open_footage(run)
     assert footage is not None, "figures are drawn with the same lens"
