@@ -89,7 +89,7 @@ def test_a_ros_bag_is_known_by_its_name_or_its_folder(name: str, tmp_path, monke
         (Path(folder) / file).touch()
     Path("~x.bag").touch()
     assert with_recording([name, "device.topic=/a"], *KNOWN)[0] == "device=rosbag"
-    assert with_recording(["other"], *KNOWN)[0] == "device=replay"
+    assert with_recording(["other"], *KNOWN)[0] == "device=folder"
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from toftrack.output.lines import (
 from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.realtime import RealTime
 from toftrack.output.records import Records, write_archive
-from toftrack.output.summary import run_metrics, summarise
+from toftrack.output.summary import run_doubts, run_metrics, summarise
 from toftrack.safe_files import whole_file, write_whole
 
 _VERSION = 1
@@ -79,6 +79,8 @@ class ResultWriter:
         """How many were appended."""
         self.realtime: RealTime | None = None
         """How a live run kept up, for summary.json; to be set before the writer is closed."""
+        self.looked_m: Sequence[float | None] = ()
+        """Of Watch.looked_m, for summary.json; to be set likewise."""
         self._truth = truth
         self._facts = {
             "format": RUN_FORMAT,
@@ -131,7 +133,9 @@ class ResultWriter:
         try:
             with self._records or records_of(self.folder, self._facts) as records:
                 realtime = None if self.realtime is None else self.realtime.summary()
-                self.summary = finish(self.folder, self._facts, self._truth, records, realtime)
+                self.summary = finish(
+                    self.folder, self._facts, self._truth, records, realtime, self.looked_m
+                )
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         finally:
@@ -171,11 +175,13 @@ def finish(
     truth: Truth | None,
     records: Records,
     realtime: dict[str, Any] | None = None,
+    looked_m: Sequence[float | None] = (),
 ) -> dict[str, Any]:
     """Make track.npz and summary.json of a run's frames; returns the summary.
 
     folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
     realtime: what summary.json says of a live run; the lines do not tell it.
+    looked_m: for run_doubts; the lines do not tell it either.
 
     Raises OSError when something cannot be read or written.
     """
@@ -189,6 +195,7 @@ def finish(
         "metadata": np.array(json.dumps(metadata)),
     } | facts_for_readers(metadata)
     summary = summarise(records, len(rows), int(dropped.sum()), folder, metadata)
+    summary["doubts"] = run_doubts(records, folder, metadata, looked_m)
     if realtime is not None:
         summary["realtime"] = realtime
     if truth is not None and len(rows):

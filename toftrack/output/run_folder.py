@@ -259,7 +259,8 @@ def open_footage(run: Run, recording: str | Path | None = None) -> Footage | Non
     if opened is None:
         return None
     store, name = opened
-    camera = store.camera
+    told = BareFacts(device.get("intrinsics"))
+    camera = told.camera(store.camera.width, store.camera.height) or store.camera
     if about.get("camera_file"):
         camera = Camera.load(run.found(about["camera_file"]))
     rows = _rows(run, store, camera, about, device, name)
@@ -300,7 +301,7 @@ def open_tracked(
     camera_file = about.get("camera_file")
     modulation_mhz = device.get("modulation_mhz", DEFAULT_MODULATION_MHZ)
     camera_path = None if camera_file is None else found(camera_file)
-    bare = BareFacts(unit_m=device.get("unit_m"), fps=device.get("fps"))
+    bare = BareFacts(device.get("intrinsics"), device.get("unit_m"), device.get("fps"))
     return open_recording(path, camera_path, modulation_mhz, device.get("topic"), bare), path
 
 

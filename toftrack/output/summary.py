@@ -9,7 +9,9 @@ same.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,10 @@ from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate
+from toftrack.output.hand_doubts import length_doubt, looked_doubt
 from toftrack.output.records import Records
 from toftrack.output.trust import Hand, Trust, trust, trust_of_two
+from toftrack.recordings.doubts import times_doubt
 
 
 def shape_file(slot: int) -> str:
@@ -73,12 +77,46 @@ def _mean(values: np.ndarray) -> float | None:
 
 def _hand(folder: Path, slot: int, metadata: dict[str, Any]) -> dict[str, Any]:
     """The hand that was tracked, where its file is in the folder."""
-    try:
-        shape = HandShape.load(folder / shape_file(slot))
-    except ToftrackError:
+    shape = _shape(folder, slot)
+    if shape is None:
         return {}
-    fitted = bool((metadata.get("hand_shape") or {}).get("fitted"))
+    fitted = _fits(metadata) and shape.fitted is not None
     return {"hand": {"side": shape.side, "length_mm": 1e3 * shape.hand_length_m, "fitted": fitted}}
+
+
+def _shape(folder: Path, slot: int) -> HandShape | None:
+    try:
+        return HandShape.load(folder / shape_file(slot))
+    except ToftrackError:
+        return None
+
+
+def _fits(metadata: dict[str, Any]) -> bool:
+    """Whether a run fits its hands, or takes them as they were given."""
+    return bool((metadata.get("hand_shape") or {}).get("fitted"))
+
+
+def run_doubts(
+    records: Records,
+    folder: Path,
+    metadata: dict[str, Any],
+    looked_m: Sequence[float | None] = (),
+) -> list[str]:
+    """What speaks against a run's input, a sentence each: what its device found, the frames' times
+    where the device did not look at them, and how long the fitted hands are.
+
+    looked_m: of the slots, how long the hand looked where it was mostly lost; () where the run did
+    not say.
+    """
+    told = (metadata.get("device") or {}).get("doubts")
+    found = [times_doubt(records.column("timestamp_s"))] if told is None else list(told)
+    k = (metadata.get("camera") or {}).get("K")
+    if _fits(metadata) and k is not None:
+        for slot, looked in zip_longest(range(records.slots), looked_m):
+            shape = _shape(folder, slot)
+            fitted = "" if shape is None else length_doubt(shape, np.array(k))
+            found.append(fitted or ("" if looked is None else looked_doubt(looked, np.array(k))))
+    return list(filter(None, found))
 
 
 def run_metrics(

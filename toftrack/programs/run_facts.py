@@ -74,7 +74,7 @@ def opening(metadata: dict[str, Any], device: Device) -> str:
     count = "live" if device.frames is None else f"{device.frames} frames"
     side = shape["side"]
     length_mm = 1e3 * float(shape["hand_length_m"])
-    fitted = "fitted from" if shape["fitted"] else "of"
+    fitted = "to be fitted from" if shape["fitted"] else "of"
     if config.get("hands", 1) > 1:
         what = "up to two hands, their lengths"
     elif side == "auto":

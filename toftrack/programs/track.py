@@ -96,6 +96,10 @@ def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
     if summary.get("frames"):
         endings.say(metrics_table(summary), sys.stdout)
         endings.say(_told_files(folder), sys.stdout)
+    said = metadata["device"].get("doubts", ())  # by the device itself
+    for doubt in summary.get("doubts", ()):
+        if doubt not in said:
+            endings.say(f"note: {doubt}", sys.stderr)
     if ended is not None:
         raise ended
     if not summary.get("frames"):
@@ -126,6 +130,7 @@ def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) ->
     finally:
         with endings.not_now():
             results.realtime = parts.realtime if device.live else None
+            results.looked_m = parts.watch.looked_m()
             try:
                 parts.shapes.save(last=True)
             finally:

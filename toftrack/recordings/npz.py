@@ -232,9 +232,10 @@ def _check_depth(depth: Images, key: str) -> Images:
         raise ToftrackError(f"'{key}' has zero frames; record at least one")
     if depth.size == 0:
         raise ToftrackError(f"the images of '{key}' are empty, shape {depth.shape}")
-    median = median_reading(some_images(depth))
+    some = some_images(depth)
+    median = median_reading(some)
     if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
-        raise wrong_unit(f"'{key}'", median, str(depth.dtype) if whole else "")
+        raise wrong_unit(f"'{key}'", some, str(depth.dtype) if whole else "")
     if isinstance(depth, StreamedImages) or depth.dtype.newbyteorder("=") in (
         np.float16,
         np.float32,

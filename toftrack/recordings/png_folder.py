@@ -17,6 +17,7 @@ import io
 import json
 import re
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -95,7 +96,7 @@ def read_png_folder(
     camera_file: str | Path | None = None,
     unit_m: float | None = None,
     fps: float | None = None,
-    intrinsics: tuple[float, float, float, float] | None = None,
+    intrinsics: Sequence[float] | None = None,
 ) -> PngFolder:
     """Open a folder of depth images: names, sizes and kinds are checked, pixels stay on the disk.
 
@@ -136,8 +137,9 @@ def read_png_folder(
         camera = Camera.from_dict(content, folder / _CAMERA)
     else:
         raise ToftrackError(
-            f"the folder '{folder}' has no {_CAMERA}; put the camera's file there, or give another "
-            "with camera.file=FILE (toftrack convert: --camera FILE, or --intrinsics FX FY CX CY)"
+            f"the folder '{folder}' has no {_CAMERA}; put the camera's file there (docs/formats.md "
+            "has an example), or give another with camera.file=FILE (toftrack convert: --camera "
+            "FILE), or the lens with device.intrinsics=[FX,FY,CX,CY] (--intrinsics FX FY CX CY)"
         )
     for path in (*depth, *amplitude):
         size = _png_size(path)

@@ -30,7 +30,8 @@ from toftrack.checks import check_number
 from toftrack.compute.backend import Motions
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.hand import make_hand_shape
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import Fitted, HandShape
+from toftrack.hand.shape_space import COMPONENTS
 from toftrack.render.scoring import Evidence
 from toftrack.tracking.shape_fit import ShapeFit
 from toftrack.tracking.side_belief import SideFit
@@ -108,6 +109,16 @@ class SizeBelief:
     def ratio(self, fit: HandFit) -> float:
         """The present size in units of the first hand's."""
         return (1 + fit.step) ** (self.index - len(self.log_likelihood) // 2)
+
+    def summary(self, fit: HandFit) -> Fitted:
+        """For the file of the shape, whose one component is the length."""
+        half = len(self.log_likelihood) // 2
+        log_size = torch.arange(-half, half + 1) * math.log1p(fit.step)
+        probability = self.log_likelihood.softmax(0)
+        mean = float(probability @ log_size)
+        variance = float(probability @ (log_size - mean).square())
+        done = self.frames >= fit.frames
+        return Fitted(COMPONENTS[:1], (mean,), ((variance,),), self.frames, done)
 
 
 def first_belief(fit: HandFit) -> SizeBelief:

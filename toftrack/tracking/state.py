@@ -12,6 +12,7 @@ from torch import Tensor
 
 from toftrack.estimate import Estimate
 from toftrack.gestures.recognition import GestureState
+from toftrack.relocation.relocaliser import Glance
 from toftrack.render.segmentation import Expected, Observation
 from toftrack.tracking.search import LastSeen
 from toftrack.tracking.shape_fit import ShapeBelief
@@ -115,6 +116,7 @@ class StepInfo:
     weights: (N,) normalised. Both are on the model's device.
     seconds: wall seconds of each stage.
     signs, joint_signs: what the beliefs were formed from; None where there are no networks.
+    glance: what the networks saw; None where they did not look.
     """
 
     observation: Observation
@@ -123,6 +125,7 @@ class StepInfo:
     seconds: Mapping[str, float]
     signs: Signs | None = None
     joint_signs: np.ndarray | None = None
+    glance: Glance | None = None
 
 
 def resumed(generator: Tensor) -> torch.Generator:

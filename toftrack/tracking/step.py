@@ -108,8 +108,7 @@ def step(
     found = Found(particles, weights, mean, pose, trend, *model.nearest(pose))
     side_probability = probability(state.sides, state.side)
     belief, signs = _believed(track, found, score, side_probability, dt_s, frame)
-    looked = frame.glance is not None
-    unlooked_s = 0.0 if looked else track.unlooked_s + dt_s
+    unlooked_s = 0.0 if frame.glance is not None else track.unlooked_s + dt_s
     estimate = _estimate(image, found, score, belief, frame)
     estimate, seen_signs = _joints_judged(image, estimate, track, found, belief, frame)
     track = replace(track, signs=signs, joint_signs=seen_signs, unlooked_s=unlooked_s)
@@ -136,7 +135,9 @@ def step(
         gesture=gesture,
         last=_worth_keeping(state.last, estimate),
     )
-    info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs, seen_signs)
+    info = StepInfo(
+        frame.observation, particles, weights, spans.seconds(), signs, seen_signs, frame.glance
+    )
     return after, info, estimate
 
 

@@ -18,6 +18,7 @@ from toftrack.render.scoring import Scorer
 from toftrack.tracking.effort import Pace, Timekeeper
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.shape_fit import ShapeBelief
+from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.step import first_state, step
 
@@ -115,11 +116,13 @@ class Tracker:
 
 
 def fitted_hand(state: TrackerState, model: TrackerModel) -> HandShape:
-    """The hand of a state, with how sure the fit is of it."""
+    """The hand of a state, with how sure the fit is of it; None before anything was fitted."""
     shape, belief, fit = model.hand(state.side, state.size).shape, state.size, model.adapt
-    if fit is None or not isinstance(belief, ShapeBelief):
-        return shape
-    return replace(shape, fitted=belief.summary(fit))
+    if isinstance(belief, ShapeBelief) and fit is not None and belief.poses:
+        return replace(shape, fitted=belief.summary(fit))
+    if isinstance(belief, SizeBelief) and model.fit is not None and belief.frames:
+        return replace(shape, fitted=belief.summary(model.fit))
+    return shape
 
 
 def restarted(state: TrackerState, model: TrackerModel, side: str | None = None) -> TrackerState:
