@@ -1,7 +1,8 @@
-"""Finish the files of a run that was killed: `toftrack recover RUN`.
+"""Finish the files of a run or a recording that was killed: `toftrack recover RUN|FILE.npz`.
 
 Makes track.npz and summary.json anew from run.json and track.jsonl, which are whole up to the last
-frame that was done. The metrics need the recording that was tracked.
+frame that was done. The metrics need the recording that was tracked. Of a recording, makes FILE.npz
+of the frames in FILE.npz.part.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from toftrack.output.files import LINES, LineFile
 from toftrack.output.results import finish, read_run_facts, records_of
 from toftrack.output.run_folder import found_again, open_tracked
 from toftrack.recordings.store import open_source
+from toftrack.recordings.unfinished import is_recording, recover_recording
 from toftrack.views.overlay import VIDEO
 from toftrack.views.video import cut_to_whole
 
@@ -30,10 +32,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run", metavar="RUN", help="the output folder of toftrack track")
+    parser.add_argument(
+        "run", metavar="RUN|FILE", help="the output folder of toftrack track, or a recording"
+    )
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE.npz")
     options = parser.parse_args(arguments)
     folder = Path(options.run).expanduser()
+    if is_recording(folder):
+        path, frames = recover_recording(folder, options.overwrite)
+        print(f"{path}: {frames} frames")
+        return
     print(metrics_table(recover(folder, options.recording)))
     for name in ("track.npz", "summary.json"):
         print(f"  {folder / name}")
