@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
@@ -212,9 +212,7 @@ def recover_recording(path: Path, overwrite: bool = False) -> tuple[Path, int]:
     return target, finish(part, target, overwrite)
 
 
-def _make_npz(
-    target: BinaryIO, source: BinaryIO, facts: Facts, frames: Sequence[_Kept]
-) -> None:
+def _make_npz(target: BinaryIO, source: BinaryIO, facts: Facts, frames: Sequence[_Kept]) -> None:
     camera = facts.camera
     shape = (len(frames), camera.height, camera.width)
     arrays: dict[str, Any] = {
@@ -305,17 +303,20 @@ def _records(stream: BinaryIO) -> Iterator[_Kept]:
 
 
 def _locked(path: Path) -> BinaryIO:
-    """The file, opened for reading and locked. Raises OSError, and ToftrackError while somebody writes it."""
+    """The file, opened for reading, and locked.
+
+    Raises OSError, and ToftrackError while somebody writes it.
+    """
     raw = open_in_place(path, make=False)
     try:
         _lock(raw, path)
     except BaseException:
         raw.close()
         raise
-    return os.fdopen(os.dup(raw.fileno()), "rb")
+    return cast(BinaryIO, io.BufferedReader(cast(io.RawIOBase, raw)))
 
 
-def _lock(stream: IO[bytes], path: Path) -> None:
+def _lock(stream: IO[bytes] | io.RawIOBase, path: Path) -> None:
     if fcntl is None:
         return
     try:
