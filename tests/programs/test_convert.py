@@ -165,10 +165,10 @@ def test_recordings_of_another_size_do_not_fit_the_camera(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["a.npz"], "is recorded to .srs"),
+        (["a.avi"], "is recorded to .npz"),
         (["a.srs", "--frames", "0"], "--frames"),
-        (["a.srs", "device=sample"], "only the SR3000"),
-        (["a.srs", "--conf", "nowhere"], "no configuration"),
+        (["a.srs", "device=sample"], "only an SR3000"),
+        (["a.srs", "--conf", "nowhere"], "no config.yaml"),
         (["a.srs", "device.transport=emulated", "device.emulated.faults=[missing]"], "1ad2:0074"),
         (["a.srs", "device.unknown=3"], "unknown"),
     ],

@@ -122,6 +122,8 @@ def record_frames(
                 endings.say(recorder.words(), sys.stdout)
     if recorder.failed:
         raise ToftrackError(recorder.ended)
+    if recorder.ended is not None:
+        print(recorder.ended, file=sys.stderr)
     if not recorder.frames:
         raise ToftrackError("the device delivered no frame; nothing was recorded")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 import time
@@ -37,6 +38,8 @@ from toftrack.tracking.effort import Pace
 from toftrack.tracking.hands import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 
+_log = logging.getLogger(__name__)
+
 
 def track(config: DictConfig, device: Device) -> float:
     """Run a configuration to its end; returns the mean joint error in mm, else 1 - mean score.
@@ -54,7 +57,8 @@ def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Reco
     # A configuration of one's own may do without.
     if config.get("record") is None:
         return nullcontext()
-    return Recorder(str(config.record), device, config.record_limit_gb)
+    limit_gb = config.record_limit_gb
+    return Recorder(str(config.record), device, limit_gb, tell=_log.warning)
 
 
 def _track(config: DictConfig, device: Device, stream: Stream, recorder: Recorder | None) -> float:

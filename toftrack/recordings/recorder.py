@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import os
 import queue
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import LARGEST_MEDIAN_M, Frame, median_reading, wrong_unit
+from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Frame, median_reading, wrong_unit
 from toftrack.recordings.npz_pieces import compressed
 from toftrack.recordings.unfinished import (
     IMAGE_TYPES,
@@ -27,12 +27,13 @@ from toftrack.recordings.unfinished import (
     finish,
 )
 
-_log = logging.getLogger(__name__)
 _WAITING = 32
 """Frames at most that are not written yet, 1.8 MB each at 640 x 480."""
 _SPARE_BYTES = 2**27
 """So much of the disk is left to others: a recording must not end the run that it is of."""
 _GIGABYTE = 1e9
+_STRANGE = 10
+"""So many frames at the beginning, none of which can be in metres, are in another unit."""
 
 
 class Source(Protocol):
@@ -55,21 +56,27 @@ class Recorder:
     """Writes frames in a thread of its own; use it with `with`.
 
     They grow in `FILE.npz.part`, of which `FILE.npz` is made when the recorder is closed or takes
-    no more; after a kill `toftrack recover FILE.npz` makes it. A recorder that cannot go on says so
-    in `ended` and in the log, keeps what there is, and raises nothing.
+    no more; after a kill `toftrack recover FILE.npz` makes it. A recorder that cannot go on says
+    so, keeps what there is, and raises nothing.
 
     Args:
         path: the recording, `.npz`.
         source: of the frames.
         limit_gb: 1e9 bytes of the file, after which no more frames are taken.
         overwrite: replace an existing file.
+        tell: called with `ended`, in the recorder's thread, as soon as that is so.
 
     Raises:
         ToftrackError: the file exists, or cannot be made.
     """
 
     def __init__(
-        self, path: str | Path, source: Source, limit_gb: float, overwrite: bool = False
+        self,
+        path: str | Path,
+        source: Source,
+        limit_gb: float,
+        overwrite: bool = False,
+        tell: Callable[[str], object] = lambda sentence: None,
     ) -> None:
         self.path = Path(path).expanduser()
         self.frames = 0
@@ -82,8 +89,9 @@ class Recorder:
         """It ended because of an error; what there is, is as `ended` says."""
         self._part = self.path.with_name(self.path.name + SUFFIX)
         self._source, self._limit_gb, self._overwrite = source, limit_gb, overwrite
+        self._tell = tell
         self._facts: Facts | None = None
-        self._clock = _Clock()
+        self._clock, self._strange = _Clock(), 0
         self._file = self._open()
         self._queue: queue.Queue[Frame | None] = queue.Queue(_WAITING)
         self._second = ThreadPoolExecutor(1, "toftrack-amplitude")
@@ -189,15 +197,26 @@ class Recorder:
         if first:
             self._file.begin(facts)
             self._facts = facts
+        self._check_unit(frame)
         self._file.append(frame.index, self._clock.at(frame.timestamp_s, facts.fps), images)
         self.frames = self._file.frames
 
+    def _check_unit(self, frame: Frame) -> None:
+        """After half a minute it would be too late: nobody reads a recording in another unit."""
+        if frame.depth.dtype.kind in "iu":
+            median, kind = median_reading(frame.depth), str(frame.depth.dtype)
+            raise wrong_unit(f"the depth of frame {frame.index}", median, kind)
+        if self._strange >= _STRANGE:
+            return
+        median = median_reading(frame.depth)
+        if SMALLEST_MEDIAN_M <= median <= LARGEST_MEDIAN_M:
+            self._strange = _STRANGE
+        elif median:
+            self._strange += 1
+            if self._strange == _STRANGE:
+                raise wrong_unit(f"the depth of the first {_STRANGE} frames", median)
+
     def _facts_of(self, frame: Frame) -> Facts:
-        kind, median = frame.depth.dtype.kind, median_reading(frame.depth)
-        if kind in "iu" or median > LARGEST_MEDIAN_M:
-            # After half a minute it would be too late.
-            name = str(frame.depth.dtype) if kind in "iu" else ""
-            raise wrong_unit("the depth of the first frame", median, name)
         about = {
             "toftrack": version("toftrack"),
             "device": without_whereabouts(self._source.description),
@@ -226,7 +245,7 @@ class Recorder:
         self.failed = failed
         if why or failed:
             self.ended = told
-            _log.warning("%s", told)
+            self._tell(told)
 
 
 def without_whereabouts(facts: dict[str, Any]) -> dict[str, Any]:
