@@ -11,6 +11,7 @@ A folder on the way to a file may be a link: which folder is meant, the user say
 from __future__ import annotations
 
 import errno
+import io
 import os
 import secrets
 import stat
@@ -40,10 +41,11 @@ def open_to_read(path: str | Path) -> BinaryIO:
         raise
 
 
-def open_new(path: str | Path, replace: bool = False) -> BinaryIO:
+def open_new(path: str | Path, replace: bool = False, buffered: bool = True) -> BinaryIO:
     """Make a file that grows from nothing, open for writing and reading.
 
     replace: let a file that stands there go; its other names, if any, keep what is in it.
+    buffered: False: what is written reaches the operating system at once; `write` may take a part.
 
     Raises OSError: something stands there, with `replace` something that is no file; or it cannot
     be made.
@@ -51,10 +53,11 @@ def open_new(path: str | Path, replace: bool = False) -> BinaryIO:
     if replace:
         check_replaceable(path)
         Path(path).unlink(missing_ok=True)
-    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666), "w+b")
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
+    return os.fdopen(descriptor, "w+b", -1 if buffered else 0)
 
 
-def open_in_place(path: str | Path, make: bool = True) -> BinaryIO:
+def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
     """Open a file of ours to change it, without buffer; what is in it stays.
 
     make: an empty one where there is none.
@@ -75,7 +78,7 @@ def open_in_place(path: str | Path, make: bool = True) -> BinaryIO:
         if status.st_nlink > 1:
             why = "it has a second name elsewhere (a hard link), where it would change, too"
             raise OSError(errno.EMLINK, why, str(path))
-        return os.fdopen(descriptor, "r+b", buffering=0)
+        return io.FileIO(descriptor, "r+b")
     except BaseException:
         os.close(descriptor)
         raise

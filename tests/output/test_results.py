@@ -23,7 +23,6 @@ from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output import records
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate, metrics_table
-from toftrack.output.files import save_whole, write_whole
 from toftrack.output.lines import KINDS, LINE_FIELDS, read_lines
 from toftrack.output.results import ResultWriter, read_results, read_run_facts
 from toftrack.output.trust import Hand, trust
@@ -321,20 +320,6 @@ def test_a_disk_that_fills_keeps_what_was_whole(tmp_path: Path) -> None:
     assert len(read_results(tmp_path / "track.npz")["lost"]) == 3
 
 
-def test_a_file_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
-    def half(stream: Any) -> None:
-        stream.write(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    path = tmp_path / "hand_shape.json"
-    path.write_text("whole")
-    with pytest.raises(OSError):
-        write_whole(path, half)
-    with pytest.raises(OSError):
-        save_whole(path, lambda partial: half(open(partial, "wb")))
-    assert path.read_text() == "whole" and list(tmp_path.iterdir()) == [path]
-
-
 def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
     def peak(frames: int) -> int:
         tracemalloc.start()
@@ -523,7 +508,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
 def test_a_result_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     writer = ResultWriter(tmp_path, {}, NAMES, None)
     writer.append((estimate(0),))
-    (tmp_path / "track.npz.part").mkdir()
+    (tmp_path / "track.npz").mkdir()
     with pytest.raises(ToftrackError, match="cannot be written"):
         writer.close()
     assert (tmp_path / "track.jsonl").read_text().count("\n") == 1

@@ -28,6 +28,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.json_text import read_json
+from toftrack.safe_files import write_whole
 
 _SLACK_DEGREES = 10.0
 _UNITS = ("degrees", "radians")
@@ -100,10 +101,8 @@ def save_poses(path: str | Path, poses: Sequence[NamedPose]) -> None:
             for pose in poses
         ],
     }
-    half = path.with_name(path.name + ".part")
     try:
-        half.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        half.replace(path)
+        write_whole(path, json.dumps(content, indent=1) + "\n")
     except OSError as error:
         raise ToftrackError(
             f"the file of gestures '{path}' cannot be written ({error.strerror}); choose another"

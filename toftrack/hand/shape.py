@@ -22,6 +22,7 @@ from torch import Tensor
 
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
+from toftrack.safe_files import write_whole
 
 SIDES = ("right", "left")
 DEFAULT_HAND_LENGTH_M = 0.190
@@ -168,7 +169,7 @@ class HandShape:
             "bone_lengths_m": self.bone_lengths_m.tolist(),
             "fitted": None if self.fitted is None else self.fitted.content(),
         }
-        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(content, indent=1) + "\n")
 
     @staticmethod
     def load(path: str | Path) -> HandShape:

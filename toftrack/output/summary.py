@@ -82,14 +82,15 @@ def _hand(folder: Path, slot: int, metadata: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_metrics(
-    records: Records, rows: np.ndarray, index: np.ndarray, truth: Truth
+    records: Records, rows: np.ndarray, index: np.ndarray, truth: Truth, counted: np.ndarray
 ) -> dict[str, Any] | None:
-    """The metrics over those frames whose numbers the truth has; None where it has none.
+    """The metrics over those frames that count and whose numbers the truth has; None where it has
+    none of them.
 
-    rows: records.  index: numbers of their frames.
+    rows: records.  index: numbers of their frames.  counted: (T,) bool of them.
     """
     true = index - truth.first
-    known = (true >= 0) & (true < len(truth))
+    known = counted & (true >= 0) & (true < len(truth))
     if not known.any():
         return None
     found = truth.of_frames(index[known])

@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import BinaryIO
 
 from toftrack.errors import ToftrackError
 from toftrack.output.exports.bvh import bvh_of
 from toftrack.output.exports.glb import glb_of
 from toftrack.output.exports.motion import motions_of
 from toftrack.output.exports.table import csv_of
-from toftrack.output.files import write_whole
 from toftrack.output.run_folder import Run, read_run
+from toftrack.safe_files import write_whole
 
 FORMATS = ("glb", "bvh", "csv")
 
@@ -46,16 +44,12 @@ def export(folder: Path, kind: str) -> list[Path]:
     contents = _contents(read_run(folder), kind)
     try:
         for name, content in contents.items():
-            write_whole(folder / name, partial(_write, content))
+            write_whole(folder / name, content)
     except OSError as error:
         raise ToftrackError(
             f"'{folder}' cannot be written ({error.strerror or error}); copy it to where it can be"
         ) from error
     return [folder / name for name in contents]
-
-
-def _write(content: bytes, stream: BinaryIO) -> None:
-    stream.write(content)
 
 
 def _contents(run: Run, kind: str) -> dict[str, bytes]:

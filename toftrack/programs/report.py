@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import math
 import statistics
 import sys
@@ -21,6 +22,8 @@ import yaml
 
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
+from toftrack.safe_files import write_whole
+from toftrack.views.pictures import write_picture
 
 FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
 """What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
@@ -176,13 +179,14 @@ def write_csv(runs: Sequence[Run], path: Path) -> None:
     """One row a job: its folder, its overrides, its figures, its error."""
     overrides = _keys(runs)
     figures = list(dict.fromkeys(key for run in runs for key in run.figures))
-    with open(path, "w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["run", *overrides, *figures, "error"])
-        for run in runs:
-            row = [*(run.overrides.get(key, "") for key in overrides)]
-            row += [*(str(run.figures.get(key, "")) for key in figures)]
-            writer.writerow([run.name, *row, run.error or ""])
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["run", *overrides, *figures, "error"])
+    for run in runs:
+        row = [*(run.overrides.get(key, "") for key in overrides)]
+        row += [*(str(run.figures.get(key, "")) for key in figures)]
+        writer.writerow([run.name, *row, run.error or ""])
+    write_whole(path, text.getvalue())
 
 
 def table(groups: Sequence[Group], figure: str) -> str:
@@ -216,7 +220,6 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 
     Raises ToftrackError when there is no job, no job has the figure, or nothing can be written.
     """
-    import cv2  # slow to import
 
     from toftrack.views.figures.sweep import sweep_figure
 
@@ -248,8 +251,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     if points:
         label = f"{figure.removeprefix('metrics.')}, mean over recordings"
         picture = folder / "sweep.png"
-        if not cv2.imwrite(str(picture), sweep_figure(points, label)):
-            raise ToftrackError(f"{picture} cannot be written")
+        write_picture(picture, sweep_figure(points, label))
         written.append(picture)
     print("\n" + "\n".join(f"  {path}" for path in written))
     return runs, groups

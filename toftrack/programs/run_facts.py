@@ -17,7 +17,6 @@ from omegaconf import DictConfig, OmegaConf
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
-from toftrack.output.files import save_whole
 from toftrack.output.summary import shape_file
 from toftrack.tracking.hands import HandsTracker
 
@@ -121,7 +120,7 @@ class _ShapeFile:
             return
         self._saved_s = now_s
         try:
-            save_whole(self._path, shape.to("cpu").save)
+            shape.to("cpu").save(self._path)
         except OSError as error:
             if last:
                 raise ToftrackError(

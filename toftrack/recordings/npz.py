@@ -22,7 +22,6 @@ Unknown keys are ignored.
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,6 +43,7 @@ from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
 from toftrack.recordings.npz_camera import CAMERA_KEYS, camera_arrays, camera_of
 from toftrack.recordings.streamed_images import Images, StreamedImages
+from toftrack.safe_files import whole_file
 
 DEFAULT_FPS = 25.0
 LOADED_BYTES = MOST_BYTES
@@ -115,13 +115,10 @@ def write_recording(path: str | Path, recording: Recording) -> None:
         arrays["amplitude"] = recording.amplitude
     if recording.truth is not None:
         arrays |= _truth_arrays(recording.truth)
-    partial = path.with_name(path.name + ".part")
     try:
-        with open(partial, "wb") as stream:
+        with whole_file(path) as stream:
             np.savez_compressed(stream, **arrays)
-        os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise ToftrackError(
             f"the recording '{path}' cannot be written ({error.strerror}); choose another place"
         ) from error

@@ -13,6 +13,7 @@ The optional further keys of `camera.json`: `depth_unit_m` (metres of one step, 
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import struct
@@ -29,6 +30,7 @@ from toftrack.json_text import read_json
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.png import LARGEST_PIXELS, SIGNATURE, decoded_png
+from toftrack.safe_files import open_new, write_whole
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
 
@@ -180,8 +182,10 @@ class PngFolderWriter:
                     f"the folder '{self.folder}' contains PNG images already; choose an empty one"
                 )
             text = json.dumps(camera.to_dict() | facts, indent=1) + "\n"
-            (self.folder / _CAMERA).write_text(text, encoding="utf-8")
-            self._times = open(self.folder / _TIMES, "w", encoding="utf-8")
+            write_whole(self.folder / _CAMERA, text)
+            self._times = io.TextIOWrapper(
+                open_new(self.folder / _TIMES, replace=True), encoding="utf-8"
+            )
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -214,7 +218,8 @@ class PngFolderWriter:
         self.close()
 
     def _save(self, name: str, image: np.ndarray) -> None:
-        (self.folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        with open_new(self.folder / name) as stream:
+            stream.write(cv2.imencode(".png", image)[1].tobytes())
 
     def _unwritable(self, error: OSError) -> ToftrackError:
         return ToftrackError(

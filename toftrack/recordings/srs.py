@@ -35,6 +35,7 @@ from toftrack.recordings.sr_frame import (
     unambiguous_range_m,
 )
 from toftrack.recordings.srs_facts import SrsFacts, SrsInit, facts_text, parse_facts
+from toftrack.safe_files import open_new
 
 _SIGNATURE, _VERSION = 0x4F497273, 1
 _INIT, _CONFIGURE, _FRAME = 1, 2, 3
@@ -76,7 +77,7 @@ class SrsWriter:
         """Whole frames written."""
         init, facts = init or SrsInit(), facts or SrsFacts()
         try:
-            self._stream = open(self.path, "wb" if overwrite else "xb", buffering=0)
+            self._stream = open_new(self.path, replace=overwrite, buffered=False)
         except FileExistsError:
             raise ToftrackError(
                 f"the file '{self.path}' exists already; choose another name or give --overwrite"
