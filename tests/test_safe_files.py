@@ -132,7 +132,7 @@ def test_what_a_killed_writer_left_can_be_removed(path: Path) -> None:
     other = path.with_name("file.part")
     other.write_text("not ours")
     assert len(list(path.parent.iterdir())) == 2
-    remove_partial(path)
+    remove_partial(path.parent, [path.name])
     assert list(path.parent.iterdir()) == [other]
 
 

@@ -15,7 +15,7 @@ import io
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -115,13 +115,25 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
         stream.write(content.encode() if isinstance(content, str) else content)
 
 
-def remove_partial(path: Path) -> None:
-    """Remove what a killed `whole_file` of this path left. Nobody may be writing it just now."""
+def remove_partial(folder: Path, names: Collection[str]) -> None:
+    """Remove what killed `whole_file`s of these names left. Nobody may be writing them just now."""
     mark = len(".") + 8 + len(_PARTIAL)
     with suppress(OSError):
-        for found in path.parent.iterdir():
-            if found.name[:-mark] == path.name and found.name.endswith(_PARTIAL):
+        for found in folder.iterdir():
+            if found.name[:-mark] in names and found.name.endswith(_PARTIAL):
                 found.unlink()
+
+
+def let_links_go(path: Path) -> None:
+    """Remove, under a name that another library will write, a link, a second name or a pipe.
+
+    What they lead to stays. Raises OSError.
+    """
+    with suppress(FileNotFoundError):
+        status = os.lstat(path)
+        alone = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+        if not alone and not stat.S_ISDIR(status.st_mode):
+            path.unlink()
 
 
 def make_folder(path: str | Path) -> None:

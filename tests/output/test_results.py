@@ -58,8 +58,13 @@ def estimate(index: int, **changes: Any) -> Estimate:
     return dataclasses.replace(whole, **changes)
 
 
-def write(folder: Path, estimates: list[Estimate], truth: Truth | None = None) -> ResultWriter:
-    with ResultWriter(folder, {"seed": 1}, NAMES, truth) as writer:
+def write(
+    folder: Path,
+    estimates: list[Estimate],
+    truth: Truth | None = None,
+    more: dict[str, Any] | None = None,
+) -> ResultWriter:
+    with ResultWriter(folder, {"seed": 1} | (more or {}), NAMES, truth) as writer:
         for one in estimates:
             writer.append((one,))
     return writer
@@ -101,6 +106,7 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "openxr_joint_parents": ((26,), "i8"),
         "timestamp_s": ((6,), "f8"),
         "compute_s": ((6,), "f4"),
+        "dropped": ((6,), "?"),
     }
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
         texts = {"gesture", "state_name", "side", "joint_names", "openxr_joint_names"}
@@ -242,11 +248,12 @@ def test_truth_is_found_by_the_frames_numbers(tmp_path: Path) -> None:
     summary = write(tmp_path, done, truth).summary
     assert truth.first == 1 and summary["frames"] == 12
     errors = np.full(12, 10 * math.sqrt(3))
-    errors[4] = 1e3 * np.linalg.norm(done[3].joints_m - truth.joints_m[6], axis=1).mean()
+    stale = 1e3 * np.linalg.norm(done[3].joints_m - truth.joints_m[6], axis=1).mean()
     assert summary["metrics"]["mean_mm"] == pytest.approx(errors[5:].mean(), rel=1e-3)
-    assert summary["metrics"]["trust"]["mean_all_mm"] == pytest.approx(
-        np.minimum(errors, 1e3).mean(), rel=1e-3
-    )
+    assert summary["metrics"]["trust"]["mean_all_mm"] == pytest.approx(errors.mean(), rel=1e-3)
+    asked = write(tmp_path, done, truth, {"config": {"count_dropped": True}}).summary
+    errors[4] = min(stale, 1e3)
+    assert asked["metrics"]["trust"]["mean_all_mm"] == pytest.approx(errors.mean(), rel=1e-3)
 
 
 def test_frames_beyond_the_truth_are_not_judged(tmp_path: Path) -> None:
@@ -467,6 +474,12 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     np.testing.assert_allclose(content["timestamp_s"], np.arange(2, 8) / 25)
     assert content["compute_s"][2:4].tolist() == [0, 0]
     assert content["metadata"]["held_frames"] == [4, 5]
+    assert content["dropped"].tolist() == [False, False, True, True, False, False]
+    told = ["tracking", "tracking", "dropped", "dropped", "tracking", "tracking"]
+    assert content["state_name"].tolist() == told
+    assert content["lost"].tolist() == [estimate(i).lost for i in rows]
+    # A dropped frame has no line: its number is missing.
+    assert [line["index"] for line in read_lines_of(tmp_path)] == [2, 3, 6, 7]
     assert summary["frames"] == 6
     assert summary["mean_ms"] == pytest.approx(1e3 * np.mean([one.compute_s for one in done]))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +22,12 @@ LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""
 
 
+_BLOCK = 65536
+WHOLE_FILES = (
+    *("run.json", "track.npz", "summary.json", "overlay.png"),
+    *("hand_shape.json", "hand_shape_2.json"),
+)
+"""Those that take their place when they are done, and of which a kill may leave a part."""
 RUN_FORMAT = "toftrack-run"
 """What the run.json of a run's folder says that it is."""
 
@@ -86,6 +94,31 @@ def locked_lines(folder: Path) -> Iterator[None]:
         yield
 
 
+def cut_unfinished_line(folder: Path) -> None:
+    """Take from the growing file's end the line that was not finished; one of its lines is ours.
+
+    A file with a second name elsewhere stays as it is. Raises OSError.
+    """
+    if (folder / LINES).stat().st_nlink > 1:
+        return
+    with open_in_place(folder / LINES, make=False) as file:
+        if whole := _size_of_lines(file):
+            file.truncate(whole)
+
+
+def _size_of_lines(file: io.FileIO) -> int:
+    """Bytes up to the end of the last whole line."""
+    end = file.seek(0, os.SEEK_END)
+    while end > 0:
+        begin = max(0, end - _BLOCK)
+        file.seek(begin)
+        found = file.read(end - begin).rfind(b"\n")
+        if found >= 0:
+            return begin + found + 1
+        end = begin
+    return 0
+
+
 def _lock(file: IO[bytes], folder: Path) -> None:
     if fcntl is None:
         return
@@ -116,7 +149,7 @@ def make_way(folder: Path) -> None:
     for name in ends:
         check_replaceable(folder / name)
         (folder / name).unlink(missing_ok=True)
-        remove_partial(folder / name)
+    remove_partial(folder, WHOLE_FILES)
 
 
 def _has_run(folder: Path) -> bool:

@@ -183,6 +183,8 @@ def finish(
     metadata = facts["metadata"]
     rows, changed = _every_frame(records)
     dropped = changed[DROPPED]
+    if dropped.any():
+        metadata = metadata | {"held_frames": changed["index"][dropped].tolist()}
     small = {
         "joint_names": np.array(facts["joint_names"], np.str_),
         "metadata": np.array(json.dumps(metadata)),
@@ -277,19 +279,19 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 
 def _dropped(arrays: dict[str, np.ndarray], content: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Which frames were dropped, (T,), and the states' names where older versions do not say so."""
+    """Which frames were dropped, (T,), and the names of states where older files do not say so."""
     count = len(content["lost"])
     if DROPPED in arrays:
         if arrays[DROPPED].dtype != bool or arrays[DROPPED].shape != (count,):
-            raise ValueError(f"{DROPPED!r} has the shape {arrays[DROPPED].shape}")
+            raise ValueError(f"{DROPPED!r} does not fit")
         return {DROPPED: arrays[DROPPED]}
     held = content["metadata"].get("held_frames")
     if "index" not in content or not isinstance(held, list) or not held:
         return {DROPPED: np.zeros(count, bool)}
     dropped = np.isin(content["index"], np.array(held, np.int64))
-    if "state_name" not in content:
-        return {DROPPED: dropped}
-    return {DROPPED: dropped, "state_name": _told_dropped(content["state_name"], dropped)}
+    names = content.get("state_name")
+    told = {} if names is None else {"state_name": _told_dropped(names, dropped)}
+    return {DROPPED: dropped} | told
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:

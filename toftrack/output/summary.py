@@ -90,22 +90,24 @@ def run_metrics(
     rows: records.  index: numbers of their frames.  counted: (T,) bool of them.
     """
     true = index - truth.first
-    known = counted & (true >= 0) & (true < len(truth))
+    inside = (true >= 0) & (true < len(truth))
+    known = counted & inside
     if not known.any():
         return None
+    position = np.flatnonzero(counted[inside])
     found = truth.of_frames(index[known])
     names = ("joints_m", "lost", "joint_sigma_m")
     arrays = {n: records.column(n, rows[known]) for n in names if n in records.names}
     if records.slots == 1:
         figures = trust(arrays["joints_m"], arrays["lost"], _hand_of(found))
-        return _metrics(figures, arrays, found)
+        return _metrics(figures, arrays, found, position)
     truths = [found] if found.other is None else [found, found.other]
     both = trust_of_two(arrays["joints_m"], arrays["lost"], [_hand_of(one) for one in truths])
     of_slots = [{n: array[:, slot] for n, array in arrays.items()} for slot in both.slots]
-    metrics = {"slot": both.slots[0]} | _metrics(both.first, of_slots[0], found)
+    metrics = {"slot": both.slots[0]} | _metrics(both.first, of_slots[0], found, position)
     if both.second is None:
         return metrics | {"ghost_pct": both.ghost_pct}
-    second = {"slot": both.slots[1]} | _metrics(both.second, of_slots[1], truths[1])
+    second = {"slot": both.slots[1]} | _metrics(both.second, of_slots[1], truths[1], position)
     return metrics | {"second": second}
 
 
@@ -113,10 +115,17 @@ def _hand_of(truth: Truth) -> Hand:
     return Hand(truth.joints_m, truth.visible)
 
 
-def _metrics(figures: Trust, arrays: dict[str, np.ndarray], truth: Truth) -> dict[str, Any]:
-    """Of the estimates of one hand, arrays of (T, ...)."""
+def _metrics(
+    figures: Trust, arrays: dict[str, np.ndarray], truth: Truth, position: np.ndarray
+) -> dict[str, Any]:
+    """Of the estimates of one hand, arrays of (T, ...).
+
+    position: (T,) of the frames among all, with those that do not count.
+    """
     joints = arrays["joints_m"]
     metrics = {"trust": asdict(figures)} | evaluate(joints, arrays["lost"], truth)
+    for event in metrics["reacquisition"]:
+        event["frame"] = int(position[event["frame"]])
     if "joint_sigma_m" in arrays:
         metrics["coverage"] = asdict(coverage(joints, arrays["joint_sigma_m"], truth))
     return metrics

@@ -19,7 +19,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.json_text import read_json
 from toftrack.output.evaluation import metrics_table
-from toftrack.output.files import LINES, locked_lines
+from toftrack.output.files import LINES, WHOLE_FILES, cut_unfinished_line, locked_lines
 from toftrack.output.results import (
     count_frames,
     finish,
@@ -83,10 +83,11 @@ def recover(
             earlier = _earlier_summary(folder)
             if not replace:
                 _check_not_less(folder, count_frames(records))
+            if records.count:
+                cut_unfinished_line(folder)
             with suppress(FileNotFoundError):
                 cut_to_whole(folder / VIDEO)
-            for name in _MADE:
-                remove_partial(folder / name)
+            remove_partial(folder, WHOLE_FILES)
             truth = _truth(facts, recording)
             return finish(folder, facts, truth, records, earlier.get("realtime"))
     except FileNotFoundError:
