@@ -142,4 +142,4 @@ def test_what_cannot_be_one_recording_is_told(words: list[str], told: str) -> No
 def test_only_what_must_be_given_is_called_required(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         record.main([])
-    assert capsys.readouterr().err.endswith("the following arguments are required: OUT.srs\n")
+    assert capsys.readouterr().err.endswith("the following arguments are required: OUT\n")

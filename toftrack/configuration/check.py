@@ -41,6 +41,7 @@ _ABOVE_ZERO = frozenset(
     likelihood.beta likelihood.tolerance_m
     lost.joints.scale
     pose_space.dims
+    record_limit_gb
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
     relocation.hypotheses relocation.landmark_m relocation.landmark_sigmas relocation.places
     relocation.rival_frames relocation.rival_m

@@ -30,7 +30,7 @@ _COMMANDS = {
     "report": _Command("toftrack.programs.report", "gather the jobs of a sweep"),
     "benchmark": _Command("toftrack.benchmark.scoring", "measure the speed"),
     "export": _Command("toftrack.programs.export", "write a run for Blender, or as a table"),
-    "recover": _Command("toftrack.programs.recover", "finish the files of a run that was killed"),
+    "recover": _Command("toftrack.programs.recover", "finish a run or a recording that was killed"),
 }
 _HELP = ("-h", "--help")
 

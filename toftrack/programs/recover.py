@@ -1,8 +1,9 @@
-"""Finish the files of a run that was killed: `toftrack recover RUN`.
+"""Finish the files of a run or a recording that was killed: `toftrack recover RUN|FILE.npz`.
 
 Makes track.npz and summary.json anew from run.json and track.jsonl, which are whole up to the last
 frame that was done. The metrics need the recording that was tracked. A track.npz that has more
-frames than that stays, unless --replace is given.
+frames than that stays, unless --replace is given. Of a recording, makes FILE.npz of the frames in
+FILE.npz.part.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from toftrack.output.results import (
 )
 from toftrack.output.run_folder import found_again, open_tracked
 from toftrack.recordings.store import open_source
+from toftrack.recordings.unfinished import is_recording, recover_recording
 from toftrack.safe_files import check_replaceable, remove_partial
 from toftrack.views.overlay import VIDEO
 from toftrack.views.video import cut_to_whole
@@ -42,13 +44,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run", metavar="RUN", help="the output folder of toftrack track")
+    parser.add_argument(
+        "run", metavar="RUN|FILE", help="the output folder of toftrack track, or a recording"
+    )
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
     parser.add_argument(
-        "--replace", action="store_true", help="also where the track.npz there has more frames"
+        "--replace",
+        action="store_true",
+        help="also a FILE.npz that is there, or a track.npz that has more frames",
     )
     options = parser.parse_args(arguments)
     folder = Path(options.run).expanduser()
+    if is_recording(folder):
+        path, frames = recover_recording(folder, options.replace)
+        print(f"{path}: {frames} frames")
+        return
     print(metrics_table(recover(folder, options.recording, options.replace)))
     for name in ("track.npz", "summary.json"):
         print(f"  {folder / name}")

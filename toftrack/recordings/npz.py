@@ -8,6 +8,8 @@
 | `fps` | scalar | no: from the time stamps, else 25 |
 | `timestamp_s` | (T,) float64 | no: from `fps` |
 | `distortion` | (4, 5, 8, 12 or 14,) float, OpenCV's k1 k2 p1 p2 k3 ... | no: zeros |
+| `lens` | text, `opencv` or `fisheye` | no: `opencv` |
+| `depth_polynomial`, `depth_polynomial_range_m` | (n,), (2,) float, see `Camera` | no: none |
 | `joints_m` | (T, 21, 3) float | no |
 | `visible`, `in_space` | (T,) bool | no: true |
 | `visible_fraction`, `joint_visible` | (T,) float, (T, 21) bool | no |
@@ -39,6 +41,7 @@ from toftrack.frames import (
 )
 from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
+from toftrack.recordings.npz_camera import CAMERA_KEYS, camera_arrays, camera_of
 from toftrack.recordings.streamed_images import Images, StreamedImages
 from toftrack.safe_files import open_to_read, whole_file
 
@@ -98,14 +101,12 @@ def read_recording(path: str | Path) -> Recording:
 def write_recording(path: str | Path, recording: Recording) -> None:
     """Write a recording, compressed; an existing file is replaced only by a complete one.
 
-    Depth keeps its type (float16 or float32). A depth polynomial has no place in the format: save
-    the camera beside the recording. Raises ToftrackError when the file cannot be written.
+    Depth keeps its type (float16 or float32). Raises ToftrackError when the file cannot be written.
     """
     path = Path(path)
     arrays: dict[str, Any] = {
         "radial_m" if recording.radial else "depth_m": recording.depth,
-        "K": recording.camera.K,
-        "distortion": recording.camera.distortion,
+        **camera_arrays(recording.camera),
         "timestamp_s": np.asarray(recording.timestamp_s, np.float64),
         "fps": np.float64(recording.fps),
         "metadata": json.dumps(recording.metadata),
@@ -140,11 +141,10 @@ _OTHER_KEYS = {name: f"{name}2" for name in _TRUTH_KEYS} | {"joints_m": "joints2
 _KEYS = (
     "depth_m",
     "radial_m",
-    "K",
+    *CAMERA_KEYS,
     "amplitude",
     "fps",
     "timestamp_s",
-    "distortion",
     *_TRUTH_KEYS.values(),
     *_OTHER_KEYS.values(),
     "metadata",
@@ -205,7 +205,7 @@ def _parse(arrays: dict[str, Any]) -> Recording:
     depth = _check_depth(arrays[depth_key], depth_key)
     check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
-    camera = Camera(arrays["K"], width, height, arrays.get("distortion", np.zeros(5)))
+    camera = camera_of(arrays, width, height)
     timestamp_s, fps = _times(arrays, count)
     return Recording(
         depth=depth,

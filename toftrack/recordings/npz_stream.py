@@ -12,6 +12,7 @@ from typing import IO, Any
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.recordings.npz_camera import camera_arrays
 from toftrack.recordings.store import FrameStore
 from toftrack.safe_files import whole_file
 
@@ -35,8 +36,7 @@ def write_npz_streamed(
     camera = store.camera
     shape = (len(store), camera.height, camera.width)
     small: dict[str, Any] = {
-        "K": camera.K,
-        "distortion": camera.distortion,
+        **camera_arrays(camera),
         "timestamp_s": np.asarray(store.timestamp_s, np.float64),
         "fps": np.float64(store.fps),
         "metadata": json.dumps(store.metadata),

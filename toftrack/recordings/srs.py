@@ -100,6 +100,11 @@ class SrsWriter:
             self._stream.close()
             raise
 
+    @property
+    def size_bytes(self) -> int:
+        """Of the file."""
+        return self._end
+
     def configure(self, registers: bytes) -> None:
         """The 64 registers under which the frames that follow are taken."""
         if len(registers) != REGISTERS:
