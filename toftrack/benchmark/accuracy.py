@@ -36,6 +36,8 @@ from toftrack.output.accuracy_tables import accuracy_tables, markdown, plain
 
 _TIMED_BESIDE = "milliseconds were measured beside other processes of this run"
 
+_TOLD_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smooth", "hydra")
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, track, report. Raises ToftrackError.
@@ -78,10 +80,12 @@ def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], lis
     """
     overrides = [word for word in words if "=" in word and not Path(word).exists()]
     for word in overrides:
-        if word.split("=")[0].split(".")[0] in ("device", "seed", "hands"):
+        key = word.split("=")[0].lstrip("+~")
+        if key == "hand.side" or key.split(".")[0] in _TOLD_ELSEWHERE:
             raise ToftrackError(
-                f"{word} cannot be given here: recordings are named, seeds and hands told by "
-                "--seeds and --hands"
+                f"{word} cannot be given here: recordings are named, with the camera that they "
+                "have, sides, seeds and hands are told by --side, --seeds and --hands, and nothing "
+                "is shown, streamed or smoothed"
             )
     if hands > 1:
         overrides.append(f"hands={hands}")

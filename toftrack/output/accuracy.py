@@ -138,16 +138,18 @@ def by_recording(rows: Sequence[Row]) -> dict[str, Row]:
     each: dict[str, Row] = {}
     for name in dict.fromkeys(row["recording"] for row in rows):
         mine = [row for row in rows if row["recording"] == name]
-        keys = dict.fromkeys(key for row in mine for key in row if key not in _NO_FIGURES)
+        keys = dict.fromkeys(
+            key
+            for row in mine
+            for key, value in row.items()
+            if key != "seed" and (value is None or isinstance(value, int | float))
+        )
         each[name] = {key: mean_of([row.get(key) for row in mine]) for key in keys}
         runs = [row["longest_silent"] for row in mine if row.get("longest_silent") is not None]
         if runs:
             each[name]["longest_silent"] = max(runs)
         each[name] = {key: _rounded(value) for key, value in each[name].items()}
     return each
-
-
-_NO_FIGURES = ("recording", "seed", "groups", "kind", "tips_mm")
 
 
 def totals(rows: Sequence[Row]) -> dict[str, Any]:

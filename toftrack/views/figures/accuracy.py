@@ -68,8 +68,8 @@ def accuracy_figure(each: Mapping[str, Mapping[str, Any]], total: Mapping[str, A
         for u in (low, high):
             cv2.line(picture, (u, middle - 5), (u, middle + 5), (0, 0, 0), 2)
     note = (
-        f"{total['recordings']} recordings, seeds: {total['seeds']}. Beside the bars the mean joint "
-        "error over all visible frames; across the last bar the 90 % interval of usable."
+        f"{total['recordings']} recordings, seeds: {total['seeds']}. Beside the bars the mean "
+        "joint error over all visible frames; across the last bar the 90 % interval of usable."
     )
     return titled(picture, "What the frames are", note)
 
