@@ -67,9 +67,9 @@ def accuracy_figure(each: Mapping[str, Mapping[str, Any]], total: Mapping[str, A
         cv2.line(picture, (low, middle), (high, middle), (0, 0, 0), 2)
         for u in (low, high):
             cv2.line(picture, (u, middle - 5), (u, middle + 5), (0, 0, 0), 2)
-    count = total["seeds"]
+    several = "s" if total["seeds"] > 1 else ""
     note = (
-        f"{total['recordings']} recordings, {count} seed{'s' if count > 1 else ''}. Beside the bars "
+        f"{total['recordings']} recordings, {total['seeds']} seed{several}. Beside the bars "
         "the mean joint error over all visible frames, across the last one the 90 % interval of "
         "usable. Silently wrong ones are % of all frames."
     )
