@@ -25,7 +25,7 @@ from toftrack.benchmark.results import (
 from toftrack.benchmark.runs import Job, jobs, run_jobs, sources
 from toftrack.errors import ToftrackError
 from toftrack.output.accuracy import Row
-from toftrack.output.accuracy_tables import Table, markdown, plain
+from toftrack.output.accuracy_tables import Table, clear_mark, markdown, plain
 from toftrack.output.paired import compared
 
 
@@ -154,8 +154,9 @@ def ablation_table(done: Mapping[str, list[Row]]) -> Table:
 
 
 def _change(one: Mapping[str, float]) -> str:
-    clear = "*" if one["low"] > 0 or one["high"] < 0 else ""
-    return f"{one['mean']:+.1f} ({one['low']:+.1f} to {one['high']:+.1f}){clear}"
+    if one["recordings"] == 1:
+        return f"{one['mean']:+.1f} (one recording)"
+    return f"{one['mean']:+.1f} ({one['low']:+.1f} to {one['high']:+.1f}){clear_mark(one)}"
 
 
 def _markdown(about: Mapping[str, Any], done: Mapping[str, list[Row]]) -> str:

@@ -91,11 +91,15 @@ def difference_table(differences: Mapping[str, Mapping[str, Any]]) -> Table:
     """Here, there, the difference and its interval; marked where that does not hold 0."""
     table = [["figure", "here", "there", "difference", "90 % interval", "recordings", ""]]
     for key, of in differences.items():
-        clear = "*" if of["low"] > 0 or of["high"] < 0 else ""
         cells = [f"{of[name]:.2f}" for name in ("here", "there")]
         change = [f"{of['mean']:+.2f}", f"{of['low']:+.2f} to {of['high']:+.2f}"]
-        table.append([key, *cells, *change, str(of["recordings"]), clear])
+        table.append([key, *cells, *change, str(of["recordings"]), clear_mark(of)])
     return table
+
+
+def clear_mark(of: Mapping[str, Any]) -> str:
+    """A star for a difference whose interval, over several recordings, does not hold 0."""
+    return "*" if of["recordings"] > 1 and (of["low"] > 0 or of["high"] < 0) else ""
 
 
 def plain(table: Table) -> str:
