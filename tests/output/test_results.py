@@ -207,6 +207,8 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     headline = asdict(trust(joints, lost, Hand(now.joints_m, now.visible)))
     regions = asdict(coverage(joints, np.full(joints.shape, 0.01), now))
     expected = {"trust": headline, "coverage": regions} | evaluate(joints, lost, now)
+    further = summary["metrics"].pop("further")
+    assert further["swap_pct"] == 0 and further["tip_mm"] == pytest.approx(10 * math.sqrt(3))
     assert summary["metrics"] == expected
     assert summary["metrics"]["trust"]["usable_pct"] == 75  # one in four is flagged
     table = metrics_table(summary).splitlines()

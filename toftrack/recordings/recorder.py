@@ -204,8 +204,8 @@ class Recorder:
     def _check_unit(self, frame: Frame) -> None:
         """After half a minute it would be too late: nobody reads a recording in another unit."""
         if frame.depth.dtype.kind in "iu":
-            median, kind = median_reading(frame.depth), str(frame.depth.dtype)
-            raise wrong_unit(f"the depth of frame {frame.index}", median, kind)
+            what = f"the depth of frame {frame.index}"
+            raise wrong_unit(what, frame.depth, str(frame.depth.dtype))
         if self._strange >= _STRANGE:
             return
         median = median_reading(frame.depth)
@@ -214,7 +214,7 @@ class Recorder:
         elif median:
             self._strange += 1
             if self._strange == _STRANGE:
-                raise wrong_unit(f"the depth of the first {_STRANGE} frames", median)
+                raise wrong_unit(f"the depth of the first {_STRANGE} frames", frame.depth)
 
     def _facts_of(self, frame: Frame) -> Facts:
         about = {
