@@ -33,6 +33,7 @@ from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
 from toftrack.output.accuracy import Row
 from toftrack.output.accuracy_tables import accuracy_tables, markdown, plain
+from toftrack.safe_files import write_whole
 
 _TIMED_BESIDE = "milliseconds were measured beside other processes of this run"
 
@@ -142,7 +143,7 @@ def write_picture(path: Path, result: dict[str, Any]) -> None:
     done, data = cv2.imencode(kind, accuracy_figure(result["each"], result["total"]))
     assert done
     try:
-        path.write_bytes(data.tobytes())
+        write_whole(path, data.tobytes())
     except OSError as error:
         raise ToftrackError(
             f"the picture '{path}' cannot be written ({error.strerror}); choose another place"
