@@ -73,6 +73,12 @@ class Truth:
     """Number of the first row's frame; the other rows' follow."""
     other: Truth | None = None
     """Of the person's other hand, in the same frames; None where nothing is known of one."""
+    pose_name: np.ndarray | None = None
+    """(T,) text: which pose is held; 'transition' between two."""
+    still: np.ndarray | None = None
+    """(T,) bool: the hand rests."""
+    side: str = ""
+    """'right' or 'left'; empty where nobody says."""
 
     def __len__(self) -> int:
         return len(self.joints_m)
@@ -100,6 +106,9 @@ class Truth:
             joint_visible=cut(self.joint_visible),
             first=first,
             other=None if self.other is None else self.other._taken(rows, first),
+            pose_name=cut(self.pose_name),
+            still=cut(self.still),
+            side=self.side,
         )
 
 

@@ -4,12 +4,12 @@ Of a run with two slots a frame is lost when no slot has a hand that can be used
 is that of the hands that are there; `slots` says the same of each. The metrics are those of the
 recording's first hand, in the slot that followed it; under `second` stand those of its other hand,
 or, where the recording has one hand, `ghost_pct` says how often the other slot had one all the
-same.
+same. What measures.py adds to trust.py stands under `further`.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,13 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
-from toftrack.output.coverage import coverage
+from toftrack.output.coverage import Coverage
 from toftrack.output.evaluation import evaluate
+from toftrack.output.measures import Estimates, Measured, measured
 from toftrack.output.records import Records
-from toftrack.output.trust import Hand, Trust, trust, trust_of_two
+
+_MEASURED = tuple(field.name for field in fields(Estimates))
+_REGIONS = tuple(field.name for field in fields(Coverage))
 
 
 def shape_file(slot: int) -> str:
@@ -93,29 +96,36 @@ def run_metrics(
     if not known.any():
         return None
     found = truth.of_frames(index[known])
-    names = ("joints_m", "lost", "joint_sigma_m")
-    arrays = {n: records.column(n, rows[known]) for n in names if n in records.names}
-    if records.slots == 1:
-        figures = trust(arrays["joints_m"], arrays["lost"], _hand_of(found))
-        return _metrics(figures, arrays, found)
-    truths = [found] if found.other is None else [found, found.other]
-    both = trust_of_two(arrays["joints_m"], arrays["lost"], [_hand_of(one) for one in truths])
-    of_slots = [{n: array[:, slot] for n, array in arrays.items()} for slot in both.slots]
-    metrics = {"slot": both.slots[0]} | _metrics(both.first, of_slots[0], found)
-    if both.second is None:
+    done = {name: records.column(name, rows[known]) for name in _MEASURED if name in records.names}
+    both = measured(Estimates(**found_side(done)), found)
+    metrics = _metrics(both.first, done, found, both.slots and both.slots[0])
+    if both.slots is None:
+        return metrics
+    metrics = {"slot": both.slots[0]} | metrics
+    if both.second is None or found.other is None:
         return metrics | {"ghost_pct": both.ghost_pct}
-    second = {"slot": both.slots[1]} | _metrics(both.second, of_slots[1], truths[1])
-    return metrics | {"second": second}
+    second = _metrics(both.second, done, found.other, both.slots[1])
+    return metrics | {"second": {"slot": both.slots[1]} | second}
 
 
-def _hand_of(truth: Truth) -> Hand:
-    return Hand(truth.joints_m, truth.visible)
+def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of a track without its side where that was told: it is no finding then."""
+    probability = arrays.get("side_probability", np.ones(0))
+    known = probability[np.isfinite(probability)]
+    told = bool((known == 1).all())
+    return {name: array for name, array in arrays.items() if not (told and name.startswith("side"))}
 
 
-def _metrics(figures: Trust, arrays: dict[str, np.ndarray], truth: Truth) -> dict[str, Any]:
-    """Of the estimates of one hand, arrays of (T, ...)."""
-    joints = arrays["joints_m"]
-    metrics = {"trust": asdict(figures)} | evaluate(joints, arrays["lost"], truth)
+def _metrics(
+    of: Measured, arrays: dict[str, np.ndarray], truth: Truth, slot: int | None
+) -> dict[str, Any]:
+    """Of the estimates of one hand."""
+    joints, lost = (
+        arrays[name] if slot is None else arrays[name][:, slot] for name in ("joints_m", "lost")
+    )
+    metrics = {"trust": asdict(of.trust)} | evaluate(joints, lost, truth)
+    regions = {name: of.figures.get(name) for name in _REGIONS}
+    further = {name: value for name, value in of.figures.items() if name not in _REGIONS}
     if "joint_sigma_m" in arrays:
-        metrics["coverage"] = asdict(coverage(joints, arrays["joint_sigma_m"], truth))
-    return metrics
+        metrics["coverage"] = regions
+    return metrics | {"further": further}
