@@ -2,7 +2,11 @@
 
 import sys
 
-from toftrack.benchmark.scoring import main
+from toftrack.benchmark.command import main
+from toftrack.errors import ToftrackError
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except ToftrackError as error:
+        sys.exit(f"error: {error}")

@@ -148,9 +148,7 @@ def _of_hand(found: Trust, estimates: Estimates, truth: Truth) -> Measured:
     return Measured(found, of, figures)
 
 
-def gestures_right(
-    gesture: np.ndarray, of: Judged, truth: Truth
-) -> tuple[np.ndarray, np.ndarray]:
+def gestures_right(gesture: np.ndarray, of: Judged, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     """(T,) bool: the frames whose pose has a name, and those of them that are called so."""
     none = np.zeros(len(of.seen), bool)
     if truth.pose_name is None:
