@@ -46,7 +46,7 @@ def _turned_index(degrees: float) -> Iterator[None]:
 BREAKS = {
     "keypoints off": Break(
         "the networks' votes for joints neither judge nor pull a pose",
-        ("relocation.votes=0", "relocation.landmark_m=100"),
+        ("relocation.votes=0", "relocation.landmark_weight=0"),
     ),
     "finger's axis": Break(
         "the index finger bends about an axis turned by 5 degrees",

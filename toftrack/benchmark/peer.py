@@ -6,10 +6,12 @@ over pipes: see peer_mediapipe.py for its configuration, and docs/accuracy.md fo
 
 from __future__ import annotations
 
+import atexit
+import functools
 import json
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +21,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.output.measures import Estimates
 
 PEERS = {"mediapipe": "peer_mediapipe.py"}
 MAKE_ENVIRONMENT = (
@@ -157,14 +160,27 @@ class Peer:
         return lines[-1] if lines else "it said nothing"
 
 
-def amplitude_of(image: np.ndarray | None, name: str, peer: str) -> np.ndarray:
-    """A recording's amplitude image; ToftrackError where it has none.
+@functools.lru_cache(maxsize=1)
+def peer_process(name: str, python: str) -> Peer:
+    """This process's peer; started once, since that takes seconds."""
+    peer = Peer(name, python)
+    atexit.register(peer.close)
+    return peer
 
-    name: of the recording.  peer: who looks at it.
+
+def peer_estimates(said: Sequence[PeerEstimate], found_side: bool) -> tuple[Estimates, np.ndarray]:
+    """What a peer said of T frames, and the seconds (T,) of each.
+
+    found_side: whether it was to find the side out.
     """
-    if image is None:
-        raise ToftrackError(
-            f"{name} has no amplitude image, which --peer {peer} looks at; leave the recording "
-            "out, or track it without --peer"
-        )
-    return image
+
+    def column(name: str) -> np.ndarray:
+        return np.array([getattr(one, name) for one in said])
+
+    estimates = Estimates(
+        joints_m=column("joints_m"),
+        lost=column("lost"),
+        side=column("side") if found_side else None,
+        side_probability=column("side_probability") if found_side else None,
+    )
+    return estimates, column("compute_s")
