@@ -92,7 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     done: dict[str, list[Row]] = {}
     try:
         for number, name in enumerate(names, 1):
-            variant, rows = VARIANTS[name], []
+            variant = VARIANTS[name]
+            rows: list[Row] = []
             chosen = [*overrides, *variant.overrides]
             todo = jobs(found, options.seeds, variant.side, chosen)
 

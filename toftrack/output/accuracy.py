@@ -161,12 +161,7 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
         "frames": round(sum(row.get("frames") or 0 for row in each)),
         "visible": round(sum(row.get("visible") or 0 for row in each)),
     }
-    for key in MEANS:
-        values = [row[key] for row in each if row.get(key) is not None]
-        if values:
-            share = interval(values)
-            total[key] = _rounded(share.mean)
-            total[interval_name(key)] = [_rounded(share.low), _rounded(share.high)]
+    total |= _means(each, MEANS)
     total["longest_silent"] = max((row.get("longest_silent") or 0 for row in each), default=0)
     total["never_right"] = _rounded(sum(row.get("never_right") or 0.0 for row in each))
     firsts = [row["first_right"] for row in rows if row.get("never_right") is not None]
@@ -175,22 +170,33 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
     return total
 
 
+def _means(each: Sequence[Row], keys: Sequence[str]) -> dict[str, Any]:
+    """Of recordings, with intervals; those of one recording say nothing, and are given of shares
+    alone, which others count on."""
+    found: dict[str, Any] = {}
+    for key in keys:
+        values = [row[key] for row in each if row.get(key) is not None]
+        if values:
+            share = interval(values)
+            found[key] = _rounded(share.mean)
+            if len(values) > 1 or key in SHARES:
+                found[interval_name(key)] = [_rounded(share.low), _rounded(share.high)]
+    return found
+
+
 def image_totals(rows: Sequence[Row]) -> dict[str, Any]:
     """Of labelled images, each of which counts as a recording: see image_labels.py."""
     each = list(by_recording(rows).values())
     total: dict[str, Any] = {"images": len(each), "seeds": len({row["seed"] for row in rows})}
+    total |= _means(each, IMAGE_MEANS)
     for key in IMAGE_MEANS:
-        values = [row[key] for row in each if row.get(key) is not None]
-        if values:
-            share = interval(values)
-            total[key] = _rounded(share.mean)
-            total[interval_name(key)] = [_rounded(share.low), _rounded(share.high)]
-            # What a seed changes: the least and the largest of its means.
-            of_seeds = [
-                mean_of([row.get(key) for row in rows if row["seed"] == seed])
-                for seed in dict.fromkeys(row["seed"] for row in rows)
-            ]
-            known = [value for value in of_seeds if value is not None]
+        # What a seed changes: the least and the largest of its means.
+        of_seeds = [
+            mean_of([row.get(key) for row in rows if row["seed"] == seed])
+            for seed in dict.fromkeys(row["seed"] for row in rows)
+        ]
+        known = [value for value in of_seeds if value is not None]
+        if known:
             total[f"{key.removesuffix('_pct')}_seeds"] = [_rounded(f(known)) for f in (min, max)]
     return total | {
         name: _rounded(value) for name, value in tip_figures(rows).items() if value is not None
@@ -214,7 +220,7 @@ def groups(rows: Sequence[Row]) -> dict[str, dict[str, Row]]:
                     mine[key] = mine.get(key, 0) + value
     seeds = max(len({row["seed"] for row in rows}), 1)
     return {
-        kind: {name: _group_figures(found[name], seeds) for name in sorted(found)}
+        kind: {name: _group_figures(found[name], seeds) for name in sorted(found, key=_order)}
         for kind, found in sums.items()
     }
 
@@ -232,13 +238,18 @@ def _group_figures(counts: Mapping[str, float], seeds: int) -> Row:
     }
 
 
+def _order(name: str) -> tuple[bool, str]:
+    """Bands in the order of their values, other groups in that of their names."""
+    return not name.startswith("below "), name
+
+
 def _length_mm(truth: Truth) -> float:
     bones = np.diff(np.asarray(truth.joints_m, np.float64)[:, _MIDDLE], axis=1)
     return 1e3 * float(np.median(np.linalg.norm(bones, axis=2).sum(1)))
 
 
 def _band(value: float, ends: Sequence[float], unit: str) -> str:
-    """Bands sort by their names."""
+    """Which band a value is in."""
     for low, high in zip((None, *ends), (*ends, None), strict=True):
         if high is None:
             return f"{low:g} {unit} and more"

@@ -8,6 +8,7 @@ from typing import Any
 from toftrack.output.accuracy import interval_name
 
 _COLUMNS = (
+    ("visible", "visible", 0),
     ("usable %", "usable_pct", 1),
     ("partly %", "partly_pct", 1),
     ("silent %", "silent_pct", 1),

@@ -76,7 +76,7 @@ class Estimates:
     def slot(self, number: int) -> Estimates:
         """Of one slot."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Estimates(**{n: None if a is None else a[:, number] for n, a in arrays.items()})
+        return Estimates(**{n: a[:, number] for n, a in arrays.items() if a is not None})
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,9 +65,13 @@ def compared(here: Sequence[Row], there: Sequence[Row]) -> Comparison:
         if both:
             means = np.array([np.mean(values, axis=0) for values in both.values()])
             share = interval((means[:, 0] - means[:, 1]).tolist())
+            here_mean, there_mean = means.mean(0).tolist()
             differences[key] = Difference(
-                *(round(float(mean), 4) for mean in means.mean(0)),
-                *(round(value, 4) for value in (share.mean, share.low, share.high)),
+                here=round(here_mean, 4),
+                there=round(there_mean, 4),
+                mean=round(share.mean, 4),
+                low=round(share.low, 4),
+                high=round(share.high, 4),
                 recordings=len(means),
             )
     return Comparison(len(common), _named(mine, theirs), _named(theirs, mine), differences)

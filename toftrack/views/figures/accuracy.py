@@ -47,7 +47,7 @@ def accuracy_figure(each: Mapping[str, Mapping[str, Any]], total: Mapping[str, A
         u = _place(tick)
         cv2.line(picture, (u, 32), (u, height - 34), (225, 225, 225), 1)
         write(picture, f"{tick:g}", (u, height - 14), align="middle", size=0.45)
-    write(picture, "% of the visible frames", (_LEFT + _BAR + 14, height - 14), size=0.4)
+    write(picture, "% of the visible frames", (_LEFT + _BAR + 24, height - 14), size=0.4)
     for number, (name, row) in enumerate(rows.items()):
         top = 38 + _LINE * number
         write(picture, name, (_LEFT - 10, top + 15), align="right", size=0.45)
@@ -67,9 +67,11 @@ def accuracy_figure(each: Mapping[str, Mapping[str, Any]], total: Mapping[str, A
         cv2.line(picture, (low, middle), (high, middle), (0, 0, 0), 2)
         for u in (low, high):
             cv2.line(picture, (u, middle - 5), (u, middle + 5), (0, 0, 0), 2)
+    count = total["seeds"]
     note = (
-        f"{total['recordings']} recordings, seeds: {total['seeds']}. Beside the bars the mean "
-        "joint error over all visible frames; across the last bar the 90 % interval of usable."
+        f"{total['recordings']} recordings, {count} seed{'s' if count > 1 else ''}. Beside the bars "
+        "the mean joint error over all visible frames, across the last one the 90 % interval of "
+        "usable. Silently wrong ones are % of all frames."
     )
     return titled(picture, "What the frames are", note)
 
