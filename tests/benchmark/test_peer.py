@@ -105,16 +105,16 @@ def test_a_recording_without_amplitude_is_refused_before_anything_runs(tmp_path)
 def test_the_lift_finds_a_flat_hand_below_its_skin() -> None:
     """Landmarks on a wall half a metre away, which is all that is read."""
     depth = np.full((144, 176), 0.5, np.float32)
-    landmarks = np.random.default_rng(0).uniform(0.3, 0.7, (21, 2))
-    world = np.concatenate((landmarks - 0.5, np.zeros((21, 1))), axis=1)
-    joints = peer_mediapipe.lifted(landmarks, world, depth, K, np)
-    tips = list(peer_mediapipe.TIPS)
-    others = [joint for joint in range(21) if joint not in tips]
-    assert np.allclose(joints[others, 2], 0.510, atol=1e-6)
-    assert np.allclose(joints[tips, 2], 0.505, atol=1e-6)
+    landmarks = np.random.default_rng(0).uniform(0.3, 0.7, (21, 3))
+    landmarks[:, 2] = 0
+    joints = peer_mediapipe.lifted(landmarks, depth, K, np)
+    assert np.allclose(joints[:, 2], 0.514, atol=1e-6)
     u = 200 * joints[:, 0] / joints[:, 2] + 88
     assert np.allclose(u, landmarks[:, 0] * 176 - 0.5, atol=1e-6)
-    nothing = peer_mediapipe.lifted(landmarks, world, 0 * depth, K, np)
+    landmarks[8, 2] = -0.1  # of the width: 44 mm nearer, whatever is read there
+    nearer = peer_mediapipe.lifted(landmarks, depth, K, np)
+    assert np.allclose(nearer[8, 2], 0.514 - 0.1 * 176 * 0.514 / 200, atol=1e-6)
+    nothing = peer_mediapipe.lifted(landmarks, 0 * depth, K, np)
     assert np.isnan(nothing).all()
 
 
@@ -124,21 +124,15 @@ def test_the_told_side_goes_before_the_surer_hand() -> None:
 
     found = SimpleNamespace(
         multi_hand_landmarks=["a", "b"],
-        multi_hand_world_landmarks=["A", "B"],
         multi_handedness=[hand("Left", 0.9), hand("Right", 0.6)],
     )
-    assert peer_mediapipe.chosen(found, "left") == ("b", "B", "left", 0.6)
-    assert peer_mediapipe.chosen(found, "right") == ("a", "A", "right", 0.9)
-    assert peer_mediapipe.chosen(found, "") == ("a", "A", "right", 0.9)
-    assert (
-        peer_mediapipe.chosen(
-            SimpleNamespace(
-                multi_hand_landmarks=None, multi_hand_world_landmarks=None, multi_handedness=None
-            ),
-            "left",
-        )
-        is None
-    )
+    assert peer_mediapipe.chosen(found, "left") == ("b", "left", 0.6)
+    assert peer_mediapipe.chosen(found, "right") == ("a", "right", 0.9)
+    assert peer_mediapipe.chosen(found, "") == ("a", "right", 0.9)
+    found.multi_handedness[1] = hand("Left", 0.6)
+    assert peer_mediapipe.chosen(found, "left") is None
+    nobody = SimpleNamespace(multi_hand_landmarks=None, multi_handedness=None)
+    assert peer_mediapipe.chosen(nobody, "left") is None
 
 
 def test_sides_are_measured_only_where_they_were_to_be_found() -> None:

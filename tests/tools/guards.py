@@ -36,11 +36,11 @@ SEEDS, SAMPLE_SEEDS = (0, 1), (0, 1, 2)
 SAMPLE_MM = 6.2
 """The mean joint error of the sample over SAMPLE_SEEDS is at most this, and nothing is lost."""
 BOUNDS = {
-    "usable_pct": (0.0, 100.0),
-    "silent_pct": (0.0, 100.0),
-    "jitter_mm": (0.0, 100.0),
-    "coverage_pct": (0.0, 100.0),
-    "called_hand_pct": (0.0, 0.0),
+    "usable_pct": (70.0, 100.0),
+    "silent_pct": (0.0, 4.0),
+    "jitter_mm": (0.0, 3.0),
+    "coverage_pct": (84.0, 95.0),
+    "called_hand_pct": (0.0, 1.0),
 }
 """Least and largest value of each figure of a seed, means over recordings: what 20 seeds had, and a
 margin for the floats of other processors."""

@@ -59,7 +59,7 @@ class Peer:
         self._size = (0, 0)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  a pipe that nobody reads fills up
         # Isolated: the modules beside the script are not its own.
-        command = [self.python, "-I", str(Path(__file__).with_name(PEERS[name]))]
+        command = [self.python, "-I", str(Path(__file__).parent / PEERS[name])]
         try:
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors

@@ -14,11 +14,12 @@ much infrared light comes back. It falls off with the square of the distance, so
 a person is bright. The 99th percentile becomes white, the square root of it is taken (a display's
 gamma, roughly), and the picture is enlarged to 640 columns by bicubic interpolation.
 
-**The lift.** Landmarks are where the image has them; their depth is what is read there (the median
-of 3 x 3 pixels, at a tip a little inwards), and a joint lies a centimetre below the skin (a tip
-half of that). Where a landmark is hidden, something nearer is read: so its depth is compared with
-MediaPipe's own, relative one, scaled to the hand's size in metres and put at the median of all
-readings; what is read counts within 3 cm of it, elsewhere MediaPipe's depth.
+**The lift.** A landmark's place in the image is MediaPipe's; how much farther from the camera than
+the wrist it is, too, which MediaPipe says in parts of the picture's width and which becomes metres
+by the hand's distance. Where the whole hand is, the depth image says: at each landmark the median
+of 3 x 3 pixels is read, at a tip a little inwards, a joint lies 14 mm below the skin there,
+a tip half of that, and the median of what all 21 say of the hand's distance is taken, so that
+landmarks that are hidden, or beside the hand, do not matter.
 
 What else was tried is in docs/lab/mediapipe.md.
 """
@@ -36,11 +37,9 @@ from typing import Any, BinaryIO
 COLUMNS = 640
 WHITE_PERCENTILE = 99.0
 GAMMA = 0.5
-BELOW_SKIN_M, TIP_BELOW_M = 0.010, 0.005
+BELOW_SKIN_M, TIP_BELOW_M = 0.014, 0.007
 INWARDS = 0.2
 """At a tip the depth is read so far towards the joint before it."""
-SEEN_M = 0.03
-"""A reading is of the joint itself where it is so near to MediaPipe's relative depth."""
 SETTINGS = {
     "static_image_mode": False,
     "max_num_hands": 2,
@@ -63,13 +62,13 @@ def picture(amplitude: Any, cv2: Any, np: Any) -> Any:
     return np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))
 
 
-def lifted(landmarks: Any, world_m: Any, depth_m: Any, k: Any, np: Any) -> Any:
+def lifted(landmarks: Any, depth_m: Any, k: Any, np: Any) -> Any:
     """Joints (21, 3) in metres; not finite where nothing is read anywhere.
 
-    landmarks: (21, 2) in parts of the image.  world_m: (21, 3) MediaPipe's hand of its own size.
+    landmarks: (21, 3) x and y in parts of the image's width and height, z of its width.
     """
     height, width = depth_m.shape
-    uv = landmarks * [width, height] - 0.5
+    uv = landmarks[:, :2] * [width, height] - 0.5
     at, below = uv.copy(), np.full(21, BELOW_SKIN_M)
     for tip in TIPS:
         at[tip] += INWARDS * (uv[tip - 1] - uv[tip])
@@ -77,11 +76,8 @@ def lifted(landmarks: Any, world_m: Any, depth_m: Any, k: Any, np: Any) -> Any:
     read = np.array([_reading(depth_m, u, v, np) for u, v in at]) + below
     if not np.isfinite(read).any():
         return np.full((21, 3), np.nan)
-    lateral = (uv - uv.mean(0)) * np.nanmedian(read) / [k[0, 0], k[1, 1]]
-    shape = world_m[:, :2] - world_m[:, :2].mean(0)
-    relative = world_m[:, 2] * (lateral * shape).sum() / max((shape**2).sum(), 1e-12)
+    relative = landmarks[:, 2] * width * np.nanmedian(read) / k[0, 0]
     z = relative + np.nanmedian(read - relative)
-    z = np.where(np.abs(read - z) < SEEN_M, read, z)
     xy = (uv - k[:2, 2]) * z[:, None] / [k[0, 0], k[1, 1]]
     return np.concatenate((xy, z[:, None]), axis=1)
 
@@ -94,23 +90,19 @@ def _reading(depth_m: Any, u: float, v: float, np: Any) -> float:
     return float(np.median(patch)) if patch.size else math.nan
 
 
-def chosen(found: Any, side: str) -> tuple[Any, Any, str, float] | None:
-    """Landmarks, world landmarks, side and its probability of the hand that is meant.
+def chosen(found: Any, side: str) -> tuple[Any, str, float] | None:
+    """Landmarks, side and its probability of the hand that is meant.
 
-    side: whose is wanted, "" for any. One of the other side is taken where there is no better: on
-    such images MediaPipe is less sure of the side than of the hand.
+    side: whose is wanted, "" for any: one of the other side is left out, which makes MediaPipe
+    wrong without saying so less often, and costs it nothing.
     """
     hands = []
-    rows = zip(
-        found.multi_hand_landmarks or (),
-        found.multi_hand_world_landmarks or (),
-        found.multi_handedness or (),
-        strict=True,
-    )
-    for landmarks, world, handedness in rows:
+    rows = zip(found.multi_hand_landmarks or (), found.multi_handedness or (), strict=True)
+    for landmarks, handedness in rows:
         told = handedness.classification[0]
-        hands.append((landmarks, world, SIDES[told.label], float(told.score)))
-    return max(hands, key=lambda hand: (hand[2] == side, hand[3])) if hands else None
+        hands.append((landmarks, SIDES[told.label], float(told.score)))
+    meant = [hand for hand in hands if side in ("", hand[1])]
+    return max(meant, key=lambda hand: hand[2]) if meant else None
 
 
 def serve(source: BinaryIO, sink: BinaryIO) -> None:
@@ -143,10 +135,9 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         found = chosen(hand.process(picture(amplitude, cv2, np)), side)
         answer = np.full(66, np.nan)
         if found is not None:
-            landmarks, world, found_side, probability = found
-            places = np.array([(p.x, p.y) for p in landmarks.landmark])
-            world_m = np.array([(p.x, p.y, p.z) for p in world.landmark])
-            answer[:63] = lifted(places, world_m, depth_m, k, np).ravel()
+            landmarks, found_side, probability = found
+            places = np.array([(p.x, p.y, p.z) for p in landmarks.landmark])
+            answer[:63] = lifted(places, depth_m, k, np).ravel()
             answer[64:] = probability, float(found_side == "right")
         answer[63] = time.perf_counter() - began
         sink.write(answer.tobytes())
