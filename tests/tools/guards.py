@@ -6,7 +6,7 @@
     python tests/tools/guards.py --break "K scaled"   with a fault put in, see breaks.py
 
 Tracks the packaged sample, tests/data/guards (the side told) and tests/data/empty (the side found),
-and compares each seed's figures with BOUNDS: docs/lab/guards.md says where they come from.
+and compares their means over seeds with BOUNDS: docs/lab/guards.md says where they come from.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from toftrack.recordings.store import FrameStore, open_recording, open_source
 
 DATA = Path(__file__).parents[1] / "data"
 WHOLE = Break("nothing is broken")
-SEEDS, SAMPLE_SEEDS = (0, 1), (0, 1, 2)
+SEEDS = (0, 1, 2)
 SAMPLE_MM = 6.2
-"""The mean joint error of the sample over SAMPLE_SEEDS is at most this, and nothing is lost."""
+"""The mean joint error of the sample over SEEDS is at most this, and nothing is lost."""
 BOUNDS = {
-    "usable_pct": (70.0, 100.0),
+    "usable_pct": (66.0, 100.0),
     "silent_pct": (0.0, 4.0),
     "jitter_mm": (0.0, 3.0),
     "coverage_pct": (84.0, 95.0),
-    "called_hand_pct": (0.0, 1.0),
+    "called_hand_pct": (0.0, 0.5),
 }
-"""Least and largest value of each figure of a seed, means over recordings: what 20 seeds had, and a
-margin for the floats of other processors."""
+"""Least and largest value of each figure, means over recordings and SEEDS. No three of 20 seeds
+leave them, and there is a margin for the floats of other processors: docs/lab/guards.md."""
 
 
 def guards() -> dict[str, FrameStore]:
@@ -125,17 +125,15 @@ def empty_figures(seed: int, fault: Break = WHOLE) -> dict[str, float]:
 def complaints(
     figures: Sequence[dict[str, float]], sample: Sequence[dict[str, float]]
 ) -> list[str]:
-    """A sentence for each figure that is out of its bounds.
+    """A sentence for each figure whose mean over seeds is out of its bounds.
 
     figures: of guards and empty recordings, a row a seed.  sample: likewise, of the sample.
     """
     said = []
-    for row in figures:
-        for name, (low, high) in BOUNDS.items():
-            if name in row and not low <= row[name] <= high:  # also true of NaN
-                said.append(
-                    f"seed {row['seed']:g}: {name} is {row[name]:.2f}, out of {low:g} to {high:g}"
-                )
+    for name, (low, high) in BOUNDS.items():
+        mean = float(np.mean([row[name] for row in figures]))
+        if not low <= mean <= high:  # also true of NaN
+            said.append(f"{name} is {mean:.2f}, out of {low:g} to {high:g}")
     if sample:
         mean = float(np.mean([row["sample_mm"] for row in sample]))
         lost = max(row["sample_lost_pct"] for row in sample)
@@ -160,12 +158,12 @@ def _rows(seeds: Sequence[int], fault: Break) -> Iterator[dict[str, float]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Is the tracker as accurate as it was?")
-    parser.add_argument("--seeds", type=_seeds, default=SEEDS, help="0-19: these (0-1)")
+    parser.add_argument("--seeds", type=_seeds, default=SEEDS, help="0-19: these (0-2)")
     parser.add_argument("--break", dest="fault", choices=BREAKS, help="put a fault in")
     parser.add_argument("--json", type=Path, help="write all figures here, too")
     options = parser.parse_args(arguments)
     fault = BREAKS[options.fault] if options.fault else WHOLE
-    sample = [{"seed": seed, **sample_figures(seed, fault)} for seed in SAMPLE_SEEDS]
+    sample = [{"seed": seed, **sample_figures(seed, fault)} for seed in SEEDS]
     for row in sample:
         print("  ".join(f"{name} {value:.2f}" for name, value in row.items()), flush=True)
     figures = list(_rows(options.seeds, fault))

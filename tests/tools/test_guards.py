@@ -29,8 +29,8 @@ def test_each_figure_has_a_bound_that_can_be_left(name: str) -> None:
     low, high = BOUNDS[name]
     assert (low, high) != (0, 100)
     for wrong in (low - 1, high + 1, np.nan):
-        said = complaints([GOOD, GOOD | {name: wrong, "seed": 7.0}], [SAMPLE])
-        assert len(said) == 1 and name in said[0] and "seed 7" in said[0]
+        said = complaints([GOOD | {name: wrong}] * 3, [SAMPLE])
+        assert len(said) == 1 and name in said[0]
 
 
 def test_the_sample_is_followed_closely_and_never_lost() -> None:
