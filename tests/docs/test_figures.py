@@ -66,9 +66,9 @@ def test_a_row_of_the_history_is_read_as_it_was_written() -> None:
 
 
 def test_what_was_not_measured_says_so() -> None:
-    page = "before\n<!-- figures: readme -->\nold\n<!-- end -->\nafter\n"
+    page = "before\n<!-- figures: readme -->\nSTALE\n<!-- end -->\nafter\n"
     text = with_tables(page, {"rows": {}})
-    assert NOT_YET in text and "old" not in text
+    assert NOT_YET in text and "STALE" not in text
     assert text.startswith("before\n") and text.endswith("<!-- end -->\nafter\n")
     history = history_rows(history_row(ROW))
     assert "87 %" in with_tables(page, {"rows": history})
