@@ -7,6 +7,9 @@ that were labelled by eye are measured, too (toftrack/output/image_labels.py).
 
 --compare FILE takes the difference to an earlier measurement, paired by recording and seed: the
 gate for a change of the tracker. A * marks intervals that do not hold 0.
+
+--peer mediapipe measures MediaPipe Hands on the amplitude images, lifted to metres by the depth
+(peer_mediapipe.py says how), with the same measures, and times it in turn with the tracker.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from toftrack.benchmark.peer import MAKE_ENVIRONMENT, PEERS, peer_process
 from toftrack.benchmark.results import (
     checked_targets,
     circumstances,
@@ -51,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     checked_targets(options.json, options.markdown, options.picture)
     others = None if options.compare is None else read_rows(options.compare)
     found = sources(paths, options.labels)
-    todo = jobs(found, options.seeds, options.side, overrides)
+    peer = _peer(options)
+    todo = jobs(found, options.seeds, options.side, overrides, peer)
     about = circumstances() | {
         "command": shlex.join(["toftrack", "benchmark", "accuracy", *arguments]),
         "side": options.side,
@@ -60,6 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "workers": options.workers,
         "overrides": overrides,
     }
+    if peer is not None:
+        about["peer"] = {"name": peer[0], **peer_process(*peer).versions}
     rows: list[Row] = []
 
     def done(job: Job, more: list[Row]) -> None:
@@ -72,6 +79,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _report(about | {"interrupted": True}, rows, None, options)
         raise
     _report(about, rows, others, options)
+
+
+def _peer(options: argparse.Namespace) -> tuple[str, str] | None:
+    if options.peer is None:
+        return None
+    if options.peer_python is None:
+        raise ToftrackError(
+            f"--peer {options.peer} runs in an environment of its own, and --peer-python does not "
+            f"say where that is; {MAKE_ENVIRONMENT}; then give --peer-python peer/bin/python"
+        )
+    if options.hands > 1:
+        raise ToftrackError("--peer is measured with one hand; leave out --hands 2, or --peer")
+    return options.peer, str(options.peer_python)
 
 
 def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], list[str]]:
@@ -100,11 +120,26 @@ def _report(
     others: Sequence[Row] | None,
     options: argparse.Namespace,
 ) -> None:
-    result = about | result_of(rows)
+    result = about | result_of([row for row in rows if "method" not in row])
+    if "peer" in about:
+        of_peer = result_of(
+            [
+                {key: value for key, value in row.items() if key != "method"}
+                for row in rows
+                if "method" in row
+            ]
+        )
+        result["peer"] = about["peer"] | of_peer
     if others is not None:
         result["comparison"] = comparison_with(result["rows"], others, str(options.compare))
     notes = notes_of(result)
     tables = accuracy_tables(result)
+    if "peer" in result:
+        name = result["peer"]["name"]
+        more = accuracy_tables(result["peer"])
+        tables |= {
+            f"{title}: {name}": [[name, *table[0][1:]], *table[1:]] for title, table in more.items()
+        }
     print("\n\n".join([*(plain(table) for table in tables.values()), *notes]))
     if options.json:
         write_text(options.json, json_text(result))
@@ -186,6 +221,8 @@ def _parser() -> argparse.ArgumentParser:
         help="of a recording without truth; may be given several times",
     )
     parser.add_argument("--compare", type=Path, metavar="FILE", help="an earlier --json")
+    parser.add_argument("--peer", choices=PEERS, help="measure another method, too")
+    parser.add_argument("--peer-python", type=Path, metavar="PYTHON", help="of its environment")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the shares there (.png)")
     return parser
 

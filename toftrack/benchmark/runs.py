@@ -17,14 +17,17 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from toftrack.benchmark.peer import Peer, PeerEstimate, peer_estimates, peer_process
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
+from toftrack.frames import Truth
 from toftrack.output.accuracy import Row, group_counts, row_figures
 from toftrack.output.evaluation import TIPS
 from toftrack.output.image_labels import Points, Stills, point_rows, read_labels, still_row
 from toftrack.output.measures import Estimates, measured
 from toftrack.recordings.npz import read_recording
+from toftrack.recordings.store import FrameStore
 
 SIDES = ("told", "auto")
 
@@ -36,6 +39,8 @@ class Job:
     name: what it is called, its folder's name and its own.  frames: how many it has.
     labels: the file with labels of its images; None: it has truth.
     side: of SIDES.  overrides: of the tracker.
+    peer: name and Python of another method that says what it sees in the same frames, in turn with
+        the tracker; None: there is none.
     """
 
     path: Path
@@ -45,6 +50,7 @@ class Job:
     side: str = "told"
     labels: Path | None = None
     overrides: tuple[str, ...] = ()
+    peer: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,7 @@ class Source:
     name: str
     frames: int
     labels: Path | None = None
+    amplitude: bool = False
 
 
 def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> list[Source]:
@@ -97,7 +104,7 @@ def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
         name = f"{file.absolute().parent.name}/{file.stem}"
         count, size = len(recording), (recording.camera.width, recording.camera.height)
         if recording.truth is not None:
-            return Source(file, name, count)
+            return Source(file, name, count, amplitude=_has_amplitude(recording))
         fitting = [
             one
             for one in known
@@ -113,12 +120,39 @@ def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
         recording.close()
 
 
+def _has_amplitude(recording: FrameStore) -> bool:
+    return len(recording) > 0 and recording.image(0)[1] is not None
+
+
 def jobs(
-    found: Sequence[Source], seeds: Sequence[int], side: str, overrides: Sequence[str]
+    found: Sequence[Source],
+    seeds: Sequence[int],
+    side: str,
+    overrides: Sequence[str],
+    peer: tuple[str, str] | None = None,
 ) -> list[Job]:
-    """Every recording with every seed."""
+    """Every recording with every seed; the peer, which has none, beside the first.
+
+    Raises ToftrackError for a recording without amplitude, where there is a peer.
+    """
+    if peer is not None:
+        for one in found:
+            if not one.amplitude:
+                raise ToftrackError(
+                    f"'{one.path}' has no amplitude image, which --peer {peer[0]} looks at; leave "
+                    "the recording out, or --peer"
+                )
     return [
-        Job(one.path, one.name, one.frames, seed, side, one.labels, tuple(overrides))
+        Job(
+            one.path,
+            one.name,
+            one.frames,
+            seed,
+            side,
+            one.labels,
+            tuple(overrides),
+            peer if seed == seeds[0] else None,
+        )
         for one in found
         for seed in seeds
     ]
@@ -173,13 +207,14 @@ def _begin_worker() -> None:
 def rows_of_job(job: Job) -> list[Row]:
     """Track a recording: one row, or one for each labelled image."""
     if job.labels is None:
-        return [_row(job)]
+        return _true_rows(job)
     labels = read_labels(job.labels)
     rows = _stills(job, labels) if isinstance(labels, Stills) else _points(job, labels)
     return [{"recording": name, "seed": job.seed, **figures} for name, figures in rows]
 
 
-def _row(job: Job) -> Row:
+def _true_rows(job: Job) -> list[Row]:
+    """A row of the tracker, and one of the peer, if there is one."""
     with Replay(job.path) as device:
         truth = device.truth
         assert truth is not None
@@ -188,12 +223,23 @@ def _row(job: Job) -> Row:
                 f"'{job.path}' does not say whose hand it shows ('side' in its metadata), and so "
                 "nobody can be told; give --side auto"
             )
-        track, compute_s = _tracked(device, job, truth.side)
-        found = measured(track, truth)
-        gesture = track.gesture
-        if gesture is not None and found.slots is not None:
-            gesture = gesture[:, found.slots[0]]
-        about = device.metadata
+        peer = None if job.peer is None else peer_process(*job.peer)
+        if peer is not None:
+            peer.begin(device.camera, truth.side if job.side == "told" else "")
+        track, compute_s, others = _tracked(device, job, truth.side, peer)
+    rows = [_row(job, device, truth, track, compute_s)]
+    if peer is not None:
+        of_peer, peer_s = peer_estimates(others, found_side=job.side == "auto")
+        rows.append({"method": peer.name, **_row(job, device, truth, of_peer, peer_s)})
+    return rows
+
+
+def _row(job: Job, device: Replay, truth: Truth, track: Estimates, compute_s: np.ndarray) -> Row:
+    found = measured(track, truth)
+    gesture = track.gesture
+    if gesture is not None and found.slots is not None:
+        gesture = gesture[:, found.slots[0]]
+    about = device.metadata
     camera = about.get("camera")
     kind = camera.get("kind") if isinstance(camera, dict) else None
     size = f"{device.camera.width} x {device.camera.height}"
@@ -208,15 +254,21 @@ def _row(job: Job) -> Row:
     }
 
 
-def _tracked(device: Replay, job: Job, side: str) -> tuple[Estimates, np.ndarray]:
+def _tracked(
+    device: Replay, job: Job, side: str, peer: Peer | None = None
+) -> tuple[Estimates, np.ndarray, list[PeerEstimate]]:
+    """What the tracker says, the seconds of its frames, and what a peer says after each of them."""
     tracker = _tracker(job, side)
     told: list[tuple[Estimate, ...]] = []
+    others: list[PeerEstimate] = []
     for frame in device:
         depth = device.camera.rectify(frame.depth, frame.radial)
         told.append(tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s))
-    return estimates_of(told, found_side=job.side == "auto"), np.array(
-        [frame[0].compute_s for frame in told]
-    )
+        if peer is not None:
+            assert frame.amplitude is not None
+            others.append(peer.step(depth, frame.amplitude))
+    seconds = np.array([frame[0].compute_s for frame in told])
+    return estimates_of(told, found_side=job.side == "auto"), seconds, others
 
 
 def estimates_of(told: Sequence[Sequence[Estimate]], found_side: bool) -> Estimates:
@@ -236,7 +288,7 @@ def estimates_of(told: Sequence[Sequence[Estimate]], found_side: bool) -> Estima
 
 def _points(job: Job, labels: Points) -> Iterator[tuple[str, dict[str, Any]]]:
     with Replay(job.path) as device:
-        track, _ = _tracked(device, job, labels.side)
+        track, _, _ = _tracked(device, job, labels.side)
         if track.joints_m.ndim == 4:
             raise ToftrackError("labelled images are of one hand; leave out --hands 2")
         rows = point_rows(labels, track.joints_m, track.lost, device.camera.K, TIPS)
