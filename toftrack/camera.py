@@ -264,6 +264,10 @@ class Camera:
     @classmethod
     def load(cls, path: str | Path) -> Camera:
         """Read a camera that `save` wrote. Raises ToftrackError for anything else."""
+        if not str(path):
+            raise ToftrackError(
+                "the name of the camera file is empty; give the path of one (.json)"
+            )
         try:
             content = read_json(Path(path).expanduser())
         except OSError as error:

@@ -17,8 +17,14 @@ import secrets
 import stat
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
+from io import RawIOBase
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 _BINARY = getattr(os, "O_BINARY", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
@@ -109,6 +115,21 @@ def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
     except BaseException:
         os.close(descriptor)
         raise
+
+
+def lock(stream: IO[bytes] | RawIOBase) -> None:
+    """Have a file for oneself among those who ask, until it is closed; Windows grants it to all.
+
+    Raises BlockingIOError while another process has it.
+    """
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:
+        pass  # some network file systems have no locks
 
 
 @contextmanager

@@ -11,12 +11,7 @@ from typing import IO
 
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
-from toftrack.safe_files import check_replaceable, open_in_place, open_to_read, remove_partial
-
-try:
-    import fcntl
-except ImportError:  # Windows: there, two runs into one folder are not noticed
-    fcntl = None  # type: ignore[assignment]
+from toftrack.safe_files import check_replaceable, lock, open_in_place, open_to_read, remove_partial
 
 LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""
@@ -120,17 +115,13 @@ def _size_of_lines(file: io.FileIO) -> int:
 
 
 def _lock(file: IO[bytes], folder: Path) -> None:
-    if fcntl is None:
-        return
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock(file)
     except BlockingIOError:
         raise ToftrackError(
             f"another run is writing into the folder '{folder}' just now; wait for its end, or "
             "choose another folder with hydra.run.dir=DIR"
         ) from None
-    except OSError:
-        pass  # some network file systems have no locks
 
 
 def make_way(folder: Path) -> None:

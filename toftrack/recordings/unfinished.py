@@ -29,12 +29,7 @@ from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
 from toftrack.recordings.npz_camera import camera_arrays
 from toftrack.recordings.npz_pieces import add_pieces
-from toftrack.safe_files import open_in_place, open_new, whole_file
-
-try:
-    import fcntl
-except ImportError:  # Windows: there, nobody notices that a recording still goes on
-    fcntl = None  # type: ignore[assignment]
+from toftrack.safe_files import lock, open_in_place, open_new, whole_file
 
 SUFFIX = ".part"
 _FIRST_LINE = b"toftrack unfinished recording 1\n"
@@ -317,13 +312,9 @@ def _locked(path: Path) -> BinaryIO:
 
 
 def _lock(stream: IO[bytes] | io.RawIOBase, path: Path) -> None:
-    if fcntl is None:
-        return
     try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock(stream)
     except BlockingIOError:
         raise ToftrackError(
             f"'{path}' is being recorded just now; end that first, or choose another name"
         ) from None
-    except OSError:
-        pass  # some network file systems have no locks
