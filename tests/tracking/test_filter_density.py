@@ -11,7 +11,7 @@ from toftrack.pose_space.density import latent_density
 from toftrack.tracking import particle_filter as sir
 from toftrack.tracking.tracker import Tracker
 
-ALONE = ("experiment=paper",)
+ALONE = ("refine=none", "hand.side=right")
 """The filter by itself."""
 
 

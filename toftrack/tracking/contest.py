@@ -101,7 +101,7 @@ def settled(
     if not bool(other.any()):
         return found.poses, None
     lead = (others.scores - found.scores) * _weight(dt_s) - frame.model.refinement.drift
-    if track.pose is None or track.age_s == 0:
+    if track.age_s == 0:
         lead = lead + torch.inf
     elif old is not None:
         lead = lead + old.lead * ~_apart(joints[1:], refiner.joints(old.pose))

@@ -15,15 +15,15 @@ class Belief:
     kept: the track goes on.  state_name, lost: as Estimate has them.
     bad_s: as Track has it, with this frame.
     confidence: probability that every joint is within 40 mm; NaN where nobody says.
-    log_odds: the same, smoothed over time; None likewise.
+    log_odds: the same, smoothed over time.
     """
 
     kept: bool
     state_name: str
     lost: bool
-    bad_s: float
+    bad_s: float = 0.0
     confidence: float = math.nan
-    log_odds: float | None = None
+    log_odds: float = math.nan
 
 
 def log_odds(probability: float) -> float:

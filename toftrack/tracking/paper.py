@@ -84,8 +84,8 @@ class RoughStart:
         particles = model.backend.motions.compose(reference, tangents)
         there = on_device(particles, model.device)
         weights = there.new_full((n,), 1.0 / n, dtype=torch.float64)
-        still = particles.new_zeros(6 + space.dims)
-        return Track(there, weights, particles[:1], still, particles.new_zeros(21))
+        mean, still = particles[:1], particles.new_zeros(6 + space.dims)
+        return Track(there, weights, mean, still, still.new_zeros(21), model.decode(mean))
 
 
 def palm_centre(observation: Observation, generator: torch.Generator) -> np.ndarray:
@@ -137,8 +137,8 @@ class ScoreThreshold:
     def judge(self, track: Track, score: float) -> Belief:
         """What is thought of an estimate with a score."""
         if score < self.score:
-            return Belief(True, "recovering", True, 0.0)
-        return Belief(True, "tracking" if track.age_s > 0 else "initialising", False, 0.0)
+            return Belief(True, "recovering", True)
+        return Belief(True, "tracking" if track.age_s > 0 else "initialising", False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,11 +48,9 @@ def refined(
     pose = model.decode(mean, track.offset)
     if not model.refinement.iterations:
         return Refined(pose, track.trend)
-    if track.pose is not None and _covered(track.pose, frame):
+    if _covered(track.pose, frame):
         return Refined(track.pose, None)
     outcome = _onto_points(pose, track, dt_s, frame, generator)
-    if track.pose is None:
-        return replace(outcome, trend=track.trend)
     steadying, motions = model.refinement.steadying, model.backend.motions
     steady, trend = steadied(outcome.pose, track.pose, track.trend, dt_s, steadying, motions)
     return replace(outcome, pose=steady, trend=trend)
@@ -82,8 +80,8 @@ def _onto_points(
 ) -> Refined:
     """The filter's hand (1, 27) brought onto the seen points, and what speaks against it."""
     refiner, cfg = frame.hand.refiner, frame.model.refinement
-    seen, before = seen_points(frame.observation), track.pose
-    glance = None if before is not None and _mostly_unseen(state, frame) else frame.glance
+    seen = seen_points(frame.observation)
+    glance = None if _mostly_unseen(state, frame) else frame.glance
     frame = replace(frame, glance=glance)
     landmarks = None if glance is None else landmarks_of(glance, frame.model)
 
@@ -92,10 +90,7 @@ def _onto_points(
 
     # The pose of the last frame stands until another one is clearly better: what the image does
     # not decide, such as a hidden finger, must not flicker. A contender moves along with it.
-    starts = [state]
-    if before is not None:
-        starts.insert(0, torch.cat((state[:, :6], before[:, 6:]), 1))
-    own = len(starts)
+    starts = [torch.cat((state[:, :6], track.pose[:, 6:]), 1), state]
     if track.contender is not None:
         starts.append(torch.cat((state[:, :6], track.contender.pose[:, 6:]), 1))
     mine = len(starts)
@@ -104,9 +99,9 @@ def _onto_points(
     hears, swaps = (True, True) if frame.hidden else turns(track, cfg.sure)
     heard = likely if hears else likely[:0]
     tried = scored(onto_points(torch.cat((*starts, heard))), frame)
-    first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[own - 1] else own - 1
+    first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[1] else 1
     rows = torch.arange(len(tried.scores), device=state.device)
-    found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[own:mine]), None
+    found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[2:mine]), None
     if len(heard):
         near, rival = rivals_of(found, tried.rows(rows[mine:]), frame)
         others = others.and_(near)
@@ -124,8 +119,8 @@ def turns(track: Track, sure: float) -> tuple[bool, bool]:
 
     Both, but in turn where a track is believed and nothing challenges it.
     """
-    calm = track.challenged_s == 0 and track.pose is not None
-    if not calm or sure == 1 or track.log_odds is None or track.log_odds < log_odds(sure):
+    believed = sure < 1 and track.log_odds is not None and track.log_odds >= log_odds(sure)
+    if track.challenged_s > 0 or not believed:
         return True, True
     first = round(track.age_s / FRAME_S) % 2 == 0
     return first, not first

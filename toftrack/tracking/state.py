@@ -40,7 +40,7 @@ class Track:
     mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a second.
     offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
         displaced by it.
-    pose: (1, 27) the last refined hand, None at the start.
+    pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see steadying.
     contender: another pose that may take its place, None where there is none.
     age_s: how long it has been followed, 0 before the first frame.
@@ -59,7 +59,7 @@ class Track:
     mean: Tensor
     velocity: Tensor
     offset: Tensor
-    pose: Tensor | None = None
+    pose: Tensor
     trend: Tensor | None = None
     contender: Contender | None = None
     age_s: float = 0.0

@@ -12,7 +12,7 @@ from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.relocation.relocaliser import Glance
 from toftrack.tracking import shape_fit
-from toftrack.tracking.estimates import emitted, estimate_of, no_hand, particles_sigma
+from toftrack.tracking.estimates import emitted, estimate_of, no_hand
 from toftrack.tracking.following import (
     Found,
     advanced,
@@ -95,7 +95,7 @@ def step(
     belief, signs = _believed(track, found, score, state, dt_s, frame)
     unlooked_s = track.unlooked_s + dt_s if frame.glance is None else 0.0
     estimate = estimate_of(image, found, score, belief, frame)
-    estimate, seen_signs = _joints_judged(image, estimate, track, found, belief, frame)
+    estimate, seen_signs = _joints_judged(image, estimate, track, belief, frame)
     track = replace(track, signs=signs, joint_signs=seen_signs, unlooked_s=unlooked_s)
     if model.refinement.iterations:
         found = drawn_to(found, model.refinement.carry, model)
@@ -178,15 +178,11 @@ def _joints_judged(
     image: DepthImage,
     estimate: Estimate,
     track: Track,
-    found: Found,
     belief: Belief,
     frame: LookedFrame,
-) -> tuple[Estimate, np.ndarray | None]:
+) -> tuple[Estimate, np.ndarray]:
     """The estimate with what is thought of each joint, and by which signs."""
     glance = frame.glance
-    if belief.log_odds is None:
-        sigma = particles_sigma(estimate.joints_m, found, frame)
-        return replace(estimate, joint_sigma_m=sigma), None
     signs = joint_signs(
         estimate.joints_m,
         None if glance is None else glance.landmarks,
