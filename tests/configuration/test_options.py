@@ -154,5 +154,5 @@ def test_the_same_seed_reaches_the_tracker_and_the_synthetic_device() -> None:
 
 
 def test_a_tracker_of_mixed_parts_is_not_built() -> None:
-    with pytest.raises(ToftrackError, match="relocation=none has no networks"):
+    with pytest.raises(ToftrackError, match="relocation=none belongs to experiment=paper"):
         build_tracker(configuration("relocation=none"))

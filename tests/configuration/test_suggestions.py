@@ -29,7 +29,10 @@ from toftrack.errors import ToftrackError
         ("lost=score", "there is no lost=score any more, since the networks' signs are judged"),
         ("start.hypotheses=9", "or give relocation.hypotheses"),
         ("start.islands=9", "there is no setting start.islands any more, since the networks"),
-        ("lost.score=0.5", "by lost.confidence: give that, or give experiment=paper"),
+        (
+            "lost.score=0.5",
+            "lost.confidence says which estimates count: give that, or give experiment",
+        ),
         (
             "hand.fit.prior=0.1",
             "no setting hand.fit.prior any more, since the whole shape",

@@ -108,10 +108,15 @@ def check_tracker(config: DictConfig) -> None:
     if not given:
         return
     some = ", ".join(given)
+    if without and {"start=prior", "lost=calibrated"} <= set(given):
+        raise ToftrackError(
+            "relocation=none belongs to experiment=paper, the tracker without networks; give"
+            " experiment=paper, or leave relocation=none out"
+        )
     if without:
         raise ToftrackError(
-            f"relocation=none has no networks, and {some} cannot do without; give experiment=paper,"
-            f" the tracker without networks, and not {some}, or leave relocation=none out"
+            f"experiment=paper has no networks, and {some} goes with these alone; leave {some} out,"
+            " or leave experiment=paper out"
         )
     raise ToftrackError(
         f"{some} belongs to experiment=paper; give experiment=paper as well, or leave {some} out"

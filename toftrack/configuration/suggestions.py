@@ -26,10 +26,10 @@ _GONE = {
         f"the networks find hands: leave it out, {_OR_PAPER}",
     ),
     "lost=score": f"the networks' signs are judged, too: leave it out, {_OR_PAPER}",
-    "lost.score": f"estimates are judged by lost.confidence: give that, {_OR_PAPER}",
+    "lost.score": f"lost.confidence says which estimates count: give that, {_OR_PAPER}",
     **dict.fromkeys(
         ("lost.start_score", "lost.rival_gain", "lost.outside_rad"),
-        "estimates are judged by lost.confidence: give that, or leave it out",
+        "lost.confidence (in experiment=paper lost.score) says which estimates count: give that",
     ),
     "hand.fit": "the whole shape is fitted, by the settings of hand.adapt: give those",
 }
