@@ -83,17 +83,21 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
 def build_tracker(config: DictConfig) -> Tracker:
     """The tracker of one hand of a configuration (conf/config.yaml composed)."""
     # These take seconds: an override's error comes before.
+    from toftrack.compute.threads import small_operations
     from toftrack.tracking.tracker import Tracker
 
-    return Tracker(build_model(config), config.seed, pace=_pace(config))
+    with small_operations():
+        return Tracker(build_model(config), config.seed, pace=_pace(config))
 
 
 def build_hands_tracker(config: DictConfig) -> HandsTracker:
     """The tracker of as many hands as a configuration says."""
+    from toftrack.compute.threads import small_operations
     from toftrack.tracking.hands import HandsTracker
 
     hands = config.get("hands", 1)
-    return HandsTracker(build_model(config), config.seed, hands, pace=_pace(config))
+    with small_operations():
+        return HandsTracker(build_model(config), config.seed, hands, pace=_pace(config))
 
 
 def _pace(config: DictConfig) -> Pace:
@@ -142,6 +146,11 @@ def compute_device(name: str) -> torch.device:
     """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
     import torch
 
+    if name != "cpu" and torch.cuda._is_in_bad_fork():
+        raise ToftrackError(
+            f"compute={name}: the process that this one was forked from has used the GPU, which "
+            "CUDA does not allow; start it by multiprocessing's spawn, or give compute=cpu"
+        )
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():

@@ -26,6 +26,8 @@ from typing import IO, Protocol
 
 import numpy as np
 
+from toftrack.safe_files import open_to_read
+
 MOST_BYTES = 2**30
 """An array of more than a gigabyte is not loaded."""
 MOST_TEXT_BYTES = 2**24
@@ -137,7 +139,7 @@ def read_archive(path: str | Path, names: Collection[str] | None = None) -> dict
     words why, when it is no .npz archive, is cut off or damaged, too large to be meant, or holds
     pickled objects.
     """
-    with open(path, "rb") as stream:
+    with open_to_read(path) as stream:
         archive = Archive(stream)
         wanted = [name for name in archive.names if names is None or name in names]
         if sum(archive.header(name).size for name in wanted) > MOST_BYTES:

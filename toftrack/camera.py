@@ -17,6 +17,7 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
+from toftrack.safe_files import write_whole
 
 _FORMAT = "toftrack-camera"
 _VERSION = 1
@@ -236,7 +237,7 @@ class Camera:
     def save(self, path: str | Path) -> None:
         """Write the camera as JSON. Raises ToftrackError when the file cannot be written."""
         try:
-            Path(path).write_text(json.dumps(self.to_dict(), indent=1) + "\n", encoding="utf-8")
+            write_whole(path, json.dumps(self.to_dict(), indent=1) + "\n")
         except OSError as error:
             raise ToftrackError(
                 f"the camera file '{path}' cannot be written ({error.strerror}); choose another "

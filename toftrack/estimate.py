@@ -15,6 +15,7 @@ STATES = {
     "initialising": "starting",
     "lost": "no hand found",
     "recovering": "trying to recover",
+    "dropped": "the frame came too late",
 }
 """What the tracker does, Estimate.state_name, and how people are told."""
 
@@ -28,7 +29,7 @@ class Estimate:
     timestamp_s: float
     state_name: str
     """'tracking', or why not: 'searching', 'hidden', 'out of view', 'initialising', 'lost' or
-    'recovering'; see STATES."""
+    'recovering'; of a frame of a finished run that was not tracked 'dropped'. See STATES."""
     lost: bool
     """Not to be used: no hand, or a joint that is likely off by more than 40 mm."""
     joints_m: np.ndarray

@@ -2,8 +2,8 @@
 
 import sys
 
-from toftrack.programs import command_line
-from toftrack.programs.evaluate import main
+import toftrack.early_ending  # noqa: F401  # before all others
+from toftrack.programs.main import main
 
 if __name__ == "__main__":
-    sys.exit(command_line.run(main))
+    sys.exit(main(["evaluate", *sys.argv[1:]]))

@@ -13,20 +13,32 @@ from toftrack.errors import ToftrackError
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
 LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
 _MILLIMETRES = (100.0, 20_000.0)
-"""A median between these is one of millimetres."""
+"""A median between these is one of millimetres, unless they are centimetres."""
+_NEAREST_CM, _LARGEST_CM = (15.0, 120.0), 1000.0
+"""What is nearest in centimetres, and no median is more: as millimetres, these would be nearer than
+cameras measure."""
+_NEAREST_PERCENT = 5
+"""So many percent of the readings may be nearer than what is called the nearest."""
 
 
-def wrong_unit(what: str, median: float, kind: str = "") -> ToftrackError:
+def wrong_unit(what: str, depth: np.ndarray, kind: str = "") -> ToftrackError:
     """What is said of depth whose readings' median is no distance in metres.
 
-    kind: of whole numbers, which are no metres whatever they are.
+    depth: all of it, or a part.  kind: of whole numbers, which are no metres whatever they are.
     """
+    median, nearest = median_reading(depth), nearest_reading(depth)
     whole = f"{what} consists of whole numbers ({kind}), their median"
     given = whole if kind else f"the median of {what}"
-    if _MILLIMETRES[0] <= median <= _MILLIMETRES[1]:
+    plainly = None
+    if _NEAREST_CM[0] <= nearest < _NEAREST_CM[1] and median <= _LARGEST_CM:
+        plainly = ("centimetres", 100)
+    elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1]:
+        plainly = ("millimetres", 1000)
+    if plainly:
+        unit, to_metres = plainly
         return ToftrackError(
-            f"{given} is {median:.0f}, which is plainly millimetres, but it must be float metres; "
-            "convert with depth.astype('float32') / 1000"
+            f"{given} is {median:.0f}, which is plainly {unit}, but it must be float metres; "
+            f"convert with depth.astype('float32') / {to_metres}"
         )
     return ToftrackError(
         f"{given} is {median:.4g}, neither metres nor millimetres of a hand before a camera; "
@@ -36,8 +48,17 @@ def wrong_unit(what: str, median: float, kind: str = "") -> ToftrackError:
 
 def median_reading(depth: np.ndarray) -> float:
     """The median of what is a reading, in the unit that it has; 0 where there is none."""
+    return _percentile(depth, 50)
+
+
+def nearest_reading(depth: np.ndarray) -> float:
+    """Likewise what nearly all readings are farther than."""
+    return _percentile(depth, _NEAREST_PERCENT)
+
+
+def _percentile(depth: np.ndarray, percent: float) -> float:
     readings = depth[(depth > 0) & (depth < np.inf)]
-    return float(np.median(readings.astype(np.float32))) if readings.size else 0.0
+    return float(np.percentile(readings.astype(np.float32), percent)) if readings.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +94,12 @@ class Truth:
     """Number of the first row's frame; the other rows' follow."""
     other: Truth | None = None
     """Of the person's other hand, in the same frames; None where nothing is known of one."""
+    pose_name: np.ndarray | None = None
+    """(T,) text: which pose is held; 'transition' between two."""
+    still: np.ndarray | None = None
+    """(T,) bool: the hand rests."""
+    side: str = ""
+    """'right' or 'left'; empty where nobody says."""
 
     def __len__(self) -> int:
         return len(self.joints_m)
@@ -100,6 +127,9 @@ class Truth:
             joint_visible=cut(self.joint_visible),
             first=first,
             other=None if self.other is None else self.other._taken(rows, first),
+            pose_name=cut(self.pose_name),
+            still=cut(self.still),
+            side=self.side,
         )
 
 
@@ -142,7 +172,7 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
             f"{depth.shape}; give one frame at a time"
         )
     if depth.dtype.kind in "iu":
-        raise wrong_unit("the depth image", median_reading(depth), str(depth.dtype))
+        raise wrong_unit("the depth image", depth, str(depth.dtype))
     if depth.dtype.kind != "f":
         raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
     depth = np.ascontiguousarray(depth, np.float32)
@@ -151,7 +181,6 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
         farthest = depth.max()
     if farthest > LARGEST_MEDIAN_M:
-        median = median_reading(depth)
-        if median > LARGEST_MEDIAN_M:
-            raise wrong_unit("the depth image", median)
+        if median_reading(depth) > LARGEST_MEDIAN_M:
+            raise wrong_unit("the depth image", depth)
     return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K

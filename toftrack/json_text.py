@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from toftrack.safe_files import open_to_read
+
 MOST_BYTES = 2**26
 """No file of JSON here comes near 64 MB."""
 _MOST_DIGITS = 30
@@ -24,7 +26,7 @@ def parse_json(text: str | bytes) -> Any:
 
 def read_json(path: str | Path) -> Any:
     """The content of a file (UTF-8); OSError, or ValueError as parse_json."""
-    with open(path, "rb") as stream:
+    with open_to_read(path) as stream:
         text = stream.read(MOST_BYTES + 1)
     if len(text) > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")

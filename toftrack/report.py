@@ -2,7 +2,8 @@
 
 import sys
 
-from toftrack.programs.report import main
+import toftrack.early_ending  # noqa: F401  # before all others
+from toftrack.programs.main import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(["report", *sys.argv[1:]]))

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import logging
-import threading
+import pkgutil
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+from numba.core.dispatcher import Dispatcher
+from numba.core.extending import _Intrinsic
 
+import toftrack
 from toftrack.compute import compiling
-from toftrack.compute.compiling import announced, entry_point
+from toftrack.compute.compiling import announced
 
 
 @pytest.mark.parametrize(("silent_s", "told"), [(0.0, ["compiling"]), (1000.0, [])])
@@ -29,31 +35,40 @@ def test_only_what_takes_long_is_announced(
     assert caplog.messages == told
 
 
-def test_without_a_place_for_the_code_what_to_do_is_said_once(
+def test_where_the_code_cannot_be_kept_it_is_said_to_be_compiled_in_every_run(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def njit(cache: bool = False, **options: object) -> Callable:
-        if cache:
-            raise RuntimeError("cannot cache function: no locator available")
-        return lambda function: function
-
-    monkeypatch.setattr(compiling.numba, "njit", njit)
+    monkeypatch.setattr(compiling, "can_be_kept", lambda: False)
     monkeypatch.setattr(compiling, "_SILENT_S", 0.0)
-    monkeypatch.setattr(compiling, "_uncached", threading.Event())
-    monkeypatch.setattr(compiling, "_told", threading.Event())
     caplog.set_level(logging.INFO)
+    with announced("compiling (once, about 6 s)"):
+        deadline = time.monotonic() + 20
+        while not caplog.messages and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert caplog.messages == ["compiling (in every run, about 6 s)"]
 
-    def kernel() -> int:
-        return 7
 
-    assert entry_point()(kernel)() == 7
-    for number, lines in enumerate((2, 3)):
-        with announced(f"compiling {number} (once, about 6 s)"):
-            deadline = time.monotonic() + 20
-            while len(caplog.messages) < lines and time.monotonic() < deadline:
-                time.sleep(0.01)
-    assert [message for message in caplog.messages if "NUMBA_CACHE_DIR" not in message] == [
-        "compiling 0 (in every run, about 6 s)",
-        "compiling 1 (in every run, about 6 s)",
-    ]
-    assert len(caplog.messages) == 3
+def _made_of(function: Callable, seen: set[Callable]) -> set[Callable]:
+    """All that a kernel calls, itself included, through any number of others."""
+    if function not in seen:
+        seen.add(function)
+        captured = inspect.getclosurevars(function)
+        for value in (*captured.globals.values(), *captured.nonlocals.values()):
+            if isinstance(value, Dispatcher):
+                _made_of(value.py_func, seen)
+            elif isinstance(value, _Intrinsic):
+                seen.add(value._defn)
+    return seen
+
+
+def test_a_change_in_any_file_that_a_kernel_is_made_of_compiles_it_anew() -> None:
+    kernels: dict[Callable, frozenset[str]] = {}
+    for found in pkgutil.walk_packages(toftrack.__path__, "toftrack."):
+        if "numba" in found.name or found.name == "toftrack.relocation.pictures":
+            for value in vars(importlib.import_module(found.name)).values():
+                if isinstance(value, Dispatcher) and hasattr(value, "sources"):
+                    kernels[value.py_func] = value.sources
+    assert len(kernels) > 10
+    for kernel, sources in kernels.items():
+        files = {str(Path(inspect.getfile(part)).resolve()) for part in _made_of(kernel, set())}
+        assert files <= sources, f"{kernel.__qualname__} is also made of {files - sources}"

@@ -1,12 +1,14 @@
 """A long live run under observation: does anything grow?
 
     python tests/endurance/soak.py --minutes 20
+    python tests/endurance/soak.py --minutes 60 --stream websocket --hands 2 --source TWO_HANDS.npz
 
 The tracker follows an emulated SR3000 at the camera's pace, in a process of its own. Each 50th
 request to the camera goes wrong, in all ways in turn; a visitor watches the page and comes anew
-after every 100 pictures; a listener takes the datagrams. At the end a table tells of each tenth of
-the time, and how long the ending took. The status is 1 if memory, threads or file handles are more
-in the last quarter than in the first one, or if the run failed. Needs /proc, that is Linux.
+after every 100 pictures; a listener takes the datagrams, or the websocket's messages, where it
+sends as well and comes anew after every 500 lines. At the end a table tells of each tenth of the
+time, and how long the ending took. The status is 1 if memory, threads or file handles are more in
+the last quarter than in the first one, or if the run failed. Needs /proc, that is Linux.
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ from typing import TypeVar
 from urllib.parse import urlsplit
 
 import numpy as np
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import connect
 
 _T = TypeVar("_T")
 ROOT = Path(__file__).parents[2]
@@ -40,9 +44,10 @@ OVERRIDES = (
     "device.emulated.fault_every=50",
     "view=browser",
     "view.port=0",
-    "stream=udp",
 )
+STREAMS = ("udp", "websocket")
 _PICTURES_A_VISIT = 100
+_LINES_A_VISIT = 500
 _STARTING_S = 180.0
 """Kernels may have to be compiled first."""
 _WARM_FRAMES = 100
@@ -68,7 +73,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Arrival:
-    """A datagram."""
+    """A datagram, or a message of the websocket."""
 
     time_s: float
     """Unix time of its arrival."""
@@ -154,17 +159,32 @@ def _figures(samples: Sequence[Sample], arrivals: Sequence[Arrival]) -> dict[str
     }
 
 
-def soak(minutes: float, folder: Path, told: Callable[[str], None] = print) -> Observation:
-    """Run the tracker in a folder and observe it for so long; `told` gets a line a sample."""
+def soak(
+    minutes: float,
+    folder: Path,
+    told: Callable[[str], None] = print,
+    stream: str = "udp",
+    overrides: Sequence[str] = (),
+) -> Observation:
+    """Run the tracker in a folder and observe it for so long.
+
+    told: gets a line a sample.  stream: one of STREAMS.  overrides: of the run besides OVERRIDES.
+    """
     ended, pictures = threading.Event(), [0, 0]
     arrivals: list[Arrival] = []
+    words = folder / "err.txt"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(0.5)
-        port = listener.getsockname()[1]
-        with _program(folder, port) as program, _threads(ended) as start:
-            start(lambda: _listen(listener, arrivals, ended))
-            url = _until(lambda: _address(folder / "err.txt"), program)
+        port = listener.getsockname()[1] if stream == "udp" else 0
+        asked = [*overrides, f"stream={stream}", f"stream.port={port}"]
+        with _program(folder, asked) as program, _threads(ended) as start:
+            if stream == "udp":
+                start(lambda: _listen(listener, arrivals, ended))
+            else:
+                address = _until(lambda: _found(r"for programs: (ws://\S+)", words), program)
+                start(lambda: _converse(address, arrivals, ended))
+            url = _until(lambda: _found(r"live view: (http://[^#]+)#", words), program)
             start(lambda: _watch(url, pictures, ended))
             _until(lambda: len(arrivals) > _WARM_FRAMES, program)
             samples = _samples(program, 60 * minutes, arrivals, told)
@@ -191,9 +211,9 @@ def _ended(program: subprocess.Popen) -> int | None:
 
 
 @contextmanager
-def _program(folder: Path, port: int) -> Iterator[subprocess.Popen]:
+def _program(folder: Path, asked: Sequence[str]) -> Iterator[subprocess.Popen]:
     tracker = [sys.executable, "-X", "faulthandler", str(ROOT / "track.py")]
-    command = [*tracker, *OVERRIDES, f"stream.port={port}"]
+    command = [*tracker, *OVERRIDES, *asked]
     with open(folder / "err.txt", "wb") as words:
         program = subprocess.Popen(
             [*command, "hydra.run.dir=run"], cwd=folder, stdout=words, stderr=words
@@ -230,8 +250,8 @@ def _until(told: Callable[[], _T], program: subprocess.Popen) -> _T:
     return value
 
 
-def _address(words: Path) -> str:
-    found = re.search(r"live view: (http://[^#]+)#", words.read_text())
+def _found(pattern: str, words: Path) -> str:
+    found = re.search(pattern, words.read_text())
     return found[1] if found else ""
 
 
@@ -268,8 +288,26 @@ def _listen(listener: socket.socket, arrivals: list[Arrival], ended: threading.E
             datagram = listener.recv(65536)
         except TimeoutError:
             continue
-        now, said = time.time(), json.loads(datagram)
-        arrivals.append(Arrival(now, said["index"], said["timestamp_s"], said["compute_s"]))
+        arrivals.append(_arrived(datagram))
+
+
+def _arrived(line: str | bytes) -> Arrival:
+    now, said = time.time(), json.loads(line)
+    return Arrival(now, said["index"], said["timestamp_s"], said["compute_s"])
+
+
+def _converse(address: str, arrivals: list[Arrival], ended: threading.Event) -> None:
+    """Listen to the websocket, answer every line, and come anew now and then."""
+    while not ended.is_set():
+        try:
+            with connect(address) as connection:
+                for _ in range(_LINES_A_VISIT):
+                    arrivals.append(_arrived(connection.recv(10.0)))
+                    connection.send("thank you")
+                    if ended.is_set():
+                        break
+        except (OSError, TimeoutError, WebSocketException):
+            ended.wait(0.2)  # the program ends, or is busy
 
 
 def _watch(url: str, counts: list[int], ended: threading.Event) -> None:
@@ -297,9 +335,21 @@ def _watch(url: str, counts: list[int], ended: threading.Event) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Does anything grow in a long live run?")
     parser.add_argument("--minutes", type=float, default=20.0, help="how long; 20 if not given")
-    minutes = parser.parse_args().minutes
+    parser.add_argument("--stream", choices=STREAMS, default=STREAMS[0], help="udp if not given")
+    parser.add_argument("--hands", type=int, choices=(1, 2), default=1, help="1 if not given")
+    parser.add_argument("--source", type=Path, help="what the camera sees; the sample if not given")
+    given = parser.parse_args()
+    overrides = [f"hands={given.hands}"]
+    if given.source is not None:
+        overrides.append(f"device.emulated.source={given.source.resolve()}")
     with tempfile.TemporaryDirectory() as folder:
-        observation = soak(minutes, Path(folder), lambda line: print(line, flush=True))
+        observation = soak(
+            given.minutes,
+            Path(folder),
+            lambda line: print(line, flush=True),
+            given.stream,
+            overrides,
+        )
         words = (Path(folder) / "err.txt").read_text()
     print(table(observation))
     print(f"{observation.pictures} pictures were seen in {observation.visits} visits")

@@ -33,8 +33,11 @@ def test_what_grows_is_named(script: ModuleType) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-def test_a_live_run_with_faults_a_visitor_and_a_stream(script: ModuleType, tmp_path: Path) -> None:
-    observation = script.soak(0.3, tmp_path, lambda line: None)
+@pytest.mark.parametrize(("stream", "hands"), [("udp", 1), ("websocket", 2)])
+def test_a_live_run_with_faults_a_visitor_and_a_stream(
+    script: ModuleType, tmp_path: Path, stream: str, hands: int
+) -> None:
+    observation = script.soak(0.3, tmp_path, lambda line: None, stream, [f"hands={hands}"])
     words = (tmp_path / "err.txt").read_text()
     assert observation.status == 143, words[-2000:]
     assert script.grown(observation.part(0, 4)[0], observation.part(3, 4)[0]) == []

@@ -211,3 +211,28 @@ def test_an_unknown_side_or_an_impossible_length_is_refused() -> None:
         default_hand_shape(side="both")
     with pytest.raises(ToftrackError, match="metres"):
         default_hand_shape(190.0)
+
+
+def test_the_fingers_of_the_mean_hand_point_and_bend_as_they_do() -> None:
+    """Directions and axes of flexion at rest, to half a degree: thumb to little finger."""
+    frames = default_hand_shape().base_frames
+    axes = torch.tensor(
+        [
+            [0.465, 0.628, -0.624],
+            [0.997, 0.052, 0.052],
+            [0.998, -0.070, 0.0],
+            [0.974, -0.207, -0.087],
+            [0.931, -0.321, -0.174],
+        ]
+    )
+    directions = torch.tensor(
+        [
+            [0.649, -0.721, -0.242],
+            [0.052, -0.999, 0.0],
+            [-0.070, -0.998, 0.0],
+            [-0.208, -0.978, 0.0],
+            [-0.326, -0.946, 0.0],
+        ]
+    )
+    assert (frames[:, :, 0] - axes).norm(dim=1).max() < 0.01
+    assert (-frames[:, :, 1] - directions).norm(dim=1).max() < 0.01

@@ -32,9 +32,11 @@ from toftrack.programs.recover import recover
 from toftrack.programs.report import read_runs
 from toftrack.recordings.datasets import icvl, msra, nyu, open_data_set
 from toftrack.recordings.npz import Recording, write_recording
+from toftrack.recordings.npz_pieces import compressed
 from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
+from toftrack.recordings.unfinished import Facts, UnfinishedRecording, recover_recording
 from toftrack.relocation.network import Finder, PoseNet
 from toftrack.relocation.weights import _checksum, load_weights, save_weights
 
@@ -72,6 +74,13 @@ def play(path: Path) -> None:
             device.camera.undistort_amplitude(frame.amplitude)
             if number + 1 == _MOST_FRAMES:
                 break
+
+
+def play_recovered(path: Path) -> None:
+    """As `play`, of what is made of an unfinished recording; that itself stays."""
+    copy = path.with_name("copy.npz.part")
+    shutil.copy(path, copy)
+    play(recover_recording(copy, overwrite=True)[0])
 
 
 def _beside(path: Path) -> Path | None:
@@ -129,6 +138,15 @@ def _recordings(folder: Path) -> list[Reader]:
     npz = _new(folder, "npz") / "recording.npz"
     facts: dict[str, Any] = {"what": "a test"}
     write_recording(npz, Recording(depth, False, camera, times, 25.0, amplitude, None, facts))
+    unfinished = _new(folder, "unfinished") / "recording.npz.part"
+    growing = UnfinishedRecording(unfinished)
+    growing.begin(Facts(camera, False, True, 25.0, facts))
+    for number, image in enumerate(depth):
+        raw = image.tobytes(), amplitude[number].tobytes()
+        growing.append(
+            number, times[number], (raw[0], compressed(raw[0]), raw[1], compressed(raw[1]))
+        )
+    growing.close()
     srs = _new(folder, "srs") / "recording.srs"
     range_m = 7.5
     shape = (nominal_camera().height, nominal_camera().width)
@@ -151,6 +169,7 @@ def _recordings(folder: Path) -> list[Reader]:
     return [
         _alone("recording .npz", npz, play),
         _alone("recording .srs", srs, play),
+        _alone("unfinished recording", unfinished, play_recovered),
         Reader("PNG folder: camera.json", png / "camera.json", png, play),
         Reader("PNG folder: an image", png / "depth_000000.png", png, play),
         Reader("PNG folder: timestamps.txt", png / "timestamps.txt", png, play),

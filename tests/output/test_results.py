@@ -23,7 +23,6 @@ from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output import records
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate, metrics_table
-from toftrack.output.files import save_whole, write_whole
 from toftrack.output.lines import KINDS, LINE_FIELDS, read_lines
 from toftrack.output.results import ResultWriter, read_results, read_run_facts
 from toftrack.output.trust import Hand, trust
@@ -59,8 +58,13 @@ def estimate(index: int, **changes: Any) -> Estimate:
     return dataclasses.replace(whole, **changes)
 
 
-def write(folder: Path, estimates: list[Estimate], truth: Truth | None = None) -> ResultWriter:
-    with ResultWriter(folder, {"seed": 1}, NAMES, truth) as writer:
+def write(
+    folder: Path,
+    estimates: list[Estimate],
+    truth: Truth | None = None,
+    more: dict[str, Any] | None = None,
+) -> ResultWriter:
+    with ResultWriter(folder, {"seed": 1} | (more or {}), NAMES, truth) as writer:
         for one in estimates:
             writer.append((one,))
     return writer
@@ -102,6 +106,7 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "openxr_joint_parents": ((26,), "i8"),
         "timestamp_s": ((6,), "f8"),
         "compute_s": ((6,), "f4"),
+        "dropped": ((6,), "?"),
     }
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
         texts = {"gesture", "state_name", "side", "joint_names", "openxr_joint_names"}
@@ -202,6 +207,8 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     headline = asdict(trust(joints, lost, Hand(now.joints_m, now.visible)))
     regions = asdict(coverage(joints, np.full(joints.shape, 0.01), now))
     expected = {"trust": headline, "coverage": regions} | evaluate(joints, lost, now)
+    further = summary["metrics"].pop("further")
+    assert further["swap_pct"] == 0 and further["tip_mm"] == pytest.approx(10 * math.sqrt(3))
     assert summary["metrics"] == expected
     assert summary["metrics"]["trust"]["usable_pct"] == 75  # one in four is flagged
     table = metrics_table(summary).splitlines()
@@ -243,11 +250,12 @@ def test_truth_is_found_by_the_frames_numbers(tmp_path: Path) -> None:
     summary = write(tmp_path, done, truth).summary
     assert truth.first == 1 and summary["frames"] == 12
     errors = np.full(12, 10 * math.sqrt(3))
-    errors[4] = 1e3 * np.linalg.norm(done[3].joints_m - truth.joints_m[6], axis=1).mean()
+    stale = 1e3 * np.linalg.norm(done[3].joints_m - truth.joints_m[6], axis=1).mean()
     assert summary["metrics"]["mean_mm"] == pytest.approx(errors[5:].mean(), rel=1e-3)
-    assert summary["metrics"]["trust"]["mean_all_mm"] == pytest.approx(
-        np.minimum(errors, 1e3).mean(), rel=1e-3
-    )
+    assert summary["metrics"]["trust"]["mean_all_mm"] == pytest.approx(errors.mean(), rel=1e-3)
+    asked = write(tmp_path, done, truth, {"config": {"count_dropped": True}}).summary
+    errors[4] = min(stale, 1e3)
+    assert asked["metrics"]["trust"]["mean_all_mm"] == pytest.approx(errors.mean(), rel=1e-3)
 
 
 def test_frames_beyond_the_truth_are_not_judged(tmp_path: Path) -> None:
@@ -319,20 +327,6 @@ def test_a_disk_that_fills_keeps_what_was_whole(tmp_path: Path) -> None:
             writer.append((estimate(3),))
     assert (tmp_path / "track.jsonl").read_text().count("\n") == 3
     assert len(read_results(tmp_path / "track.npz")["lost"]) == 3
-
-
-def test_a_file_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
-    def half(stream: Any) -> None:
-        stream.write(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    path = tmp_path / "hand_shape.json"
-    path.write_text("whole")
-    with pytest.raises(OSError):
-        write_whole(path, half)
-    with pytest.raises(OSError):
-        save_whole(path, lambda partial: half(open(partial, "wb")))
-    assert path.read_text() == "whole" and list(tmp_path.iterdir()) == [path]
 
 
 def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
@@ -482,6 +476,12 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     np.testing.assert_allclose(content["timestamp_s"], np.arange(2, 8) / 25)
     assert content["compute_s"][2:4].tolist() == [0, 0]
     assert content["metadata"]["held_frames"] == [4, 5]
+    assert content["dropped"].tolist() == [False, False, True, True, False, False]
+    told = ["tracking", "tracking", "dropped", "dropped", "tracking", "tracking"]
+    assert content["state_name"].tolist() == told
+    assert content["lost"].tolist() == [estimate(i).lost for i in rows]
+    # A dropped frame has no line: its number is missing.
+    assert [line["index"] for line in read_lines_of(tmp_path)] == [2, 3, 6, 7]
     assert summary["frames"] == 6
     assert summary["mean_ms"] == pytest.approx(1e3 * np.mean([one.compute_s for one in done]))
 
@@ -523,7 +523,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
 def test_a_result_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     writer = ResultWriter(tmp_path, {}, NAMES, None)
     writer.append((estimate(0),))
-    (tmp_path / "track.npz.part").mkdir()
+    (tmp_path / "track.npz").mkdir()
     with pytest.raises(ToftrackError, match="cannot be written"):
         writer.close()
     assert (tmp_path / "track.jsonl").read_text().count("\n") == 1

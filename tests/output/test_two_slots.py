@@ -137,6 +137,10 @@ def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
     write(tmp_path, [both for both in frames() if both[0].index not in (2, 7)])
     content = read_results(tmp_path / "track.npz")
     assert content["metadata"]["held_frames"] == [2, 7]
+    assert np.flatnonzero(content["dropped"]).tolist() == [2, 7]
+    there = content["state_name"] != ""  # a slot without a hand says nothing
+    assert ((content["state_name"] == "dropped") == content["dropped"][:, None] & there).all()
+    assert there[2].tolist() == [True, False]
     np.testing.assert_array_equal(content["joints_m"][7], content["joints_m"][6])
     assert content["lost"][2].tolist() == [False, True]
 

@@ -91,7 +91,7 @@ def test_the_polynomial_is_not_lost_in_npz(srs: Path, tmp_path: Path) -> None:
     camera = Camera(np.diag((200.0, 200, 1)), 176, 144, depth_polynomial=(0.01,))
     camera.save(tmp_path / "camera.json")
     convert.convert(srs, tmp_path / "a.npz", camera_file=tmp_path / "camera.json")
-    assert Camera.load(tmp_path / "a.camera.json").depth_polynomial == (0.01,)
+    assert read_recording(tmp_path / "a.npz").camera.depth_polynomial == (0.01,)
 
 
 def test_convert_errors(srs: Path, tmp_path: Path) -> None:
@@ -147,14 +147,12 @@ def test_a_topic_of_a_bag_is_converted_with_its_lens(tmp_path: Path) -> None:
     np.testing.assert_array_equal(made.camera.distortion, camera.distortion)
 
 
-def test_a_fisheye_lens_is_not_lost_in_npz(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_fisheye_lens_is_not_lost_in_npz(tmp_path: Path) -> None:
     camera = Camera(np.diag((30.0, 31, 1)), 32, 24, np.full(4, 0.1), lens="fisheye")
     camera.save(tmp_path / "camera.json")
     np.save(tmp_path / "a.npy", np.ones((2, 24, 32)))
     convert.convert(tmp_path / "a.npy", tmp_path / "out.npz", tmp_path / "camera.json")
-    assert Camera.load(tmp_path / "out.camera.json").lens == "fisheye"
-    assert not read_recording(tmp_path / "out.npz").camera.distortion.any()
-    assert "a fisheye lens has no place in .npz" in capsys.readouterr().err
+    assert read_recording(tmp_path / "out.npz").camera.to_dict() == camera.to_dict()
 
 
 def test_recordings_of_another_size_do_not_fit_the_camera(tmp_path: Path) -> None:
@@ -167,10 +165,10 @@ def test_recordings_of_another_size_do_not_fit_the_camera(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["a.npz"], "is recorded to .srs"),
+        (["a.avi"], "is recorded to .npz"),
         (["a.srs", "--frames", "0"], "--frames"),
-        (["a.srs", "device=sample"], "only the SR3000"),
-        (["a.srs", "--conf", "nowhere"], "no configuration"),
+        (["a.srs", "device=sample"], "only an SR3000"),
+        (["a.srs", "--conf", "nowhere"], "no config.yaml"),
         (["a.srs", "device.transport=emulated", "device.emulated.faults=[missing]"], "1ad2:0074"),
         (["a.srs", "device.unknown=3"], "unknown"),
     ],

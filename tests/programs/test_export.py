@@ -2,41 +2,116 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.animation import Gltf, read_bvh
 from helpers.hands import hand_estimate, lost_hand
 
 from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import ResultWriter
+from toftrack.output.summary import shape_file
 from toftrack.programs import export
+
+FRAMES, MISSED, LOST = 9, 4, 6
+"""Of the run, how many; which was dropped; in which no hand was found."""
+
+
+def run_of(folder: Path, *sides: str | None) -> Path:
+    """A run with a slot for each side; None: one that never had a hand."""
+    with ResultWriter(folder, {"config": {}}, JOINT_NAMES) as results:
+        for slot in range(len(sides)):
+            default_hand_shape().save(folder / shape_file(slot))
+        for index in range(FRAMES):
+            if index != MISSED:
+                there = [side if index != LOST else None for side in sides]
+                results.append(tuple(estimate(index, side) for side in there))
+    return folder
+
+
+def estimate(index: int, side: str | None) -> Estimate:
+    return lost_hand(index) if side is None else hand_estimate(index, side, bent=0.1 * index)
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    folder = tmp_path / "run"
-    with ResultWriter(folder, {"config": {}}, JOINT_NAMES) as results:
-        default_hand_shape().save(folder / "hand_shape.json")
-        for index in range(5):
-            results.append((hand_estimate(index),))
-    return folder
+    return run_of(tmp_path / "run", "right")
 
 
-@pytest.mark.parametrize(("kind", "begin"), [("bvh", b"HIERARCHY"), ("csv", b"index,timestamp_s,")])
-def test_the_file_is_in_the_folder_and_told(run: Path, kind: str, begin: bytes, capsys) -> None:
+SLOTS = [("right",), ("left",), ("right", "left"), ("right", None), (None, "left")]
+
+
+@pytest.mark.parametrize("sides", SLOTS)
+def test_a_glb_loads_and_moves_each_hand_that_was_there(
+    sides: tuple[str | None, ...], tmp_path: Path
+) -> None:
+    pygltflib = pytest.importorskip("pygltflib", reason="pip install '.[export]'")
+    (made,) = export.export(run_of(tmp_path / "run", *sides), "glb")
+    assert made.name == "hand.glb"
+    there = [side for side in sides if side]
+    document = pygltflib.GLTF2().load_binary(str(made))
+    assert len(document.skins) == len(document.meshes) == len(there)
+    assert all(len(skin.joints) == 26 for skin in document.skins)
+    gltf = Gltf(made.read_bytes())
+    for side in there:
+        letter = side[0].upper()
+        _, shown, _ = gltf.channels()[f"Hand_{letter}", "scale"]
+        assert np.flatnonzero(shown[:, 0] == 0).tolist() == [LOST]
+        for frame in (0, 3, MISSED, FRAMES - 1):
+            as_in = frame - 1 if frame == MISSED else frame
+            seen = hand_estimate(as_in, side, bent=0.1 * as_in)
+            tip = seen.openxr_position_m[OPENXR_JOINT_NAMES.index("index_tip")]
+            assert np.allclose(gltf.world(frame)[f"Index_Tip_{letter}"][:3, 3], tip, atol=1e-5)
+
+
+@pytest.mark.parametrize("sides", SLOTS)
+def test_a_bvh_has_the_skeleton_of_a_hand_that_was_there(
+    sides: tuple[str | None, ...], tmp_path: Path
+) -> None:
+    made = export.export(run_of(tmp_path / "run", *sides), "bvh")
+    slots = {f"hand{slot}.bvh": side for slot, side in enumerate(sides, 1) if side}
+    assert [path.name for path in made] == (["hand.bvh"] if len(sides) == 1 else list(slots))
+    for path, side in zip(made, slots.values(), strict=True):
+        names, places = read_bvh(path.read_text())
+        assert names[0] == f"Wrist_{side[0].upper()}" and len(places) == FRAMES
+        for frame in (0, FRAMES - 1):
+            wrist = 100 * hand_estimate(frame, side, bent=0.1 * frame).openxr_position_m[1]
+            assert np.allclose(places[frame, -1], wrist, atol=0.001)  # the root ends last
+        assert np.allclose(places[[MISSED]], places[3])
+
+
+@pytest.mark.parametrize("sides", SLOTS)
+def test_a_csv_has_a_row_a_frame_and_slot(sides: tuple[str | None, ...], tmp_path: Path) -> None:
+    (made,) = export.export(run_of(tmp_path / "run", *sides), "csv")
+    rows = list(csv.DictReader(io.StringIO(made.read_text())))
+    assert len(rows) == FRAMES * len(sides)
+    for number, row in enumerate(rows):
+        frame, slot = divmod(number, len(sides))
+        assert row["index"] == str(frame)
+        assert row.get("slot", "0") == str(slot)
+        there = sides[slot] is not None and frame != LOST
+        assert (row["side"], row["lost"]) == ((sides[slot], "0") if there else ("", "1"))
+        assert (row["wrist_x_m"] != "") == there
+
+
+def test_of_two_hands_of_one_side_the_joints_have_names_of_their_own(tmp_path: Path) -> None:
+    made = export.export(run_of(tmp_path / "run", "left", "left"), "bvh")
+    names = [read_bvh(path.read_text())[0] for path in made]
+    assert names[0][0] == "Wrist_L" and names[1][0] == "Wrist_L_2"
+    assert not set(names[0]) & set(names[1])
+
+
+@pytest.mark.parametrize("kind", ["bvh", "csv"])
+def test_the_file_is_in_the_folder_and_told(run: Path, kind: str, capsys) -> None:
     export.main([str(run), "--to", kind])
-    made = run / f"hand.{kind}"
-    assert made.read_bytes().startswith(begin)
-    assert capsys.readouterr().out.split() == [str(made)]
-
-
-def test_a_glb_is_one_whole_file(run: Path) -> None:
-    pytest.importorskip("pygltflib", reason="pip install '.[export]'")
-    (made,) = export.export(run, "glb")
-    data = made.read_bytes()
-    assert data[:4] == b"glTF" and int.from_bytes(data[8:12], "little") == len(data)
+    assert capsys.readouterr().out.split() == [str(run / f"hand.{kind}")]
 
 
 def test_what_is_no_run_or_has_no_hand_is_told(run: Path, tmp_path: Path) -> None:

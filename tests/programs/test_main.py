@@ -89,7 +89,7 @@ def test_a_ros_bag_is_known_by_its_name_or_its_folder(name: str, tmp_path, monke
         (Path(folder) / file).touch()
     Path("~x.bag").touch()
     assert with_recording([name, "device.topic=/a"], *KNOWN)[0] == "device=rosbag"
-    assert with_recording(["other"], *KNOWN)[0] == "device=replay"
+    assert with_recording(["other"], *KNOWN)[0] == "device=folder"
 
 
 @pytest.mark.parametrize(
@@ -142,4 +142,4 @@ def test_what_cannot_be_one_recording_is_told(words: list[str], told: str) -> No
 def test_only_what_must_be_given_is_called_required(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         record.main([])
-    assert capsys.readouterr().err.endswith("the following arguments are required: OUT.srs\n")
+    assert capsys.readouterr().err.endswith("the following arguments are required: OUT\n")

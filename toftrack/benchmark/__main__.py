@@ -2,7 +2,12 @@
 
 import sys
 
-from toftrack.benchmark.scoring import main
+import toftrack.early_ending  # noqa: F401  # before all others
+from toftrack.benchmark.command import main
+from toftrack.errors import ToftrackError
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except ToftrackError as error:
+        sys.exit(f"error: {error}")

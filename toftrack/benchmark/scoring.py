@@ -49,6 +49,7 @@ from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.render.closed_form import project
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import Evidence, Scorer
+from toftrack.safe_files import write_whole
 from toftrack.tracking.backend import BACK_ENDS, make_scorer
 
 PARTICLES = (100, 300, 1000, 3000, 10_000)
@@ -312,5 +313,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     print(show(result))
     if options.json:
-        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_whole(options.json, json.dumps(result, indent=1) + "\n")
     return 0

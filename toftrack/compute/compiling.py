@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import zlib
 from collections.abc import Callable, Iterator
@@ -13,7 +14,10 @@ from typing import Any
 import numba
 from llvmlite import ir
 from numba.core import types
+from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
+
+from toftrack.compute.kernel_cache import KernelCache, can_be_kept
 
 log = logging.getLogger(__name__)
 
@@ -24,15 +28,7 @@ compiled = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 _SILENT_S = 1.0
 """Taking a kernel from numba's cache is faster than this, compiling it is slower."""
-_compiling = threading.Lock()
-_uncached = threading.Event()
-"""There is no place to keep the machine code."""
-_told = threading.Event()
-"""And that was said."""
-_HINT = (
-    "compiled kernels cannot be kept, because neither installation nor home can be written; "
-    "set NUMBA_CACHE_DIR to a folder of your own that can be"
-)
+_compiling = threading.RLock()
 
 
 def entry_point(*sources: str | Path | None) -> Callable:
@@ -40,17 +36,15 @@ def entry_point(*sources: str | Path | None) -> Callable:
 
     sources: the files that the kernel is made of; a change in any of them compiles it anew.
     """
-    # numba's cache notices changes of the function's own file only, but it does go by the name.
     files = [file for file in (__file__, *sources) if file is not None]
     checksum = zlib.crc32(b"".join(Path(file).read_bytes() for file in files))
 
     def decorator(function: Callable) -> Callable:
         function.__qualname__ += f"_{checksum:08x}"
-        try:
-            return numba.njit(cache=True, **OPTIONS)(function)
-        except RuntimeError:  # there is no place to write to
-            _uncached.set()
-            return numba.njit(**OPTIONS)(function)
+        kernel = numba.njit(**OPTIONS)(function)
+        kernel._cache = KernelCache(f"{function.__module__}.{function.__qualname__}")
+        kernel.sources = frozenset(str(Path(file).resolve()) for file in files)
+        return kernel
 
     return decorator
 
@@ -70,7 +64,6 @@ def take(typingctx, counter):
 def announced(message: str) -> Iterator[None]:
     """Around the first call of an entry point: logs the message if compiling it takes long.
 
-    Where the machine code cannot be cached, the first message is followed by what to do.
     Only one thread compiles at a time, so that the others do not compile the same once more.
     """
     with _compiling:
@@ -84,13 +77,25 @@ def announced(message: str) -> Iterator[None]:
 
 
 def _tell(message: str) -> None:
-    if not _uncached.is_set():
-        log.info(message)
-        return
-    log.info(message.replace("(once", "(in every run"))
-    if not _told.is_set():
-        _told.set()
-        log.info(_HINT)
+    log.info(message if can_be_kept() else message.replace("(once", "(in every run"))
+
+
+def _before_fork() -> None:
+    # What another thread compiles is finished first: a lock that it holds would never be released
+    # in the forked process, which has no such thread.
+    _compiling.acquire()
+    global_compiler_lock.acquire()
+
+
+def _after_fork() -> None:
+    global_compiler_lock.release()
+    _compiling.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=_before_fork, after_in_parent=_after_fork, after_in_child=_after_fork
+    )
 
 
 def called(kernel: Any, message: str, *arguments: object) -> None:
@@ -100,3 +105,8 @@ def called(kernel: Any, message: str, *arguments: object) -> None:
         return
     with announced(message):
         kernel(*arguments)
+
+
+def must_be_compiled(kernel: Any) -> bool:
+    """Whether an entry point's code is not on the disk, but can be kept there."""
+    return not kernel.signatures and can_be_kept() and not kernel._cache.is_kept()

@@ -55,7 +55,8 @@ def small_operations() -> Iterator[None]:
     """Within, torch computes on one thread, and `threads` says how many there were before.
 
     Operations on a few hundred particles gain nothing from a second thread, and wait for
-    milliseconds at its barrier when another process, or the scorer, has the other core.
+    milliseconds at its barrier when another process, or the scorer, has the other core. And in a
+    forked process OpenMP would wait for ever for threads that only the first one has.
     """
     if _given.get() is not None:
         yield
@@ -87,7 +88,7 @@ def run_shared(task: Callable[[], object], parts: int) -> None:
     if parts <= 1:
         task()
         return
-    others = [_pool(os.getpid()).submit(task) for _ in range(min(threads(), parts) - 1)]
+    others = [_pool().submit(task) for _ in range(min(threads(), parts) - 1)]
     task()
     for other in others:
         # A helper that has not begun has nothing left to do.
@@ -102,10 +103,22 @@ def beside(task: Callable[[], Result]) -> Callable[[], Result]:
     """
     if threads() == 1:
         return task
-    return _pool(os.getpid()).submit(task).result
+    return _pool().submit(task).result
 
 
 @functools.cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Helper threads of this process; a forked one gets its own."""
+def _pool() -> ThreadPoolExecutor:
+    """Helper threads of this process."""
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="toftrack")
+
+
+def _in_a_forked_process() -> None:
+    """It has the thread that forked and no other: neither helpers, nor who held the lock."""
+    global _lock
+    _lock = Lock()
+    _inside.count = 0 if _given.get() is None else 1
+    _pool.cache_clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_in_a_forked_process)

@@ -40,6 +40,7 @@ _ABOVE_ZERO = frozenset(
     likelihood.beta likelihood.tolerance_m
     lost.joints.scale
     pose_space.dims
+    record_limit_gb
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
     relocation.hypotheses relocation.landmark_m relocation.landmark_sigmas relocation.places
     relocation.rival_frames relocation.rival_m
@@ -51,7 +52,8 @@ _ABOVE_ZERO = frozenset(
     view.most_fps view.quality
     """.split()
 )
-_AT_MOST = {"hands": 2}
+_AT_MOST = {"hands": 2, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
+"""More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""
 _LOG_ODDS = ("lost.intercept", "lost.weights.", "lost.joints.odds", "relocation.merit")

@@ -31,6 +31,8 @@ def sentence(error: BaseException) -> str:
             return _of_system(cause)
         if isinstance(cause, yaml.YAMLError):
             return f"a file of the configuration is no YAML: {_one_line(str(cause))}; mend it there"
+    if any(isinstance(cause, RecursionError) for cause in chain):
+        return "a setting or a file is nested too deeply; take out what is not meant"
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
         return (
             f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from toftrack.devices.replay import Replay
@@ -16,6 +17,7 @@ class Folder(Replay):
         path: the folder; see `toftrack.recordings.png_folder` for what lies in it.
         unit_m: metres of one step of the images; None = as the folder says, else 0.001.
         fps: frames a second; None = as the folder says, else 25.
+        intrinsics: fx, fy, cx, cy in pixels, without distortion, instead of the folder's camera.
         start, stop, realtime, repeat, camera_file: as for `Replay`.
 
     Raises:
@@ -32,9 +34,10 @@ class Folder(Replay):
         realtime: bool = False,
         repeat: bool = False,
         camera_file: str | Path | None = None,
+        intrinsics: Sequence[float] | None = None,
     ) -> None:
         if not path:
             raise ToftrackError("no folder was given; set device.path=FOLDER")
-        store = read_png_folder(path, camera_file, unit_m, fps)
-        self._set_up(store, path, start, stop, realtime, repeat, camera_file)
+        store = read_png_folder(path, camera_file, unit_m, fps, intrinsics)
+        self._set_up(store, path, start, stop, realtime, repeat, camera_file, intrinsics)
         self.description |= {"device": "folder", "unit_m": store.unit_m}

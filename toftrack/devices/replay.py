@@ -6,7 +6,7 @@ import itertools
 import logging
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
+from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.doubts import doubts
-from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording
 
@@ -44,6 +44,7 @@ class Replay(BaseDevice):
         repeat: begin again after the last frame, until nobody asks for more.
         camera_file: a calibrated camera instead of the recording's own.
         modulation_mhz: of the SR3000, for a `.srs` that does not state its range.
+        intrinsics: fx, fy, cx, cy in pixels, without distortion, instead of the recording's camera.
 
     Raises:
         ToftrackError: the recording or the camera cannot be used, or the range lies outside.
@@ -58,11 +59,13 @@ class Replay(BaseDevice):
         repeat: bool = False,
         camera_file: str | Path | None = None,
         modulation_mhz: int = DEFAULT_MODULATION_MHZ,
+        intrinsics: Sequence[float] | None = None,
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=FILE.npz")
-        store = open_recording(path, camera_file, modulation_mhz)
-        self._set_up(store, path, start, stop, realtime, repeat, camera_file)
+        told = BareFacts(intrinsics)
+        store = open_recording(path, camera_file, modulation_mhz, bare=told)
+        self._set_up(store, path, start, stop, realtime, repeat, camera_file, intrinsics)
 
     def _set_up(
         self,
@@ -73,18 +76,27 @@ class Replay(BaseDevice):
         realtime: bool,
         repeat: bool,
         camera_file: str | Path | None,
+        intrinsics: Sequence[float] | None = None,
     ) -> None:
         self._recording = store
         damage = getattr(store, "damage", None)
         if damage:
             _log.warning("%s: %s; its %d whole frames are used", path, damage, len(store))
-        if isinstance(store, Recording) and (doubt := doubts(store.depth)):
-            _log.warning("%s: %s", path, doubt)
         self._range = _checked_range(start, stop, len(self._recording), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         camera = store.camera
-        if camera_file is not None:
+        told = BareFacts(intrinsics).camera(camera.width, camera.height)
+        if told is not None and camera_file is not None:
+            raise ToftrackError(
+                "camera.file and device.intrinsics both tell the lens; leave one out"
+            )
+        if told is not None:
+            camera = told
+        elif camera_file is not None:
             camera = Camera.load_for(camera_file, camera.width, camera.height, f"'{path}'")
+        found = doubts(store, camera)
+        for doubt in found:
+            _log.warning("%s: %s", path, doubt)
         truth = None if self._repeat else store.truth
         super().__init__(
             camera,
@@ -102,6 +114,7 @@ class Replay(BaseDevice):
             "realtime": self._realtime,
             "repeat": self._repeat,
             "camera_file": None if camera_file is None else str(camera_file),
+            "doubts": list(found),
         }
 
     def close(self) -> None:

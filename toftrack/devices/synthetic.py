@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from toftrack.camera import Camera
+from toftrack.compute.threads import small_operations
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame, Truth
@@ -93,7 +94,8 @@ class Synthetic(BaseDevice):
         k = torch.tensor(camera.K, dtype=torch.float32)
         for index in range(self._count):
             hand = Ellipsoids(centres[index : index + 1], axes[index : index + 1])
-            depth = render_range_images(hand, k, camera.height, camera.width)[0].numpy()
+            with small_operations():
+                depth = render_range_images(hand, k, camera.height, camera.width)[0].numpy()
             depth = np.where(depth > 0, depth, _WALL_M)
             noise = generator.standard_normal(depth.shape) * self._noise_m * (depth / 0.5) ** 2
             amplitude = np.minimum(_AMPLITUDE_AT_1M / depth**2, 65535).astype(np.uint16)

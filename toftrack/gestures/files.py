@@ -20,6 +20,7 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.json_text import read_json
+from toftrack.safe_files import open_to_read, write_whole
 
 _SLACK_DEGREES = 10.0
 _UNITS = ("degrees", "radians")
@@ -100,10 +102,8 @@ def save_poses(path: str | Path, poses: Sequence[NamedPose]) -> None:
             for pose in poses
         ],
     }
-    half = path.with_name(path.name + ".part")
     try:
-        half.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        half.replace(path)
+        write_whole(path, json.dumps(content, indent=1) + "\n")
     except OSError as error:
         raise ToftrackError(
             f"the file of gestures '{path}' cannot be written ({error.strerror}); choose another"
@@ -218,7 +218,7 @@ def _by_name(path: Path, number: int, key: str, given: object) -> dict[str, Any]
 
 def _read_csv(path: Path) -> _Content:
     units, lines = None, []
-    with open(path, encoding="utf-8-sig", newline="") as stream:
+    with TextIOWrapper(open_to_read(path), "utf-8-sig", newline="") as stream:
         for line in stream:
             if line.lstrip().startswith("#"):
                 key, _, value = line.lstrip("# \t").partition(":")

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
+from toftrack.safe_files import write_whole
 
 SIDES = ("right", "left")
 DEFAULT_HAND_LENGTH_M = 0.190
@@ -68,7 +69,8 @@ class Fitted:
     """How a shape was fitted to its user, in components (hand/shape_space.py).
 
     names: of the components.  mean: (K,).  covariance: (K, K), rows.
-    poses: how many different, well seen poses it rests on.  frozen: nothing more was learned.
+    poses: how many different, well seen poses it rests on.
+    frozen: nothing more was learned.
     """
 
     names: tuple[str, ...]
@@ -168,7 +170,7 @@ class HandShape:
             "bone_lengths_m": self.bone_lengths_m.tolist(),
             "fitted": None if self.fitted is None else self.fitted.content(),
         }
-        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(content, indent=1) + "\n")
 
     @staticmethod
     def load(path: str | Path) -> HandShape:

@@ -19,6 +19,9 @@ _LOOKED_AT_PX = 5000
 _HARDLY = 0.01
 """A share of pixels that is none."""
 _MOST = 0.5
+_FEWEST_LOOKS, _LOOKS, _PRESENT = 10, 0.25, 0.9
+"""Lost frames that must say how long the hand looked: so many, and such a share. So sure must the
+networks be that there is one."""
 _FEWEST_PX = 150
 """Fewer pixels show no fingers."""
 _TOO_NEAR_M = 0.22
@@ -37,6 +40,7 @@ class LostFrame:
     nearest_m, farthest_m: between which nearly all readings lie; NaN without any.
     hand_px: pixels that were taken for the hand; 0 where nothing was.
     other_side: whether it looks rather like the other hand; None where nobody says.
+    looked_m: how long the hand looked, from wrist to middle fingertip; None where nobody says.
     """
 
     state_name: str
@@ -46,6 +50,7 @@ class LostFrame:
     farthest_m: float
     hand_px: int
     other_side: bool | None
+    looked_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,10 @@ class RunFacts:
     """The networks said which hand it looked like."""
     other_side: int = 0
     """That was the other one."""
+    looked: int = 0
+    """The networks said how long it looked."""
+    looked_m: float = 0.0
+    """The sum of that."""
     tracked_judged: int = 0
     """The same of frames that were not lost."""
     tracked_other_side: int = 0
@@ -106,7 +115,16 @@ class RunFacts:
             small=self.small + (0 < frame.hand_px < _FEWEST_PX),
             judged=self.judged + (frame.other_side is not None),
             other_side=self.other_side + (frame.other_side is True),
+            looked=self.looked + (frame.looked_m is not None),
+            looked_m=self.looked_m + (frame.looked_m or 0.0),
         )
+
+    def mean_looked_m(self) -> float | None:
+        """How long the hand looked, where most of a run was lost and enough was seen to say so."""
+        enough = max(_FEWEST_LOOKS, _LOOKS * self.lost)
+        if self.lost <= _MOST * self.frames or self.looked < enough:
+            return None
+        return self.looked_m / self.looked
 
 
 def lost_frame(
@@ -128,12 +146,18 @@ def lost_frame(
         farthest_m=float(farthest),
         hand_px=0 if insight is None else int(insight.observation.hand.sum()),
         other_side=_other_side(insight),
+        looked_m=_looked_m(insight),
     )
 
 
 def _other_side(insight: StepInfo | None) -> bool | None:
     signs = None if insight is None else insight.signs
     return None if signs is None else signs.other_side > 0
+
+
+def _looked_m(insight: StepInfo | None) -> float | None:
+    glance = None if insight is None else insight.glance
+    return None if glance is None or glance.present < _PRESENT else glance.length_m
 
 
 class Watch:
@@ -170,6 +194,10 @@ class Watch:
         if estimate.lost:
             return facts.with_lost(lost_frame(estimate, depth_m, insight, self.reach_m))
         return facts.tracked(_other_side(insight))
+
+    def looked_m(self) -> tuple[float | None, ...]:
+        """Of RunFacts.mean_looked_m, for each slot."""
+        return tuple(facts.mean_looked_m() for facts in self.facts)
 
     def advice(self, side: str | None) -> tuple[str, ...]:
         """Of the function of that name, for each slot."""

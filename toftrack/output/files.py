@@ -1,15 +1,17 @@
-"""Files that are either whole or as they were, and folders that only one run writes into."""
+"""A run's folder: its growing file, the lock on it, and what of an earlier run may go."""
 
 from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import read_json
+from toftrack.safe_files import check_replaceable, open_in_place, open_to_read, remove_partial
 
 try:
     import fcntl
@@ -18,36 +20,16 @@ except ImportError:  # Windows: there, two runs into one folder are not noticed
 
 LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""
+
+
 _BLOCK = 65536
-
-
-def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill a binary stream; `path` changes only when all of it is on the disk.
-
-    Raises OSError, after which `path` is as it was.
-    """
-    partial = path.with_name(path.name + ".part")
-    try:
-        with open(partial, "wb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(partial, path)
-    finally:
-        # A folder in its place was not made here; opening it has failed already.
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-
-
-def save_whole(path: Path, save: Callable[[Path], object]) -> None:
-    """As write_whole, for a function that writes a file of a given name by itself."""
-    partial = path.with_name(path.name + ".part")
-    try:
-        save(partial)
-        os.replace(partial, path)
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+WHOLE_FILES = (
+    *("run.json", "track.npz", "summary.json", "overlay.png"),
+    *("hand_shape.json", "hand_shape_2.json"),
+)
+"""Those that take their place when they are done, and of which a kill may leave a part."""
+RUN_FORMAT = "toftrack-run"
+"""What the run.json of a run's folder says that it is."""
 
 
 class LineFile:
@@ -56,28 +38,28 @@ class LineFile:
     A line is in the file as a whole or not at all, unless the process is killed within it. The lock
     goes with the process, however that ends.
 
+    What was in the file stays there until `clear`.
+
     Args:
         folder: exists.
-        keep: keep the lines that are there, but for one at the end that was not finished; otherwise
-            the file is emptied.
 
     Raises:
         ToftrackError: another run is writing into the folder.
         OSError: the file cannot be opened, or (by `append`) not be written.
     """
 
-    def __init__(self, folder: Path, keep: bool = False) -> None:
-        self.path = folder / LINES
-        descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
-        self._file = io.FileIO(descriptor, "r+")
+    def __init__(self, folder: Path) -> None:
+        self.path, self._size = folder / LINES, 0
+        self._file = open_in_place(self.path)
         try:
-            self._lock()
-            self._size = _size_of_lines(self._file) if keep else 0
-            self._file.truncate(self._size)
-            self._file.seek(self._size)
+            _lock(self._file, folder)
         except BaseException:
             self._file.close()
             raise
+
+    def clear(self) -> None:
+        """Begin with an empty file. Raises OSError."""
+        self._file.truncate(0)
 
     def append(self, line: str) -> None:
         """Write a line, given without its end."""
@@ -99,18 +81,29 @@ class LineFile:
         """Close the file, which gives the folder free; a second call does nothing."""
         self._file.close()
 
-    def _lock(self) -> None:
-        if fcntl is None:
-            return
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ToftrackError(
-                f"another run is writing into the folder '{self.path.parent}' just now; wait for "
-                "its end, or choose another folder with hydra.run.dir=DIR"
-            ) from None
-        except OSError:
-            pass  # some network file systems have no locks
+
+@contextmanager
+def locked_lines(folder: Path) -> Iterator[None]:
+    """Keep a folder for oneself that has a growing file; nothing in that file is changed.
+
+    Raises ToftrackError where a run is writing into the folder, OSError where the file is none.
+    """
+    check_replaceable(folder / LINES)
+    with open_to_read(folder / LINES) as file:
+        _lock(file, folder)
+        yield
+
+
+def cut_unfinished_line(folder: Path) -> None:
+    """Take from the growing file's end the line that was not finished; one of its lines is ours.
+
+    A file with a second name elsewhere stays as it is. Raises OSError.
+    """
+    if (folder / LINES).stat().st_nlink > 1:
+        return
+    with open_in_place(folder / LINES, make=False) as file:
+        if whole := _size_of_lines(file):
+            file.truncate(whole)
 
 
 def _size_of_lines(file: io.FileIO) -> int:
@@ -124,3 +117,57 @@ def _size_of_lines(file: io.FileIO) -> int:
             return begin + found + 1
         end = begin
     return 0
+
+
+def _lock(file: IO[bytes], folder: Path) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ToftrackError(
+            f"another run is writing into the folder '{folder}' just now; wait for its end, or "
+            "choose another folder with hydra.run.dir=DIR"
+        ) from None
+    except OSError:
+        pass  # some network file systems have no locks
+
+
+def make_way(folder: Path) -> None:
+    """Let the results of an earlier run go; ToftrackError where it is not clear that they are.
+
+    Raises OSError, too.
+    """
+    ends = ("track.npz", "summary.json")
+    if not _has_run(folder):
+        for name in (LINES, *ends):
+            if not _may_go(folder / name):
+                raise ToftrackError(
+                    f"'{folder}' has a {name}, but no run.json that says that it is a run's; take "
+                    "it away, or choose another folder with hydra.run.dir=DIR"
+                )
+    for name in ends:
+        check_replaceable(folder / name)
+        (folder / name).unlink(missing_ok=True)
+    remove_partial(folder, WHOLE_FILES)
+
+
+def _has_run(folder: Path) -> bool:
+    try:
+        facts = read_json(folder / "run.json")
+    except (OSError, ValueError):
+        return False
+    return isinstance(facts, dict) and facts.get("format") == RUN_FORMAT
+
+
+def _may_go(path: Path) -> bool:
+    """Whether there is nothing, or what a run leaves that ended before it had a run.json."""
+    try:
+        if path.stat().st_size == 0:
+            return True
+        content = read_json(path)
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError):
+        return False
+    return path.suffix == ".json" and isinstance(content, dict) and set(content) == {"error"}

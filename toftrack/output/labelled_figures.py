@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from toftrack.output.evaluation import TIPS
 from toftrack.output.trust import OK_MM, Hand, Trust, interval, trust
 
 _PERCENT = ("within_pct", "usable_pct", "partly_pct", "silent_pct", "false_alarm_pct")
@@ -22,7 +23,6 @@ _COLUMNS = (
     ("false al.", "false_alarm_pct", 1),
     ("first right", "first_right", 0),
 )
-_TIPS = (4, 8, 12, 16, 20)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def labelled_figures(
     figures = trust(joints_m, lost, Hand(true_m, np.ones(len(true_m), bool)))
     finite = np.isfinite(joints_m).all(axis=(1, 2))
     error = 1e3 * np.linalg.norm(joints_m[finite] - true_m[finite], axis=2)
-    tips = error[:, np.isin(joints, _TIPS)]
+    tips = error[:, np.isin(joints, TIPS)]
     count = max(len(finite), 1)
     return LabelledFigures(
         frames=len(finite),

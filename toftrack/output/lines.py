@@ -17,6 +17,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, is_vacant
 from toftrack.json_text import parse_json
+from toftrack.safe_files import open_to_read
 
 _KINDS: dict[type, type] = {
     bool: np.bool_,
@@ -49,6 +50,9 @@ LINE_FIELDS = (*_FIRST, *(name for name in KINDS if name not in _FIRST))
 """What a line of track.jsonl says, fields of Estimate, in their order."""
 FRAME_FIELDS = ("index", "timestamp_s", "compute_s")
 """What is said of a frame, not of each hand in it."""
+DROPPED = "dropped"
+"""The array of track.npz that says which frames a live run did not track, and what their
+`state_name` is; they have no line, and their numbers are missing among those of the lines."""
 HAND_FIELDS = tuple(name for name in LINE_FIELDS if name not in FRAME_FIELDS)
 FROM_THE_START = (
     "joints_m",
@@ -109,7 +113,7 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
 
     Raises ToftrackError when another one is damaged, OSError when the file cannot be read.
     """
-    with open(path, "rb") as stream:
+    with open_to_read(path) as stream:
         for number, line in enumerate(stream, 1):
             if not line.endswith(b"\n"):
                 return  # the run was killed, or the machine went down, while it was written

@@ -33,6 +33,7 @@ from toftrack.output.lines import (
     damaged,
     read_lines,
 )
+from toftrack.safe_files import open_to_read
 
 SLOTS = 2
 """Of lines with `hands`."""
@@ -77,7 +78,7 @@ class Records:
         like = first
         if slots > 1:  # which fields there are, any hand says
             like = next((hand for line in read_lines(lines) for hand in _hands(line)), None)
-        with open(lines, "rb") as stream:
+        with open_to_read(lines) as stream:
             count = sum(1 for _ in stream)
         last = 1
         try:

@@ -1,8 +1,7 @@
 """The result files of a run: run.json, track.jsonl, track.npz and summary.json.
 
 `run.json` is written at the start, `track.jsonl` grows by a line as each frame is done. The two
-others are made when the writer is closed, also after an interruption, for the frames that were done
-until then; or later, of the lines, if it never was.
+others are made when the writer is closed, or later, of the lines, if it never was.
 """
 
 from __future__ import annotations
@@ -22,18 +21,27 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.json_text import parse_json, read_json
-from toftrack.output.files import LINES, LineFile, write_whole
-from toftrack.output.lines import FROM_THE_START, HAND_FIELDS, KINDS, SHAPES, json_line, strict
+from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way
+from toftrack.output.lines import (
+    DROPPED,
+    FROM_THE_START,
+    HAND_FIELDS,
+    KINDS,
+    SHAPES,
+    json_line,
+    strict,
+)
 from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.realtime import RealTime
 from toftrack.output.records import Records, write_archive
-from toftrack.output.summary import run_metrics, summarise
+from toftrack.output.summary import run_doubts, run_metrics, summarise
+from toftrack.safe_files import whole_file, write_whole
 
-RUN_FORMAT = "toftrack-run"
 _VERSION = 1
 _MOST_HELD = 10_000_000
 """Dropped frames between others, 4 days of them; more are none, but a damaged number."""
 _MOST_DIMS = 100
+_TEXTS = ("joint_names", "metadata")
 _PARTS = ("camera", "config", "device", "hand_shape", "pose_space")
 """Of the metadata: what is told of each."""
 
@@ -43,7 +51,7 @@ class ResultWriter:
 
     Frames that a device dropped leave gaps between the indices of the estimates. `track.npz` has a
     row for every frame of the input nevertheless: a dropped frame repeats the newest estimate there
-    was, with no time spent on it, and is listed in the metadata as `held_frames`.
+    was, with no time spent on it, and `dropped` and the state's name say so.
 
     Args:
         folder: made when it does not exist; locked until the writer is closed. The results of an
@@ -53,8 +61,8 @@ class ResultWriter:
         truth: ground truth; adds `metrics` to the summary.
 
     Raises:
-        ToftrackError: the folder cannot be made or written, another run is writing into it, or a
-            file in it cannot be written.
+        ToftrackError: the folder cannot be made or written, another run is writing into it, it has
+            files of these names that are no run's, or a file in it cannot be written.
     """
 
     def __init__(
@@ -71,6 +79,8 @@ class ResultWriter:
         """How many were appended."""
         self.realtime: RealTime | None = None
         """How a live run kept up, for summary.json; to be set before the writer is closed."""
+        self.looked_m: Sequence[float | None] = ()
+        """Of Watch.looked_m, for summary.json; to be set likewise."""
         self._truth = truth
         self._facts = {
             "format": RUN_FORMAT,
@@ -87,12 +97,14 @@ class ResultWriter:
         except OSError as error:
             raise _unwritable(self.folder, error) from error
         try:
-            for made_at_the_end in ("track.npz", "summary.json"):  # of an earlier run
-                (self.folder / made_at_the_end).unlink(missing_ok=True)
+            make_way(self.folder)
+            self._lines.clear()
             _write_json(self.folder / "run.json", self._facts)
-        except OSError as error:
+        except BaseException as error:
             self._lines.close()
-            raise _unwritable(self.folder, error) from error
+            if isinstance(error, OSError):
+                raise _unwritable(self.folder, error) from error
+            raise
         self._records: Records | None = None
         self._closed = False
 
@@ -120,7 +132,10 @@ class ResultWriter:
         self._closed = True
         try:
             with self._records or records_of(self.folder, self._facts) as records:
-                self.summary = finish(self.folder, self._facts, self._truth, records, self.realtime)
+                realtime = None if self.realtime is None else self.realtime.summary()
+                self.summary = finish(
+                    self.folder, self._facts, self._truth, records, realtime, self.looked_m
+                )
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         finally:
@@ -159,40 +174,49 @@ def finish(
     facts: dict[str, Any],
     truth: Truth | None,
     records: Records,
-    realtime: RealTime | None = None,
+    realtime: dict[str, Any] | None = None,
+    looked_m: Sequence[float | None] = (),
 ) -> dict[str, Any]:
     """Make track.npz and summary.json of a run's frames; returns the summary.
 
     folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
-    realtime: of a live run; the lines do not tell it.
+    realtime: what summary.json says of a live run; the lines do not tell it.
+    looked_m: for run_doubts; the lines do not tell it either.
 
     Raises OSError when something cannot be read or written.
     """
     metadata = facts["metadata"]
-    rows, changed, held = _every_frame(records)
-    if held:
-        metadata = metadata | {"held_frames": held}
+    rows, changed = _every_frame(records)
+    dropped = changed[DROPPED]
+    if dropped.any():
+        metadata = metadata | {"held_frames": changed["index"][dropped].tolist()}
     small = {
         "joint_names": np.array(facts["joint_names"], np.str_),
         "metadata": np.array(json.dumps(metadata)),
     } | facts_for_readers(metadata)
-    summary = summarise(records, len(rows), len(held), folder, metadata)
+    summary = summarise(records, len(rows), int(dropped.sum()), folder, metadata)
+    summary["doubts"] = run_doubts(records, folder, metadata, looked_m)
     if realtime is not None:
-        summary["realtime"] = realtime.summary()
+        summary["realtime"] = realtime
     if truth is not None and len(rows):
-        metrics = run_metrics(records, rows, changed["index"], truth)
+        counted = ~dropped | bool((metadata.get("config") or {}).get("count_dropped"))
+        metrics = run_metrics(records, rows, changed["index"], truth, counted)
         summary |= {"metrics": metrics} if metrics else {}
-    write_whole(
-        folder / "track.npz", lambda stream: write_archive(stream, records, rows, changed, small)
-    )
+    with whole_file(folder / "track.npz") as stream:
+        write_archive(stream, records, rows, changed, small)
     _write_json(folder / "summary.json", summary)
     return summary
 
 
-def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray], list[int]]:
-    """Which record each row of track.npz is, the columns that are not copied, the dropped frames.
+def count_frames(records: Records) -> int:
+    """How many rows the track.npz of these records has."""
+    return len(_every_frame(records)[0])
 
-    The columns are index, timestamp_s and compute_s.
+
+def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Which record each row of track.npz is, and the columns that are not copied.
+
+    These are index, timestamp_s, compute_s and dropped, and state_name where frames were.
     """
     names = ("index", "timestamp_s", "compute_s")
     index, times, seconds = (records.column(name) for name in names)
@@ -200,17 +224,26 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray], l
     if not counts_on or int(index[-1]) - int(index[0]) > _MOST_HELD:
         # Where the device counts anew there is nothing to fill in.
         changed = dict(zip(names, (index, times, seconds), strict=True))
-        return np.arange(len(index)), changed, []
+        return np.arange(len(index)), changed | {DROPPED: np.zeros(len(index), bool)}
     every = np.arange(index[0], index[-1] + 1)
     rows = np.searchsorted(index, every, side="right") - 1
-    held = index[rows] != every
-    seconds = np.where(held, np.float32(0), seconds[rows])
+    dropped = index[rows] != every
+    seconds = np.where(dropped, np.float32(0), seconds[rows])
     changed = {
         "index": every,
         "timestamp_s": np.interp(every, index, times),
         "compute_s": seconds,
+        DROPPED: dropped,
     }
-    return rows, changed, every[held].tolist()
+    if dropped.any() and "state_name" in records.names:
+        changed["state_name"] = _told_dropped(records.column("state_name", rows), dropped)
+    return rows, changed
+
+
+def _told_dropped(state_names: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+    """(T,) or (T, S) texts that say it where a frame was; a slot without a hand says nothing."""
+    of_frame = dropped.reshape(-1, *(1,) * (state_names.ndim - 1))
+    return np.where(of_frame & (state_names != ""), DROPPED, state_names)
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
@@ -221,18 +254,20 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
     A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
     side, side_probability, the joints' regions and confidence, the pointing ray, the pinch).
+    `dropped`, which also came later, is there nevertheless.
 
     Raises ToftrackError when the file is missing, damaged or not a result.
     """
     path = Path(path).expanduser()
     try:
-        arrays = read_archive(path, {*FROM_THE_START, *KINDS, "joint_names", "metadata"})
+        arrays = read_archive(path, {*FROM_THE_START, *KINDS, DROPPED, *_TEXTS})
         known = (*FROM_THE_START, *(name for name in KINDS if name in arrays))
-        names = (*dict.fromkeys(known), "joint_names", "metadata")
+        names = (*dict.fromkeys(known), *_TEXTS)
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
         _check_arrays({name: arrays[name] for name in known}, content["metadata"])
+        content |= _dropped(arrays, content)
     except OSError as error:
         raise ToftrackError(
             f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
@@ -247,6 +282,22 @@ def read_results(path: str | Path) -> dict[str, Any]:
             f"'{path}' is not a track.npz, or it is damaged; give the path of one"
         ) from error
     return content
+
+
+def _dropped(arrays: dict[str, np.ndarray], content: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Which frames were dropped, (T,), and the names of states where older files do not say so."""
+    count = len(content["lost"])
+    if DROPPED in arrays:
+        if arrays[DROPPED].dtype != bool or arrays[DROPPED].shape != (count,):
+            raise ValueError(f"{DROPPED!r} does not fit")
+        return {DROPPED: arrays[DROPPED]}
+    held = content["metadata"].get("held_frames")
+    if "index" not in content or not isinstance(held, list) or not held:
+        return {DROPPED: np.zeros(count, bool)}
+    dropped = np.isin(content["index"], np.array(held, np.int64))
+    names = content.get("state_name")
+    told = {} if names is None else {"state_name": _told_dropped(names, dropped)}
+    return {DROPPED: dropped} | told
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:
@@ -299,8 +350,7 @@ def _is_whole(facts: dict[str, Any]) -> bool:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    text = json.dumps(strict(content), indent=1, allow_nan=False) + "\n"
-    write_whole(path, lambda stream: stream.write(text.encode()))
+    write_whole(path, json.dumps(strict(content), indent=1, allow_nan=False) + "\n")
 
 
 def _unwritable(folder: Path, error: OSError, frames: int | None = None) -> ToftrackError:

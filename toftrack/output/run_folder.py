@@ -29,6 +29,7 @@ from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FrameStore, open_recording, open_source
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
+from toftrack.safe_files import open_to_read
 
 FILES = ("track.npz", "track.jsonl", "summary.json", "hand_shape.json")
 """What a folder must hold to be a run's."""
@@ -227,7 +228,8 @@ def found_again(path: str | Path, ran_in: str | None) -> Path:
 def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
     """Frame numbers and state names for the rows of track.npz, which also has dropped frames."""
     try:
-        told = [parse_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        with open_to_read(path) as stream:
+            told = [parse_json(line) for line in stream.read().decode("utf-8").splitlines()]
         index = np.array([int(line["index"]) for line in told])
         names = [str(line["state_name"]) for line in told]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -257,7 +259,8 @@ def open_footage(run: Run, recording: str | Path | None = None) -> Footage | Non
     if opened is None:
         return None
     store, name = opened
-    camera = store.camera
+    told = BareFacts(device.get("intrinsics"))
+    camera = told.camera(store.camera.width, store.camera.height) or store.camera
     if about.get("camera_file"):
         camera = Camera.load(run.found(about["camera_file"]))
     rows = _rows(run, store, camera, about, device, name)
@@ -298,7 +301,7 @@ def open_tracked(
     camera_file = about.get("camera_file")
     modulation_mhz = device.get("modulation_mhz", DEFAULT_MODULATION_MHZ)
     camera_path = None if camera_file is None else found(camera_file)
-    bare = BareFacts(unit_m=device.get("unit_m"), fps=device.get("fps"))
+    bare = BareFacts(device.get("intrinsics"), device.get("unit_m"), device.get("fps"))
     return open_recording(path, camera_path, modulation_mhz, device.get("topic"), bare), path
 
 

@@ -4,12 +4,14 @@ Of a run with two slots a frame is lost when no slot has a hand that can be used
 is that of the hands that are there; `slots` says the same of each. The metrics are those of the
 recording's first hand, in the slot that followed it; under `second` stand those of its other hand,
 or, where the recording has one hand, `ghost_pct` says how often the other slot had one all the
-same.
+same. What measures.py adds to trust.py stands under `further`.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,15 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
-from toftrack.output.coverage import coverage
+from toftrack.output.coverage import Coverage
 from toftrack.output.evaluation import evaluate
+from toftrack.output.hand_doubts import length_doubt, looked_doubt
+from toftrack.output.measures import Estimates, Measured, measured
 from toftrack.output.records import Records
-from toftrack.output.trust import Hand, Trust, trust, trust_of_two
+from toftrack.recordings.doubts import times_doubt
+
+_MEASURED = tuple(field.name for field in fields(Estimates))
+_REGIONS = tuple(field.name for field in fields(Coverage))
 
 
 def shape_file(slot: int) -> str:
@@ -73,49 +80,102 @@ def _mean(values: np.ndarray) -> float | None:
 
 def _hand(folder: Path, slot: int, metadata: dict[str, Any]) -> dict[str, Any]:
     """The hand that was tracked, where its file is in the folder."""
-    try:
-        shape = HandShape.load(folder / shape_file(slot))
-    except ToftrackError:
+    shape = _shape(folder, slot)
+    if shape is None:
         return {}
-    fitted = bool((metadata.get("hand_shape") or {}).get("fitted"))
+    fitted = _fits(metadata) and shape.fitted is not None
     return {"hand": {"side": shape.side, "length_mm": 1e3 * shape.hand_length_m, "fitted": fitted}}
 
 
-def run_metrics(
-    records: Records, rows: np.ndarray, index: np.ndarray, truth: Truth
-) -> dict[str, Any] | None:
-    """The metrics over those frames whose numbers the truth has; None where it has none.
+def _shape(folder: Path, slot: int) -> HandShape | None:
+    try:
+        return HandShape.load(folder / shape_file(slot))
+    except ToftrackError:
+        return None
 
-    rows: records.  index: numbers of their frames.
+
+def _fits(metadata: dict[str, Any]) -> bool:
+    """Whether a run fits its hands, or takes them as they were given."""
+    return bool((metadata.get("hand_shape") or {}).get("fitted"))
+
+
+def run_doubts(
+    records: Records,
+    folder: Path,
+    metadata: dict[str, Any],
+    looked_m: Sequence[float | None] = (),
+) -> list[str]:
+    """What speaks against a run's input, a sentence each: what its device found, the frames' times
+    where the device did not look at them, and how long the fitted hands are.
+
+    looked_m: of the slots, how long the hand looked where it was mostly lost; () where the run did
+    not say.
+    """
+    told = (metadata.get("device") or {}).get("doubts")
+    found = [times_doubt(records.column("timestamp_s"))] if told is None else list(told)
+    k = (metadata.get("camera") or {}).get("K")
+    if _fits(metadata) and k is not None:
+        for slot, looked in zip_longest(range(records.slots), looked_m):
+            shape = _shape(folder, slot)
+            fitted = "" if shape is None else length_doubt(shape, np.array(k))
+            found.append(fitted or ("" if looked is None else looked_doubt(looked, np.array(k))))
+    return list(filter(None, found))
+
+
+def run_metrics(
+    records: Records, rows: np.ndarray, index: np.ndarray, truth: Truth, counted: np.ndarray
+) -> dict[str, Any] | None:
+    """The metrics over those frames that count and whose numbers the truth has; None where it has
+    none of them.
+
+    rows: records.  index: numbers of their frames.  counted: (T,) bool of them.
     """
     true = index - truth.first
-    known = (true >= 0) & (true < len(truth))
+    inside = (true >= 0) & (true < len(truth))
+    known = counted & inside
     if not known.any():
         return None
+    position = np.flatnonzero(counted[inside])
     found = truth.of_frames(index[known])
-    names = ("joints_m", "lost", "joint_sigma_m")
-    arrays = {n: records.column(n, rows[known]) for n in names if n in records.names}
-    if records.slots == 1:
-        figures = trust(arrays["joints_m"], arrays["lost"], _hand_of(found))
-        return _metrics(figures, arrays, found)
-    truths = [found] if found.other is None else [found, found.other]
-    both = trust_of_two(arrays["joints_m"], arrays["lost"], [_hand_of(one) for one in truths])
-    of_slots = [{n: array[:, slot] for n, array in arrays.items()} for slot in both.slots]
-    metrics = {"slot": both.slots[0]} | _metrics(both.first, of_slots[0], found)
-    if both.second is None:
+    done = {name: records.column(name, rows[known]) for name in _MEASURED if name in records.names}
+    both = measured(Estimates(**found_side(done)), found)
+    metrics = _metrics(both.first, done, found, both.slots and both.slots[0], position)
+    if both.slots is None:
+        return metrics
+    metrics = {"slot": both.slots[0]} | metrics
+    if both.second is None or found.other is None:
         return metrics | {"ghost_pct": both.ghost_pct}
-    second = {"slot": both.slots[1]} | _metrics(both.second, of_slots[1], truths[1])
-    return metrics | {"second": second}
+    second = _metrics(both.second, done, found.other, both.slots[1], position)
+    return metrics | {"second": {"slot": both.slots[1]} | second}
 
 
-def _hand_of(truth: Truth) -> Hand:
-    return Hand(truth.joints_m, truth.visible)
+def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of a track without its side where that was told: it is no finding then."""
+    probability = arrays.get("side_probability", np.ones(0))
+    known = probability[np.isfinite(probability)]
+    told = bool((known == 1).all())
+    return {name: array for name, array in arrays.items() if not (told and name.startswith("side"))}
 
 
-def _metrics(figures: Trust, arrays: dict[str, np.ndarray], truth: Truth) -> dict[str, Any]:
-    """Of the estimates of one hand, arrays of (T, ...)."""
-    joints = arrays["joints_m"]
-    metrics = {"trust": asdict(figures)} | evaluate(joints, arrays["lost"], truth)
+def _metrics(
+    of: Measured,
+    arrays: dict[str, np.ndarray],
+    truth: Truth,
+    slot: int | None,
+    position: np.ndarray,
+) -> dict[str, Any]:
+    """Of the estimates of one hand.
+
+    position: (T,) of the frames among all, with those that do not count.
+    """
+    joints, lost = (
+        arrays[name] if slot is None else arrays[name][:, slot] for name in ("joints_m", "lost")
+    )
+    metrics = {"trust": asdict(of.trust)} | evaluate(joints, lost, truth)
+    for event in metrics["reacquisition"]:
+        event["frame"] = int(position[event["frame"]])
+    regions = {name: of.figures.get(name) for name in _REGIONS}
+    further = {name: value for name, value in of.figures.items() if name not in _REGIONS}
     if "joint_sigma_m" in arrays:
-        metrics["coverage"] = asdict(coverage(joints, arrays["joint_sigma_m"], truth))
-    return metrics
+        metrics["coverage"] = regions
+    return metrics | {"further": further}

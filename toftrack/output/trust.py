@@ -29,6 +29,8 @@ OK_MM = 40.0
 """The largest error of a joint that can be used, and the largest mean error that is not wrong."""
 RIGHT_MM = 25.0
 RIGHT_FRAMES = 3
+MOST_MM = 1e3
+"""The most that one frame counts for in a mean over flagged frames, too."""
 FORGIVEN_FRAMES = 3
 """So many frames after the hand went may still say that it is there."""
 
@@ -72,6 +74,25 @@ class Hand:
     """(T,) bool."""
 
 
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What each of T frames is, see the head of this module: (T,) bool, but for the errors."""
+
+    counted: np.ndarray
+    seen: np.ndarray
+    """Counted frames in which the hand is visible."""
+    said: np.ndarray
+    """There is an estimate that is not flagged lost."""
+    usable: np.ndarray
+    partly: np.ndarray
+    false_alarm: np.ndarray
+    silent: np.ndarray
+    error_mm: np.ndarray
+    """(T, J) joint errors; of estimates that are not finite, those to a point a kilometre away."""
+    mean_mm: np.ndarray
+    """(T,) their means."""
+
+
 @dataclass(frozen=True)
 class TwoSlots:
     """The figures of a track of two slots."""
@@ -106,31 +127,47 @@ def trust(joints_m: np.ndarray, lost: np.ndarray, hand: Hand, skip: int = 0) -> 
     Raises:
         ToftrackError: estimates and truth differ in shape.
     """
+    of = judged(joints_m, lost, hand, skip)
+    average, visible = of.mean_mm, np.asarray(hand.visible, bool)
+    right = _runs(visible & of.said & (average < RIGHT_MM), RIGHT_FRAMES)
+    returns = np.flatnonzero(visible[1:] & ~visible[:-1]) + 1
+    good = of.seen & of.said
+    return Trust(
+        frames=int(of.counted.sum()),
+        visible=int(of.seen.sum()),
+        usable_pct=_share_pct(of.usable, of.seen),
+        partly_pct=_share_pct(of.partly, of.seen),
+        false_alarm_pct=_share_pct(of.false_alarm, of.seen),
+        silent_pct=_share_pct(of.silent, of.counted),
+        longest_silent=longest_run(of.silent),
+        mean_mm=float(average[good].mean()) if good.any() else None,
+        mean_all_mm=float(np.minimum(average[of.seen], MOST_MM).mean()) if of.seen.any() else None,
+        first_right=_until(right, 0),
+        found_after=tuple(_until(right, int(frame)) for frame in returns),
+    )
+
+
+def judged(joints_m: np.ndarray, lost: np.ndarray, hand: Hand, skip: int = 0) -> Judged:
+    """What each frame of a track is; arguments and errors as of `trust`."""
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
     _check(estimate.shape, lost.shape, hand)
     visible = np.asarray(hand.visible, bool)
     finite = np.asarray(np.isfinite(estimate).all((1, 2)))
     error = _errors_mm(estimate, finite, hand)
     average, largest = error.mean(1), error.max(1)
-    used = np.arange(len(lost)) >= skip
-    said = ~lost & finite
-    seen = visible & used
-    good = seen & said
-    silent = used & said & np.where(visible, average > OK_MM, ~lingering(visible, FORGIVEN_FRAMES))
-    right = _runs(visible & said & (average < RIGHT_MM), RIGHT_FRAMES)
-    returns = np.flatnonzero(visible[1:] & ~visible[:-1]) + 1
-    return Trust(
-        frames=int(used.sum()),
-        visible=int(seen.sum()),
-        usable_pct=_share_pct(good & (largest <= OK_MM), seen),
-        partly_pct=_share_pct(good & (average <= OK_MM) & (largest > OK_MM), seen),
-        false_alarm_pct=_share_pct(seen & lost & finite & (largest <= OK_MM), seen),
-        silent_pct=_share_pct(silent, used),
-        longest_silent=longest_run(silent),
-        mean_mm=float(average[good].mean()) if good.any() else None,
-        mean_all_mm=float(np.minimum(average[seen], 1e3).mean()) if seen.any() else None,
-        first_right=_until(right, 0),
-        found_after=tuple(_until(right, int(frame)) for frame in returns),
+    counted = np.arange(len(lost)) >= skip
+    said, seen = ~lost & finite, visible & counted
+    wrong = np.where(visible, average > OK_MM, ~lingering(visible, FORGIVEN_FRAMES))
+    return Judged(
+        counted=counted,
+        seen=seen,
+        said=said,
+        usable=seen & said & (largest <= OK_MM),
+        partly=seen & said & (average <= OK_MM) & (largest > OK_MM),
+        false_alarm=seen & lost & finite & (largest <= OK_MM),
+        silent=counted & said & wrong,
+        error_mm=error,
+        mean_mm=average,
     )
 
 

@@ -24,6 +24,7 @@ from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.json_text import parse_json
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
+from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
@@ -95,7 +96,7 @@ def save_pose_space(
         "sources": sources,
     }
     arrays = {name: tensor.cpu().numpy() for name, tensor in space.arrays().items()}
-    with open(path, "wb") as file:
+    with whole_file(path) as file:
         content: dict[str, Any] = {"header": np.array(json.dumps(header)), **arrays}
         np.savez_compressed(file, **content)
 

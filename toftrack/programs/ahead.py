@@ -12,7 +12,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -59,6 +58,7 @@ def _helper(config: DictConfig) -> subprocess.Popen | None:
     numba = config.renderer in ("auto", "numba") and compute_device(config.compute).type == "cpu"
     if (cores or 1) < 2 or not numba or getattr(sys, "frozen", False):
         return None
+    from toftrack.compute.compiling import must_be_compiled
     from toftrack.refinement.gauss_newton_numba import refine_hands
 
     if not must_be_compiled(refine_hands):
@@ -73,14 +73,6 @@ def _helper(config: DictConfig) -> subprocess.Popen | None:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-
-
-def must_be_compiled(kernel: Any) -> bool:
-    """Whether an entry point's code is not on the disk, but can be kept there."""
-    folder = kernel.stats.cache_path
-    if folder is None or kernel.signatures:
-        return False
-    return not any(Path(folder).glob(f"*.{kernel.py_func.__qualname__}-*.nbi"))
 
 
 def main() -> None:

@@ -17,7 +17,6 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
@@ -27,7 +26,9 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import FrameStore, open_recording
+from toftrack.safe_files import write_whole
 from toftrack.views.figures.calibration import corner_sheet, error_plot
+from toftrack.views.pictures import write_picture
 
 _PICTURES = 12
 _LENS = "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tauX tauY".split()
@@ -232,11 +233,10 @@ def _write_report(
     )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
-        content = json.dumps(facts, indent=1) + "\n"
-        (folder / "report.json").write_text(content, encoding="utf-8")
+        write_whole(folder / "report.txt", text + "\n")
+        write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
         for name, picture in (("corners.png", sheet), ("depth_error.png", plot)):
-            (folder / name).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+            write_picture(folder / name, picture)
     except OSError as error:
         raise ToftrackError(
             f"the report folder '{folder}' cannot be written ({error.strerror}); choose another "

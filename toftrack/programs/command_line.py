@@ -33,6 +33,7 @@ from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
 from toftrack.json_text import read_json
 from toftrack.programs import endings
+from toftrack.safe_files import write_whole
 
 
 @dataclass
@@ -171,4 +172,4 @@ def _note_error(folder: Path, text: str) -> None:
             summary = read_json(path)
         except (FileNotFoundError, ValueError):
             summary = {}
-        path.write_text(json.dumps(summary | {"error": text}, indent=1) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(summary | {"error": text}, indent=1) + "\n")

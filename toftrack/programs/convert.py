@@ -138,16 +138,6 @@ def convert(
 
 
 def _to_npz(store: FrameStore, target: Path, bar: tqdm) -> None:
-    camera = store.camera
-    fisheye = camera.lens == "fisheye"
-    if camera.depth_polynomial or fisheye:
-        beside = target.with_name(target.stem + ".camera.json")
-        camera.save(beside)
-        what = "a fisheye lens" if fisheye else "the depth polynomial"
-        _warn(f"{what} has no place in .npz; use camera.file={beside}")
-    if fisheye:  # its coefficients would be taken for those of another model
-        plain = Camera(camera.K, camera.width, camera.height)
-        store = _with_camera(store, plain, beside)
     if isinstance(store, Recording):
         write_recording(target, store)
     else:

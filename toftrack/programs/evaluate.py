@@ -24,6 +24,7 @@ from toftrack.output.labelled_figures import LabelledFigures, labelled_figures, 
 from toftrack.programs import command_line
 from toftrack.recordings.datasets import DATA_SETS, open_data_set
 from toftrack.recordings.datasets.base import DataSet, LabelledSequence, compared_joints
+from toftrack.safe_files import write_whole
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -149,7 +150,7 @@ def _chosen(sequences: list[LabelledSequence], names: str | None) -> list[Labell
 
 def _write(path: Path, facts: dict[str, Any]) -> None:
     try:
-        path.write_text(json.dumps(facts, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(facts, indent=1, allow_nan=False) + "\n")
     except OSError as error:
         raise ToftrackError(
             f"the file '{path}' cannot be written ({error.strerror}); choose another place"

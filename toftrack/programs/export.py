@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import BinaryIO
 
 from toftrack.errors import ToftrackError
 from toftrack.output.exports.bvh import bvh_of
 from toftrack.output.exports.glb import glb_of
 from toftrack.output.exports.motion import motions_of
 from toftrack.output.exports.table import csv_of
-from toftrack.output.files import write_whole
 from toftrack.output.run_folder import Run, read_run
+from toftrack.safe_files import write_whole
 
 FORMATS = ("glb", "bvh", "csv")
 
@@ -46,7 +44,7 @@ def export(folder: Path, kind: str) -> list[Path]:
     contents = _contents(read_run(folder), kind)
     try:
         for name, content in contents.items():
-            write_whole(folder / name, partial(_write, content))
+            write_whole(folder / name, content)
     except OSError as error:
         raise ToftrackError(
             f"'{folder}' cannot be written ({error.strerror or error}); copy it to where it can be"
@@ -54,18 +52,14 @@ def export(folder: Path, kind: str) -> list[Path]:
     return [folder / name for name in contents]
 
 
-def _write(content: bytes, stream: BinaryIO) -> None:
-    stream.write(content)
-
-
 def _contents(run: Run, kind: str) -> dict[str, bytes]:
     """What each file is to hold, by its name."""
     if kind == "csv":
         return {"hand.csv": csv_of(run.results).encode()}
-    motions = motions_of(run.results, (run.shape,))
+    motions = motions_of(run.results, run.shapes)
     if kind == "glb":
         return {"hand.glb": glb_of(motions)}
-    if len(motions) == 1:
+    if len(run.shapes) == 1:
         return {"hand.bvh": bvh_of(motions[0]).encode()}
     # A file has one skeleton.
-    return {f"hand{slot}.bvh": bvh_of(motion).encode() for slot, motion in enumerate(motions, 1)}
+    return {f"hand{motion.slot + 1}.bvh": bvh_of(motion).encode() for motion in motions}

@@ -23,7 +23,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from tqdm import tqdm
@@ -33,6 +32,7 @@ from toftrack.estimate import confidence_words, state_words
 from toftrack.frames import Truth
 from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
 from toftrack.render.model_image import model_range_image
+from toftrack.safe_files import make_folder
 from toftrack.views.classified import classify
 from toftrack.views.figures.runs import (
     course_figure,
@@ -42,6 +42,7 @@ from toftrack.views.figures.runs import (
     measurement_figure,
 )
 from toftrack.views.overlay import draw_panel, panel_scale
+from toftrack.views.pictures import write_picture
 
 _FILM_FRAMES = 10
 _LOST_FRAMES = 5
@@ -104,12 +105,12 @@ def draw_figures(
         figures |= _of_slot(run, footage, slot, frame, with_film=position == 0)
     target = Path(out).expanduser() if out is not None else run.folder / "figures"
     try:
-        target.mkdir(parents=True, exist_ok=True)
+        # The folder within the run's must be no link; which one --out is, the user says.
+        make_folder(target) if out is None else target.mkdir(parents=True, exist_ok=True)
         written = []
         for name in tqdm(figures, unit=" figures", file=sys.stderr, delay=1.0, leave=False):
             path = target / f"{name}.png"
-            if not cv2.imwrite(str(path), figures[name]()):
-                raise ToftrackError(f"'{path}' cannot be written; give another folder with --out")
+            write_picture(path, figures[name]())
             written.append(path)
     except OSError as error:
         raise ToftrackError(

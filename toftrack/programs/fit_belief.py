@@ -27,9 +27,11 @@ from toftrack.programs import command_line
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
 from toftrack.relocation.sequences import Sequence, random_sequence, read_sequence, write_sequence
 from toftrack.relocation.shapes import shape_bank
+from toftrack.safe_files import whole_file, write_whole
 from toftrack.tracking.joint_belief import JOINT_SIGNS
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.signs import SIGNS
+from toftrack.views.pictures import write_picture
 
 RIGHT_M = 0.04
 """An estimate is right when every joint is within this."""
@@ -80,7 +82,6 @@ def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 def main(arguments: list[str] | None = None) -> None:
     """Render, track, fit, report."""
-    import cv2
 
     from toftrack.views.figures.reliability import reliability_figure
 
@@ -99,18 +100,19 @@ def main(arguments: list[str] | None = None) -> None:
     seen = with_doubt(seen, log_odds, _memory(asked.overrides))
     more, joint_lines = _fitted_joints(seen, kept)
     summary |= more
-    (asked.output / "belief.json").write_text(json.dumps(summary, indent=1) + "\n")
+    write_whole(asked.output / "belief.json", json.dumps(summary, indent=1) + "\n")
     pasted = "\n".join(lines + joint_lines)
-    (asked.output / "belief.yaml").write_text(pasted + "\n")
+    write_whole(asked.output / "belief.yaml", pasted + "\n")
     picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
-    cv2.imwrite(str(asked.output / "reliability.png"), picture)
-    np.savez_compressed(
-        asked.output / "signs.npz",
-        signs=seen.signs,
-        right=seen.right,
-        sequence=seen.sequence,
-        **{f"joint_{name}": values for name, values in seen.joints._asdict().items()},
-    )
+    write_picture(asked.output / "reliability.png", picture)
+    with whole_file(asked.output / "signs.npz") as stream:
+        np.savez_compressed(
+            stream,
+            signs=seen.signs,
+            right=seen.right,
+            sequence=seen.sequence,
+            **{f"joint_{name}": values for name, values in seen.joints._asdict().items()},
+        )
     print(f"{pasted}\n\n{_words(summary)}\nresults: {asked.output}")
 
 

@@ -1,12 +1,15 @@
-"""Record what an SR3000 sends: `toftrack record OUT.srs`, until Ctrl-C.
+"""Record a camera: `toftrack record OUT.npz device=realsense`, until Ctrl-C.
 
-The camera's settings are those of conf/device/sr3000.yaml, changed as for `track.py`:
-`toftrack record OUT.srs device.transport=emulated`.
+Every device is recorded to `.npz`, also one of your own; its settings are those of conf/device/,
+changed as for `toftrack track`. An SR3000 may be recorded to `.srs`, too, as it sends its images:
+`toftrack record OUT.srs device.transport=emulated`. After a kill or a full disk
+`toftrack recover OUT.npz` makes the file of the frames that came until then.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 import threading
@@ -20,52 +23,109 @@ import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from toftrack.configuration.compose import configuration_folder
+from toftrack.checks import check_number
+from toftrack.configuration.compose import configuration, configuration_folder, one_sentence
+from toftrack.devices.base import Device
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
+from toftrack.programs import endings
 from toftrack.programs.endings import ENDINGS, EndedError
+from toftrack.programs.recording_argument import quoted
+from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.srs_facts import SrsFacts, SrsInit
 
-_ONLY = (
-    "only the SR3000 is recorded, which needs no device=; other recordings are converted with "
-    "python -m toftrack.convert"
-)
+_GIGABYTE = 1e9
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and record. Raises ToftrackError, and EndedError at the end of an
     interrupted recording, whose frames are all in the file."""
-    parser = argparse.ArgumentParser(prog="toftrack record", description=__doc__)
-    parser.add_argument("out", metavar="OUT.srs", help="the new recording")
+    parser = argparse.ArgumentParser(
+        prog="toftrack record",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("out", metavar="OUT", help="the new recording, .npz or .srs")
     parser.add_argument("--frames", type=int, help="stop after so many (default: at Ctrl-C)")
     parser.add_argument("--seconds", type=float, help="stop after so long")
+    parser.add_argument("--limit", type=float, metavar="GB", help="stop at this size (default: 1)")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     parser.add_argument(
         "--conf", default=configuration_folder(), help="folder of the configuration"
     )
+    parser.add_argument("--config-dir", help="folder of choices of your own")
     parser.add_argument(
-        "overrides", nargs="*", default=[], metavar="device.KEY=VALUE", help="settings"
+        "overrides",
+        nargs="*",
+        default=[],
+        metavar="KEY=VALUE",
+        help="device=KIND and settings of it, device.KEY=VALUE",
     )
     # Intermixed: options may stand between the settings.
     options = parser.parse_intermixed_args(arguments)
-    if Path(options.out).suffix.lower() != ".srs":
+    for name, whole in (("frames", True), ("seconds", False), ("limit", False)):
+        if (value := getattr(options, name)) is not None:
+            check_number(f"--{name}", value, 0, above=True, whole=whole)
+    suffix = Path(options.out).suffix.lower()
+    if suffix not in (".npz", ".srs"):
         raise ToftrackError(
-            f"a camera is recorded to .srs, not to '{options.out}'; convert that afterwards with "
-            "python -m toftrack.convert"
+            f"a camera is recorded to .npz, or an SR3000 to .srs, not to '{options.out}'; convert "
+            "that afterwards with toftrack convert"
         )
-    for name in ("frames", "seconds"):
-        value = getattr(options, name)
-        if value is not None and not value > 0:
-            raise ToftrackError(f"--{name} must be above 0, not {value}")
-    device: Sr3000 = hydra.utils.instantiate(_compose(options.conf, options.overrides).device)
-    with device:
-        interrupted = record(
-            device, options.out, options.frames, options.seconds, options.overwrite
-        )
-    if interrupted is not None:
-        raise EndedError(interrupted)
+    config = _configuration(options, raw=suffix == ".srs")
+    limit_gb = config.record_limit_gb if options.limit is None else options.limit
+    with one_sentence():
+        device: Device = hydra.utils.instantiate(config.device)
+    if suffix == ".srs":
+        assert isinstance(device, Sr3000)
+        limit = (options.frames, options.seconds, limit_gb)
+        with device:
+            interrupted = record(device, options.out, *limit, options.overwrite)
+        if interrupted is not None:
+            raise EndedError(interrupted)
+    else:
+        recorder = Recorder(options.out, device, limit_gb, options.overwrite)
+        record_frames(device, recorder, options.frames, options.seconds)
+
+
+def record_frames(
+    device: Device, recorder: Recorder, frames: int | None = None, seconds: float | None = None
+) -> None:
+    """Write the frames of any device, which is opened and closed here, and finish the file.
+
+    Args:
+        device: one that drops no frames; of a live one (keep=newest), those that it delivers.
+        recorder: of the device, closed at the end.
+        frames: stop after so many; None = go on.
+        seconds: stop after so long; None = go on.
+
+    Raises:
+        ToftrackError: the camera was given up, no frame came, or not all could be written.
+        KeyboardInterrupt: somebody ended it. In all cases what came until then is in the file.
+    """
+    try:
+        with device, tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
+            began = time.monotonic()
+            for count, frame in enumerate(device, 1):
+                with endings.not_now():
+                    recorder.put(frame, wait=True)
+                bar.update()
+                late = seconds is not None and time.monotonic() - began >= seconds
+                if recorder.ended is not None or count == frames or late:
+                    break
+    finally:
+        with endings.not_now():
+            recorder.close()
+            if recorder.words():
+                endings.say(recorder.words(), sys.stdout)
+    if recorder.failed:
+        raise ToftrackError(recorder.ended)
+    if recorder.ended is not None:
+        print(recorder.ended, file=sys.stderr)
+    if not recorder.frames:
+        raise ToftrackError("the device delivered no frame; nothing was recorded")
 
 
 def record(
@@ -73,6 +133,7 @@ def record(
     path: str | Path,
     frames: int | None = None,
     seconds: float | None = None,
+    limit_gb: float = math.inf,
     overwrite: bool = False,
 ) -> int | None:
     """Write every frame of an opened camera to a `.srs` file.
@@ -84,6 +145,7 @@ def record(
         path: the file.
         frames: stop after so many; None = go on.
         seconds: stop after so long; None = go on.
+        limit_gb: stop where the file has so many times 1e9 bytes.
         overwrite: replace an existing file.
 
     Returns:
@@ -112,6 +174,13 @@ def record(
             writer.append(capture.data, capture.timestamp_s)
             bar.update()
             if frames is not None and writer.frames >= frames:
+                break
+            if writer.size_bytes >= limit_gb * _GIGABYTE:
+                print(
+                    f"the recording '{path}' ends after {writer.frames} frames: it has "
+                    f"{limit_gb:g} GB, its limit",
+                    file=sys.stderr,
+                )
                 break
             if seconds is not None and time.monotonic() - began >= seconds:
                 device.request_stop()
@@ -145,16 +214,32 @@ class _Signals:
         self._device.request_stop()
 
 
-def _compose(conf: str | Path, overrides: Sequence[str]) -> DictConfig:
-    folder = Path(conf).expanduser().resolve()
-    if not (folder / "config.yaml").is_file():
+def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:
+    """As the command line says, with a device that gives all of its frames.
+
+    raw: as the camera sends them, which only the SR3000 does.
+    """
+    overrides = list(options.overrides)
+    if options.config_dir is not None:
+        folder = Path(options.config_dir).expanduser().resolve()
+        if not folder.is_dir():
+            raise ToftrackError(f"there is no folder '{options.config_dir}'; give --config-dir one")
+        overrides.insert(0, f"hydra.searchpath=[{quoted(folder.as_uri())}]")
+    chosen = next((word for word in overrides if word.startswith("device=")), None)
+    if raw and chosen not in (None, "device=sr3000"):
+        raise ToftrackError(f"only an SR3000 is recorded to .srs; record {chosen} to .npz")
+    if raw and chosen is None:
+        overrides.insert(0, "device=sr3000")
+    if not raw and chosen is None:
+        kinds = sorted(path.stem for path in Path(options.conf, "device").glob("*.yaml"))
         raise ToftrackError(
-            f"there is no configuration in '{folder}'; give toftrack's conf folder with --conf"
+            f"which camera is it? Give device={', '.join(kinds)}, or one of your own with "
+            "--config-dir (docs/own_device.md)"
         )
-    if any(override.startswith("device=") for override in overrides):
-        raise ToftrackError(_ONLY)
-    with hydra.initialize_config_dir(str(folder), version_base="1.3"):
-        return hydra.compose("config", ["device=sr3000", "device.keep=every", *overrides])
+    config = configuration(*overrides, config_dir=options.conf)
+    if "keep" in config.device and not any(word.startswith("device.keep=") for word in overrides):
+        config.device.keep = "every"
+    return config
 
 
 def _digits(serial: str | None) -> int:

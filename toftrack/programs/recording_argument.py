@@ -24,8 +24,8 @@ def with_recording(
 
     known: the first parts of keys, groups and settings: what begins with one and has a = is one,
     whatever files there are.
-    players: the devices that play a file; where none is chosen, rosbag is taken for a ROS bag, and
-    replay for everything else.
+    players: the devices that play a file; where none is chosen, rosbag is taken for a ROS bag,
+    folder for another folder, and replay for everything else.
 
     Raises ToftrackError for two recordings, or one beside a device that plays none.
     """
@@ -40,6 +40,8 @@ def with_recording(
             files.append(argument)
     if not files:
         return others
+    if "" in files:
+        raise ToftrackError("the recording's name is empty; give that of a file")
     if len(files) > 1:
         raise ToftrackError(
             f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"
@@ -57,9 +59,15 @@ def with_recording(
         )
     # What the shell has left of a ~ is the file's own, where there is one.
     name = f"./{files[0]}" if files[0][0] == "~" and os.path.exists(files[0]) else files[0]
-    usual = "device=rosbag" if is_bag(os.path.expanduser(name)) else "device=replay"
-    chosen = [] if device is not None else [usual]
+    chosen = [] if device is not None else [f"device={_player(os.path.expanduser(name), players)}"]
     return [*chosen, f"device.path={quoted(name)}", *others]
+
+
+def _player(name: str, players: Collection[str]) -> str:
+    """The device that plays a file or folder."""
+    if is_bag(name):
+        return "rosbag"
+    return "folder" if os.path.isdir(name) and "folder" in players else "replay"
 
 
 def quoted(text: str) -> str:

@@ -1,7 +1,9 @@
-"""Finish the files of a run that was killed: `toftrack recover RUN`.
+"""Finish the files of a run or a recording that was killed: `toftrack recover RUN|FILE.npz`.
 
 Makes track.npz and summary.json anew from run.json and track.jsonl, which are whole up to the last
-frame that was done. The metrics need the recording that was tracked.
+frame that was done. The metrics need the recording that was tracked. A track.npz that has more
+frames than that stays, unless --replace is given. Of a recording, makes FILE.npz of the frames in
+FILE.npz.part.
 """
 
 from __future__ import annotations
@@ -9,18 +11,30 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
+from toftrack.json_text import read_json
 from toftrack.output.evaluation import metrics_table
-from toftrack.output.files import LINES, LineFile
-from toftrack.output.results import finish, read_run_facts, records_of
+from toftrack.output.files import LINES, WHOLE_FILES, cut_unfinished_line, locked_lines
+from toftrack.output.results import (
+    count_frames,
+    finish,
+    read_results,
+    read_run_facts,
+    records_of,
+)
 from toftrack.output.run_folder import found_again, open_tracked
 from toftrack.recordings.store import open_source
+from toftrack.recordings.unfinished import is_recording, recover_recording
+from toftrack.safe_files import check_replaceable, remove_partial
 from toftrack.views.overlay import VIDEO
 from toftrack.views.video import cut_to_whole
+
+_MADE = ("track.npz", "summary.json")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -30,35 +44,54 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run", metavar="RUN", help="the output folder of toftrack track")
+    parser.add_argument(
+        "run", metavar="RUN|FILE", help="the output folder of toftrack track, or a recording"
+    )
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
+    parser.add_argument(
+        "--replace",
+        action="store_true",
+        help="also a FILE.npz that is there, or a track.npz that has more frames",
+    )
     options = parser.parse_args(arguments)
     folder = Path(options.run).expanduser()
-    print(metrics_table(recover(folder, options.recording)))
+    if is_recording(folder):
+        path, frames = recover_recording(folder, options.replace)
+        print(f"{path}: {frames} frames")
+        return
+    print(metrics_table(recover(folder, options.recording, options.replace)))
     for name in ("track.npz", "summary.json"):
         print(f"  {folder / name}")
 
 
-def recover(folder: Path, recording: str | Path | None = None) -> dict[str, Any]:
+def recover(
+    folder: Path, recording: str | Path | None = None, replace: bool = False
+) -> dict[str, Any]:
     """Write track.npz and summary.json of a run's folder; returns the summary.
 
-    recording: where the recording is now, when it is not where it was.
+    recording: where the recording is now, when it is not where it was.  replace: also a track.npz
+    that cannot be read, or that has more frames than will be made.
 
-    Raises ToftrackError: the folder is no run's, the run still goes on, or nothing can be written.
+    Raises ToftrackError: the folder is no run's, the run still goes on, less would be made than
+    there is, or nothing can be written.
     """
     facts = read_run_facts(folder)
-    if not (folder / LINES).is_file():
-        raise ToftrackError(f"'{folder}' has no {LINES}, so there is nothing to recover")
     try:
-        lines = LineFile(folder, keep=True)
-        try:
-            if (folder / VIDEO).is_file():
+        with locked_lines(folder), records_of(folder, facts) as records:
+            for name in _MADE:
+                check_replaceable(folder / name)
+            earlier = _earlier_summary(folder)
+            if not replace:
+                _check_not_less(folder, count_frames(records))
+            if records.count:
+                cut_unfinished_line(folder)
+            with suppress(FileNotFoundError):
                 cut_to_whole(folder / VIDEO)
+            remove_partial(folder, WHOLE_FILES)
             truth = _truth(facts, recording)
-            with records_of(folder, facts) as records:
-                return finish(folder, facts, truth, records)
-        finally:
-            lines.close()
+            return finish(folder, facts, truth, records, earlier.get("realtime"))
+    except FileNotFoundError:
+        raise ToftrackError(f"'{folder}' has no {LINES}, so there is nothing to recover") from None
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ToftrackError(
             f"'{folder / 'run.json'}' is damaged ({' '.join(repr(error).split())}); put that of "
@@ -66,9 +99,35 @@ def recover(folder: Path, recording: str | Path | None = None) -> dict[str, Any]
         ) from error
     except OSError as error:
         raise ToftrackError(
-            f"'{folder}' cannot be read or written ({error.strerror or error}); make room, or copy "
-            "it to where it can be written"
+            f"'{error.filename or folder}' cannot be read or written ({error.strerror or error}); "
+            "make room, or copy the folder to where it can be written"
         ) from error
+
+
+def _check_not_less(folder: Path, frames: int) -> None:
+    """ToftrackError where there is a track.npz that has more frames, or that cannot be read."""
+    path = folder / "track.npz"
+    if not path.exists():
+        return
+    hint = "nothing was changed; --replace makes it anew of the lines all the same"
+    try:
+        there = len(read_results(path)["lost"])
+    except ToftrackError:
+        raise ToftrackError(
+            f"there is a '{path}' that is damaged, or no run's, and {LINES} has {frames} frames; "
+            f"{hint}"
+        ) from None
+    if there > frames:
+        raise ToftrackError(f"'{path}' has {there} frames, but {LINES} only {frames}; {hint}")
+
+
+def _earlier_summary(folder: Path) -> dict[str, Any]:
+    """Of the run itself, if it came to that."""
+    try:
+        summary = read_json(folder / "summary.json")
+    except (OSError, ValueError):
+        return {}
+    return summary if isinstance(summary, dict) else {}
 
 
 def _truth(facts: dict[str, Any], recording: str | Path | None) -> Truth | None:

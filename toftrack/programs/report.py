@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import math
 import statistics
 import sys
@@ -21,6 +22,8 @@ import yaml
 
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
+from toftrack.safe_files import open_to_read, write_whole
+from toftrack.views.pictures import write_picture
 
 FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
 """What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
@@ -82,10 +85,11 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def _read_run(path: Path, folder: Path) -> Run:
-    name = path.relative_to(folder).as_posix()
+    name = _printable(path.relative_to(folder).as_posix())
     try:
-        lines = yaml.safe_load((path / ".hydra" / "overrides.yaml").read_text("utf-8"))
-        overrides = dict(_split(line) for line in lines)
+        with open_to_read(path / ".hydra" / "overrides.yaml") as stream:
+            lines = yaml.safe_load(stream.read().decode("utf-8"))
+        overrides = dict(_split(_printable(line)) for line in lines)
     except Exception as error:  # whatever a YAML reader may say about a damaged file
         return Run(name, {}, {}, f"its overrides cannot be read ({type(error).__name__})")
     try:
@@ -93,16 +97,23 @@ def _read_run(path: Path, folder: Path) -> Run:
     except FileNotFoundError:
         return Run(name, overrides, {}, "it left no summary.json: it did not finish")
     except (OSError, ValueError) as error:
-        return Run(name, overrides, {}, f"its summary.json cannot be read ({error})")
+        return Run(
+            name, overrides, {}, f"its summary.json cannot be read ({_printable(str(error))})"
+        )
     if not isinstance(summary, dict):
         return Run(name, overrides, {}, "its summary.json is not one of track.py")
     told = summary.get("error")
-    return Run(name, overrides, _flat(summary), None if told is None else str(told))
+    return Run(name, overrides, _flat(summary), None if told is None else _printable(str(told)))
 
 
 def _split(override: str) -> tuple[str, str]:
     key, _, value = override.partition("=")
     return key.lstrip("+~"), value
+
+
+def _printable(text: str) -> str:
+    """A text as UTF-8 has it: names of files and JSON may hold what no file or terminal takes."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:
@@ -111,7 +122,7 @@ def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:
         if isinstance(value, dict):
             figures |= _flat(value, f"{prefix}{name}.")
         elif isinstance(value, (int, float)) and not isinstance(value, bool):
-            figures[prefix + name] = value
+            figures[_printable(prefix + name)] = value
     return figures
 
 
@@ -176,13 +187,14 @@ def write_csv(runs: Sequence[Run], path: Path) -> None:
     """One row a job: its folder, its overrides, its figures, its error."""
     overrides = _keys(runs)
     figures = list(dict.fromkeys(key for run in runs for key in run.figures))
-    with open(path, "w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["run", *overrides, *figures, "error"])
-        for run in runs:
-            row = [*(run.overrides.get(key, "") for key in overrides)]
-            row += [*(str(run.figures.get(key, "")) for key in figures)]
-            writer.writerow([run.name, *row, run.error or ""])
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["run", *overrides, *figures, "error"])
+    for run in runs:
+        row = [*(run.overrides.get(key, "") for key in overrides)]
+        row += [*(str(run.figures.get(key, "")) for key in figures)]
+        writer.writerow([run.name, *row, run.error or ""])
+    write_whole(path, text.getvalue())
 
 
 def table(groups: Sequence[Group], figure: str) -> str:
@@ -216,7 +228,6 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 
     Raises ToftrackError when there is no job, no job has the figure, or nothing can be written.
     """
-    import cv2  # slow to import
 
     from toftrack.views.figures.sweep import sweep_figure
 
@@ -248,10 +259,9 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     if points:
         label = f"{figure.removeprefix('metrics.')}, mean over recordings"
         picture = folder / "sweep.png"
-        if not cv2.imwrite(str(picture), sweep_figure(points, label)):
-            raise ToftrackError(f"{picture} cannot be written")
+        write_picture(picture, sweep_figure(points, label))
         written.append(picture)
-    print("\n" + "\n".join(f"  {path}" for path in written))
+    print("\n" + "\n".join(_printable(f"  {path}") for path in written))
     return runs, groups
 
 

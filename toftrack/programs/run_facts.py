@@ -17,7 +17,6 @@ from omegaconf import DictConfig, OmegaConf
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
-from toftrack.output.files import save_whole
 from toftrack.output.summary import shape_file
 from toftrack.tracking.hands import HandsTracker
 
@@ -75,7 +74,7 @@ def opening(metadata: dict[str, Any], device: Device) -> str:
     count = "live" if device.frames is None else f"{device.frames} frames"
     side = shape["side"]
     length_mm = 1e3 * float(shape["hand_length_m"])
-    fitted = "fitted from" if shape["fitted"] else "of"
+    fitted = "to be fitted from" if shape["fitted"] else "of"
     if config.get("hands", 1) > 1:
         what = "up to two hands, their lengths"
     elif side == "auto":
@@ -121,7 +120,7 @@ class _ShapeFile:
             return
         self._saved_s = now_s
         try:
-            save_whole(self._path, shape.to("cpu").save)
+            shape.to("cpu").save(self._path)
         except OSError as error:
             if last:
                 raise ToftrackError(

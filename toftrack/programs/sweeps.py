@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from toftrack.json_text import read_json
 from toftrack.programs.command_line import note_failed_job
+from toftrack.safe_files import let_links_go
 
 
 class FailedJobs(Callback):
@@ -21,13 +22,29 @@ class FailedJobs(Callback):
     def __init__(self) -> None:
         self._before: dict[Path, int] = {}
 
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        _let_links_go(Path(config.hydra.run.dir))
+
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        folder = Path(config.hydra.sweep.dir)
+        _let_links_go(folder)
+        for job in folder.iterdir() if folder.is_dir() else ():
+            let_links_go(job)
+            _let_links_go(job)
         self._before = {path: path.stat().st_mtime_ns for path in _summaries(config)}
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         for path in _summaries(config):
             if path.stat().st_mtime_ns != self._before.get(path) and _tells_an_error(path):
                 note_failed_job(path.parent)
+
+
+def _let_links_go(folder: Path) -> None:
+    """Hydra writes its files into an old folder through whatever stands there."""
+    if folder.is_dir():
+        let_links_go(folder / ".hydra")
+        for path in (*folder.glob("*.log"), *folder.glob("*.yaml"), *folder.glob(".hydra/*")):
+            let_links_go(path)
 
 
 def _summaries(config: DictConfig) -> list[Path]:

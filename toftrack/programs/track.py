@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,10 +32,13 @@ from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import endings
 from toftrack.programs.ahead import ready_tracker
 from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata, told_side
+from toftrack.recordings.recorder import Recorder
 from toftrack.tracking.conventions import in_all_conventions
 from toftrack.tracking.effort import Pace
 from toftrack.tracking.hands import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
+
+_log = logging.getLogger(__name__)
 
 
 def track(config: DictConfig, device: Device) -> float:
@@ -42,18 +47,29 @@ def track(config: DictConfig, device: Device) -> float:
     `device` is what `config.device` describes; it is opened and closed here. A request to end the
     program is obeyed between two frames; then everything is finished before it is passed on.
     """
-    with hydra.utils.instantiate(config.stream) as stream:
-        return _track(config, device, stream)
+    # Both tell at once what is wrong with them.
+    with _recorder(config, device) as recorder, hydra.utils.instantiate(config.stream) as stream:
+        return _track(config, device, stream, recorder)
 
 
-def _track(config: DictConfig, device: Device, stream: Stream) -> float:
+def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Recorder | None]:
+    """What keeps the frames; None where nothing is to be kept."""
+    # A configuration of one's own may do without.
+    if config.get("record") is None:
+        return nullcontext()
+    limit_gb = config.record_limit_gb
+    return Recorder(str(config.record), device, limit_gb, tell=_log.warning)
+
+
+def _track(config: DictConfig, device: Device, stream: Stream, recorder: Recorder | None) -> float:
     tracker = ready_tracker(config)
     tracker.time.pace = _pace(tracker.time.pace, device)
     reach_m = float(config.segmentation.get("max_distance_m", math.inf))
     make = hydra.utils.instantiate
     shapes = ShapeFiles(Path(HydraConfig.get().runtime.output_dir), tracker)
     watch = Watch(reach_m, len(tracker.states))
-    parts = _Parts(tracker, stream, make(config.smooth), watch, shapes, RealTime(device.fps))
+    realtime = RealTime(device.fps)
+    parts = _Parts(tracker, stream, make(config.smooth), watch, shapes, realtime, recorder)
     try:
         return _run(config, device, parts)
     finally:  # a live run that lost the hand ends by an interruption
@@ -96,6 +112,12 @@ def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
     if summary.get("frames"):
         endings.say(metrics_table(summary), sys.stdout)
         endings.say(_told_files(folder), sys.stdout)
+    if parts.recorder is not None and parts.recorder.words():
+        endings.say(f"  {parts.recorder.words()}", sys.stdout)
+    said = metadata["device"].get("doubts", ())  # by the device itself
+    for doubt in summary.get("doubts", ()):
+        if doubt not in said:
+            endings.say(f"note: {doubt}", sys.stderr)
     if ended is not None:
         raise ended
     if not summary.get("frames"):
@@ -115,6 +137,7 @@ class _Parts:
     shapes: ShapeFiles
     realtime: RealTime
     """As of the newest frame; of a recording nothing."""
+    recorder: Recorder | None
 
 
 def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) -> None:
@@ -126,10 +149,13 @@ def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) ->
     finally:
         with endings.not_now():
             results.realtime = parts.realtime if device.live else None
+            results.looked_m = parts.watch.looked_m()
             try:
                 parts.shapes.save(last=True)
             finally:
                 results.close()
+                if parts.recorder is not None:
+                    parts.recorder.close()
 
 
 def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> None:
@@ -140,6 +166,8 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
         for frame in device:
             began_s = time.perf_counter()
             with endings.not_now():
+                if parts.recorder is not None:  # first: whatever it may do to the tracker
+                    parts.recorder.put(frame, wait=not device.live)
                 for command in view.commands():
                     tracker.restart(None if command == "restart" else command)
                 depth = device.camera.rectify(frame.depth, frame.radial)

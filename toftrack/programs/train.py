@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import cv2
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -17,12 +16,14 @@ from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space, spaces_to_learn
+from toftrack.safe_files import write_whole
 from toftrack.views.figures.poses import (
     corners_figure,
     manifold_figure,
     poses_figure,
     traversals_figure,
 )
+from toftrack.views.pictures import write_picture
 
 _SILENT_S = 1.0
 """What is done sooner needs no progress shown."""
@@ -65,15 +66,11 @@ def train(config: DictConfig) -> float:
         "corners.png": corners_figure(space),
     }
     for name, picture in figures.items():
-        if not cv2.imwrite(str(folder / name), picture):
-            raise ToftrackError(
-                f"{folder / name} cannot be written; give another hydra.run.dir=DIR"
-            )
+        write_picture(folder / name, picture)
     asked = next(row for row in rows if row.dims == dims)
     error = (asked.reached or asked.training).degrees
-    (folder / "summary.json").write_text(
-        json.dumps(_summary(kind, dims, data, rows), indent=1) + "\n", encoding="utf-8"
-    )
+    summary = _summary(kind, dims, data, rows)
+    write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     print("\n".join(f"  {folder / name}" for name in (model.name, *figures, "summary.json")))
     print(f"use it: toftrack track pose_space={kind} pose_space.file={model}")
     return error

@@ -16,6 +16,8 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.compose import configuration_folder
 from toftrack.programs import command_line
+from toftrack.safe_files import write_whole
+from toftrack.views.pictures import write_picture
 
 
 @hydra.main(
@@ -29,7 +31,6 @@ def main(config: DictConfig) -> float:
 
 def train(config: DictConfig) -> float:
     """See main; everything goes into Hydra's output folder."""
-    import cv2
     import torch
 
     from toftrack.errors import ToftrackError
@@ -43,7 +44,7 @@ def train(config: DictConfig) -> float:
     if not (isinstance(config.shapes, int) and config.shapes > 0):
         raise ToftrackError("shapes must be a whole number above 0: how many hands are drawn from")
     began = time.perf_counter()
-    cv2.imwrite(str(folder / "images.png"), images_figure(config.seed))
+    write_picture(folder / "images.png", images_figure(config.seed))
     torch.set_num_threads(1)  # the other core makes the images
     finder_network, finder_course = train_finder(finder, config.shapes, config.seed)
     pose_network, pose_course = train_poses(poses, config.shapes, config.seed)
@@ -58,9 +59,9 @@ def train(config: DictConfig) -> float:
     }
     path = folder / config.output
     save_weights(path, pose_network, finder_network, about)
-    cv2.imwrite(str(folder / "course.png"), course_figure(pose_course))
+    write_picture(folder / "course.png", course_figure(pose_course))
     summary = about | {"poses": pose_course, "finder": finder_course}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     last = pose_course[-1]
     print(
         f"trained in {minutes} minutes; on the last training images: joints {last['votes_mm']:.1f}"

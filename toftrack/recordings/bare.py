@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,10 +20,11 @@ _BESIDE = "camera.json"
 class BareFacts:
     """None = not told.
 
-    Raises ToftrackError for a unit or a rate that is not positive.
+    Raises ToftrackError for a unit or a rate that is not positive, and for intrinsics that are not
+    four numbers, the first two of them positive.
     """
 
-    intrinsics: tuple[float, float, float, float] | None = None
+    intrinsics: Sequence[float] | None = None
     """fx, fy, cx, cy in pixels, without distortion."""
     unit_m: float | None = None
     """Metres of one step of whole numbers."""
@@ -32,6 +35,11 @@ class BareFacts:
             value = getattr(self, name)
             if value is not None and not 0 < value < 1e6:
                 raise ToftrackError(f"{name} must be a positive number, but is {value!r}")
+        if self.intrinsics is not None and not _four_numbers(self.intrinsics):
+            raise ToftrackError(
+                "intrinsics must be four numbers of pixels, fx, fy (above 0), cx, cy, as "
+                f"[504.6,504.7,332.8,348.8], but are {self.intrinsics}"
+            )
 
     def camera(self, width: int, height: int) -> Camera | None:
         """The camera of the intrinsics for images of that size; None when they are not told."""
@@ -39,6 +47,13 @@ class BareFacts:
             return None
         fx, fy, cx, cy = self.intrinsics
         return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), width, height)
+
+
+def _four_numbers(values: object) -> bool:
+    if isinstance(values, str) or not isinstance(values, Sequence) or len(values) != 4:
+        return False
+    numbers = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
+    return numbers and all(map(math.isfinite, values)) and min(values[0], values[1]) > 0
 
 
 NOTHING_TOLD = BareFacts()
@@ -61,6 +76,6 @@ def bare_camera(
         return Camera.load_for(beside, width, height, f"'{path}'")
     raise ToftrackError(
         f"'{path}' ({width}x{height} pixels) does not say what camera made it; give the lens with "
-        "toftrack convert --intrinsics FX FY CX CY, or a camera file with camera.file=FILE "
-        "(toftrack convert: --camera FILE)"
+        "device.intrinsics=[FX,FY,CX,CY] (toftrack convert: --intrinsics FX FY CX CY), or a camera "
+        "file with camera.file=FILE (toftrack convert: --camera FILE)"
     )

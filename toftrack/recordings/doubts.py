@@ -1,13 +1,24 @@
-"""What looks wrong in the arrays of a recording: frames counted last, and images of nothing."""
+"""What looks wrong in a recording: frames counted last, images of nothing, units, times, the lens.
+
+What cannot be used at all is an error where it is read; what is said here is a warning, as it may
+be right: the run goes on.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames import median_reading, nearest_reading
 from toftrack.recordings.streamed_images import Images, StreamedImages
+
+if TYPE_CHECKING:
+    from toftrack.recordings.store import FrameStore
 
 _PER_FRAME = (
     *("timestamp_s", "joints_m", "visible", "in_space"),
@@ -15,6 +26,22 @@ _PER_FRAME = (
 )
 _IN_THE_MIDDLE, _ASIDE = 0.12, 0.15
 """How far from the image's middle the centre of K lies, in shares of its sides."""
+_NO_CAMERA_M, _NO_SCENE_M, _NO_HAND_M = 0.1, 0.3, 4.0
+"""No camera sees what is nearer, no hand's background is so near, no hand is tracked so far."""
+_NEAREST_M = (0.15, 1.5)
+"""Between these lies what is nearest in an image of a hand."""
+_STEP_S, _FASTEST_S = (0.005, 5.0), 0.0005
+"""Between frames of a hand that is to be followed; of the fastest camera."""
+_TIME_UNITS = (
+    ("milliseconds", 1e3),
+    ("microseconds", 1e6),
+    ("nanoseconds", 1e9),
+    ("thousands of seconds", 1e-3),
+)
+"""Names of units and how many of them a second has, the likeliest first."""
+_KEPT, _LEFT_BY_RIGHT_ONE = 0.7, 0.85
+"""Share of the image that is left when a lens is undone: one that leaves less is doubted; one that
+may have been meant leaves more than the other."""
 
 
 def check_layout(shape: tuple[int, ...], arrays: dict[str, Any], key: str) -> None:
@@ -34,15 +61,121 @@ def check_layout(shape: tuple[int, ...], arrays: dict[str, Any], key: str) -> No
         )
 
 
-def doubts(depth: Images) -> str:
-    """What speaks against images that could be read, in a few words; "" for nothing."""
-    some = some_images(depth)
+def doubts(store: FrameStore, camera: Camera) -> tuple[str, ...]:
+    """What speaks against a recording that could be read; a sentence each.
+
+    camera: of the images, which may be another one than the recording's.
+    """
+    found = (_images_doubt(store), times_doubt(store.timestamp_s), lens_doubt(camera))
+    return tuple(filter(None, found))
+
+
+def _images_doubt(store: FrameStore) -> str:
+    depth = getattr(store, "depth", None)
+    some = _first_image(store) if depth is None else some_images(depth)
     readings = some[(some > 0) & (some < np.inf)]
     if not readings.size:
+        if depth is None:  # a camera's first image may be empty
+            return ""
         return "no pixel has a reading (0 = none); was the depth saved, and not another image?"
     if readings.size > 1 and readings.min() == readings.max():
         return f"every reading is {readings[0]:g} m, which no camera measures; was it saved whole?"
+    return _unit_doubt(some, getattr(store, "unit_m", None))
+
+
+def _first_image(store: FrameStore) -> np.ndarray:
+    try:
+        return store.image(0)[0]
+    except ToftrackError:  # told when its turn comes
+        return np.zeros((1, 1), np.float32)
+
+
+def _unit_doubt(depth_m: np.ndarray, unit_m: float | None) -> str:
+    """unit_m: metres of one step, where the images are whole numbers."""
+    nearest, median = nearest_reading(depth_m), median_reading(depth_m)
+    if nearest > _NO_HAND_M:
+        where = f"nearly all readings are farther than {nearest:.3g} m, where no hand is tracked"
+    elif nearest < _NO_CAMERA_M and median < _NO_SCENE_M:
+        where = f"readings are as near as {nearest:.2g} m, half of them within {median:.2g} m"
+    else:
+        return ""
+    for power in (1, -1, 2, -2, 3, -3):
+        if _NEAREST_M[0] <= nearest * 10.0**power <= _NEAREST_M[1]:
+            right = f"{10.0**power:g} times the distances would fit"
+            if unit_m is not None:
+                right += (
+                    f", {unit_m * 10.0**power:.3g} m a step instead of {unit_m:g} (device.unit_m, "
+                    "depth_unit_m in camera.json, or convert --source-unit)"
+                )
+            return f"{where}; {right}"
+    return f"{where}; is its unit right?"
+
+
+def times_doubt(timestamp_s: np.ndarray) -> str:
+    """What speaks against the times (T,) of frames; "" for nothing."""
+    steps = np.diff(timestamp_s)
+    if not steps.size:
+        return ""
+    remedy = "or leave them out and give the frame rate (fps)"
+    standing = int(np.count_nonzero(steps <= 0))
+    if standing == steps.size:
+        return f"all time stamps are {timestamp_s[0]:g}; give the seconds of each frame, {remedy}"
+    if standing > steps.size / 2:
+        return (
+            f"{standing} of {len(timestamp_s)} time stamps repeat the one before; give the seconds "
+            f"of each frame, {remedy}"
+        )
+    step = float(np.median(steps[steps > 0]))
+    if _FASTEST_S <= step < _STEP_S[1]:
+        return ""
+    for unit, in_a_second in _TIME_UNITS:
+        if _STEP_S[0] <= step / in_a_second < _STEP_S[1]:
+            what = f"the time stamps look like {unit}: their median step is {step:.6g}"
+            if in_a_second > 1:
+                return f"{what}; divide them by {in_a_second:.0f}, {remedy}"
+            return f"{what}; multiply them by {1 / in_a_second:.0f}, {remedy}"
     return ""
+
+
+def lens_doubt(camera: Camera) -> str:
+    """What speaks against a camera's lens; "" for nothing."""
+    kept = _left_by(camera)
+    if kept >= _KEPT:
+        return ""
+    text = (
+        f"of the image only {100 * kept:.0f} % is left when the lens's distortion "
+        f"{[float(f'{value:.4g}') for value in camera.distortion]} is undone"
+    )
+    for what, other in _other_lenses(camera):
+        if (share := _left_by(other)) >= _LEFT_BY_RIGHT_ONE:
+            return f"{text}; {what} would leave {100 * share:.0f} %"
+    return f"{text}; are the coefficients OpenCV's k1 k2 p1 p2 k3, and those of this image's size?"
+
+
+def _left_by(camera: Camera) -> float:
+    """The share of the undistorted image that shows something, 0 to 1: what comes from within the
+    measured image, and from where the lens's model does not fold it."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    from_u, from_v = (camera.undistort_amplitude(at + 1) for at in (u, v))
+    assert from_u is not None and from_v is not None
+    shown = from_u > 0
+    if min(shown.shape) > 1:
+        (u_down, u_right), (v_down, v_right) = np.gradient(from_u), np.gradient(from_v)
+        shown &= u_right * v_down >= u_down * v_right
+    return float(shown.mean())
+
+
+def _other_lenses(camera: Camera) -> Iterator[tuple[str, Camera]]:
+    """What may have been meant, and how it is said."""
+    given = camera.distortion
+    if camera.lens == "opencv" and len(given) == 5 and given[2:].any():
+        k1, k2, k3, p1, p2 = given
+        yield (
+            "k1 k2 p1 p2 k3, if they were given as k1 k2 k3 p1 p2,",
+            replace(camera, distortion=np.array([k1, k2, p1, p2, k3])),
+        )
+    yield "the opposite signs", replace(camera, distortion=-given)
+    yield "zeros", replace(camera, distortion=np.zeros(5), lens="opencv")
 
 
 def some_images(depth: Images) -> np.ndarray:

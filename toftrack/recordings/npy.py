@@ -16,6 +16,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames import LARGEST_MEDIAN_M
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera
 from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.safe_files import check_readable
 
 
 class NpyStack:
@@ -90,6 +91,7 @@ def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) 
 
 def _mapped(path: Path) -> np.ndarray:
     try:
+        check_readable(path)
         return np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
         raise ToftrackError(f"there is no file '{path}'; give the path of a recording") from None

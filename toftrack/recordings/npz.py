@@ -8,11 +8,14 @@
 | `fps` | scalar | no: from the time stamps, else 25 |
 | `timestamp_s` | (T,) float64 | no: from `fps` |
 | `distortion` | (4, 5, 8, 12 or 14,) float, OpenCV's k1 k2 p1 p2 k3 ... | no: zeros |
+| `lens` | text, `opencv` or `fisheye` | no: `opencv` |
+| `depth_polynomial`, `depth_polynomial_range_m` | (n,), (2,) float, see `Camera` | no: none |
 | `joints_m` | (T, 21, 3) float | no |
 | `visible`, `in_space` | (T,) bool | no: true |
 | `visible_fraction`, `joint_visible` | (T,) float, (T, 21) bool | no |
+| `pose_name` | (T,) text | no |
 | `joints2_m`, `visible2`, `in_space2`, ... | the same of the other hand | no |
-| `metadata` | text, a JSON object | no |
+| `metadata` | text, a JSON object | no; of the truth: `side`, `side2`, `still` |
 
 Unknown keys are ignored.
 """
@@ -20,9 +23,8 @@ Unknown keys are ignored.
 from __future__ import annotations
 
 import json
-import os
 import zipfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +42,15 @@ from toftrack.frames import (
 )
 from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
+from toftrack.recordings.npz_camera import CAMERA_KEYS, camera_arrays, camera_of
 from toftrack.recordings.streamed_images import Images, StreamedImages
+from toftrack.recordings.truth import TRUTH_KEYS, of_shape, read_truth, truth_arrays
+from toftrack.safe_files import open_to_read, whole_file
 
 DEFAULT_FPS = 25.0
 LOADED_BYTES = MOST_BYTES
 """Longer recordings are not loaded: their images are read in turn."""
 _IMAGES = ("depth_m", "radial_m", "amplitude")
-_JOINTS = 21
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +102,12 @@ def read_recording(path: str | Path) -> Recording:
 def write_recording(path: str | Path, recording: Recording) -> None:
     """Write a recording, compressed; an existing file is replaced only by a complete one.
 
-    Depth keeps its type (float16 or float32). A depth polynomial has no place in the format: save
-    the camera beside the recording. Raises ToftrackError when the file cannot be written.
+    Depth keeps its type (float16 or float32). Raises ToftrackError when the file cannot be written.
     """
     path = Path(path)
     arrays: dict[str, Any] = {
         "radial_m" if recording.radial else "depth_m": recording.depth,
-        "K": recording.camera.K,
-        "distortion": recording.camera.distortion,
+        **camera_arrays(recording.camera),
         "timestamp_s": np.asarray(recording.timestamp_s, np.float64),
         "fps": np.float64(recording.fps),
         "metadata": json.dumps(recording.metadata),
@@ -113,43 +115,24 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     if recording.amplitude is not None:
         arrays["amplitude"] = recording.amplitude
     if recording.truth is not None:
-        arrays |= _truth_arrays(recording.truth)
-    partial = path.with_name(path.name + ".part")
+        arrays |= truth_arrays(recording.truth)
     try:
-        with open(partial, "wb") as stream:
+        with whole_file(path) as stream:
             np.savez_compressed(stream, **arrays)
-        os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise ToftrackError(
             f"the recording '{path}' cannot be written ({error.strerror}); choose another place"
         ) from error
 
 
-def _truth_arrays(truth: Truth) -> dict[str, np.ndarray]:
-    arrays: dict[str, np.ndarray] = {}
-    for keys, hand in ((_TRUTH_KEYS, truth), (_OTHER_KEYS, truth.other)):
-        values = {key: getattr(hand, name, None) for name, key in keys.items()}
-        arrays |= {key: value for key, value in values.items() if value is not None}
-    return arrays
-
-
-_TRUTH_KEYS = {
-    name: name for name in ("joints_m", "visible", "in_space", "visible_fraction", "joint_visible")
-}
-"""What fields of Truth are called in a file."""
-_OTHER_KEYS = {name: f"{name}2" for name in _TRUTH_KEYS} | {"joints_m": "joints2_m"}
-"""Those of the other hand."""
 _KEYS = (
     "depth_m",
     "radial_m",
-    "K",
+    *CAMERA_KEYS,
     "amplitude",
     "fps",
     "timestamp_s",
-    "distortion",
-    *_TRUTH_KEYS.values(),
-    *_OTHER_KEYS.values(),
+    *TRUTH_KEYS,
     "metadata",
 )
 
@@ -159,7 +142,7 @@ def _read_members(path: Path) -> dict[str, Images]:
     if path.is_dir():
         raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.npz)")
     try:
-        with open(path, "rb") as stream:
+        with open_to_read(path) as stream:
             if not zipfile.is_zipfile(stream):
                 raise ToftrackError(
                     f"'{path}' is not an .npz archive, or it was cut off; give a recording as "
@@ -208,8 +191,9 @@ def _parse(arrays: dict[str, Any]) -> Recording:
     depth = _check_depth(arrays[depth_key], depth_key)
     check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
-    camera = Camera(arrays["K"], width, height, arrays.get("distortion", np.zeros(5)))
+    camera = camera_of(arrays, width, height)
     timestamp_s, fps = _times(arrays, count)
+    metadata = _metadata(arrays)
     return Recording(
         depth=depth,
         radial=depth_key == "radial_m",
@@ -217,8 +201,8 @@ def _parse(arrays: dict[str, Any]) -> Recording:
         timestamp_s=timestamp_s,
         fps=fps,
         amplitude=_amplitude(arrays, depth.shape),
-        truth=_truth(arrays, count),
-        metadata=_metadata(arrays),
+        truth=read_truth(arrays, count, metadata),
+        metadata=metadata,
     )
 
 
@@ -235,28 +219,16 @@ def _check_depth(depth: Images, key: str) -> Images:
         raise ToftrackError(f"'{key}' has zero frames; record at least one")
     if depth.size == 0:
         raise ToftrackError(f"the images of '{key}' are empty, shape {depth.shape}")
-    median = median_reading(some_images(depth))
+    some = some_images(depth)
+    median = median_reading(some)
     if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
-        raise wrong_unit(f"'{key}'", median, str(depth.dtype) if whole else "")
+        raise wrong_unit(f"'{key}'", some, str(depth.dtype) if whole else "")
     if isinstance(depth, StreamedImages) or depth.dtype.newbyteorder("=") in (
         np.float16,
         np.float32,
     ):
         return depth
     return depth.astype(np.float32)
-
-
-def _of_shape(arrays: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    """A numeric or boolean array of the given shape."""
-    array = arrays[key]
-    if array.dtype.kind not in "biuf":
-        raise ToftrackError(f"'{key}' must consist of numbers, but is {array.dtype}")
-    if array.shape != shape:
-        raise ToftrackError(
-            f"'{key}' must have the shape {shape} (the first is the number of frames), but has "
-            f"{array.shape}"
-        )
-    return array
 
 
 def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
@@ -270,7 +242,7 @@ def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
     if "timestamp_s" not in arrays:
         fps = DEFAULT_FPS if fps is None else fps
         return np.arange(count) / fps, fps
-    timestamp_s = _of_shape(arrays, "timestamp_s", (count,)).astype(np.float64)
+    timestamp_s = of_shape(arrays, "timestamp_s", (count,)).astype(np.float64)
     steps = np.diff(timestamp_s)
     if not np.isfinite(timestamp_s).all() or (steps < 0).any():
         raise ToftrackError("'timestamp_s' must be finite and must not go backwards")
@@ -282,7 +254,7 @@ def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
 def _amplitude(arrays: dict[str, Any], shape: tuple[int, ...]) -> Images | None:
     if "amplitude" not in arrays:
         return None
-    amplitude = _of_shape(arrays, "amplitude", shape)
+    amplitude = of_shape(arrays, "amplitude", shape)
     if amplitude.dtype.kind not in "iu":
         raise ToftrackError(f"'amplitude' must be uint16, but is {amplitude.dtype}")
     if amplitude.dtype == np.uint16:
@@ -292,37 +264,6 @@ def _amplitude(arrays: dict[str, Any], shape: tuple[int, ...]) -> Images | None:
             f"'amplitude' must be uint16 in a long recording, but is {amplitude.dtype}"
         )
     return np.clip(amplitude, 0, np.iinfo(np.uint16).max).astype(np.uint16)
-
-
-def _truth(arrays: dict[str, Any], count: int) -> Truth | None:
-    first = _truth_of_one(arrays, count, _TRUTH_KEYS)
-    return first and replace(first, other=_truth_of_one(arrays, count, _OTHER_KEYS))
-
-
-def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> Truth | None:
-    """Of one hand.  keys: what the fields are called."""
-    if keys["joints_m"] not in arrays:
-        return None
-    joints = _of_shape(arrays, keys["joints_m"], (count, _JOINTS, 3)).astype(np.float32)
-    if not np.isfinite(joints).all():
-        name = keys["joints_m"]
-        raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
-
-    def flags(name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-        key = keys[name]
-        return _of_shape(arrays, key, shape).astype(bool) if key in arrays else None
-
-    visible, in_space = flags("visible", (count,)), flags("in_space", (count,))
-    fraction = None
-    if keys["visible_fraction"] in arrays:
-        fraction = _of_shape(arrays, keys["visible_fraction"], (count,)).astype(np.float32)
-    return Truth(
-        joints_m=joints,
-        visible=np.ones(count, bool) if visible is None else visible,
-        in_space=np.ones(count, bool) if in_space is None else in_space,
-        visible_fraction=fraction,
-        joint_visible=flags("joint_visible", (count, _JOINTS)),
-    )
 
 
 def _metadata(arrays: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,9 @@ from typing import IO, Any
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.recordings.npz_camera import camera_arrays
 from toftrack.recordings.store import FrameStore
+from toftrack.safe_files import whole_file
 
 
 def write_npz_streamed(
@@ -32,18 +33,16 @@ def write_npz_streamed(
         ToftrackError: the file cannot be written, or the store not be read.
     """
     path = Path(path)
-    partial = path.with_name(path.name + ".part")
     camera = store.camera
     shape = (len(store), camera.height, camera.width)
     small: dict[str, Any] = {
-        "K": camera.K,
-        "distortion": camera.distortion,
+        **camera_arrays(camera),
         "timestamp_s": np.asarray(store.timestamp_s, np.float64),
         "fps": np.float64(store.fps),
         "metadata": json.dumps(store.metadata),
     }
     try:
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        with whole_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, value in small.items():
                 content = io.BytesIO()
                 np.lib.format.write_array(content, np.asanyarray(value), allow_pickle=False)
@@ -60,13 +59,10 @@ def write_npz_streamed(
                         amplitude = store.image(index)[1]
                         assert amplitude is not None  # all images have one, or none has
                         stream.write(amplitude.astype("<u2").tobytes())
-        os.replace(partial, path)
     except OSError as error:
         raise ToftrackError(
             f"the recording '{path}' cannot be written ({error.strerror}); choose another place"
         ) from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _member(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kind: str) -> IO[bytes]:

@@ -13,9 +13,11 @@ The optional further keys of `camera.json`: `depth_unit_m` (metres of one step, 
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -29,6 +31,7 @@ from toftrack.json_text import read_json
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.png import LARGEST_PIXELS, SIGNATURE, decoded_png
+from toftrack.safe_files import open_new, open_to_read, write_whole
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
 
@@ -74,7 +77,8 @@ class PngFolder:
 
     def _read(self, path: Path) -> np.ndarray:
         try:
-            content = path.read_bytes()
+            with open_to_read(path) as stream:
+                content = stream.read()
         except OSError as error:
             raise ToftrackError(
                 f"the image '{path}' cannot be read ({error.strerror}); check its permissions"
@@ -92,7 +96,7 @@ def read_png_folder(
     camera_file: str | Path | None = None,
     unit_m: float | None = None,
     fps: float | None = None,
-    intrinsics: tuple[float, float, float, float] | None = None,
+    intrinsics: Sequence[float] | None = None,
 ) -> PngFolder:
     """Open a folder of depth images: names, sizes and kinds are checked, pixels stay on the disk.
 
@@ -133,8 +137,9 @@ def read_png_folder(
         camera = Camera.from_dict(content, folder / _CAMERA)
     else:
         raise ToftrackError(
-            f"the folder '{folder}' has no {_CAMERA}; put the camera's file there, or give another "
-            "with camera.file=FILE (toftrack convert: --camera FILE, or --intrinsics FX FY CX CY)"
+            f"the folder '{folder}' has no {_CAMERA}; put the camera's file there (docs/formats.md "
+            "has an example), or give another with camera.file=FILE (toftrack convert: --camera "
+            "FILE), or the lens with device.intrinsics=[FX,FY,CX,CY] (--intrinsics FX FY CX CY)"
         )
     for path in (*depth, *amplitude):
         size = _png_size(path)
@@ -180,8 +185,10 @@ class PngFolderWriter:
                     f"the folder '{self.folder}' contains PNG images already; choose an empty one"
                 )
             text = json.dumps(camera.to_dict() | facts, indent=1) + "\n"
-            (self.folder / _CAMERA).write_text(text, encoding="utf-8")
-            self._times = open(self.folder / _TIMES, "w", encoding="utf-8")
+            write_whole(self.folder / _CAMERA, text)
+            self._times = io.TextIOWrapper(
+                open_new(self.folder / _TIMES, replace=True), encoding="utf-8"
+            )
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -214,7 +221,8 @@ class PngFolderWriter:
         self.close()
 
     def _save(self, name: str, image: np.ndarray) -> None:
-        (self.folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        with open_new(self.folder / name) as stream:
+            stream.write(cv2.imencode(".png", image)[1].tobytes())
 
     def _unwritable(self, error: OSError) -> ToftrackError:
         return ToftrackError(
@@ -268,7 +276,9 @@ def _timestamps(path: Path, count: int) -> np.ndarray | None:
     if not path.exists():
         return None
     try:
-        times = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
+        with open_to_read(path) as stream:
+            text = stream.read().decode("utf-8")
+        times = np.array([float(word) for word in text.split()])
     except OSError as error:
         raise ToftrackError(f"'{path}' cannot be read ({error.strerror})") from error
     except ValueError:
@@ -284,7 +294,7 @@ def _timestamps(path: Path, count: int) -> np.ndarray | None:
 def _png_size(path: Path) -> tuple[int, int]:
     """Columns and rows of a 16-bit grey PNG, from its header."""
     try:
-        with open(path, "rb") as stream:
+        with open_to_read(path) as stream:
             start = stream.read(26)
     except OSError as error:
         raise ToftrackError(f"the image '{path}' cannot be read ({error.strerror})") from error

@@ -25,6 +25,7 @@ from toftrack.recordings.bare import MILLIMETRE, BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.ros_camera import CAMERA_INFO, camera_of
 from toftrack.recordings.ros_images import COMPRESSED, IMAGE, depth_image, encoding, is_depth
+from toftrack.safe_files import check_readable
 
 _REPAIR = {
     ".bag": "rosbag reindex FILE repairs a bag that was cut off",
@@ -118,6 +119,12 @@ def read_rosbag(
     if not path.exists():
         raise ToftrackError(f"there is no bag '{path}'; give the path of a recording")
     unit_m = BareFacts(unit_m=unit_m).unit_m or MILLIMETRE
+    try:
+        check_readable(path)
+    except OSError as error:
+        raise ToftrackError(
+            f"the bag '{path}' cannot be read ({error.strerror}); give the path of a recording"
+        ) from error
     bag = _Bag(path)
     try:
         chosen = _choose(bag, topic)

@@ -35,6 +35,7 @@ from toftrack.recordings.sr_frame import (
     unambiguous_range_m,
 )
 from toftrack.recordings.srs_facts import SrsFacts, SrsInit, facts_text, parse_facts
+from toftrack.safe_files import open_new, open_to_read
 
 _SIGNATURE, _VERSION = 0x4F497273, 1
 _INIT, _CONFIGURE, _FRAME = 1, 2, 3
@@ -76,7 +77,7 @@ class SrsWriter:
         """Whole frames written."""
         init, facts = init or SrsInit(), facts or SrsFacts()
         try:
-            self._stream = open(self.path, "wb" if overwrite else "xb", buffering=0)
+            self._stream = open_new(self.path, replace=overwrite, buffered=False)
         except FileExistsError:
             raise ToftrackError(
                 f"the file '{self.path}' exists already; choose another name or give --overwrite"
@@ -98,6 +99,11 @@ class SrsWriter:
         except BaseException:
             self._stream.close()
             raise
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the file."""
+        return self._end
 
     def configure(self, registers: bytes) -> None:
         """The 64 registers under which the frames that follow are taken."""
@@ -183,7 +189,7 @@ class SrsRecording:
         """A frame as the camera sent it, FRAME_BYTES bytes. Raises ToftrackError if unreadable."""
         try:
             if self._stream is None:
-                self._stream = open(self.path, "rb")
+                self._stream = open_to_read(self.path)
             self._stream.seek(int(self._offsets[index]))
             data = self._stream.read(FRAME_BYTES)
         except OSError as error:
@@ -222,7 +228,7 @@ def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> 
         raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.srs)")
     default_range_m = unambiguous_range_m(modulation_mhz)
     try:
-        with open(path, "rb") as stream:
+        with open_to_read(path) as stream:
             scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
     except FileNotFoundError:
         raise ToftrackError(

@@ -9,6 +9,7 @@ import numpy as np
 
 from toftrack.archives import Archive, Header
 from toftrack.errors import ToftrackError
+from toftrack.safe_files import open_to_read
 
 
 class StreamedImages:
@@ -58,7 +59,7 @@ class StreamedImages:
         shape = self.shape[1:]
         size = int(np.prod(shape)) * self.dtype.itemsize
         try:
-            with open(self._path, "rb") as file, Archive(file).rows(self._name) as stream:
+            with open_to_read(self._path) as file, Archive(file).rows(self._name) as stream:
                 for _ in range(len(self)):
                     content = stream.read(size)
                     if len(content) < size:

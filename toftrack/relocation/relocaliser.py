@@ -47,6 +47,7 @@ class RelocationSettings:
     votes: float
     landmark_m: float
     landmark_sigmas: float
+    landmark_weight: float
 
     def __post_init__(self) -> None:
         for name in ("places", "hypotheses"):
@@ -58,7 +59,7 @@ class RelocationSettings:
         check_number("relocation.rival_frames", self.rival_frames, 1, whole=True)
         check_number("relocation.least", self.least, 0, 1)
         check_number("relocation.merit", self.merit)
-        for name in ("prior", "rival_gain", "votes"):
+        for name in ("prior", "rival_gain", "votes", "landmark_weight"):
             check_number(f"relocation.{name}", getattr(self, name), 0)
         for name in ("rival_m", "landmark_m", "landmark_sigmas"):
             check_number(f"relocation.{name}", getattr(self, name), 0, above=True)

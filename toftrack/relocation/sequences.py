@@ -22,6 +22,7 @@ from toftrack.relocation.images import random_scenes
 from toftrack.relocation.pictures import Lens, random_sensors, take_pictures
 from toftrack.relocation.scenes import HAND, Dice, posed_hands, random_rotations
 from toftrack.relocation.shapes import ShapeBank
+from toftrack.safe_files import whole_file
 
 CAMERAS = ((176, 144, 200.0), (176, 144, 200.0), (320, 240, 280.0), (512, 424, 365.0))
 """Columns, rows and focal length in pixels."""
@@ -95,14 +96,15 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
 
 def write_sequence(path: Path, sequence: Sequence) -> None:
     """Keep a sequence as an npz file."""
-    np.savez_compressed(
-        path,
-        depth=sequence.depth_m,
-        k=sequence.k,
-        joints=sequence.joints_m,
-        visible=sequence.visible,
-        side=sequence.side,
-    )
+    with whole_file(path) as stream:
+        np.savez_compressed(
+            stream,
+            depth=sequence.depth_m,
+            k=sequence.k,
+            joints=sequence.joints_m,
+            visible=sequence.visible,
+            side=sequence.side,
+        )
 
 
 def read_sequence(path: Path) -> Sequence:

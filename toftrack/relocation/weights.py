@@ -16,6 +16,7 @@ from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
 from toftrack.relocation.network import Finder, PoseNet, Residual
+from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-relocaliser"
 VERSION = 1
@@ -44,7 +45,8 @@ def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any
         "about": about,
     }
     content: dict[str, Any] = {"metadata": np.array(json.dumps(metadata)), **arrays}
-    np.savez_compressed(path, **content)
+    with whole_file(path) as stream:
+        np.savez_compressed(stream, **content)
 
 
 def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[str, Any]]:

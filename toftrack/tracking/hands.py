@@ -185,6 +185,7 @@ class HandsTracker:
         took_s = self.time.took_s()
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
 
+    @small_operations()
     def prepare(self) -> None:
         """Load and compile now what the first frame would have to wait for; changes nothing."""
         stepped(self.states[0], _rendered_hand(), self.model)

@@ -213,9 +213,11 @@ class TrackerModel(FilterModel):
         return not self.adapt.fixed
 
     def fitted(self, side: str, belief: ShapeBelief) -> HandShape:
-        """See FilterModel."""
+        """See FilterModel; None is said of the fit before anything was fitted."""
         shape = super().fitted(side, belief)
-        return replace(shape, fitted=belief.summary(self.adapt)) if self.fits else shape
+        if not (self.fits and belief.poses):
+            return shape
+        return replace(shape, fitted=belief.summary(self.adapt))
 
     @cached_property
     def poses(self) -> Tensor:

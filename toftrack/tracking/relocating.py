@@ -31,6 +31,8 @@ _UNLIKELY = 0.03
 _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
 """How many hypotheses are bent to the votes, in how many steps; how sure the votes are at best, and
 how far an angle may go."""
+_NO_WEIGHT = 1e-6
+"""Instead of 0, so that deviations stay numbers: kilometres."""
 _AS_WELL = 1.3
 """Hands are seen about as well when their expected errors differ by less than this factor."""
 _IN_OTHER = 4.0
@@ -168,7 +170,7 @@ def landmarks_of(glance: Glance, model: TrackerModel) -> Landmarks:
     """The network's joints as the refinement takes them."""
     cfg, found = model.relocaliser.settings, glance.landmarks
     sigma = (cfg.landmark_sigmas * found.sigma_m).clamp(min=cfg.landmark_m)
-    return Landmarks(found.points_m, sigma)
+    return Landmarks(found.points_m, sigma / max(cfg.landmark_weight, _NO_WEIGHT))
 
 
 def hypotheses(glance: Glance, hand: SizedHand, count: int) -> tuple[Tensor, Tensor]:
@@ -193,7 +195,9 @@ def candidates(glance: Glance, frame: LookedFrame, count: int) -> Tensor:
     nothing = SeenPoints(
         states.new_zeros(0, 3), states.new_zeros(0, 0, 2), frame.observation.k, (0, 0)
     )
-    votes = Landmarks(glance.landmarks.points_m, glance.landmarks.sigma_m.clamp(min=_BENT_M))
+    weight = max(model.relocaliser.settings.landmark_weight, _NO_WEIGHT)
+    sigma = glance.landmarks.sigma_m.clamp(min=_BENT_M) / weight
+    votes = Landmarks(glance.landmarks.points_m, sigma)
     freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
     return torch.cat((frame.hand.refiner(bent, bent[:, 6:], nothing, freely, votes), states))
 

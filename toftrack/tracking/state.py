@@ -13,6 +13,7 @@ from torch import Tensor
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import GestureState
+from toftrack.relocation.relocaliser import Glance
 from toftrack.render.segmentation import Expected, Observation
 from toftrack.tracking.prior import LastSeen
 from toftrack.tracking.shape_fit import ShapeBelief
@@ -124,6 +125,7 @@ class StepInfo:
     weights: (N,) normalised. Both are on the model's device.
     seconds: wall seconds of each stage.
     signs, joint_signs: what the beliefs were formed from; None where there are no networks.
+    glance: what the networks saw; None where they did not look.
     """
 
     observation: Observation
@@ -132,6 +134,7 @@ class StepInfo:
     seconds: Mapping[str, float]
     signs: Signs | None = None
     joint_signs: np.ndarray | None = None
+    glance: Glance | None = None
 
 
 def resumed(generator: Tensor) -> torch.Generator:

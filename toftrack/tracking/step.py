@@ -109,7 +109,9 @@ def step(
         seen=remembered(state.seen, track, belief, model.lost.probation),
         size=size,
     )
-    info = StepInfo(frame.observation, particles, weights, spans.seconds(), signs, seen_signs)
+    info = StepInfo(
+        frame.observation, particles, weights, spans.seconds(), signs, seen_signs, frame.glance
+    )
     return after, info, estimate
 
 

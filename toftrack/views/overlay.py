@@ -23,9 +23,9 @@ from toftrack.estimate import (
     is_vacant,
     state_words,
 )
-from toftrack.output.files import write_whole
 from toftrack.render.model_image import model_range_image
 from toftrack.views.base import TrackedFrame
+from toftrack.views.pictures import write_picture
 from toftrack.views.skeleton import SLOT_RGB, draw_hands, side_words
 from toftrack.views.video import VideoFile, unwritable, video_library
 
@@ -173,13 +173,10 @@ class VideoView:
             self.close()
 
     def _write_strip(self) -> None:
-        done, picture = cv2.imencode(".png", filmstrip(self._tiles))
-        if not done:
-            raise unwritable(self.strip_path)
         try:
-            write_whole(self.strip_path, lambda stream: stream.write(picture.tobytes()))
+            write_picture(self.strip_path, filmstrip(self._tiles))
         except OSError as error:
-            raise unwritable(self.strip_path) from error
+            raise unwritable(self.strip_path, error) from error
 
     def _keep(self, panel: np.ndarray) -> None:
         """Keep a tile; when they become too many, every other one goes and the stride doubles."""

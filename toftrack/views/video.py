@@ -7,16 +7,18 @@ not play their MPEG-4, and their VP8 takes 38 ms a frame where this takes 3.
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.safe_files import open_in_place, open_new
 
 _OPTIONS = {"preset": "ultrafast", "tune": "zerolatency", "crf": "23"}
 """3 ms and 10 kB for 1056 x 468 pixels; no frame is held back."""
@@ -41,12 +43,17 @@ class VideoFile:
         # Two decimals, so that the clock's steps are whole numbers of modest size.
         rate = min(max(round(float(fps), 2), 1.0), 120.0) if math.isfinite(fps) else 25.0
         try:
-            self._file: Any = av.open(str(path), "w", format="mp4", options=_FRAGMENTS)
+            self._disk = open_new(path, replace=True)
+        except OSError as error:
+            raise unwritable(path, error) from error
+        try:
+            self._file: Any = av.open(self._disk, "w", format="mp4", options=_FRAGMENTS)
             self._stream: Any = self._file.add_stream(
                 "libx264", rate=Fraction(rate).limit_denominator(100), options=_OPTIONS
             )
         except (OSError, ValueError) as error:
-            raise unwritable(path) from error
+            self._disk.close()
+            raise unwritable(path, error) from error
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.gop_size = max(1, round(rate))
@@ -64,43 +71,58 @@ class VideoFile:
         finally:
             try:
                 self._file.close()
+                self._disk.flush()
             except OSError as error:
-                raise unwritable(self._path) from error
+                raise unwritable(self._path, error) from error
             finally:
                 # Not every failure to write is told by the library.
                 with suppress(OSError):
-                    cut_to_whole(self._path)
+                    _cut(self._disk)
+                with suppress(OSError):  # what could not be written waits still
+                    self._disk.close()
 
     def _write(self, frame: Any) -> None:
         try:
             self._file.mux(self._stream.encode(frame))
+            self._disk.flush()
         except OSError as error:
-            raise unwritable(self._path) from error
+            raise unwritable(self._path, error) from error
 
 
 def cut_to_whole(path: Path) -> None:
     """Take from a video's end the second that was not written as a whole, where there is one.
 
-    Players stop there with an error. Raises OSError.
+    Players stop there with an error. What is no video of ours stays as it is. Raises OSError.
     """
-    with open(path, "r+b") as file:
-        size, whole = os.fstat(file.fileno()).st_size, 0
-        position = 0
-        while len(header := file.read(8)) == 8:  # an MP4 is a row of boxes: length, then kind
-            length, kind = int.from_bytes(header[:4], "big"), header[4:]
-            if length < 8 or position + length > size:
-                break
-            position += length
-            if kind != b"moof":  # it describes the box of pictures that follows
-                whole = position
-            file.seek(position)
+    with open_in_place(path, make=False) as file:
+        _cut(file)
+
+
+def _cut(file: BinaryIO | io.FileIO) -> None:
+    size, position = os.fstat(file.fileno()).st_size, 0
+    kinds: list[bytes] = []
+    whole = 0
+    file.seek(0)
+    while len(header := file.read(8)) == 8:  # an MP4 is a row of boxes: length, then kind
+        length, kind = int.from_bytes(header[:4], "big"), header[4:]
+        if length < 8 or position + length > size:
+            break
+        position += length
+        kinds.append(kind)
+        if kind != b"moof":  # it describes the box of pictures that follows
+            whole = position
+        file.seek(position)
+    # Others begin otherwise, and have boxes whose length stands elsewhere.
+    if kinds[:2] == [b"ftyp", b"moov"] and whole < size:
         file.truncate(whole)
 
 
-def unwritable(path: Path) -> ToftrackError:
+def unwritable(path: Path, error: Exception | None = None) -> ToftrackError:
     """What is said about a file of a view."""
+    reason = getattr(error, "strerror", None)
+    why = f" ({reason})" if reason else ""
     return ToftrackError(
-        f"'{path}' cannot be written; check the folder and the free space, or choose view=none"
+        f"'{path}' cannot be written{why}; check the folder and the free space, or choose view=none"
     )
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-import struct
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.animation import Gltf, read_bvh
 from helpers.hands import hand_estimate, lost_hand
 from scipy.spatial.transform import Rotation
 
@@ -42,52 +41,6 @@ def moving(side: str = "right", lost: tuple[int, ...] = ()) -> list[Estimate]:
 
 def shape_of(side: str):
     return default_hand_shape(side=side)
-
-
-class Gltf:
-    """A .glb, read by the rules of the format."""
-
-    def __init__(self, data: bytes) -> None:
-        magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
-        assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
-        self.document = json.loads(data[20 : 20 + size])
-        self._binary = data[28 + size :]
-        assert data[24 + size : 28 + size] == b"BIN\0"
-
-    def array(self, number: int) -> np.ndarray:
-        accessor = self.document["accessors"][number]
-        view = self.document["bufferViews"][accessor["bufferView"]]
-        kinds = {5121: np.uint8, 5125: np.uint32, 5126: np.float32}
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
-        start = view.get("byteOffset", 0)
-        data = self._binary[start : start + view["byteLength"]]
-        return np.frombuffer(data, kinds[accessor["componentType"]]).reshape(-1, width)
-
-    def channels(self) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, str]]:
-        """Times, values and interpolation of each animated property of a node."""
-        (animation,) = self.document["animations"]
-        found = {}
-        for channel in animation["channels"]:
-            sampler = animation["samplers"][channel["sampler"]]
-            node = self.document["nodes"][channel["target"]["node"]]["name"]
-            time, values = self.array(sampler["input"])[:, 0], self.array(sampler["output"])
-            found[node, channel["target"]["path"]] = time, values, sampler["interpolation"]
-        return found
-
-    def world(self, frame: int) -> dict[str, np.ndarray]:
-        """(4, 4) of every animated joint in a frame."""
-        nodes, channels = self.document["nodes"], self.channels()
-        parents = {child: i for i, node in enumerate(nodes) for child in node.get("children", ())}
-
-        def matrix(number: int) -> np.ndarray:
-            name, own = nodes[number]["name"], np.eye(4)
-            if (name, "rotation") in channels:
-                turn = channels[name, "rotation"][1][frame]
-                own[:3, :3] = Rotation.from_quat(turn).as_matrix()
-                own[:3, 3] = channels[name, "translation"][1][frame]
-            return matrix(parents[number]) @ own if number in parents else own
-
-        return {node["name"]: matrix(number) for number, node in enumerate(nodes)}
 
 
 def exported(estimates: list[Estimate], side: str) -> Gltf:
@@ -179,6 +132,16 @@ def test_each_of_several_hands_has_a_skeleton_of_its_own() -> None:
     ]
 
 
+def test_until_its_side_is_found_out_a_hand_is_turned_as_it_was_then() -> None:
+    estimates = [*moving("left")[:2], *moving("right")[2:]]
+    gltf = exported(estimates, "right")
+    for frame in (0, 5):
+        world = gltf.world(frame)
+        for joint, name in enumerate(OPENXR_JOINT_NAMES):
+            turned = Rotation.from_quat(estimates[frame].openxr_orientation[joint]).as_matrix()
+            assert np.allclose(world[f"{name.title()}_R"][:3, :3], turned, atol=1e-5), (frame, name)
+
+
 def test_a_run_without_a_hand_is_told() -> None:
     with pytest.raises(ToftrackError, match="nothing to export"):
         motions_of(results_of([lost_hand(0), lost_hand(1)]), (shape_of("right"),))
@@ -188,38 +151,6 @@ def test_frames_whose_times_stand_still_are_laid_out_evenly() -> None:
     estimates = [replace(hand, timestamp_s=hand.index % 4 / 25) for hand in moving()]
     (motion,) = motions_of(results_of(estimates), (shape_of("right"),))
     assert np.allclose(motion.time_s, np.arange(8) / 25)
-
-
-def read_bvh(text: str) -> tuple[list[str], np.ndarray]:
-    """Names of the joints as they begin, and places (T, joints, 3) of all as they end, in cm."""
-    hierarchy, _, motion = text.partition("MOTION\n")
-    frames = np.array([line.split() for line in motion.splitlines()[2:]], float)
-    names: list[str] = []
-    places, column, stack = [], 0, []
-    for line in hierarchy.splitlines()[1:]:
-        match line.split():
-            case ["ROOT" | "JOINT", name]:
-                names.append(name)
-            case ["End", "Site"]:
-                names.append(f"end of {names[-1]}")
-            case ["OFFSET", *offset]:
-                origin, turn = stack[-1] if stack else (np.zeros((len(frames), 3)), None)
-                shift = np.array(offset, float)
-                here = origin + (shift if turn is None else turn.apply(shift))
-                stack.append((here, turn))
-            case ["CHANNELS", count, *kinds]:
-                here, turn = stack[-1]
-                values = frames[:, column : column + int(count)]
-                column += int(count)
-                order = "".join(kind[0] for kind in kinds if kind.endswith("rotation"))
-                if int(count) == 6:
-                    here = here + values[:, :3]
-                own = Rotation.from_euler(order, values[:, -3:], degrees=True)
-                stack[-1] = here, own if turn is None else turn * own
-            case ["}"]:
-                places.append(stack.pop()[0])
-    assert column == frames.shape[1] and not stack
-    return names, np.stack(places, 1)
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

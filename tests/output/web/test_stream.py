@@ -21,7 +21,7 @@ from helpers.settings import part
 
 from toftrack.errors import ToftrackError
 from toftrack.output.lines import json_line
-from toftrack.output.web.stream import WebSocketStream
+from toftrack.output.web.stream import MOST_HALF_OPEN, WebSocketStream
 
 pytest.importorskip("websockets", reason="pip install '.[web]'")
 client = pytest.importorskip("websockets.sync.client", reason="pip install '.[web]'")
@@ -94,6 +94,84 @@ def test_what_a_client_sends_is_not_looked_at(stream: WebSocketStream) -> None:
         one.send("restart")
         stream.send((hand_estimate(1),))
         assert json.loads(one.recv(PATIENCE_S))["index"] == 1
+
+
+def test_a_client_that_sends_again_and_again_is_answered_and_stays(
+    stream: WebSocketStream,
+) -> None:
+    """More than any queue holds; who were not read would not be answered a ping either."""
+    with listening(stream) as one:
+        for number in range(3000):
+            one.send(f"message {number}" if number % 2 else b"bytes")
+        assert one.ping().wait(PATIENCE_S)
+        stream.send((hand_estimate(1),))
+        assert json.loads(one.recv(PATIENCE_S))["index"] == 1
+
+
+def half_open(stream: WebSocketStream, count: int, words: bytes = b"") -> list[socket.socket]:
+    """Connections that never finish their request."""
+    url = urlsplit(stream.url)
+    opened = []
+    for number in range(count):
+        if number % 20 == 0:  # what the system has no room for yet would wait for a second
+            time.sleep(0.02)
+        opened.append(socket.create_connection((url.hostname, url.port), PATIENCE_S))
+        opened[-1].sendall(words)
+    return opened
+
+
+def ended(one: socket.socket) -> bool:
+    """Whether the other side has closed a connection."""
+    one.setblocking(False)
+    try:
+        return one.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionResetError:
+        return True
+
+
+@pytest.mark.parametrize("words", [b"", b"GET /stream HTTP/1.1\r\nHost: 127"])
+def test_connections_that_ask_nothing_are_few_and_keep_nobody_out(
+    stream: WebSocketStream, words: bytes
+) -> None:
+    with ExitStack() as stack, listening(stream) as before:
+        opened = [stack.enter_context(one) for one in half_open(stream, 200, words)]
+        eventually(lambda: sum(map(ended, opened)) >= 200 - MOST_HALF_OPEN)
+        with listening(stream) as after:
+            stream.send((hand_estimate(1),))
+            for one in (before, after):
+                assert json.loads(one.recv(PATIENCE_S))["index"] == 1
+            assert answer(stream, "/")[0] == 200
+        assert len(stream._open) <= MOST_HALF_OPEN + 2
+        eventually(lambda: all(map(ended, opened)))  # they have seconds to ask
+        eventually(lambda: len(stream._open) == 1)
+
+
+def test_connections_that_ask_nothing_do_not_hold_up_the_end() -> None:
+    with ExitStack() as stack:
+        with websocket_stream() as stream:
+            opened = [stack.enter_context(one) for one in half_open(stream, 5)]
+            eventually(lambda: len(stream._open) == 5)
+        assert not any(t.name == "websocket-server" for t in threading.enumerate())
+        eventually(lambda: all(map(ended, opened)))
+
+
+def test_trouble_of_the_server_is_told_once_in_a_while(
+    stream: WebSocketStream, caplog: pytest.LogCaptureFixture
+) -> None:
+    for _ in range(500):
+        stream._loop.call_soon_threadsafe(
+            stream._loop.call_exception_handler,
+            {"message": "no more descriptors", "exception": OSError(24, "Too many open files")},
+        )
+    eventually(lambda: stream._run(_nothing()) is None)
+    told = [record for record in caplog.records if "no more descriptors" in record.getMessage()]
+    assert len(told) == 1 and told[0].exc_info is None
+    assert "Too many open files" in told[0].getMessage()
+
+
+async def _nothing() -> None: ...
 
 
 def test_a_client_that_never_reads_stops_nothing_and_its_oldest_lines_go(

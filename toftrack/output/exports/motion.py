@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,25 +22,29 @@ _WRIST = OPENXR_JOINT_NAMES.index("wrist")
 class HandMotion:
     """One hand over T frames: the 26 joints of OpenXR, each relative to the one it hangs on.
 
+    slot: of the run.
     time_s: (T,) from 0 on, increasing.
     tracked: (T,) bool; where it is false, the pose is held from the frame before, or from the first
         tracked one.
     offset_m: (T, 26, 3) in the axes of the joint that each hangs on; of the wrist in the world.
     turn: (T, 26, 4) unit quaternions x y z w likewise, without jumps of sign.
     rest_offset_m: (26, 3) of the straight hand at the origin.
-    shape: of that side.
+    shape: of the side that the hand had in most of its frames.
+    suffix: of its joints' names, where another hand has the same side.
     """
 
+    slot: int
     time_s: np.ndarray
     tracked: np.ndarray
     offset_m: np.ndarray
     turn: np.ndarray
     rest_offset_m: np.ndarray
     shape: HandShape
+    suffix: str = ""
 
     def name(self, joint: str) -> str:
         """As the specification of OpenXR advises: "Index_Metacarpal_R"."""
-        return f"{joint.title()}_{self.shape.side[0].upper()}"
+        return f"{joint.title()}_{self.shape.side[0].upper()}{self.suffix}"
 
 
 def motions_of(results: Mapping[str, Any], shapes: Sequence[HandShape]) -> list[HandMotion]:
@@ -49,18 +53,25 @@ def motions_of(results: Mapping[str, Any], shapes: Sequence[HandShape]) -> list[
     results: of a track.npz; arrays of several hands have a second axis.
     shapes: the run's hands, one a slot.
 
-    Raises ToftrackError when there is none.
+    In a frame that was dropped a hand stays as the row has it, which is as it was before.
+
+    Raises ToftrackError when no slot had a hand that was tracked.
     """
     names = [name for name in ("lost", "joints_m", "state", "side") if name in results]
     arrays = {name: np.asarray(results[name]) for name in names}
     if arrays["lost"].ndim == 1:
-        hands = [arrays]
-    else:
-        slots = range(arrays["lost"].shape[1])
-        hands = [{name: array[:, slot] for name, array in arrays.items()} for slot in slots]
+        arrays = {name: array[:, None] for name, array in arrays.items()}
     time_s = _times(np.asarray(results["timestamp_s"], np.float64))
-    motions = (_motion(*one, time_s) for one in zip(hands, shapes, strict=True))
-    found = [motion for motion in motions if motion is not None]
+    found: list[HandMotion] = []
+    for slot in range(arrays["lost"].shape[1]):
+        hand = {name: array[:, slot] for name, array in arrays.items()}
+        motion = _motion(slot, hand, shapes[slot], time_s)
+        if motion is None:
+            continue
+        # What animates a hand finds its joints by their names.
+        if any(motion.shape.side == other.shape.side for other in found):
+            motion = replace(motion, suffix=f"_{slot + 1}")
+        found.append(motion)
     if not found:
         raise ToftrackError(
             "no frame of this run has a hand that is not lost, so there is nothing to export"
@@ -92,20 +103,30 @@ def rest_joints(shape: HandShape) -> tuple[np.ndarray, np.ndarray]:
     return hand.position_m, hand.orientation
 
 
-def _motion(hand: dict[str, np.ndarray], shape: HandShape, time_s: np.ndarray) -> HandMotion | None:
+def _motion(
+    slot: int, hand: dict[str, np.ndarray], shape: HandShape, time_s: np.ndarray
+) -> HandMotion | None:
+    """The motion of a slot's hand, None where it never had one."""
     finite = np.isfinite(hand["joints_m"]).all((1, 2)) & np.isfinite(hand["state"]).all(1)
     tracked = ~hand["lost"].astype(bool) & finite
     if not tracked.any():
         return None
-    sides = list(hand["side"][tracked]) if "side" in hand else []
-    shape = shape.of_side(max(SIDES, key=sides.count) if any(sides) else shape.side)
+    side = np.asarray(hand.get("side", np.full(len(tracked), shape.side)))
+    told = list(side[tracked])
+    shape = shape.of_side(max(SIDES, key=told.count) if any(told) else shape.side)
     held = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked)), -1))
     held = np.where(held < 0, tracked.argmax(), held)
     there = openxr_hand(hand["joints_m"], hand["state"], openxr_rig(shape))
+    # Until it was found out whose hand it is, or where a slot took another one.
+    (opposite,) = set(SIDES) - {shape.side}
+    other = side == opposite
+    mirrored = openxr_rig(shape.of_side(opposite))
+    as_other = openxr_hand(hand["joints_m"][other], hand["state"][other], mirrored)
+    there.position_m[other], there.orientation[other] = as_other.position_m, as_other.orientation
     offset, turn = relative(there.position_m[held], there.orientation[held])
     position, turned = rest_joints(shape)
     rest_offset, _ = relative(position[None], turned[None])
-    return HandMotion(time_s, tracked, offset, _smooth_signs(turn), rest_offset[0], shape)
+    return HandMotion(slot, time_s, tracked, offset, _smooth_signs(turn), rest_offset[0], shape)
 
 
 def _smooth_signs(turn: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 _PLAIN = (
-    *("state_name", "lost", "confidence", "side", "side_probability", "score", "outside_rad"),
-    *("gesture", "gesture_probability", "pinch", "pinching"),
+    *("state_name", "lost", "dropped", "confidence", "side", "side_probability", "score"),
+    *("outside_rad", "gesture", "gesture_probability", "pinch", "pinching"),
 )
 _POINTS = ("pointing_origin_m", "pointing_direction")
 
@@ -44,7 +44,8 @@ def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
             here = (row, slot) if several else (row,)
             seconds = f"{results['timestamp_s'][row]:.6f}"
             cells = [number, seconds, *([slot] if several else [])]
-            cells += [results[name][here] for name in plain]
+            # A frame is dropped for all of its hands.
+            cells += [np.asarray(results[name])[here[: np.ndim(results[name])]] for name in plain]
             for name in (*points, "joints_m"):
                 cells += results[name][here].ravel().tolist()
             yield [_cell(value) for value in cells]

@@ -9,17 +9,21 @@
 
 The server answers only those who call it by an address or as localhost, and opens websockets to
 its own pages, to pages of the origins that the configuration names, and to programs that are no
-browsers; so no other web site can listen. What clients send is not looked at.
+browsers; so no other web site can listen. What clients send is read and thrown away. Connections
+that have not asked for anything yet are few and have seconds to ask: when there are too many, the
+oldest has to go.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import sys
 import threading
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import resources
 from types import SimpleNamespace
 from typing import Any, Self
@@ -29,6 +33,8 @@ from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
 from toftrack.output.stream import known_fields, told
 from toftrack.output.web.visitors import called_by_a_known_name, refused
+
+_log = logging.getLogger(__name__)
 
 STREAM = "/stream"
 _PAGES = {
@@ -49,8 +55,15 @@ _FIXED_HEADERS = (
     ("Referrer-Policy", "no-referrer"),
 )
 _MOST_CLIENTS = 32
+MOST_HALF_OPEN = 32
+"""Connections that are no clients yet, or were answered and not closed."""
+_HANDSHAKE_S = 3.0
+"""How long a request may take to arrive."""
+_BACKLOG = 32
+"""Connections that the system keeps, and that are accepted at a time."""
 _MOST_SENT_BYTES = 4096
-"""By a client, whose messages nobody reads."""
+"""In a message of a client, which nobody looks at; who sends a longer one is cut off."""
+_TOLD_EVERY_S = 60.0
 _LAST_WORDS_S = 1.0
 """How long the lines that still wait at the end have to leave."""
 _PAUSE_S = 0.01
@@ -93,12 +106,17 @@ class WebSocketStream:
         self._websockets = _websockets()
         self._files = {path: _page(name) for path, (name, _) in _PAGES.items()}
         self._clients: set[_Client] = set()
+        self._open: dict[Any, None] = {}
+        """Every connection, the oldest first."""
+        self._half_open: dict[Any, None] = {}
+        self._told_s = -math.inf
         self._sent = self._dropped = 0
         self.url = ""
         """Of the first page, within the `with`."""
 
     def __enter__(self) -> Self:
         self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(self._trouble)
         self._thread = threading.Thread(
             target=self._loop.run_forever, name="websocket-server", daemon=True
         )
@@ -141,7 +159,10 @@ class WebSocketStream:
             self._talk,
             self._host,
             self._port,
+            create_connection=self._connection,
             process_request=self._answer,
+            open_timeout=_HANDSHAKE_S,
+            backlog=_BACKLOG,
             compression=None,  # of short messages to near clients it would only take time
             max_size=_MOST_SENT_BYTES,
             close_timeout=_LAST_WORDS_S,
@@ -154,15 +175,40 @@ class WebSocketStream:
         while any(client.lines for client in self._clients) and self._loop.time() < deadline:
             await asyncio.sleep(_PAUSE_S)
         self._dropped += sum(len(client.lines) for client in self._clients)
-        # Who does not read does not say goodbye either.
-        mute = [connection for connection in self._server.connections if connection.transport]
+        for connection in list(self._half_open):
+            connection.transport.abort()
         self._server.close()
         try:
             await asyncio.wait_for(self._server.wait_closed(), _LAST_WORDS_S)
         except TimeoutError:
-            for connection in mute:
+            # Who does not read does not say goodbye either.
+            for connection in list(self._open):
                 connection.transport.abort()
             await self._server.wait_closed()
+
+    def _connection(self, *arguments: Any, **settings: Any) -> Any:
+        """A connection that this stream counts."""
+        return self._websockets.Connection(self, *arguments, **settings)
+
+    def opened(self, connection: Any) -> None:
+        """Count a connection; too many that are no clients push out the oldest of them."""
+        self._open[connection] = self._half_open[connection] = None
+        if len(self._half_open) > MOST_HALF_OPEN:
+            oldest = next(iter(self._half_open))
+            del self._half_open[oldest]
+            oldest.transport.abort()
+
+    def closed(self, connection: Any) -> None:
+        """Count a connection no more."""
+        self._open.pop(connection, None)
+        self._half_open.pop(connection, None)
+
+    def _trouble(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """What the event loop complains of, as that there are no descriptors any more."""
+        if loop.time() >= self._told_s + _TOLD_EVERY_S:
+            self._told_s = loop.time()
+            reason = context.get("exception") or "unknown reason"
+            _log.warning("stream=websocket: %s (%s)", context.get("message"), reason)
 
     def _offer(self, line: str) -> None:
         for client in self._clients:
@@ -174,7 +220,8 @@ class WebSocketStream:
         """Send what there is to one client until it leaves."""
         client = _Client(self._waiting)
         self._clients.add(client)
-        gone = asyncio.ensure_future(connection.wait_closed())
+        self._half_open.pop(connection, None)
+        gone = asyncio.ensure_future(self._ignore(connection))
         try:
             while not gone.done():
                 news = asyncio.ensure_future(client.news.wait())
@@ -189,6 +236,12 @@ class WebSocketStream:
         finally:
             gone.cancel()
             self._clients.discard(client)
+
+    async def _ignore(self, connection: Any) -> None:
+        """Read what a client sends until it leaves: unread messages would hold up its pongs."""
+        with suppress(self._websockets.ConnectionClosed):
+            async for _ in connection:
+                pass
 
     def _answer(self, connection: Any, request: Any) -> Any:
         """The answer to a request; None lets a websocket be opened."""
@@ -252,7 +305,7 @@ def _quiet_log() -> logging.Logger:
 def _websockets() -> SimpleNamespace:
     """What is used of the package; ToftrackError when it is not installed."""
     try:
-        from websockets.asyncio.server import serve
+        from websockets.asyncio.server import ServerConnection, serve
         from websockets.datastructures import Headers
         from websockets.exceptions import ConnectionClosed
         from websockets.http11 import Response
@@ -261,6 +314,26 @@ def _websockets() -> SimpleNamespace:
             "stream=websocket needs websockets, which is not installed: pip install "
             "'toftrack[web]', in a checkout pip install -e '.[web]'"
         ) from None
+
+    class Connection(ServerConnection):
+        """Tells its stream from when on it takes a descriptor, and until when."""
+
+        def __init__(self, stream: WebSocketStream, *arguments: Any, **settings: Any) -> None:
+            super().__init__(*arguments, **settings)
+            self._stream = stream
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._stream.opened(self)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            self._stream.closed(self)
+
     return SimpleNamespace(
-        serve=serve, Headers=Headers, ConnectionClosed=ConnectionClosed, Response=Response
+        serve=serve,
+        Connection=Connection,
+        Headers=Headers,
+        ConnectionClosed=ConnectionClosed,
+        Response=Response,
     )

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import math
+from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.pose_space.data.pose_data import PoseData
+from toftrack.safe_files import open_to_read
 
 UNITS = ("degrees", "radians")
 _SLACK_DEGREES = 10.0
@@ -116,7 +118,7 @@ _Content = tuple[np.ndarray, list[str], list[str], str | None]
 
 def _read_csv(path: str) -> _Content:
     said = None
-    with open(path, encoding="utf-8-sig", newline="") as stream:
+    with TextIOWrapper(open_to_read(path), "utf-8-sig", newline="") as stream:
         lines = []
         for line in stream:
             if line.lstrip().startswith("#"):

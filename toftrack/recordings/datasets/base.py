@@ -11,6 +11,7 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.recordings.png import decoded_png
+from toftrack.safe_files import open_to_read
 
 MILLIMETRE = 1e-3
 _TIPS = (4, 8, 12, 16, 20)
@@ -82,7 +83,8 @@ def compared_joints(
 def read_bytes(path: Path) -> bytes:
     """The content of a file; ToftrackError, one sentence, when it cannot be read."""
     try:
-        return path.read_bytes()
+        with open_to_read(path) as stream:
+            return stream.read()
     except OSError as error:
         raise ToftrackError(
             f"the file '{path}' cannot be read ({error.strerror}); copy the data set again"

@@ -22,12 +22,14 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import secrets
 import socket
 import socketserver
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -43,9 +45,11 @@ _log = logging.getLogger(__name__)
 _WAIT_S = 1.0
 """The longest that a request for news is kept waiting."""
 _PATIENCE_S = 5.0
-"""After so long without reading or sending anything a visitor is cut off."""
+"""After so long without a whole request, or without reading an answer, a visitor is cut off."""
 _MOST_CONNECTIONS = 64
+"""Who waits for news or is answered; further ones push out who asks nothing."""
 _MOST_COMMAND_BYTES = 1000
+_BREATH_S = 0.1
 _LAST_WORDS_S = 1.0
 """How long answers may take that are under way when the server closes."""
 _POLICY = (
@@ -115,8 +119,17 @@ class BrowserServer:
             self._server.all_gone(_LAST_WORDS_S)
 
 
+@dataclass
+class _Visit:
+    """A connection, and until when its next request must have arrived; inf while it is answered."""
+
+    connection: socket.socket
+    until_s: float
+
+
 class _Server(ThreadingHTTPServer):
     daemon_threads = True  # a program that fails without closing must end nevertheless
+    request_queue_size = 32  # the usual 5 keeps a browser with two tabs waiting for a second
     allow_reuse_address = os.name == "posix"  # elsewhere it would let two trackers share a port
 
     def __init__(self, source: Source, host: str, family: int, address: tuple) -> None:
@@ -125,7 +138,7 @@ class _Server(ThreadingHTTPServer):
         self.run = secrets.token_hex(4)
         self.token = secrets.token_urlsafe(12)
         self.page = (resources.files("toftrack.views.browser") / "page.html").read_bytes()
-        self._connections: dict[threading.Thread, socket.socket] = {}
+        self._visits: dict[threading.Thread, _Visit] = {}
         self._lock = threading.Lock()
         super().__init__(address, _Handler)
 
@@ -135,24 +148,51 @@ class _Server(ThreadingHTTPServer):
         at, port = self.server_address[:2]
         self.server_name, self.server_port = str(at), port
 
+    def get_request(self) -> tuple[socket.socket, Any]:
+        try:
+            return super().get_request()
+        except OSError:  # there are no descriptors: the connection still waits, and would at once
+            time.sleep(_BREATH_S)
+            raise
+
     def verify_request(self, request: Any, client_address: Any) -> bool:
         with self._lock:
-            return len(self._connections) < _MOST_CONNECTIONS
+            if len(self._visits) < _MOST_CONNECTIONS:
+                return True
+            first = min(self._visits.values(), key=lambda visit: visit.until_s)
+            idle = first.until_s < math.inf
+            if idle:
+                first.until_s = math.inf  # its thread ends soon
+                _hang_up(first.connection, socket.SHUT_RDWR)
+            return idle and len(self._visits) < 2 * _MOST_CONNECTIONS
 
     def process_request(self, request: Any, client_address: Any) -> None:
         thread = threading.Thread(
             target=self._talk, args=(request, client_address), name="browser-visitor", daemon=True
         )
         with self._lock:
-            self._connections[thread] = request
+            self._visits[thread] = _Visit(request, time.monotonic() + _PATIENCE_S)
         thread.start()
+
+    def service_actions(self) -> None:
+        """Between connections: hang up on who sends a request bit by bit."""
+        now_s = time.monotonic()
+        with self._lock:
+            for visit in self._visits.values():
+                if now_s > visit.until_s:
+                    _hang_up(visit.connection, socket.SHUT_RDWR)
+
+    def expect(self, within_s: float) -> None:
+        """This thread's visitor has so long for a request; inf = it has arrived."""
+        with self._lock:
+            self._visits[threading.current_thread()].until_s = time.monotonic() + within_s
 
     def _talk(self, request: socket.socket, client_address: Any) -> None:
         try:
             self.process_request_thread(request, client_address)
         finally:
             with self._lock:
-                del self._connections[threading.current_thread()]
+                del self._visits[threading.current_thread()]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A visitor who leaves in the middle of an answer is no error."""
@@ -160,19 +200,21 @@ class _Server(ThreadingHTTPServer):
 
     def hang_up(self, how: int) -> None:
         with self._lock:
-            for connection in self._connections.values():
-                try:
-                    connection.shutdown(how)
-                except OSError:  # gone already
-                    pass
+            for visit in self._visits.values():
+                _hang_up(visit.connection, how)
 
     def all_gone(self, within_s: float) -> bool:
         deadline = time.monotonic() + within_s
         with self._lock:
-            threads = list(self._connections)
+            threads = list(self._visits)
         for thread in threads:
             thread.join(max(0.0, deadline - time.monotonic()))
         return not any(thread.is_alive() for thread in threads)
+
+
+def _hang_up(connection: socket.socket, how: int) -> None:
+    with suppress(OSError):  # gone already
+        connection.shutdown(how)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -183,7 +225,12 @@ class _Handler(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
     server: _Server
 
+    def handle_one_request(self) -> None:
+        self.server.expect(_PATIENCE_S)
+        super().handle_one_request()
+
     def do_GET(self) -> None:  # noqa: N802
+        self.server.expect(math.inf)
         url = urlsplit(self.path)
         if not self._called_by_a_known_name():
             return
@@ -196,6 +243,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:  # noqa: N802
         body = self._body()
+        self.server.expect(math.inf)
         if body is None or not self._called_by_a_known_name():
             return
         origin = self.headers.get("Origin")

@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 from toftrack.errors import ToftrackError
 from toftrack.render.likelihood import FMeasure
+from toftrack.safe_files import open_new
 from toftrack.views.base import TrackedFrame
 from toftrack.views.rerun.entities import Entities, blueprint, rr
 
@@ -67,8 +68,9 @@ class RerunView:
             self._stream.connect_grpc(connect or _ADDRESS, default_blueprint=blueprint())
         else:
             try:
+                open_new(self._path, replace=True).close()  # the library follows links
                 self._stream.save(self._path, default_blueprint=blueprint())
-            except _RERUN_ERRORS as error:
+            except (OSError, *_RERUN_ERRORS) as error:
                 raise _unwritable(self._path) from error
         self._entities = Entities(self._stream, likelihood)
         self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_FRAMES_AHEAD)

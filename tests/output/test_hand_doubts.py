@@ -1,0 +1,110 @@
+"""A hand of a length that hands do not have speaks against the focal length."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
+from toftrack.hand.shape_space import COMPONENTS
+from toftrack.output.advice import LostFrame, RunFacts
+from toftrack.output.hand_doubts import length_doubt, looked_doubt
+from toftrack.programs.main import main
+from toftrack.recordings.store import packaged_sample
+
+K = np.array([[300.0, 0, 88], [0, 300, 72], [0, 0, 1]])
+
+
+def hand(length_m: float, sigma: float = 0.024) -> HandShape:
+    mean, covariance = (0.0,) * len(COMPONENTS), np.eye(len(COMPONENTS)) * sigma**2
+    fitted = Fitted(COMPONENTS, mean, tuple(map(tuple, covariance)), 3.0, False)
+    return dataclasses.replace(default_hand_shape(length_m), fitted=fitted)
+
+
+@pytest.mark.parametrize(
+    ("length_m", "words"),
+    [
+        (0.136, "136 mm long, as only small children's are.*too large.*fx = 214.7 instead of 300"),
+        (0.230, "230 mm long, as hardly anybody's is.*too small.*fx = 363.2 instead of 300"),
+    ],
+)
+def test_a_fitted_hand_that_is_hardly_anybody_s_is_told(length_m: float, words: str) -> None:
+    assert re.search(words, length_doubt(hand(length_m), K))
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        hand(0.145),
+        hand(0.140),
+        hand(0.19),
+        hand(0.215),
+        hand(0.13, sigma=0.12),
+        default_hand_shape(0.1),
+    ],
+    ids=["child", "child, fitted small", "adult", "large", "unsure", "given"],
+)
+def test_hands_of_people_and_unsure_fits_are_not_doubted(shape: HandShape) -> None:
+    assert length_doubt(shape, K) == ""
+
+
+def test_how_long_a_lost_hand_looked_counts_where_most_was_lost_and_it_was_seen_often() -> None:
+    seen = LostFrame("searching", 0.9, 0.3, 0.5, 2.0, 900, False, looked_m=0.226)
+    unseen = dataclasses.replace(seen, looked_m=None)
+
+    def mean(often: int, seldom: int, tracked: int) -> float | None:
+        facts = RunFacts()
+        for frame in [seen] * often + [unseen] * seldom:
+            facts = facts.with_lost(frame)
+        for _ in range(tracked):
+            facts = facts.tracked(None)
+        return facts.mean_looked_m()
+
+    assert mean(20, 10, 5) == pytest.approx(0.226)
+    assert mean(20, 10, 30) is None and mean(9, 0, 0) is None and mean(11, 69, 0) is None
+    assert "looks 226 mm long" in looked_doubt(0.226, K)
+    assert looked_doubt(0.209, K) == looked_doubt(0.145, K) == ""
+
+
+def tracked(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[dict, str]:
+    run = folder / "run"
+    given = [*words, "hand.side=right", "view=none", f"hydra.run.dir={run}"]
+    assert main(["track", *given]) == 0
+    captured = capsys.readouterr()
+    summary = json.loads((run / "summary.json").read_text())
+    summary["file"] = json.loads((run / "hand_shape.json").read_text())
+    return summary, captured.err + captured.out
+
+
+def test_a_focal_length_that_makes_the_hand_small_is_told_at_the_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with packaged_sample() as path:
+        words = [str(path), "device.intrinsics=[300,300,88,72]", "device.stop=24"]
+        summary, said = tracked(tmp_path, capsys, *words)
+    (doubt,) = summary["doubts"]
+    assert "as only small children's are" in doubt and f"note: {doubt}" in said
+    assert summary["hand"]["fitted"] and summary["file"]["fitted"]["poses"] > 0
+    assert ", fitted" in said
+
+
+def test_fitted_is_not_said_of_a_hand_that_was_never_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "wall.npz"
+    depth = np.random.default_rng(0).uniform(1.5, 1.52, (3, 144, 176)).astype(np.float32)
+    np.savez(path, depth_m=depth, K=K, timestamp_s=[0.0, 33, 66])
+    summary, said = tracked(tmp_path, capsys, str(path))
+    assert not summary["hand"]["fitted"] and summary["file"]["fitted"] is None
+    assert "190 mm long\n" in said and ", fitted" not in said
+    (doubt,) = summary["doubts"]
+    assert "milliseconds" in doubt
+    again = tmp_path / "run" / "summary.json"
+    again.unlink()
+    assert main(["recover", str(again.parent)]) == 0
+    assert json.loads(again.read_text())["doubts"] == [doubt]

@@ -1,0 +1,137 @@
+"""What looks wrong in a recording is said with the value that would fit; what is right is not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from toftrack.api import make_device, make_hands_tracker
+from toftrack.camera import Camera
+from toftrack.devices.folder import Folder
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.frames import checked_image
+from toftrack.output.advice import Watch
+from toftrack.output.hand_doubts import length_doubt, looked_doubt
+from toftrack.recordings.doubts import lens_doubt, times_doubt
+from toftrack.recordings.npz import read_recording
+
+K = np.array([[200.0, 0, 88], [0, 200, 72], [0, 0, 1]])
+TIMES = np.array([0, 0.033, 0.067, 0.1, 0.133, 0.5])
+DATA = Path(__file__).parents[3] / "shared" / "data"
+FOLDERS = ("crowd", "grasps", "mesh-hand", "real")
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1e3, "look like milliseconds: their median step is 33; divide them by 1000,"),
+        (1e6, "look like microseconds: their median step is 33000; divide them by 1000000,"),
+        (1e9, "look like nanoseconds"),
+        (1e-3, "look like thousands of seconds: their median step is 3.3e-05; multiply them by"),
+    ],
+)
+def test_times_in_another_unit_are_told_with_the_factor(factor: float, words: str) -> None:
+    assert words in times_doubt(TIMES * factor + 17)
+
+
+def test_times_that_stand_still_are_told() -> None:
+    assert "all time stamps are 3" in times_doubt(np.full(5, 3.0))
+    whole_seconds = np.floor(np.arange(60) / 25)
+    assert "57 of 60 time stamps repeat the one before" in times_doubt(whole_seconds)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [TIMES, TIMES + 1.7e9, np.arange(9) / 300, np.arange(9.0), np.zeros(1), [0, 0, 0.1, 0.1, 0.2]],
+)
+def test_times_of_cameras_are_not_doubted(times: np.ndarray) -> None:
+    assert times_doubt(np.asarray(times)) == ""
+
+
+@pytest.mark.parametrize(
+    ("distortion", "words"),
+    [
+        ([8.0, 3, 0, 0, 0], "zeros would leave 100 %"),
+        ([-8.0, 0, 0, 0, 0], "zeros would leave 100 %"),
+        ([0.1, -0.3, 0.8, 0, 0], "if they were given as k1 k2 k3 p1 p2, would leave"),
+    ],
+)
+def test_a_lens_that_leaves_little_of_the_image_is_told(distortion: list, words: str) -> None:
+    doubt = lens_doubt(Camera(K, 176, 144, distortion))
+    assert doubt.startswith("of the image only ") and words in doubt
+
+
+@pytest.mark.parametrize(
+    ("distortion", "lens"),
+    [
+        ([0.09, -0.27, 0, 0, 0.09], "opencv"),
+        ([-0.3, 0.1, 0.001, 0, 0], "opencv"),
+        ([0.1, -0.01, 0.01, 0.002], "fisheye"),
+    ],
+)
+def test_lenses_of_cameras_are_not_doubted(distortion: list, lens: str) -> None:
+    assert lens_doubt(Camera(K, 176, 144, distortion, lens=lens)) == ""
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint16])
+def test_centimetres_are_not_called_millimetres(kind: type, tmp_path: Path) -> None:
+    with make_device("device=sample", "device.stop=2") as sample:
+        depth = np.stack([frame.depth for frame in sample])
+    path = tmp_path / "cm.npz"
+    np.savez(path, depth_m=(100 * depth).astype(kind), K=K)
+    with pytest.raises(ToftrackError, match=r"plainly centimetres.*float32'\) / 100$"):
+        read_recording(path)
+    with pytest.raises(ToftrackError, match="plainly centimetres"):
+        checked_image((100 * depth[0]).astype(kind), K)
+    np.savez(path, depth_m=(1000 * depth).astype(kind), K=K)
+    with pytest.raises(ToftrackError, match=r"plainly millimetres.*float32'\) / 1000$"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(("step_mm", "right"), [(10, "0.01 m a step"), (0.1, "0.0001 m a step")])
+def test_a_folder_in_another_unit_is_told(step_mm: float, right: str, tmp_path: Path) -> None:
+    with make_device("device=sample", "device.stop=1") as sample:
+        depth_mm = 1000 * next(iter(sample)).depth
+    cv2.imwrite(str(tmp_path / "0.png"), (depth_mm / step_mm).astype(np.uint16))
+    given = {"intrinsics": [200, 200, 88, 72]}
+    (doubt,) = Folder(tmp_path, **given).description["doubts"]
+    assert right in doubt and "device.unit_m" in doubt
+    assert not Folder(tmp_path, unit_m=step_mm / 1000, **given).description["doubts"]
+
+
+def test_doubts_reach_the_log_and_whoever_asks_the_device(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "recording.npz"
+    depth = np.random.default_rng(0).uniform(0.4, 1.5, (6, 144, 176)).astype(np.float32)
+    lens = np.array([8.0, 3, 0, 0, 0])
+    np.savez(path, depth_m=depth, K=K, timestamp_s=TIMES * 1e6, distortion=lens)
+    times, distortion = Replay(path).description["doubts"]
+    assert "microseconds" in times and "zeros would" in distortion
+    assert [message.split(": ", 1)[1] for message in caplog.messages] == [times, distortion]
+    caplog.clear()
+    with make_device("device=sample") as sample:
+        assert sample.description["doubts"] == [] and not caplog.messages
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_no_recording_at_hand_is_doubted(folder: str) -> None:
+    """Of those that lie beside the checkout; of others nothing can be said here."""
+    for path in sorted((DATA / folder).glob("*.npz")):
+        device = Replay(path)
+        assert device.description["doubts"] == [], path.name
+        side = device.metadata.get("side", "right" if folder == "mesh-hand" else "auto")
+        tracker, watch = make_hands_tracker(f"hand.side={side}"), Watch(math.inf)
+        for frame in device:
+            depth = device.camera.rectify(frame.depth, frame.radial)
+            made = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+            watch.see(made, depth, tracker.insights)
+        k, (looked_m,) = device.camera.K, watch.looked_m()
+        assert length_doubt(tracker.fitted[0], k) == "", path.name
+        assert looked_m is None or looked_doubt(looked_m, k) == "", path.name

@@ -1,0 +1,97 @@
+"""The camera of a folder of images: the file that the documentation shows, or the command line."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.tracking import ROOT
+
+from toftrack.api import make_device
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.output.run_folder import open_footage, read_run
+from toftrack.programs.main import main
+from toftrack.recordings.png_folder import read_png_folder
+
+LENS = "device.intrinsics=[201,202,87,71]"
+K = [[201, 0, 87], [0, 202, 71], [0, 0, 1]]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two frames of the sample, without a camera."""
+    made = tmp_path / "images"
+    made.mkdir()
+    with make_device("device=sample", "device.stop=2") as sample:
+        for frame in sample:
+            cv2.imwrite(str(made / f"{frame.index}.png"), (1000 * frame.depth).astype(np.uint16))
+    return made
+
+
+def test_the_camera_file_that_the_page_shows_is_read(folder: Path) -> None:
+    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"<!-- test: camera.json -->\n```json\n(.*?)```", page, re.DOTALL)
+    (folder / "camera.json").write_text(example)
+    read = read_png_folder(folder)
+    np.testing.assert_array_equal(read.camera.K, [[200, 0, 88], [0, 200, 72], [0, 0, 1]])
+    assert (read.camera.width, read.camera.height) == (176, 144)
+    assert (read.unit_m, read.fps, read.radial) == (0.001, 25, False)
+
+
+def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["view=none", "hand.side=right", f"hydra.run.dir={tmp_path / 'run'}"]
+    assert main(["track", str(folder), *words]) == 1
+    assert "device.intrinsics=[FX,FY,CX,CY]" in capsys.readouterr().err
+    assert main(["track", str(folder), LENS, "device.fps=50", *words]) == 0
+    run = read_run(tmp_path / "run")
+    np.testing.assert_array_equal(run.results["metadata"]["camera"]["K"], K)
+    np.testing.assert_allclose(run.results["timestamp_s"], [0, 0.02])
+    footage = open_footage(run)
+    assert footage is not None, "figures are drawn with the same lens"
+    np.testing.assert_array_equal(footage.camera.K, K)
+
+
+def test_the_lens_of_any_recording_can_be_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    depth = np.random.default_rng(0).uniform(0.4, 2, (2, 144, 176)).astype(np.float32)
+    np.savez(path, depth_m=depth, K=np.array(K) * 2 - np.diag([0, 0, 1]), distortion=[0.1, 0, 0, 0])
+    camera = Replay(path, intrinsics=[201, 202, 87, 71]).camera
+    np.testing.assert_array_equal(camera.K, K)
+    assert not camera.distortion.any()
+    np.save(tmp_path / "b.npy", depth)
+    with make_device("device=replay", f"device.path={tmp_path / 'b.npy'}", LENS) as device:
+        np.testing.assert_array_equal(device.camera.K, K)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("[200,200,88]", "intrinsics must be four numbers of pixels"),
+        ("[a,1,2,3]", "intrinsics must be four numbers of pixels"),
+        ("[-1,200,88,72]", r"fx, fy \(above 0\)"),
+        ("[200,200,inf,72]", "intrinsics must be four numbers of pixels"),
+        ("[true,200,88,72]", "intrinsics must be four numbers of pixels"),
+        ("200", "intrinsics must be four numbers of pixels.*but are 200"),
+        ("[1,1,88,72]", "cannot be that of images of 176x144 pixels"),
+    ],
+)
+def test_lenses_that_are_none_are_told(given: str, words: str, folder: Path) -> None:
+    for device in ("folder", "replay"):
+        with pytest.raises(ToftrackError, match=words) as caught:
+            make_device(f"device={device}", f"device.path={folder}", f"device.intrinsics={given}")
+        assert "\n" not in str(caught.value)
+
+
+def test_a_lens_is_told_once(folder: Path) -> None:
+    read_png_folder(folder, intrinsics=[201, 202, 87, 71]).camera.save(folder / "mine.json")
+    words = ["device=folder", f"device.path={folder}", f"camera.file={folder / 'mine.json'}"]
+    with make_device(*words) as device:
+        np.testing.assert_array_equal(device.camera.K, K)
+    with pytest.raises(ToftrackError, match="both tell the lens; leave one out"):
+        make_device(*words, LENS)

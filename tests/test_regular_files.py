@@ -1,0 +1,94 @@
+"""Pipes, devices and folders with them are refused at once, whoever would read them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from helpers.readers import write_readers
+
+from toftrack.configuration.compose import configuration
+from toftrack.errors import ToftrackError
+from toftrack.programs.recording_argument import with_recording
+from toftrack.programs.report import read_runs, report
+from toftrack.recordings.store import open_recording
+from toftrack.safe_files import open_to_read
+
+pytestmark = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+
+
+def test_every_reader_refuses_a_pipe_in_place_of_its_file(tmp_path: Path) -> None:
+    for reader in write_readers(tmp_path, whole=False):
+        if reader.name in ("config.yaml", "group: a .yaml"):  # programs, and read by Hydra
+            continue
+        reader.file.unlink()
+        os.mkfifo(reader.file)
+        try:
+            reader.read(reader.given)
+        except ToftrackError as error:
+            assert "\n" not in str(error), reader.name
+        else:
+            assert reader.name == "overrides.yaml"  # a job that is told to have failed
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev/full"])
+def test_a_device_is_no_recording(path: str) -> None:
+    with pytest.raises(ToftrackError, match="is a device, and only files"):
+        open_recording(path)
+
+
+def test_a_folder_with_a_pipe_is_no_bag(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    for name in ("metadata.yaml", "one.db3"):
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(ToftrackError, match="is a pipe, and only files"):
+        open_recording(tmp_path)
+
+
+def test_files_and_links_to_them_are_read(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"content")
+    (tmp_path / "link").symlink_to("file")
+    with open_to_read(tmp_path / "link") as stream:
+        assert stream.read() == b"content"
+    with pytest.raises(FileNotFoundError):
+        open_to_read(tmp_path / "none")
+
+
+def test_names_that_are_not_utf8_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    job = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff\xfe"))
+    (job / ".hydra").mkdir(parents=True)
+    (job / ".hydra" / "overrides.yaml").write_text('- "seed=\\ud800"\n')
+    (job / "summary.json").write_text('{"metrics": {"mean_mm": 5.5}, "\\udc00": 1, "mean_ms": 2.0}')
+    (tmp_path / "1" / ".hydra").mkdir(parents=True)
+    (tmp_path / "1" / ".hydra" / "overrides.yaml").write_bytes(b"- seed=\xff\n")
+    report(tmp_path)
+    assert "udcff" in (tmp_path / "sweep.csv").read_text(encoding="utf-8")
+    assert "1 of 2 jobs failed" in capsys.readouterr().out
+    assert len(read_runs(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("filter.particles=10000000", "filter.particles=10000000 is not possible"),
+        ("filter.particles=1e7", "filter.particles=10000000.0 is not possible"),
+        ("filter.passes=1000000000", "filter.passes=1000000000 is not possible"),
+        (f"seed={10**23}", "is not possible"),
+        ("seed=-1", "seed=-1 is not possible"),
+        (".".join("a" * 5000) + "=1", ""),
+        ("seed=" + "[" * 3000 + "]" * 3000, ""),
+        ("+seed.x=" + "{a:" * 400 + "1" + "}" * 400, ""),
+    ],
+)
+def test_what_cannot_be_meant_is_one_sentence(override: str, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words) as told:
+        configuration(override)
+    assert "\n" not in str(told.value)
+
+
+def test_an_empty_name_is_no_recording() -> None:
+    with pytest.raises(ToftrackError, match="name is empty"):
+        with_recording([""], {"seed"}, {"replay"})

@@ -1,0 +1,170 @@
+"""Whatever a folder of somebody else holds, nothing outside of it changes, and nothing waits."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from toftrack import safe_files
+from toftrack.safe_files import (
+    make_folder,
+    open_in_place,
+    open_new,
+    open_to_read,
+    remove_partial,
+    whole_file,
+    write_whole,
+)
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "write_whole": lambda path: write_whole(path, "new"),
+    "open_new": lambda path: open_new(path, replace=True).close(),
+    "open_in_place": lambda path: open_in_place(path).close(),
+}
+every_writer = pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Path:
+    path = tmp_path / "elsewhere"
+    path.write_text("precious")
+    return path
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "folder").mkdir()
+    return tmp_path / "folder" / "file"
+
+
+@every_writer
+@pytest.mark.parametrize("there", [True, False])
+def test_nothing_is_written_through_a_link(
+    write: Callable[[Path], object], there: bool, path: Path, elsewhere: Path
+) -> None:
+    if not there:
+        elsewhere.unlink()
+    path.symlink_to(elsewhere)
+    with pytest.raises(OSError, match="symbolic link"):
+        write(path)
+    assert path.is_symlink()
+    assert (elsewhere.read_text() == "precious") if there else not elsewhere.exists()
+
+
+@every_writer
+def test_what_has_a_second_name_stays_as_it_was_there(
+    write: Callable[[Path], object], path: Path, elsewhere: Path
+) -> None:
+    os.link(elsewhere, path)
+    if write is WRITERS["open_in_place"]:
+        with pytest.raises(OSError, match="second name"):
+            write(path)
+    else:
+        write(path)
+    assert elsewhere.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    "open_it",
+    [*WRITERS.values(), lambda path: open_to_read(path).close()],
+    ids=[*WRITERS, "open_to_read"],
+)
+def test_a_pipe_is_refused_and_not_waited_for(
+    open_it: Callable[[Path], object], path: Path
+) -> None:
+    os.mkfifo(path)
+    with pytest.raises(OSError, match="pipe"):
+        open_it(path)
+    assert stat.S_ISFIFO(path.lstat().st_mode)
+
+
+@pytest.mark.parametrize(
+    "open_it",
+    [*WRITERS.values(), lambda path: open_to_read(path).close()],
+    ids=[*WRITERS, "open_to_read"],
+)
+def test_a_device_is_refused(open_it: Callable[[Path], object]) -> None:
+    with pytest.raises(OSError, match="device"):
+        open_it(Path("/dev/null"))
+    assert stat.S_ISCHR(Path("/dev/null").lstat().st_mode)
+
+
+@every_writer
+def test_a_folder_in_the_place_of_a_file_is_refused(
+    write: Callable[[Path], object], path: Path
+) -> None:
+    path.mkdir()
+    with pytest.raises(IsADirectoryError):
+        write(path)
+
+
+def test_a_file_is_there_as_a_whole_or_as_it_was(path: Path) -> None:
+    path.write_text("whole")
+    with pytest.raises(RuntimeError), whole_file(path) as stream:
+        stream.write(b"half")
+        raise RuntimeError
+    assert path.read_text() == "whole" and list(path.parent.iterdir()) == [path]
+    write_whole(path, "ä")
+    assert path.read_bytes() == "ä".encode() and list(path.parent.iterdir()) == [path]
+
+
+def test_two_who_write_a_file_at_once_do_not_meet(path: Path) -> None:
+    with whole_file(path) as one, whole_file(path) as other:
+        one.write(b"one")
+        other.write(b"other")
+    assert path.read_bytes() == b"one"
+
+
+def test_a_new_file_has_the_usual_permissions(path: Path) -> None:
+    path.write_text("old")
+    usual = stat.S_IMODE(path.stat().st_mode)
+    write_whole(path, "new")
+    assert stat.S_IMODE(path.stat().st_mode) == usual
+
+
+def test_what_a_killed_writer_left_can_be_removed(path: Path) -> None:
+    stream = whole_file(path)
+    stream.__enter__()  # and no end
+    other = path.with_name("file.part")
+    other.write_text("not ours")
+    assert len(list(path.parent.iterdir())) == 2
+    remove_partial(path.parent, [path.name])
+    assert list(path.parent.iterdir()) == [other]
+
+
+def test_a_file_that_is_there_is_only_replaced_when_asked(path: Path) -> None:
+    path.write_text("there")
+    with pytest.raises(FileExistsError):
+        open_new(path)
+    with open_in_place(path) as stream:
+        assert stream.read() == b"there"
+    with open_new(path, replace=True) as stream:
+        assert stream.read() == b""
+    with pytest.raises(FileNotFoundError):
+        open_in_place(path.with_name("other"), make=False)
+
+
+def test_links_are_read_through(path: Path, elsewhere: Path) -> None:
+    path.symlink_to(elsewhere)
+    with open_to_read(path) as stream:
+        assert stream.read() == b"precious"
+
+
+def test_a_folder_that_is_a_link_is_refused(path: Path, tmp_path: Path) -> None:
+    path.symlink_to(tmp_path, target_is_directory=True)
+    with pytest.raises(OSError, match="symbolic link"):
+        make_folder(path)
+    make_folder(path.with_name("other"))
+
+
+def test_where_the_system_knows_no_such_flag_links_are_refused_all_the_same(
+    path: Path, elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(safe_files, "_NO_LINK", 0)
+    path.symlink_to(elsewhere)
+    with pytest.raises(OSError, match="symbolic link"):
+        open_in_place(path)

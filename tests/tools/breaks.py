@@ -1,0 +1,69 @@
+"""Faults put into the tracker on purpose, to see which guard notices them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+
+import numpy as np
+
+from toftrack.hand import shape
+
+INDEX = 1
+OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+@dataclass(frozen=True)
+class Break:
+    """One fault.
+
+    overrides: of the configuration.  patched: entered before the tracker is made, for what no
+    setting can do.  k_scale: times the camera's matrix.  other_side: the side is told wrongly.
+    """
+
+    about: str
+    overrides: tuple[str, ...] = ()
+    patched: Callable[[], AbstractContextManager[None]] = nullcontext
+    k_scale: float = 1.0
+    other_side: bool = False
+
+
+@contextmanager
+def _turned_index(degrees: float) -> Iterator[None]:
+    """The index finger bends about another axis, turned about the finger's own direction."""
+    kept = shape._REST_DEGREES
+    rows = list(kept)
+    abduction, elevation, roll = rows[INDEX]
+    rows[INDEX] = (abduction, elevation, roll + degrees)
+    shape._REST_DEGREES = tuple(rows)
+    try:
+        yield
+    finally:
+        shape._REST_DEGREES = kept
+
+
+BREAKS = {
+    "keypoints off": Break(
+        "the networks' votes for joints neither judge nor pull a pose",
+        ("relocation.votes=0", "relocation.landmark_weight=0"),
+    ),
+    "finger's axis": Break(
+        "the index finger bends about an axis turned by 5 degrees",
+        patched=lambda: _turned_index(5.0),
+    ),
+    "sigma doubled": Break(
+        "all joints' standard deviations twice as large", ("lost.joints.scale=2",)
+    ),
+    "hysteresis off": Break(
+        "another pose or finger need not lead for a while before it takes over",
+        ("relocation.rival_gain=0", "relocation.rival_frames=1", "refine.swap_gain=0"),
+    ),
+    "other side": Break("the other hand's side is told", other_side=True),
+    "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),
+}
+
+
+def scaled(k: np.ndarray, factor: float) -> np.ndarray:
+    """A pinhole matrix (3, 3) whose focal lengths and principal point are so many times larger."""
+    return k * np.array([[factor], [factor], [1.0]])

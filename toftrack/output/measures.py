@@ -1,0 +1,211 @@
+"""All that is measured of a track of one recording, from estimates and truth alone.
+
+A track is plain arrays, so that what any method found is measured alike. Beside the figures of
+trust.py and coverage.py, of each hand, over the frames in which it is visible:
+
+- `usable_mean_mm`, `usable_tip_mm`: mean error of joints and of fingertips in usable frames.
+- `tip_mm`: mean error of the fingertips in frames that are not flagged lost, as `mean_mm`.
+- `swap_pct`: frames, not flagged lost, in which a fingertip is taken for another finger's: it lies
+  nearer to another finger's true tip than to its own, by more than 10 mm.
+- `jitter_mm`: mean movement of a joint from a frame to the next while the hand rests, beyond the
+  true one; frames flagged lost say nothing.
+- `gesture_pct`: frames of a pose that has a name (`POSE_GESTURES`) in which the gesture is called
+  so; a frame flagged lost calls nothing.
+- `side_right_end`, `side_right_soon`: whether the last frame in which a side is named, and the
+  tenth after the first one, names the right one.
+- `side_wrong_certain_pct`: frames in which the wrong side is named with a probability above 0.9.
+
+A figure is None where there is nothing that it could be about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from toftrack.frames import Truth
+from toftrack.output.coverage import coverage
+from toftrack.output.evaluation import TIPS
+from toftrack.output.trust import Hand, Judged, Trust, judged, trust, trust_of_two
+
+SWAP_MM = 10.0
+CERTAIN = 0.9
+SOON_FRAMES = 10
+POSE_GESTURES = {
+    "palm": "palm",
+    "spread": "palm",
+    "flat": "palm",
+    "fist": "fist",
+    "point": "pointing",
+    "point_thumb": "pointing_thumb",
+    "thumb_up": "thumb_up",
+    "victory": "victory",
+    "three": "three",
+    "four": "four",
+    "ok": "ok",
+    "relaxed": "relaxed",
+    "hook": "other",
+}
+"""Which gesture a recording's pose is; what is not here has no name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What a method says of the T frames of a recording, of one hand or of slots.
+
+    With slots every array has an axis of slots after T. None: it says nothing of it.
+    """
+
+    joints_m: np.ndarray
+    """(T, 21, 3) metres, camera frame; not finite where there is none."""
+    lost: np.ndarray
+    """(T,) bool."""
+    joint_sigma_m: np.ndarray | None = None
+    """(T, 21, 3), see hand/regions.py."""
+    gesture: np.ndarray | None = None
+    """(T,) text."""
+    side: np.ndarray | None = None
+    """(T,) text, 'right' or 'left', which it found out; empty where it names none. None where it
+    was told."""
+    side_probability: np.ndarray | None = None
+    """(T,)."""
+
+    def slot(self, number: int) -> Estimates:
+        """Of one slot."""
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Estimates(**{n: a[:, number] for n, a in arrays.items() if a is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What was measured of one hand.
+
+    trust: its figures.  frames: what each frame is.  figures: see the head of this module, and of
+    coverage.py; JSON-able, unrounded.
+    """
+
+    trust: Trust
+    frames: Judged
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRecording:
+    """What was measured of a recording.
+
+    slots: that of the first hand, and the other one; None where the track has no slots.
+    ghost_pct: frames in which the slot without a hand says that it has one; None where there is no
+        such slot.
+    """
+
+    first: Measured
+    second: Measured | None = None
+    ghost_pct: float | None = None
+    slots: tuple[int, int] | None = None
+
+
+def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
+    """All measures of a track of one hand or of two slots.
+
+    Raises ToftrackError when estimates and truth differ in shape.
+    """
+    if np.ndim(estimates.joints_m) == 3:
+        found = trust(estimates.joints_m, estimates.lost, hand_of(truth))
+        return MeasuredRecording(_of_hand(found, estimates, truth))
+    truths = [truth] if truth.other is None else [truth, truth.other]
+    both = trust_of_two(estimates.joints_m, estimates.lost, [hand_of(one) for one in truths])
+    first = _of_hand(both.first, estimates.slot(both.slots[0]), truth)
+    if both.second is None:
+        return MeasuredRecording(first, None, both.ghost_pct, both.slots)
+    second = _of_hand(both.second, estimates.slot(both.slots[1]), truths[1])
+    return MeasuredRecording(first, second, None, both.slots)
+
+
+def hand_of(truth: Truth) -> Hand:
+    """The truth of its first hand."""
+    return Hand(truth.joints_m, truth.visible)
+
+
+def _of_hand(found: Trust, estimates: Estimates, truth: Truth) -> Measured:
+    of = judged(estimates.joints_m, estimates.lost, hand_of(truth))
+    good = of.seen & of.said
+    figures: dict[str, Any] = {
+        "usable_mean_mm": _mean(of.error_mm[of.usable]),
+        "usable_tip_mm": _mean(of.error_mm[of.usable][:, TIPS]),
+        "tip_mm": _mean(of.error_mm[good][:, TIPS]),
+        "swap_pct": _share_pct(good & _swapped(estimates.joints_m, truth.joints_m), of.seen),
+        "jitter_mm": _jitter_mm(estimates.joints_m, truth, of.said),
+    }
+    if estimates.joint_sigma_m is not None:
+        figures |= asdict(coverage(estimates.joints_m, estimates.joint_sigma_m, truth))
+    if estimates.gesture is not None:
+        named, right = gestures_right(estimates.gesture, of, truth)
+        figures["gesture_pct"] = _share_pct(right, named)
+    figures |= _side_figures(estimates, of, truth)
+    return Measured(found, of, figures)
+
+
+def gestures_right(gesture: np.ndarray, of: Judged, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
+    """(T,) bool: the frames whose pose has a name, and those of them that are called so."""
+    none = np.zeros(len(of.seen), bool)
+    if truth.pose_name is None:
+        return none, none
+    names = np.array([POSE_GESTURES.get(str(pose), "") for pose in truth.pose_name])
+    named = of.seen & (names != "")
+    return named, named & of.said & (np.asarray(gesture, str) == names)
+
+
+def _swapped(joints_m: np.ndarray, true_m: np.ndarray) -> np.ndarray:
+    """(T,) bool; false where there is no estimate."""
+    tips, true = np.asarray(joints_m, np.float64)[:, TIPS], np.asarray(true_m)[:, TIPS]
+    off = 1e3 * np.linalg.norm(tips[:, :, None] - true[:, None], axis=3)  # (T, found, true)
+    own = np.diagonal(off, axis1=1, axis2=2)
+    others = np.where(np.eye(len(TIPS), dtype=bool), np.inf, off).min(2)
+    with np.errstate(invalid="ignore"):
+        swapped: np.ndarray = (others < own - SWAP_MM).any(1)
+    return swapped
+
+
+def _jitter_mm(joints_m: np.ndarray, truth: Truth, said: np.ndarray) -> float | None:
+    if truth.still is None:
+        return None
+    rests = truth.still & truth.visible & said
+    pairs = rests[1:] & rests[:-1]
+    moved = np.diff(np.asarray(joints_m, np.float64) - truth.joints_m, axis=0)[pairs]
+    return _mean(1e3 * np.linalg.norm(moved, axis=2))
+
+
+def _side_figures(estimates: Estimates, of: Judged, truth: Truth) -> dict[str, Any]:
+    """Nothing where the side was told, or nobody knows it."""
+    if estimates.side is None or not truth.side:
+        return {}
+    side = np.asarray(estimates.side, str)
+    named = np.flatnonzero((side != "") & of.seen)
+    right = side == truth.side
+    figures: dict[str, Any] = {
+        "side_right_end": bool(right[named[-1]]) if len(named) else None,
+        "side_right_soon": bool(right[named[SOON_FRAMES]]) if len(named) > SOON_FRAMES else None,
+    }
+    if estimates.side_probability is not None:
+        with np.errstate(invalid="ignore"):
+            certain = np.asarray(estimates.side_probability) > CERTAIN
+        wrong = certain & (side != "") & ~right
+        figures["side_wrong_certain_pct"] = _share_pct(wrong & of.seen, of.seen)
+    return figures
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(values.mean()) if values.size else None
+
+
+def _share_pct(part: np.ndarray, whole: np.ndarray) -> float | None:
+    return 100.0 * float((part & whole).sum()) / float(whole.sum()) if whole.any() else None
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """The mean of those that there are."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

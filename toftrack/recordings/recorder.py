@@ -1,0 +1,275 @@
+"""Records the frames of any device into an `.npz`, beside whatever else is done with them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Frame, median_reading, wrong_unit
+from toftrack.recordings.npz_pieces import compressed
+from toftrack.recordings.unfinished import (
+    IMAGE_TYPES,
+    SUFFIX,
+    Facts,
+    UnfinishedRecording,
+    finish,
+)
+
+_WAITING = 32
+"""Frames at most that are not written yet, 1.8 MB each at 640 x 480."""
+_SPARE_BYTES = 2**27
+"""So much of the disk is left to others: a recording must not end the run that it is of."""
+_GIGABYTE = 1e9
+_STRANGE = 10
+"""So many frames at the beginning, none of which can be in metres, are in another unit."""
+
+
+class Source(Protocol):
+    """Whose frames are recorded: a device, of which this is read when the first frame came."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def fps(self) -> float: ...
+
+    @property
+    def description(self) -> dict[str, Any]: ...
+
+    @property
+    def metadata(self) -> dict[str, Any]: ...
+
+
+class Recorder:
+    """Writes frames in a thread of its own; use it with `with`.
+
+    They grow in `FILE.npz.part`, of which `FILE.npz` is made when the recorder is closed or takes
+    no more; after a kill `toftrack recover FILE.npz` makes it. A recorder that cannot go on says
+    so, keeps what there is, and raises nothing.
+
+    Args:
+        path: the recording, `.npz`.
+        source: of the frames.
+        limit_gb: 1e9 bytes of the file, after which no more frames are taken.
+        overwrite: replace an existing file.
+        tell: called with `ended`, in the recorder's thread, as soon as that is so.
+
+    Raises:
+        ToftrackError: the file exists, or cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        source: Source,
+        limit_gb: float,
+        overwrite: bool = False,
+        tell: Callable[[str], object] = lambda sentence: None,
+    ) -> None:
+        self.path = Path(path).expanduser()
+        self.frames = 0
+        """Frames in the recording."""
+        self.missed = 0
+        """Frames that came faster than they could be written."""
+        self.ended: str | None = None
+        """Why it took no more frames, a sentence; None: it went on to the end."""
+        self.failed = False
+        """It ended because of an error; what there is, is as `ended` says."""
+        self._part = self.path.with_name(self.path.name + SUFFIX)
+        self._source, self._limit_gb, self._overwrite = source, limit_gb, overwrite
+        self._tell = tell
+        self._facts: Facts | None = None
+        self._clock, self._strange = _Clock(), 0
+        self._file = self._open()
+        self._queue: queue.Queue[Frame | None] = queue.Queue(_WAITING)
+        self._second = ThreadPoolExecutor(1, "toftrack-amplitude")
+        self._thread = threading.Thread(target=self._run, name="toftrack-recorder", daemon=True)
+        self._thread.start()
+        self._closed = False
+
+    def put(self, frame: Frame, wait: bool) -> None:
+        """Record a frame.  wait: where too many wait to be written, wait, too, or leave it out."""
+        if self.ended is not None:
+            return
+        # Copies: whose memory the images are in, may use it again.
+        depth, amplitude = np.array(frame.depth), frame.amplitude
+        kept = Frame(
+            frame.index,
+            frame.timestamp_s,
+            depth,
+            None if amplitude is None else np.array(amplitude),
+            frame.radial,
+        )
+        try:
+            self._queue.put(kept, block=wait)
+        except queue.Full:
+            self.missed += 1
+
+    def close(self) -> None:
+        """Write what waits, and finish the file; a second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            self._queue.put(None)
+            self._thread.join()
+            self._second.shutdown()
+
+    def words(self) -> str:
+        """What became of it, once it is closed; "" where no frame came."""
+        missed = f", {self.missed} more came too fast" if self.missed else ""
+        return f"{self.path}: {self.frames} frames{missed}" if self.frames else ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _open(self) -> UnfinishedRecording:
+        if self.path.suffix.lower() != ".npz":
+            raise ToftrackError(f"a recording of frames is an .npz, not '{self.path}'")
+        if not self._overwrite:
+            for path in (self.path, self._part):
+                if os.path.lexists(path):
+                    rest = f"`toftrack recover {path}` finishes it, or " * (path == self._part)
+                    raise ToftrackError(
+                        f"the file '{path}' exists already; {rest}choose another name, or "
+                        "overwrite it with `toftrack record --overwrite`"
+                    )
+        try:
+            return UnfinishedRecording(self._part, self._overwrite)
+        except OSError as error:
+            raise ToftrackError(
+                f"the recording '{self.path}' cannot be written ({error.strerror or error}); "
+                "choose another place"
+            ) from error
+
+    def _run(self) -> None:
+        while (frame := self._queue.get()) is not None:
+            if self.ended is None:
+                self._take(frame)
+        if self.ended is None:
+            self._end("", failed=False)
+
+    def _take(self, frame: Frame) -> None:
+        try:
+            self._write(frame)
+        except OSError as error:
+            self._end(error.strerror or str(error), failed=True)
+        except Exception as error:  # of whatever kind, nobody is to wait for this thread
+            self._end(str(error) or type(error).__name__, failed=True)
+        else:
+            if self._file.bytes >= self._limit_gb * _GIGABYTE:
+                self._end(f"it has {self._limit_gb:g} GB, its limit", failed=False)
+            elif not self._file.has_room(_SPARE_BYTES):
+                self._end("the disk is nearly full", failed=False)
+
+    def _write(self, frame: Frame) -> None:
+        first, facts = self._facts is None, self._facts or self._facts_of(frame)
+        camera = facts.camera
+        if frame.depth.shape != (camera.height, camera.width) or frame.radial != facts.radial:
+            raise ToftrackError(
+                f"frame {frame.index} is another kind of image than those before, of "
+                f"{'x'.join(map(str, frame.depth.shape[::-1]))} pixels"
+            )
+        second = None
+        if facts.amplitude:  # black where a frame lacks it
+            amplitude = np.zeros_like(frame.depth) if frame.amplitude is None else frame.amplitude
+            if amplitude.shape != frame.depth.shape:
+                raise ToftrackError(f"the amplitude of frame {frame.index} has another size")
+            words = np.clip(amplitude, 0, 0xFFFF).astype(IMAGE_TYPES[1]).tobytes()
+            second = words, self._second.submit(compressed, words)
+        depth = frame.depth.astype(IMAGE_TYPES[0], copy=False).tobytes()
+        images = [depth, compressed(depth)]
+        if second is not None:
+            images += [second[0], second[1].result()]
+        if first:
+            self._file.begin(facts)
+            self._facts = facts
+        self._check_unit(frame)
+        self._file.append(frame.index, self._clock.at(frame.timestamp_s, facts.fps), images)
+        self.frames = self._file.frames
+
+    def _check_unit(self, frame: Frame) -> None:
+        """After half a minute it would be too late: nobody reads a recording in another unit."""
+        if frame.depth.dtype.kind in "iu":
+            what = f"the depth of frame {frame.index}"
+            raise wrong_unit(what, frame.depth, str(frame.depth.dtype))
+        if self._strange >= _STRANGE:
+            return
+        median = median_reading(frame.depth)
+        if SMALLEST_MEDIAN_M <= median <= LARGEST_MEDIAN_M:
+            self._strange = _STRANGE
+        elif median:
+            self._strange += 1
+            if self._strange == _STRANGE:
+                raise wrong_unit(f"the depth of the first {_STRANGE} frames", frame.depth)
+
+    def _facts_of(self, frame: Frame) -> Facts:
+        about = {
+            "toftrack": version("toftrack"),
+            "device": without_whereabouts(self._source.description),
+        }
+        metadata = {**self._source.metadata, "recorded": about}
+        return Facts(
+            self._source.camera,
+            frame.radial,
+            frame.amplitude is not None,
+            self._source.fps,
+            json.loads(json.dumps(metadata, default=str)),
+        )
+
+    def _end(self, why: str, failed: bool) -> None:
+        """Finish the file; no more frames are taken."""
+        self._file.close()
+        try:
+            if self.frames:
+                finish(self._part, self.path, self._overwrite)
+                told = f"the recording '{self.path}' ends after {self.frames} frames: {why}"
+            else:
+                self._part.unlink(missing_ok=True)
+                told = f"the recording '{self.path}' was not made: {why}"
+        except (OSError, ToftrackError) as error:
+            failed, told = True, str(error)
+        self.failed = failed
+        if why or failed:
+            self.ended = told
+            self._tell(told)
+
+
+def without_whereabouts(facts: dict[str, Any]) -> dict[str, Any]:
+    """A device's facts as they may be given away: no serial number, no folders."""
+
+    def name(value: Any) -> Any:
+        return Path(value).name if isinstance(value, str | Path) else value
+
+    return {key: name(value) for key, value in facts.items() if "serial" not in key.lower()}
+
+
+class _Clock:
+    """Times that do not go back: a camera that counts anew goes on a frame after the one before."""
+
+    def __init__(self) -> None:
+        self._offset_s, self._latest_s = 0.0, -math.inf
+
+    def at(self, time_s: float, fps: float) -> float:
+        """The time of the next frame."""
+        shifted_s = time_s + self._offset_s
+        if not math.isfinite(shifted_s) or shifted_s < self._latest_s:
+            before_s = self._latest_s if math.isfinite(self._latest_s) else 0.0
+            shifted_s = before_s + 1 / fps
+            if math.isfinite(time_s):
+                self._offset_s = shifted_s - time_s
+        self._latest_s = shifted_s
+        return shifted_s

@@ -1,0 +1,192 @@
+"""Opening files: what is written is ours, what is read is a file.
+
+A folder that somebody else made may hold anything under the names that are written there: symbolic
+links, second names (hard links) of files elsewhere, pipes, devices. Nothing is written through any
+of them. A file becomes new under another name and then takes its place, so that what stood there is
+whole until then; only what must grow in place is opened in place, when it has no other name.
+
+A folder on the way to a file may be a link: which folder is meant, the user says.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import secrets
+import stat
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+_BINARY = getattr(os, "O_BINARY", 0)
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
+"""Opening a pipe otherwise waits for its other end."""
+_PARTIAL = ".part"
+_KINDS = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+class _NoFileError(OSError):
+    """What is named is a pipe, a device or a socket."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+def open_to_read(path: str | Path) -> BinaryIO:
+    """Open a file, also through a link; a pipe is never waited for.
+
+    Raises OSError: it cannot be opened, or is a folder, a pipe or a device.
+    """
+    _refuse(path, os.stat(path))  # before it is opened, which does something to some devices
+    descriptor = os.open(path, os.O_RDONLY | _BINARY | _NO_WAIT)
+    try:
+        _refuse(path, os.fstat(descriptor))
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def check_readable(path: str | Path) -> None:
+    """For those who open a file by themselves, or all files in a folder: raise OSError for what is
+    no file, or is not there.
+    """
+    status = os.stat(path)
+    if not stat.S_ISDIR(status.st_mode):
+        _refuse(path, status)
+        return
+    for entry in os.scandir(path):
+        if not entry.is_dir():
+            _refuse(entry.path, entry.stat())
+
+
+def open_new(path: str | Path, replace: bool = False, buffered: bool = True) -> BinaryIO:
+    """Make a file that grows from nothing, open for writing and reading.
+
+    replace: let a file that stands there go; its other names, if any, keep what is in it.
+    buffered: False: what is written reaches the operating system at once; `write` may take a part.
+
+    Raises OSError: something stands there, with `replace` something that is no file; or it cannot
+    be made.
+    """
+    if replace:
+        check_replaceable(path)
+        Path(path).unlink(missing_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
+    return os.fdopen(descriptor, "w+b", -1 if buffered else 0)
+
+
+def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
+    """Open a file of ours to change it, without buffer; what is in it stays.
+
+    make: an empty one where there is none.
+
+    Raises OSError: it is a link, has a second name, or is no file; or it cannot be opened.
+    """
+    flags = os.O_RDWR | (os.O_CREAT if make else 0) | _NO_LINK | _NO_WAIT | _BINARY
+    if not _NO_LINK:  # Windows
+        check_replaceable(path)
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError:
+        check_replaceable(path)  # which says more than "too many levels of symbolic links"
+        raise
+    try:
+        status = os.fstat(descriptor)
+        _refuse(path, status)
+        if status.st_nlink > 1:
+            why = "it has a second name elsewhere (a hard link), where it would change, too"
+            raise OSError(errno.EMLINK, why, str(path))
+        return io.FileIO(descriptor, "r+b")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[BinaryIO]:
+    """A stream, open for writing and reading; `path` changes when all of it is on the disk.
+
+    Raises OSError, after which, as after any other error, `path` is as it was.
+    """
+    path = Path(path)
+    check_replaceable(path)
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}{_PARTIAL}")
+    stream = open_new(partial)
+    try:
+        with stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, path)
+    except BaseException:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
+
+
+def write_whole(path: str | Path, content: bytes | str) -> None:
+    """Write a file, text in UTF-8; it is there as a whole, or as it was.
+
+    Raises OSError.
+    """
+    with whole_file(path) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+
+
+def remove_partial(folder: Path, names: Collection[str]) -> None:
+    """Remove what killed `whole_file`s of these names left. Nobody may be writing them just now."""
+    mark = len(".") + 8 + len(_PARTIAL)
+    with suppress(OSError):
+        for found in folder.iterdir():
+            if found.name[:-mark] in names and found.name.endswith(_PARTIAL):
+                found.unlink()
+
+
+def let_links_go(path: Path) -> None:
+    """Remove, under a name that another library will write, a link, a second name or a pipe.
+
+    What they lead to stays. Raises OSError.
+    """
+    with suppress(FileNotFoundError):
+        status = os.lstat(path)
+        alone = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+        if not alone and not stat.S_ISDIR(status.st_mode):
+            path.unlink()
+
+
+def make_folder(path: str | Path) -> None:
+    """Make a folder within one that may be somebody else's; one that is there is no link.
+
+    Raises OSError.
+    """
+    if Path(path).is_symlink():
+        raise OSError(errno.ELOOP, "it is a symbolic link; take it away", str(path))
+    Path(path).mkdir(parents=True, exist_ok=True)
+
+
+def check_replaceable(path: str | Path) -> None:
+    """Raise OSError where something stands that is no file, or the link to one."""
+    with suppress(FileNotFoundError):
+        _refuse(path, os.lstat(path))
+
+
+def _refuse(path: str | Path, status: os.stat_result) -> None:
+    """OSError for what is no file."""
+    if stat.S_ISREG(status.st_mode):
+        return
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if stat.S_ISLNK(status.st_mode):
+        why = "it is a symbolic link, and nothing is written through one; take it away"
+        raise OSError(errno.ELOOP, why, str(path))
+    kind = _KINDS.get(stat.S_IFMT(status.st_mode), "no file")
+    raise _NoFileError(errno.EINVAL, f"it is {kind}, and only files are read or written", str(path))
