@@ -20,7 +20,7 @@ import toftrack
 from toftrack.compute.threads import small_operations, threads
 from toftrack.configuration.compose import configuration
 
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+QUICK = ("filter.particles=100",)
 
 
 def python(code: str, *arguments: str, folder: Path) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from toftrack.configuration.check import check_tracker
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from toftrack.devices.base import Device
     from toftrack.tracking.effort import Pace
     from toftrack.tracking.hands import HandsTracker
-    from toftrack.tracking.model import TrackerModel
+    from toftrack.tracking.model import FilterModel
     from toftrack.tracking.tracker import Tracker
 
 
@@ -107,28 +108,36 @@ def _pace(config: DictConfig) -> Pace:
     return pace_within((config.get("tracker") or {}).get("budget_ms"))
 
 
-def build_model(config: DictConfig) -> TrackerModel:
-    """The parts of a tracker of a configuration."""
+def build_model(config: DictConfig) -> FilterModel:
+    """The parts of a tracker of a configuration; those of the paper's where it has no networks.
+
+    Raises ToftrackError for parts of one tracker in the other.
+    """
     from toftrack.tracking.backend import choose_backend
     from toftrack.tracking.model import TrackerModel
+    from toftrack.tracking.paper import PaperModel
 
+    check_tracker(config)
     device = compute_device(config.compute)
-    hand = instantiate(config.hand)
-    relocaliser = instantiate(config.relocation)
+    hand, relocaliser = instantiate(config.hand), instantiate(config.relocation)
+    parts: dict[str, Any] = {
+        "shape": hand.shape,
+        "space": instantiate(config.pose_space),
+        "segmentation": instantiate(config.segmentation),
+        "likelihood": instantiate(config.likelihood),
+        "filter": instantiate(config.filter),
+        "gestures": instantiate(config.gestures),
+        "backend": choose_backend(config.renderer, device),
+        "lost": instantiate(config.lost),
+    }
+    if relocaliser is None:
+        return PaperModel(**parts, start=instantiate(config.start))
     return TrackerModel(
-        shape=hand.shape,
-        space=instantiate(config.pose_space),
-        segmentation=instantiate(config.segmentation),
-        likelihood=instantiate(config.likelihood),
-        filter=instantiate(config.filter),
+        **parts,
+        relocaliser=relocaliser.to(device),
         refinement=instantiate(config.refine),
-        start=instantiate(config.start),
-        lost=instantiate(config.lost),
-        fit=hand.fit,
-        gestures=instantiate(config.gestures),
-        backend=choose_backend(config.renderer, device),
-        relocaliser=None if relocaliser is None else relocaliser.to(device),
-        adapt=None if relocaliser is None else hand.adapt,
+        prior=instantiate(config.start),
+        adapt=hand.adapt,
         sides=hand.sides,
     )
 

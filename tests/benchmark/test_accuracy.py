@@ -12,7 +12,7 @@ from toftrack.benchmark import ablation, accuracy, command, runs, scoring
 from toftrack.errors import ToftrackError
 from toftrack.recordings.store import packaged_sample
 
-QUICK = ("relocation=none", "lost=score", "start=rough", "filter.particles=30")
+QUICK = ("experiment=paper", "filter.particles=30")
 """Overrides with which a start takes no time; how good the track is does not matter."""
 
 
@@ -148,15 +148,15 @@ def test_an_interruption_reports_what_is_done(folder, tmp_path, monkeypatch) -> 
 
 def test_an_ablation_has_the_differences_of_each_variant(folder, tmp_path, capsys) -> None:
     files = ["--json", str(tmp_path / "a.json"), "--markdown", str(tmp_path / "a.md")]
-    chosen = ["--variants", "few-particles,no-networks"]
-    ablation.main([str(folder), *chosen, *files, "start=rough"])
+    chosen = ["--variants", "few-particles,no-refinement"]
+    ablation.main([str(folder), *chosen, *files])
     said = capsys.readouterr().out
-    assert "20 particles" in said and "no networks" in said and "no votes" not in said
+    assert "20 particles" in said and "no refinement" in said and "no rivals" not in said
     result = json.loads((tmp_path / "a.json").read_text())
-    assert set(result["variants"]) == {"default", "few-particles", "no-networks"}
+    assert set(result["variants"]) == {"default", "few-particles", "no-refinement"}
     assert result["variants"]["default"]["differences"]["usable_pct"]["mean"] == 0
     text = (tmp_path / "a.md").read_text()
-    assert "    toftrack benchmark ablation" in text and "| no networks |" in text
+    assert "    toftrack benchmark ablation" in text and "| no refinement |" in text
     with pytest.raises(ToftrackError, match="there is no variant 'no-luck'"):
         ablation.main([str(folder), "--variants", "no-luck"])
 

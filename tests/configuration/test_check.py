@@ -16,10 +16,10 @@ from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
 WRONG = (
-    ("start.islands=0", "start.islands=0 .*whole number above 0"),
+    ("relocation.hypotheses=0", "relocation.hypotheses=0 .*whole number above 0"),
     ("refine.points=0", "refine.points=0 .*above 0"),
     ("segmentation.max_pixels=0", "max_pixels=0 .*above 0"),
-    ("hand.fit.step=0", "hand.fit.step=0 .*a number above 0"),
+    ("hand.adapt.sure_m=0", "hand.adapt.sure_m=0 .*a number above 0"),
     ("filter.spread.depth_m=-0.1", "filter.spread.depth_m=-0.1 .*at least 0"),
     ("filter.particles=many", "filter.particles=many .*a whole number"),
     ("filter.particles=2.5", "filter.particles=2.5 .*a whole number"),
@@ -49,12 +49,12 @@ def test_a_wrong_value_is_told_in_one_sentence(override: str, words: str) -> Non
     [
         ("filter.exponent=30", "filter.particles=100"),  # a whole number is a number
         ("view=browser", "view.linger_s=inf"),
-        ("relocation=none", "lost=score", "lost.outside_rad=inf"),
         ("experiment=paper", "filter.particles=10"),
         ("segmentation.reach_m=inf",),
         ("relocation.merit=-4", "lost.intercept=-1", "lost.weights.log_score=-0.5"),
         ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
-        ("start=rough", "start.pose=[0,0,0.4,0,0,0]"),
+        ("experiment=paper", "start.pose=[0,0,0.4,0,0,0]", "relocation=none", "start=rough"),
+        ("refine=none", "relocation.rivals=0", "start.forearm=0"),
         ("+device.anything=-1",),
         ("~device.repeat",),
         ("gestures.file=mine.csv", "device.stop=5"),
@@ -62,6 +62,43 @@ def test_a_wrong_value_is_told_in_one_sentence(override: str, words: str) -> Non
 )
 def test_a_right_value_passes(overrides: tuple[str, ...]) -> None:
     configuration(*overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (
+            ("relocation=none",),
+            "relocation=none belongs to experiment=paper, .* give experiment=paper, or leave",
+        ),
+        (("lost=never",), "lost=never belongs to experiment=paper; .* leave lost=never out"),
+        (("start=rough",), "start=rough belongs to experiment=paper; "),
+        (
+            ("experiment=paper", "start=prior"),
+            "start=prior goes with these alone; leave start=prior out",
+        ),
+        (
+            ("experiment=paper", "lost=calibrated"),
+            "lost=calibrated goes with these alone; leave lost=calibrated out",
+        ),
+        (
+            ("experiment=paper", "hand.shape=auto"),
+            "hand.shape=auto goes with these alone; leave hand.shape=auto out",
+        ),
+        (
+            ("experiment=paper", "hand.side=auto"),
+            "hand.side=auto goes with these alone; leave hand.side=auto out",
+        ),
+        (
+            ("experiment=paper", "refine=gauss_newton"),
+            "refine=gauss_newton goes with these alone; leave refine=gauss_newton out",
+        ),
+    ],
+)
+def test_parts_of_two_trackers_do_not_mix(overrides: tuple[str, ...], words: str) -> None:
+    with pytest.raises(ToftrackError, match=words) as error:
+        configuration(*overrides)
+    assert "\n" not in str(error.value)
 
 
 def test_what_a_part_of_somebody_else_s_accepts_is_not_judged(tmp_path) -> None:
@@ -107,10 +144,10 @@ def test_the_file_and_the_line_that_are_no_yaml_are_told() -> None:
 
 
 def test_the_program_ends_without_torch_having_been_loaded(tmp_path) -> None:
-    command = [sys.executable, "-X", "importtime", str(ROOT / "track.py"), "start.islands=0"]
+    command = [sys.executable, "-X", "importtime", str(ROOT / "track.py"), "filter.passes=0"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].startswith("error: start.islands=0 is not possible")
+    assert done.stderr.splitlines()[-1].startswith("error: filter.passes=0 is not possible")
     assert "| torch\n" not in done.stderr
 
 

@@ -153,8 +153,6 @@ def test_the_same_seed_reaches_the_tracker_and_the_synthetic_device() -> None:
     assert (config.seed, config.device.seed) == (7, 7)
 
 
-def test_belief_by_the_networks_without_networks_is_one_clear_sentence() -> None:
-    with pytest.raises(ToftrackError, match="relocation=none.*; give lost=score as well") as error:
+def test_a_tracker_of_mixed_parts_is_not_built() -> None:
+    with pytest.raises(ToftrackError, match="relocation=none belongs to experiment=paper"):
         build_tracker(configuration("relocation=none"))
-    assert "\n" not in str(error.value)
-    assert build_tracker(configuration("relocation=none", "lost=score")).model.rivals == 0

@@ -25,6 +25,18 @@ from toftrack.errors import ToftrackError
         ("view=quux", "there is no view=quux; give one of browser, none, rerun, video"),
         ("device.path=a (1).npz", "give the recording by its name alone: toftrack track 'a (1)"),
         ("seed=[1", "'seed=[1' cannot be read as a setting"),
+        ("start=search", "there is no start=search any more, since the networks find hands: leave"),
+        ("lost=score", "there is no lost=score any more, since the networks' signs are judged"),
+        ("start.hypotheses=9", "or give relocation.hypotheses"),
+        ("start.islands=9", "there is no setting start.islands any more, since the networks"),
+        (
+            "lost.score=0.5",
+            "lost.confidence says which estimates count: give that, or give experiment",
+        ),
+        (
+            "hand.fit.prior=0.1",
+            "no setting hand.fit.prior any more, since the whole shape",
+        ),
     ],
 )
 def test_a_misspelt_override_gets_the_nearest_one(override: str, told: str) -> None:

@@ -16,8 +16,8 @@ from toftrack.relocation.relocaliser import RelocationSettings
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import NearestSurface
 from toftrack.tracking.belief import CalibratedBelief
-from toftrack.tracking.life_cycle import LostSettings
-from toftrack.tracking.search import RoughStart, SearchStart
+from toftrack.tracking.paper import RoughStart
+from toftrack.tracking.prior import Prior
 from toftrack.tracking.side_belief import SideFit
 
 
@@ -47,19 +47,14 @@ def steadying(**changes: Any) -> Steadying:
     return replace(_part("refine").steadying, **changes)
 
 
-def search_start(**changes: Any) -> SearchStart:
-    """conf/start/search.yaml"""
-    return replace(_part("start", "search"), **changes)
+def prior(**changes: Any) -> Prior:
+    """conf/start/prior.yaml"""
+    return replace(_part("start", "prior"), **changes)
 
 
 def rough_start(**changes: Any) -> RoughStart:
     """conf/start/rough.yaml"""
     return replace(_part("start", "rough"), **changes)
-
-
-def lost_settings(**changes: Any) -> LostSettings:
-    """conf/lost/score.yaml"""
-    return replace(_part("lost", "score"), **changes)
 
 
 def calibrated_belief(**changes: Any) -> CalibratedBelief:

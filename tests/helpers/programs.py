@@ -16,7 +16,7 @@ from pathlib import Path
 from helpers.tracking import ROOT
 from hydra.core.singleton import Singleton
 
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+QUICK = ("filter.particles=100",)
 """Overrides for runs whose accuracy is of no matter."""
 
 

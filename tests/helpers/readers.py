@@ -259,7 +259,7 @@ def read_weights(path: Path) -> None:
 
 
 def _runs(folder: Path) -> list[Reader]:
-    quick = ("start.hypotheses=100", "start.samples=32", "start.islands=4", "filter.particles=50")
+    quick = ("filter.particles=50",)
     there = _new(folder, "run")
     with Sample(stop=2) as device:
         run(there, device, *quick, "view=none")

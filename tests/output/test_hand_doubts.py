@@ -20,9 +20,9 @@ from toftrack.recordings.store import packaged_sample
 K = np.array([[300.0, 0, 88], [0, 300, 72], [0, 0, 1]])
 
 
-def hand(length_m: float, sigma: float = 0.024, count: int = len(COMPONENTS)) -> HandShape:
-    covariance = np.eye(count) * sigma**2
-    fitted = Fitted(COMPONENTS[:count], (0.0,) * count, tuple(map(tuple, covariance)), 3.0, False)
+def hand(length_m: float, sigma: float = 0.024) -> HandShape:
+    mean, covariance = (0.0,) * len(COMPONENTS), np.eye(len(COMPONENTS)) * sigma**2
+    fitted = Fitted(COMPONENTS, mean, tuple(map(tuple, covariance)), 3.0, False)
     return dataclasses.replace(default_hand_shape(length_m), fitted=fitted)
 
 
@@ -45,10 +45,9 @@ def test_a_fitted_hand_that_is_hardly_anybody_s_is_told(length_m: float, words: 
         hand(0.19),
         hand(0.215),
         hand(0.13, sigma=0.12),
-        hand(0.13, count=1),
         default_hand_shape(0.1),
     ],
-    ids=["child", "child, fitted small", "adult", "large", "unsure", "size alone", "given"],
+    ids=["child", "child, fitted small", "adult", "large", "unsure", "given"],
 )
 def test_hands_of_people_and_unsure_fits_are_not_doubted(shape: HandShape) -> None:
     assert length_doubt(shape, K) == ""

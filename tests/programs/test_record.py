@@ -32,7 +32,7 @@ from toftrack.recordings.npz import read_recording
 from toftrack.recordings.recorder import Recorder
 
 FEW = 5
-TRACK = ("view=none", "relocation=none", "lost=score", *QUICK)
+TRACK = ("view=none", "experiment=paper", *QUICK)
 
 
 def a_realsense(monkeypatch: pytest.MonkeyPatch) -> Device:

@@ -26,7 +26,6 @@ from toftrack.refinement.gauss_newton import (
     Landmarks,
     Refinement,
     TorchRefiner,
-    no_refinement,
     point_jacobian,
     refine,
 )
@@ -323,7 +322,7 @@ def test_swapped_hands_differ_from_the_first_in_exactly_one_finger(side: str) ->
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("iterations", 0),
+        ("iterations", -1),
         ("points", 0),
         ("points", 2.5),
         ("swaps", -1),
@@ -337,9 +336,3 @@ def test_swapped_hands_differ_from_the_first_in_exactly_one_finger(side: str) ->
 def test_impossible_settings_are_refused(key: str, value: object) -> None:
     with pytest.raises(ToftrackError, match=f"^refine.{key}={value} "):
         refinement(**{key: value})
-
-
-def test_no_refinement_is_none() -> None:
-    assert no_refinement() is None
-    with pytest.raises(ToftrackError, match="refine=none"):
-        refinement(iterations=0)

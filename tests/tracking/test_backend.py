@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -19,7 +15,6 @@ from toftrack.render.torch_scorer import TorchScorer
 from toftrack.tracking.backend import choose_backend, make_scorer
 
 SHAPE = default_hand_shape()
-TESTS = Path(__file__).parents[1]
 
 
 def test_a_back_end_is_of_one_kind() -> None:
@@ -50,38 +45,3 @@ def test_unknown_back_ends_are_refused(name: str) -> None:
 def test_triton_is_refused_where_it_cannot_run() -> None:
     with pytest.raises(ToftrackError, match="renderer=triton cannot run here"):
         choose_backend("triton")
-
-
-_WITHOUT_NUMBA = """
-import logging, sys
-logging.basicConfig(level=logging.INFO, format="%(message)s")
-sys.modules["numba"] = sys.modules["llvmlite"] = None
-from helpers.programs import QUICK
-from helpers.tracking import follow, sample
-for renderer in ("torch", "auto"):
-    print(renderer, file=sys.stderr)
-    found = follow(sample().cut(0, 1), f"renderer={renderer}", *QUICK)
-    print(len(found), found[-1].score)
-"""
-
-
-def test_without_numba_torch_does_all_of_it() -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", _WITHOUT_NUMBA],
-        cwd=TESTS,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert run.returncode == 0, run.stderr
-    for line in run.stdout.splitlines():
-        frames, score = line.split()
-        assert int(frames) == 2 and float(score) > 0.3
-    asked, auto = run.stderr.split("auto\n")
-    assert "numba is not available" in auto and "numba is not available" not in asked
-
-
-def test_without_numba_it_cannot_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "toftrack.render.numba.scorer", None)  # no such module
-    with pytest.raises(ToftrackError, match="renderer=numba cannot run here.*renderer=torch"):
-        choose_backend("numba")

@@ -49,7 +49,9 @@ def with_odds(log_odds: float, **changes: float) -> Signs:
 
 def followed(**changes: object) -> Track:
     nothing = torch.zeros(1, 10)
-    track = Track(nothing, torch.ones(1), nothing, nothing[0], torch.zeros(21), age_s=1.0)
+    track = Track(
+        nothing, torch.ones(1), nothing, nothing[0], torch.zeros(21), torch.zeros(1, 27), age_s=1.0
+    )
     return replace(track, **changes)
 
 

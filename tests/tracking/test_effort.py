@@ -109,27 +109,26 @@ def test_a_frame_is_timed_from_when_its_raw_image_was_there() -> None:
 
 def test_each_level_leaves_out_more() -> None:
     model = make_tracker("hand.side=right").model
-    assert model.relocaliser is not None and model.refinement is not None
     for effort in LEVELS[:REDUCED]:
         assert model.spending(effort) is model
     before = model
     for effort in LEVELS[REDUCED:]:
         less = model.spending(effort)
         assert less is model.spending(effort), "made once"
-        assert less.relocaliser is not None and before.relocaliser is not None
         assert less.relocaliser.settings.every > before.relocaliser.settings.every
         assert less.relocaliser.settings.search > before.relocaliser.settings.search
         assert less.refinement.swaps <= before.refinement.swaps
-        assert less.rivals <= before.rivals
+        assert less.relocaliser.settings.rivals <= before.relocaliser.settings.rivals
         assert less.filter == model.filter and less.poses is model.poses
-        assert less.hand("right", None) is model.hand("right", None)
+        shape = model.first_state(0).size
+        assert less.hand("right", shape) is model.hand("right", shape)
         before = less
 
 
 def test_settings_that_leave_out_more_stay() -> None:
     model = make_tracker("relocation.every=6", "relocation.rivals=0", "refine=none").model
     less = model.spending(LEVELS[-1])
-    assert less.relocaliser.settings.every == 6 and less.rivals == 0
+    assert less.relocaliser.settings.every == 6 and less.relocaliser.settings.rivals == 0
 
 
 def test_less_effort_may_be_one_thread() -> None:
@@ -175,7 +174,7 @@ def test_the_search_is_bounded(search: int, searches: int) -> None:
             self.count += 1
             return super().search(depth_m, k, side, likely)
 
-    usual = make_tracker("relocation=none", "lost=score", "filter.particles=20", "hand.side=right")
+    usual = make_tracker("filter.particles=20", "hand.side=right")
     told = Counting(search=search)
     tracker = Tracker(replace(usual.model, relocaliser=told))
     image = np.full((72, 88), 0.9, np.float32)

@@ -131,8 +131,8 @@ def test_other_numbers_of_hands_are_refused(hands: float) -> None:
 
 
 def test_two_hands_without_networks_are_refused() -> None:
-    with pytest.raises(ToftrackError, match="relocation=network"):
-        tracker_of("hands=2", "relocation=none", "lost=score")
+    with pytest.raises(ToftrackError, match="hands=2 .*leave experiment=paper out"):
+        tracker_of("hands=2", "experiment=paper")
 
 
 def test_the_second_hand_has_to_convince_more_than_the_first() -> None:

@@ -160,7 +160,7 @@ def test_a_covariance_is_carried_to_the_joints() -> None:
     np.testing.assert_allclose(sigma[0], [0.012, 0.006, 0.003], rtol=1e-5)
 
 
-@pytest.mark.parametrize("overrides", [(), ("relocation=none", "lost=score", "start=rough")])
+@pytest.mark.parametrize("overrides", [(), ("experiment=paper",)])
 def test_every_estimate_says_how_far_off_its_joints_may_be(overrides: tuple[str, ...]) -> None:
     scene, tracker = sample().cut(0, 1, 2), make_tracker(*overrides)
     for index, depth in enumerate(scene.depth_m):

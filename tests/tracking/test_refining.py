@@ -24,7 +24,7 @@ def test_a_believed_hand_is_tried_in_turn() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"log_odds": 0.0}, {"log_odds": None}, {"pose": None}, {"challenged_s": FRAME_S}]
+    "changes", [{"log_odds": 0.0}, {"log_odds": None}, {"challenged_s": FRAME_S}]
 )
 def test_a_hand_that_is_doubted_or_challenged_is_tried_in_both_ways(changes: dict) -> None:
     assert all(turns(track(frames, **changes), 0.9) == (True, True) for frames in range(1, 5))

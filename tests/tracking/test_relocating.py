@@ -17,12 +17,12 @@ from toftrack.compute.pace import FRAME_S
 from toftrack.frames import DepthImage
 from toftrack.relocation.relocaliser import SAME_PLACE_M
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.refining import Refined
+from toftrack.tracking.prior import LastSeen
+from toftrack.tracking.refining import Refined, challenged
 from toftrack.tracking.relocating import expected_of, glanced, hypotheses, landmarks_of, track_of
-from toftrack.tracking.search import LastSeen
-from toftrack.tracking.starting import challenged
+from toftrack.tracking.shape_fit import first_belief
 from toftrack.tracking.state import Track, TrackerState
-from toftrack.tracking.step import _hand_told, first_state
+from toftrack.tracking.step import _hand_told
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -32,7 +32,7 @@ IMAGE = DepthImage(np.full((144, 176), 0.9, np.float32), K, 0, 0.0)
 
 @cache
 def plain_model() -> TrackerModel:
-    return make_tracker("relocation=none", "lost=score", "filter.particles=20").model
+    return make_tracker("hand.shape=default", "hand.side=right", "filter.particles=20").model
 
 
 def model_with(told: ToldRelocaliser) -> TrackerModel:
@@ -51,17 +51,12 @@ def track_at(x: float, **changes: object) -> Track:
 
 
 def state_of(track: Track | None, seen: LastSeen | None = None) -> TrackerState:
-    return replace(first_state(plain_model(), 0), track=track, seen=seen)
+    return replace(plain_model().first_state(0), track=track, seen=seen)
 
 
 def middle(track: Track) -> np.ndarray:
     """(3,) of the palm."""
     return glance_of(track.pose).centre_m.numpy()
-
-
-def test_without_networks_nothing_is_said() -> None:
-    track = track_at(0.0)
-    assert glanced(state_of(track), FRAME_S, IMAGE, plain_model()) == (track, None)
 
 
 def test_without_a_track_the_best_place_of_all_is_taken() -> None:
@@ -185,14 +180,15 @@ def test_a_track_that_has_just_begun_gives_way_at_once() -> None:
 
 def test_the_networks_say_the_length_that_a_track_begins_with() -> None:
     model = make_tracker("filter.particles=20").model
-    first = first_state(model, 0)
+    first = model.first_state(0)
     said = glance_of(hand_at(0.0), log_size=math.log(0.8))
     belief = _hand_told(first, None, said, model)
     assert model.hand("right", belief).shape.hand_length_m == pytest.approx(0.152, rel=1e-3)
     # A track goes on as it began, and a hand that is not fitted stays as it is.
     followed = _hand_told(first, track_at(0.0), said, model)
     assert model.hand("right", followed) is model.hand("right", first.size)
-    assert _hand_told(replace(first, size=None), None, said, replace(model, adapt=None)) is None
+    fixed = replace(model, adapt=replace(model.adapt, fixed=True))
+    assert _hand_told(first, None, said, fixed).worn == first.size.worn
 
 
 def test_what_is_expected_of_a_hand_that_is_not_tracked_yet() -> None:
@@ -213,7 +209,7 @@ def test_landmarks_are_trusted_no_more_than_is_set() -> None:
 
 def test_only_likely_hypotheses_compete_and_at_least_one() -> None:
     model = plain_model()
-    hand = model.hand("right", None)
+    hand = model.hand("right", first_belief())
     glance = glance_of(torch.cat([hand_at(0.01 * i) for i in range(6)]))
     states, log_probability = hypotheses(glance, hand, 4)
     assert 1 <= len(states) == len(log_probability) < 4, "the third has a chance of 2 %"

@@ -154,13 +154,13 @@ def test_a_single_odd_look_reopens_nothing() -> None:
 
 def test_the_network_s_length_is_worn_until_estimates_say_better() -> None:
     first = default_hand_shape()
-    said = shape_fit.told(first_belief(), 0.16, first)
+    said = shape_fit.told(first_belief(), 0.16, FIT, first)
     assert shaped(first, torch.tensor(said.worn)).hand_length_m == pytest.approx(0.16, rel=1e-4)
     for absurd in (1e-3, 10.0):
-        worn = shape_fit.told(first_belief(), absurd, first).worn
+        worn = shape_fit.told(first_belief(), absurd, FIT, first).worn
         assert abs(worn[0]) <= 3 * POPULATION_SIGMA[0]
     known = fitted(first_belief(), default_hand_shape(0.18), poses(3))
-    assert shape_fit.told(known, 0.15, first) is known
+    assert shape_fit.told(known, 0.15, FIT, first) is known
 
 
 def test_the_shape_in_use_changes_in_steps_only() -> None:
@@ -169,14 +169,18 @@ def test_the_shape_in_use_changes_in_steps_only() -> None:
     assert nearly.worn == belief.worn and not torch.equal(nearly.mean, belief.mean)
 
 
-def test_only_auto_is_fitted_and_by_networks_where_there_are_some() -> None:
-    assert make_tracker("hand.shape=default").state.size is None
-    assert isinstance(make_tracker().state.size, ShapeBelief)
-    alone = make_tracker("relocation=none", "lost=score")
-    assert alone.state.size is not None and not isinstance(alone.state.size, ShapeBelief)
+def test_a_fixed_hand_stays_whatever_is_seen_of_another() -> None:
+    fit, shape = replace(FIT, fixed=True), default_hand_shape(0.16)
+    assert shape_fit.told(first_belief(), 0.16, fit, default_hand_shape()).worn == (0.0,) * 6
+    assert fitted(first_belief(), shape, poses(3), fit=fit).worn == (0.0,) * 6
+
+
+def test_only_auto_is_fitted() -> None:
+    fixed = make_tracker("hand.shape=default")
+    assert not fixed.model.fits and fixed.fitted.fitted is None
+    assert make_tracker().model.fits
     fitted_hand = make_tracker("hand.side=left").fitted
     assert fitted_hand.side == "left" and fitted_hand.fitted is None, "nothing was fitted yet"
-    assert alone.fitted.fitted is None
 
 
 @pytest.mark.parametrize("name", ["sure_m", "length_sigma", "votes", "certain_poses", "memory"])

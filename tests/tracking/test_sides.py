@@ -65,12 +65,6 @@ def test_a_side_that_is_told_at_a_restart_stays_told() -> None:
         tracker.restart()
 
 
-def test_without_networks_a_hand_is_taken_for_a_right_one_and_nobody_is_sure() -> None:
-    quick = ("relocation=none", "lost=score", "start.hypotheses=600", "start.samples=128")
-    estimate = follow(first(1), *quick)[0]
-    assert (estimate.side, estimate.side_probability) == ("right", 0.5)
-
-
 def test_the_evidence_of_looks_is_summed_up_and_bounded() -> None:
     fit, belief = side_fit(weight=1.0, largest=2.0, most=3.0, shoulder=0.0), SideBelief()
     belief = belief.looked(0.5, 0.0, fit)

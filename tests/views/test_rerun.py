@@ -28,7 +28,7 @@ from toftrack.errors import ToftrackError
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import classify
 
-QUICK = ("start.hypotheses=500", "start.samples=128", "start.islands=16", "filter.particles=100")
+QUICK = ("filter.particles=100",)
 FRAMES = 6
 
 

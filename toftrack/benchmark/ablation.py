@@ -58,7 +58,6 @@ VARIANTS: dict[str, Variant] = {
     "no-overlap": Variant("fingers may be in one another", ("refine.overlap=0",)),
     "side-found": Variant("the side found out", (), "auto"),
     "two-hands": Variant("two hands", ("hands=2",)),
-    "no-networks": Variant("no networks", ("relocation=none", "lost=score")),
 }
 _SHOWN = (
     ("usable_pct", "usable %"),

@@ -139,13 +139,10 @@ def _times(
         return FrameRow(what, tracker.model.filter.particles, shortest, median, len(whole), parts)
 
     starts = [anew(index) for index in range(_STARTS)]
-    # Young tracks are still compared with a new start in every frame.
-    young = range(_STARTS, _STARTS + int(tracker.model.lost.probation) + 1)
-    for index in young:
-        step(index)
+    step(_STARTS)
     tracked = []
     began = time.perf_counter()
-    for index in cycle(range(young.stop, len(frames))):
+    for index in cycle(range(_STARTS + 1, len(frames))):
         tracked.append(step(index))
         if len(tracked) >= _FEWEST and time.perf_counter() - began > seconds:
             break

@@ -36,8 +36,7 @@ _ABOVE_ZERO = frozenset(
     hands
     hand.adapt.certain_poses hand.adapt.contradiction hand.adapt.length_sigma hand.adapt.memory
     hand.adapt.sure_m hand.adapt.votes
-    hand.length_m hand.fit.beta hand.fit.exponent hand.fit.frames hand.fit.largest hand.fit.prior
-    hand.fit.samples hand.fit.step
+    hand.length_m
     likelihood.beta likelihood.tolerance_m
     lost.joints.scale
     pose_space.dims
@@ -48,20 +47,31 @@ _ABOVE_ZERO = frozenset(
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
-    start.hypotheses start.islands start.memory_rad start.memory_s start.samples
+    start.memory_rad start.memory_s
     stream.waiting
     view.most_fps view.quality
     """.split()
 )
 _AT_MOST = {"hands": 2, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
 """More particles or passes than these take minutes a frame; larger seeds are none for torch."""
-_OPEN_ENDED = frozenset(
-    {"lost.outside_rad", "segmentation.reach_m", "view.linger_s", "view.wait_s"}
-)
+_OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""
 _LOG_ODDS = ("lost.intercept", "lost.weights.", "lost.joints.odds", "relocation.merit")
 """How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
+_OF_NETWORKS = {
+    "start._target_": ("toftrack.tracking.prior.Prior", "start=prior"),
+    "lost._target_": ("toftrack.tracking.belief.CalibratedBelief", "lost=calibrated"),
+    "hand.shape": ("auto", "hand.shape=auto"),
+    "hand.side": ("auto", "hand.side=auto"),
+}
+"""What the tracker with networks alone has: settings, their values, and how these are given."""
+_OF_PAPER = {
+    "start._target_": ("toftrack.tracking.paper.RoughStart", "start=rough"),
+    "lost._target_": ("toftrack.tracking.paper.ScoreThreshold", "lost=never"),
+}
+"""Likewise the paper's."""
+_NO_NETWORKS = "toftrack.relocation.relocaliser.no_relocaliser"
 
 
 def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> None:
@@ -72,6 +82,7 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     config: what was composed.  name: of the configuration file.  overrides: of the command line.
     Raises ToftrackError with one sentence that names the setting.
     """
+    check_tracker(config)
     loader = GlobalHydra.instance().config_loader()
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     chosen = [o for o in parsed if not o.is_delete() and loader.get_group_options(o.key_or_group)]
@@ -84,6 +95,34 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
         return  # options that exclude each other unless something is deleted: nothing to compare
     for key, value, usual in _pairs(config, default):
         check_value(key, value, usual)
+
+
+def check_tracker(config: DictConfig) -> None:
+    """Raise ToftrackError where parts of the paper's tracker and of the other one are mixed."""
+    without = OmegaConf.select(config, "relocation._target_") == _NO_NETWORKS
+    given = [
+        choice
+        for key, (value, choice) in (_OF_NETWORKS if without else _OF_PAPER).items()
+        if OmegaConf.select(config, key) == value
+    ]
+    if without and OmegaConf.select(config, "refine.iterations"):
+        given.append("refine=gauss_newton")
+    if not given:
+        return
+    some = ", ".join(given)
+    if without and {"start=prior", "lost=calibrated"} <= set(given):
+        raise ToftrackError(
+            "relocation=none belongs to experiment=paper, the tracker without networks; give"
+            " experiment=paper, or leave relocation=none out"
+        )
+    if without:
+        raise ToftrackError(
+            f"experiment=paper has no networks, and {some} goes with these alone; leave {some} out,"
+            " or leave experiment=paper out"
+        )
+    raise ToftrackError(
+        f"{some} belongs to experiment=paper; give experiment=paper as well, or leave {some} out"
+    )
 
 
 def check_value(key: str, value: object, usual: object) -> None:

@@ -14,6 +14,26 @@ _ALIKE = 0.6
 """How much of a name must be right, 0..1."""
 _MOST = 12
 """So many names are listed at most."""
+_OR_PAPER = "or give experiment=paper, the tracker without networks"
+_GONE = {
+    "start=search": f"the networks find hands: leave it out, {_OR_PAPER}",
+    "start.hypotheses": "the networks find hands: leave it out, or give relocation.hypotheses",
+    **dict.fromkeys(
+        (
+            *("start.islands", "start.samples", "start.improved", "start.coverage"),
+            *("start.position_m", "start.tilt_rad", "start.arm_rad"),
+        ),
+        f"the networks find hands: leave it out, {_OR_PAPER}",
+    ),
+    "lost=score": f"the networks' signs are judged, too: leave it out, {_OR_PAPER}",
+    "lost.score": f"lost.confidence says which estimates count: give that, {_OR_PAPER}",
+    **dict.fromkeys(
+        ("lost.start_score", "lost.rival_gain", "lost.outside_rad"),
+        "lost.confidence (in experiment=paper lost.score) says which estimates count: give that",
+    ),
+    "hand.fit": "the whole shape is fitted, by the settings of hand.adapt: give those",
+}
+"""What there was, and what is to be done instead."""
 
 
 def nearest(word: str, names: Sequence[str]) -> str | None:
@@ -50,6 +70,8 @@ def _of_syntax(error: OverrideParseException) -> str:
 
 def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     group, _, word = missing.rpartition("/")
+    if told := _GONE.get(f"{group}={word}"):
+        return f"there is no {group}={word} any more, since {told}"
     if not group or not options:
         return None
     likely = nearest(word, options)
@@ -69,6 +91,9 @@ def _of_key(chain: Sequence[BaseException]) -> str | None:
 def _unknown_key(key: str, parent: DictConfig) -> str:
     root = parent._get_root()
     assert isinstance(root, DictConfig)
+    for gone, told in _GONE.items():
+        if f"{key}.".startswith(f"{gone}."):
+            return f"there is no setting {key} any more, since {told}"
     keys = [name for name in _keys(root) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]

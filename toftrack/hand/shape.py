@@ -69,7 +69,7 @@ class Fitted:
     """How a shape was fitted to its user, in components (hand/shape_space.py).
 
     names: of the components.  mean: (K,).  covariance: (K, K), rows.
-    poses: how many different, well seen poses it rests on; without networks, how many frames.
+    poses: how many different, well seen poses it rests on.
     frozen: nothing more was learned.
     """
 

@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
-from toftrack.hand.shape_space import COMPONENTS
 
 _SMALLEST_M, _LARGEST_M = 0.145, 0.210
 """Hands between these are no reason to doubt: of children from about ten years on, and of all but
@@ -26,9 +25,9 @@ usual."""
 
 def length_doubt(shape: HandShape, k: np.ndarray) -> str:
     """What speaks against the camera matrix k (3, 3), in pixels, where a hand was fitted; "" for
-    nothing, and where the whole shape was not fitted: of the size alone little is known."""
+    nothing."""
     fitted = shape.fitted
-    if fitted is None or fitted.names != COMPONENTS:
+    if fitted is None:
         return ""
     length, factor = shape.hand_length_m, math.exp(_SIGMAS * fitted.sigma[0])
     if _SMALLEST_M <= length * factor and length / factor <= _LARGEST_M:

@@ -23,7 +23,7 @@ from toftrack.hand.openxr import openxr_rig
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.tracking.hands import HandsTracker
-from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.model import FilterModel, TrackerModel
 
 _log = logging.getLogger(__name__)
 
@@ -43,10 +43,10 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
     return tracker
 
 
-def _compile_here(model: TrackerModel) -> None:
+def _compile_here(model: FilterModel) -> None:
     """The large kernels but for the one that the second process compiles."""
     model.backend.make_scorer(model.shape)
-    if model.relocaliser is not None:
+    if isinstance(model, TrackerModel):
         nothing = np.zeros((72, 88), np.float32)
         k = np.array([[110.0, 0, 44], [0, 110.0, 36], [0, 0, 1]])
         model.relocaliser.glance(nothing, k, np.array([[0.0, 0.0, 0.5]]), model.shape.side)
@@ -58,11 +58,8 @@ def _helper(config: DictConfig) -> subprocess.Popen | None:
     numba = config.renderer in ("auto", "numba") and compute_device(config.compute).type == "cpu"
     if (cores or 1) < 2 or not numba or getattr(sys, "frozen", False):
         return None
-    try:
-        from toftrack.refinement.gauss_newton_numba import refine_hands
-    except ImportError:  # without numba everything is done by torch
-        return None
     from toftrack.compute.compiling import must_be_compiled
+    from toftrack.refinement.gauss_newton_numba import refine_hands
 
     if not must_be_compiled(refine_hands):
         return None

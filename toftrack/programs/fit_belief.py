@@ -28,8 +28,8 @@ from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
 from toftrack.relocation.sequences import Sequence, random_sequence, read_sequence, write_sequence
 from toftrack.relocation.shapes import shape_bank
 from toftrack.safe_files import whole_file, write_whole
-from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.joint_belief import JOINT_SIGNS
+from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.signs import SIGNS
 from toftrack.views.pictures import write_picture
 
@@ -161,10 +161,10 @@ def _fitted_frames(
 
 def _memory(overrides: list[str]) -> float:
     """The part of the log odds that the tracker takes from the frames before."""
-    settings = make_tracker(*overrides).model.lost
-    if not isinstance(settings, CalibratedBelief):
-        raise ToftrackError("fit_belief fits lost=calibrated; leave lost= as it is")
-    return settings.memory
+    model = make_tracker(*overrides).model
+    if not isinstance(model, TrackerModel):
+        raise ToftrackError("fit_belief fits lost=calibrated; leave experiment=paper out")
+    return model.lost.memory
 
 
 def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:

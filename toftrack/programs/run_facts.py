@@ -41,7 +41,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
         "pose_space": {"kind": tracker.space.kind, "dims": tracker.space.dims},
         "hand_shape": {
             "side": told_side(config, shape.side) or "auto",
-            "fitted": tracker.model.fit is not None,
+            "fitted": tracker.model.fits,
             "thickness": shape.thickness,
             "hand_length_m": shape.hand_length_m,
             "bone_lengths_m": shape.bone_lengths_m.tolist(),

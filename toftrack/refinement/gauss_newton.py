@@ -74,7 +74,7 @@ POINT_REACH = 0.4
 class Refinement:
     """How an estimate is refined; see conf/refine/gauss_newton.yaml for what each does.
 
-    iterations: Gauss-Newton steps.
+    iterations: Gauss-Newton steps; 0 leaves the filter's estimate as it is.
     points: seen points that are used at most.
     reach_m: points farther than this from the surface are no part of the hand.
     point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
@@ -107,20 +107,14 @@ class Refinement:
     carry: float
 
     def __post_init__(self) -> None:
-        least = {"iterations": 1, "points": 1, "swaps": 0}
-        for name, value in least.items():
-            remedy = ", or refine=none for no refinement" if name == "iterations" else ""
-            check_number(f"refine.{name}", getattr(self, name), value, whole=True, remedy=remedy)
+        for name, least in (("iterations", 0), ("points", 1), ("swaps", 0)):
+            check_number(f"refine.{name}", getattr(self, name), least, whole=True)
         for name in ("reach_m", "point_m", "silhouette_px", "angle_rad"):
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
         for name in ("damping", "swap_gain", "drift", "keep_gain", "overlap"):
             check_number(f"refine.{name}", getattr(self, name), 0)
         check_number("refine.sure", self.sure, 0.5, 1)
         check_number("refine.carry", self.carry, 0, 1)
-
-
-def no_refinement() -> None:
-    """The filter's estimate as it is: refine=none."""
 
 
 @dataclass(frozen=True, eq=False)

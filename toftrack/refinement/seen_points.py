@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.refinement import seen_points_numba
 from toftrack.render.segmentation import Observation
 
 REACH_M = 0.16
@@ -75,10 +74,9 @@ def seen_points(observation: Observation) -> SeenPoints:
     if wide == 0:
         left = top = right = bottom = 0
     part = slice(top, bottom), slice(left, right)
-    points_of, nearest_of = _loops()
     k = observation.k.cpu().numpy()
     depth = observation.depth_m.cpu().numpy()[part]
-    points = points_of(depth, hand[part], (top, left), k, _EDGE_M, _FAR_M)
+    points = seen_points_numba.smooth_points(depth, hand[part], (top, left), k, _EDGE_M, _FAR_M)
     nearest = np.zeros((0, 0, 2), np.float32)
     if solid[part].size:
         labels = cv2.distanceTransformWithLabels(
@@ -87,7 +85,7 @@ def seen_points(observation: Observation) -> SeenPoints:
             cv2.DIST_MASK_5,
             labelType=cv2.DIST_LABEL_PIXEL,
         )[1]
-        nearest = nearest_of(labels, solid[part], (top, left))
+        nearest = seen_points_numba.nearest_of_labels(labels, solid[part], (top, left))
     device = observation.depth_m.device
     return SeenPoints(
         torch.from_numpy(points).to(device),
@@ -96,16 +94,6 @@ def seen_points(observation: Observation) -> SeenPoints:
         (observation.hand.shape[0], observation.hand.shape[1]),
         (top, left),
     )
-
-
-@functools.cache
-def _loops() -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
-    """The loops over pixels: compiled ones, or those below where there is no numba."""
-    try:
-        from toftrack.refinement import seen_points_numba
-    except ImportError:
-        return smooth_points, nearest_of_labels
-    return seen_points_numba.smooth_points, seen_points_numba.nearest_of_labels
 
 
 def smooth_points(

@@ -6,9 +6,8 @@ mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -140,13 +139,6 @@ def look(
         present=p.present,
         right=p.right,
     )
-
-
-def looking(
-    pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
-) -> Callable[[], Look]:
-    """The same, when it is asked for."""
-    return partial(look, pose, depth_m, k, centres_m, side)
 
 
 def _sigma_m(votes_m: Tensor, sigma_m: Tensor, log_size: Tensor) -> Tensor:

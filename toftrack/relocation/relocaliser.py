@@ -17,12 +17,8 @@ from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Landmarks
 from toftrack.relocation.network import Finder, PoseNet
 from toftrack.relocation.proposals import Look, find_hands
+from toftrack.relocation.proposals_numba import look, looking
 from toftrack.relocation.weights import load_weights
-
-try:
-    from toftrack.relocation.proposals_numba import look, looking
-except ImportError:  # there is no numba
-    from toftrack.relocation.proposals import look, looking
 
 SAME_PLACE_M = 0.06
 """Places that lie closer together are one."""
@@ -242,4 +238,4 @@ def make_relocaliser(weights: str | None = None, **settings: Any) -> Relocaliser
 
 
 def no_relocaliser() -> None:
-    """relocation=none: starts are searched for, and nothing challenges a track."""
+    """relocation=none: the paper's tracker."""

@@ -10,12 +10,8 @@ import torch
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
-from toftrack.render.closed_form import project, render_range_images, screen_boxes
-
-try:
-    from toftrack.render.numba.drawing import draw
-except ImportError:  # there is no numba
-    draw = None
+from toftrack.render.closed_form import project, screen_boxes
+from toftrack.render.numba.drawing import draw
 
 
 @functools.lru_cache(maxsize=4)
@@ -40,14 +36,12 @@ def parted(both: Ellipsoids) -> tuple[Ellipsoids, Ellipsoids]:
 def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) -> np.ndarray:
     """Z of the nearest surface of one hand, (H, W) float32 metres, 0 = none.
 
-    As `render_range_images`, but each ellipsoid is drawn within its own box only, in compiled code
-    where there is numba: what draws every frame must not take longer than the tracker.
+    As `render_range_images`, but each ellipsoid is drawn within its own box only, in compiled code:
+    what draws every frame must not take longer than the tracker.
 
     ellipsoids: (1, E).  k: (3, 3).
     """
     k = np.asarray(k, np.float32)
-    if draw is None:
-        return render_range_images(ellipsoids, torch.from_numpy(k), height, width)[0].numpy()
     conics = project(ellipsoids)
     # One more pixel all around than the outline needs, which rounding could move.
     boxes = screen_boxes(conics, torch.from_numpy(k), height, width)[0].numpy()

@@ -12,15 +12,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-
-try:
-    from toftrack.render.numba.median import thinned
-except ImportError:  # there is no numba
-
-    def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
-        """As toftrack.render.numba.median.thinned."""
-        return cv2.medianBlur(image, 5)[offset::factor, offset::factor]
-
+from toftrack.render.numba.median import thinned
 
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import TypedDict
 
@@ -76,14 +75,11 @@ class _Beside(TypedDict):
 
 def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
     """In torch on the CPU; on a device `there`, with compiled code on the CPU next to it."""
-    here = _Beside(
-        motions=rigid.MOTIONS, joints_penalty=penalty.joints_penalty, make_refiner=TorchRefiner
-    )
     if device.type == "cpu":
-        here["motions"] = there
-        return here
-    with suppress(ImportError):  # there may be no numba
-        here = _compiled()
+        return _Beside(
+            motions=there, joints_penalty=penalty.joints_penalty, make_refiner=TorchRefiner
+        )
+    here = _compiled()
 
     def at(tensor: Tensor) -> Motions:
         return here["motions"] if tensor.device.type == "cpu" else there

@@ -94,7 +94,7 @@ class CalibratedBelief:
         new = 0.0 if track.believed else self.second if second else self.believe
         lost = confidence < new or side * confidence < self.confidence
         confidence *= side
-        return Belief(not ends, _state_name(signs, lost), lost, bad, 0.0, confidence, smooth)
+        return Belief(not ends, _state_name(signs, lost), lost, bad, confidence, smooth)
 
 
 def _state_name(signs: Signs, lost: bool) -> str:

@@ -17,7 +17,7 @@ from torch import Tensor
 from toftrack.compute.pace import FRAME_S
 from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.proposals import exchange_fingers, swap_fingers
-from toftrack.tracking.model import ObservedFrame
+from toftrack.tracking.model import LookedFrame
 from toftrack.tracking.relocating import joints_word, known_scores
 from toftrack.tracking.state import Contender, Track
 
@@ -51,7 +51,7 @@ class Alternatives:
         )
 
 
-def scored(states: Tensor, frame: ObservedFrame) -> Alternatives:
+def scored(states: Tensor, frame: LookedFrame) -> Alternatives:
     """Hands (N, 27) with what they are compared by: the image, the votes, room for the fingers."""
     scores = frame.log_scores(states)
     # What speaks against a pose never raises its score: it matters for the first few only.
@@ -66,7 +66,7 @@ def scored(states: Tensor, frame: ObservedFrame) -> Alternatives:
 def with_other_fingers(
     found: Alternatives,
     poses: Tensor,
-    frame: ObservedFrame,
+    frame: LookedFrame,
     cfg: Refinement,
     generator: torch.Generator,
 ) -> Tensor:
@@ -84,13 +84,12 @@ def with_other_fingers(
 
 
 def settled(
-    found: Alternatives, others: Alternatives, track: Track, dt_s: float, frame: ObservedFrame
+    found: Alternatives, others: Alternatives, track: Track, dt_s: float, frame: LookedFrame
 ) -> tuple[Tensor, Contender | None]:
     """The pose (1, 27) of a frame and its contender, from the found pose and others beside it.
 
     Much the same poses are better or worse; other ones must prove themselves.
     """
-    assert frame.model.refinement is not None
     if not len(others.scores):
         return found.poses, None
     refiner, old = frame.hand.refiner, track.contender
@@ -102,7 +101,7 @@ def settled(
     if not bool(other.any()):
         return found.poses, None
     lead = (others.scores - found.scores) * _weight(dt_s) - frame.model.refinement.drift
-    if track.pose is None or track.age_s == 0:
+    if track.age_s == 0:
         lead = lead + torch.inf
     elif old is not None:
         lead = lead + old.lead * ~_apart(joints[1:], refiner.joints(old.pose))
@@ -124,9 +123,8 @@ def _apart(joints_m: Tensor, from_m: Tensor) -> Tensor:
     return (joints_m - from_m).norm(dim=-1).amax(1) > _OTHER_M
 
 
-def _needed(track: Track, frame: ObservedFrame) -> float:
+def _needed(track: Track, frame: LookedFrame) -> float:
     """The lead with which a contender takes over: little where the track is not believed."""
-    assert frame.model.refinement is not None
     gain = frame.model.refinement.swap_gain
     if track.log_odds is None:
         return gain
@@ -135,14 +133,13 @@ def _needed(track: Track, frame: ObservedFrame) -> float:
 
 
 def rivals_of(
-    found: Alternatives, others: Alternatives, frame: ObservedFrame
+    found: Alternatives, others: Alternatives, frame: LookedFrame
 ) -> tuple[Alternatives, Tensor | None]:
     """Those of the networks' poses that are about the found one, and the best that is not.
 
     The latter, (1, 27), is another hand or another way round; None where none is better.
     """
     relocaliser = frame.model.relocaliser
-    assert relocaliser is not None and frame.glance is not None
     states = torch.cat((found.poses, others.poses))
     joints = frame.hand.refiner.joints(states)
     near = (joints[1:] - joints[:1]).norm(dim=-1).mean(1) < relocaliser.settings.rival_m

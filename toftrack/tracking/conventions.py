@@ -9,12 +9,8 @@ import numpy as np
 from toftrack.estimate import Estimate
 from toftrack.hand.landmarks import image_landmarks
 from toftrack.hand.openxr import openxr_hand, openxr_rig
+from toftrack.hand.openxr_numba import openxr_hand_compiled
 from toftrack.hand.shape import HandShape
-
-try:
-    from toftrack.hand.openxr_numba import openxr_hand_compiled
-except ImportError:  # there is no numba
-    openxr_hand_compiled = openxr_hand
 
 _DECIMALS = 6
 """Micrometres: so many are less than anybody sees, and a line is half as long as with all."""

@@ -12,11 +12,10 @@ from toftrack.compute.pace import FRAME_S
 from toftrack.compute.transfer import on_device
 from toftrack.render.segmentation import Expected
 from toftrack.tracking import particle_filter
-from toftrack.tracking.belief import CalibratedBelief
-from toftrack.tracking.life_cycle import Belief, LostSettings, lasted, longer
-from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
+from toftrack.tracking.life_cycle import Belief, lasted, longer
+from toftrack.tracking.model import FilterModel, ObservedFrame, SizedHand
 from toftrack.tracking.particle_filter import FilterSettings
-from toftrack.tracking.search import LastSeen
+from toftrack.tracking.prior import LastSeen
 from toftrack.tracking.spans import Spans
 from toftrack.tracking.state import Track, generator_on
 
@@ -35,15 +34,17 @@ def displacement(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:
     return track.velocity * (settings.velocity * reach_s)
 
 
-def young(track: Track, settings: LostSettings) -> bool:
-    """Whether a better start may still take a track's place."""
-    return not lasted(track.age_s, settings.probation)
-
-
 def filtered(
-    track: Track, dt_s: float, frame: ObservedFrame, generator: torch.Generator, spans: Spans
+    track: Track,
+    dt_s: float,
+    frame: ObservedFrame,
+    generator: torch.Generator,
+    spans: Spans,
+    width: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
     """The filter's particles (N, 6 + d) and weights (N,) of a frame.
+
+    width: times as far the particles are diffused as usual.
 
     Nothing within waits for the device, so that it is not held up between passes.
     """
@@ -58,8 +59,6 @@ def filtered(
     ahead = displacement(track, dt_s, model.filter)
     there = on_device(ahead[None], model.device)
     particles = model.backend.motions.compose(track.particles, there)
-    # A hand that was nearly lost is looked for farther away, but not ever farther.
-    width = 1.0 + (track.bad_s / FRAME_S if model.lost.patience else 0.0)
     sigmas = width * particle_filter.widened(
         model.sigmas, dt_s / FRAME_S, ahead, model.filter.rest, model.filter.speed_gain
     )
@@ -85,6 +84,7 @@ class Found:
     mean: (1, 6 + d) of them.
     pose: (1, 27) refined.  trend: (27,) see steadying.
     refined: (1, 6 + d) the pose in the pose space.  offset: (21,) rad, how far the pose lies off.
+    carried: (21,) rad, by how much the next frame's hypotheses are displaced.
     """
 
     particles: Tensor
@@ -94,11 +94,24 @@ class Found:
     trend: Tensor | None
     refined: Tensor
     offset: Tensor
+    carried: Tensor
 
     @property
     def off_rad(self) -> float:
         """How far the pose lies off the pose space, rms."""
         return float(self.offset.square().mean().sqrt())
+
+
+def drawn_to(found: Found, carry: float, model: FilterModel) -> Found:
+    """The particles follow the refined pose; what the space cannot say of it is remembered beside
+    them, but for a part: `carry` of it is kept.
+    """
+    motions, space = model.backend.motions, model.space_of(found.particles)
+    change = motions.difference(found.refined, found.mean)
+    particles = motions.compose(found.particles, on_device(change, model.device))
+    latent = particle_filter.bound(particles[:, 6:], space.lower, space.upper, "truncate")
+    particles[:, 6:] = latent
+    return replace(found, particles=particles, mean=found.refined, carried=carry * found.offset)
 
 
 def advanced(
@@ -107,70 +120,46 @@ def advanced(
     belief: Belief,
     expected: Expected | None,
     dt_s: float,
-    model: TrackerModel,
+    model: FilterModel,
 ) -> Track:
     """The track as of this frame, which comes dt_s after the last one.
 
     expected: where the hand was looked for, if something hides part of it.
     """
-    cfg, motions = model.filter, model.backend.motions
-    space = model.space_of(found.particles)
-    particles, mean, offset = found.particles, found.mean, track.offset
-    if model.refinement is not None:
-        # The particles follow the refined estimate, and what the space cannot say of its pose
-        # is remembered beside them.
-        change = motions.difference(found.refined, mean)
-        particles = motions.compose(particles, on_device(change, model.device))
-        latent = particle_filter.bound(particles[:, 6:], space.lower, space.upper, "truncate")
-        particles[:, 6:] = latent
-        mean, offset = found.refined, model.refinement.carry * found.offset
     velocity = torch.zeros_like(track.velocity)
     if track.age_s > 0:
-        moved = motions.difference(mean, track.mean)[0]
-        keep = cfg.velocity_smoothing ** (dt_s / FRAME_S)
+        moved = model.backend.motions.difference(found.mean, track.mean)[0]
+        keep = model.filter.velocity_smoothing ** (dt_s / FRAME_S)
         velocity = torch.lerp(moved / dt_s, track.velocity, keep)
-    return Track(
-        particles=particles,
+    return replace(
+        track,
+        particles=found.particles,
         weights=found.weights,
-        mean=mean,
+        mean=found.mean,
         velocity=velocity,
-        offset=offset,
+        offset=found.carried,
         pose=found.pose,
         trend=found.trend,
-        contender=track.contender,
         age_s=longer(track.age_s, dt_s),
         bad_s=belief.bad_s,
-        outside_s=belief.outside_s,
-        challenged_s=track.challenged_s,
         log_odds=belief.log_odds,
         doubted=belief.lost,
         believed=track.believed or not belief.lost,
-        unlooked_s=track.unlooked_s,
-        signs=track.signs,
-        joint_signs=track.joint_signs,
         expected=expected,
     )
 
 
 def remembered(
-    seen: LastSeen | None,
-    track: Track | None,
-    belief: Belief,
-    settings: LostSettings | CalibratedBelief,
+    seen: LastSeen | None, track: Track, belief: Belief, probation: int
 ) -> LastSeen | None:
-    """The last hand that was believed, as of this frame."""
-    if track is None or belief.lost or not lasted(track.age_s, settings.probation + 1):
+    """The last hand that was believed, as of this frame; a new track waits `probation` frames."""
+    if belief.lost or not lasted(track.age_s, probation + 1):
         return seen
     return LastSeen(track.mean, 0.0)
 
 
-def aged(seen: LastSeen | None, seconds: float) -> LastSeen | None:
-    """The same hand, longer ago."""
-    return None if seen is None else replace(seen, age_s=seen.age_s + seconds)
-
-
 def expected_depths(
-    track: Track | None, dt_s: float, hand: SizedHand, model: TrackerModel
+    track: Track | None, dt_s: float, hand: SizedHand, model: FilterModel
 ) -> Expected | None:
     """Where the hand is looked for, dt_s after the last frame; None where there is none."""
     if track is None:
@@ -183,7 +172,5 @@ def expected_depths(
         # the hand: while something hides the hand, it comes nearer only as its middle does.
         approach = _APPROACH_M_S * dt_s + max(0.0, -float(ahead[2]))
         nearest = max(nearest, track.expected.nearest_m - approach)
-    if model.relocaliser is None:
-        return Expected(nearest, farthest)
     middle = hand.refiner.joints(state)[0].mean(0)
     return Expected(nearest, farthest, tuple(middle.tolist()))

@@ -24,7 +24,7 @@ from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Scorer
 from toftrack.render.segmentation import reduce_image
 from toftrack.tracking.effort import Pace, Timekeeper
-from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.side_belief import OTHER_SIDE
 from toftrack.tracking.slots import (
     believed,
@@ -38,8 +38,8 @@ from toftrack.tracking.slots import (
     sureness,
 )
 from toftrack.tracking.state import StepInfo, TrackerState
-from toftrack.tracking.step import at, first_state, step
-from toftrack.tracking.tracker import fitted_hand, restarted
+from toftrack.tracking.step import step
+from toftrack.tracking.tracker import restarted, stepped
 
 _SOUGHT_S = 0.12
 """How often a further hand is looked for."""
@@ -64,9 +64,9 @@ class HandsState:
     one_s: float = 0.0
 
 
-def first_states(model: TrackerModel, seed: int, hands: int) -> HandsState:
+def first_states(model: FilterModel, seed: int, hands: int) -> HandsState:
     """Before any frame. The second slot looks for the other side of the first one."""
-    first, *others = (first_state(model, seed + slot) for slot in range(hands))
+    first, *others = (model.first_state(seed + slot) for slot in range(hands))
     return HandsState((first, *(replace(state, side=OTHER_SIDE[first.side]) for state in others)))
 
 
@@ -91,7 +91,7 @@ def step_hands(
     for mine in sorted((0, 1), key=lambda slot: -sureness(slots[slot])):
         theirs = 1 - mine
         if vacant[mine] and not sought:
-            slots[mine] = at(slots[mine], image)
+            slots[mine] = slots[mine].at(image)
             continue
         other = seen_beside(slots[theirs], hands[theirs], hands[mine], depth_m)
         partner = partnered(slots[mine], slots[theirs], model)
@@ -135,7 +135,7 @@ class HandsTracker:
 
     def __init__(
         self,
-        model: TrackerModel,
+        model: FilterModel,
         seed: int = 0,
         hands: int = 1,
         pace: Pace | None = None,
@@ -146,10 +146,10 @@ class HandsTracker:
         Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without networks.
         """
         check_number("hands", hands, 1, 2, whole=True)
-        if hands > 1 and model.relocaliser is None:
+        if hands > 1 and not isinstance(model, TrackerModel):
             raise ToftrackError(
-                "hands=2 tells two hands apart by the networks, but relocation=none has none; give "
-                "hands=1, or relocation=network"
+                "hands=2 tells two hands apart by the networks, but experiment=paper has none;"
+                " give hands=1, or leave experiment=paper out"
             )
         self.model, self.time = model, Timekeeper(pace, clock)
         self.state = first_states(model, seed, hands)
@@ -176,19 +176,19 @@ class HandsTracker:
         image = DepthImage(depth_m, k, index, timestamp_s)
         model = self.model.spending(effort)
         with at_most(effort.threads):
-            if len(self.states) == 1:
-                state, info, estimate = step(self.states[0], image, model)
-                estimates: tuple[Estimate, ...] = (estimate,)
-                self.state, self.infos = HandsState((state,)), (info,)
-            else:
+            if len(self.states) == 2 and isinstance(model, TrackerModel):
                 self.state, self.infos, estimates = step_hands(self.state, image, model)
+            else:
+                state, info, estimate = stepped(self.states[0], image, model)
+                estimates = (estimate,)
+                self.state, self.infos = HandsState((state,)), (info,)
         took_s = self.time.took_s()
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
 
     @small_operations()
     def prepare(self) -> None:
         """Load and compile now what the first frame would have to wait for; changes nothing."""
-        step(self.states[0], _rendered_hand(), self.model)
+        stepped(self.states[0], _rendered_hand(), self.model)
 
     def restart(self, side: str | None = None) -> None:
         """Forget the hands, see Tracker.restart; a side is the first one's."""
@@ -207,7 +207,7 @@ class HandsTracker:
     @property
     def fitted(self) -> tuple[HandShape, ...]:
         """The same hands, with how sure the fit is of them."""
-        return tuple(fitted_hand(state, self.model) for state in self.states)
+        return tuple(self.model.fitted(state.side, state.size) for state in self.states)
 
     @property
     def scorer(self) -> Scorer:

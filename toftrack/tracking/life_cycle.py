@@ -1,37 +1,11 @@
-"""When a hand is believed, doubted and given up."""
+"""What is thought of an estimate, and how long something has gone on."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from toftrack.checks import check_number
 from toftrack.compute.pace import FRAME_S
-from toftrack.tracking.state import Track
-
-
-@dataclass(frozen=True)
-class LostSettings:
-    """When the tracker says that it has lost the hand; see conf/lost for what each does.
-
-    patience, probation: in frames of FRAME_S.
-    """
-
-    score: float
-    patience: float
-    start_score: float
-    probation: float
-    rival_gain: float
-    outside_rad: float
-
-    def __post_init__(self) -> None:
-        for name in ("patience", "probation"):
-            check_number(f"lost.{name}", getattr(self, name), 0)
-        for name in ("score", "start_score"):
-            check_number(f"lost.{name}", getattr(self, name), 0, 1)
-        check_number("lost.rival_gain", self.rival_gain, 0)
-        if self.outside_rad != math.inf:
-            check_number("lost.outside_rad", self.outside_rad, 0, remedy=", or .inf")
 
 
 @dataclass(frozen=True)
@@ -39,18 +13,17 @@ class Belief:
     """What is thought of a frame's estimate.
 
     kept: the track goes on.  state_name, lost: as Estimate has them.
-    bad_s, outside_s: as Track has them, with this frame.
+    bad_s: as Track has it, with this frame.
     confidence: probability that every joint is within 40 mm; NaN where nobody says.
-    log_odds: the same, smoothed over time; None likewise.
+    log_odds: the same, smoothed over time.
     """
 
     kept: bool
     state_name: str
     lost: bool
-    bad_s: float
-    outside_s: float
+    bad_s: float = 0.0
     confidence: float = math.nan
-    log_odds: float | None = None
+    log_odds: float = math.nan
 
 
 def log_odds(probability: float) -> float:
@@ -73,23 +46,3 @@ def bad_for(seconds: float, dt_s: float) -> float:
     that a frame counts twice FRAME_S at most.
     """
     return longer(seconds, min(dt_s, 2 * FRAME_S))
-
-
-def believe(
-    track: Track, score: float, off_rad: float, dt_s: float, settings: LostSettings
-) -> Belief:
-    """Whether to believe an estimate, and whether to go on with its track.
-
-    track: as of the frame before.  score: of the estimate, 0..1.
-    off_rad: how far its pose lies off the pose space, rms.  dt_s: since the last frame.
-    """
-    bad = bad_for(track.bad_s, dt_s) if score < settings.score else 0.0
-    outside = longer(track.outside_s, dt_s) if off_rad > settings.outside_rad else 0.0
-    if track.age_s == 0 and score < settings.start_score:
-        return Belief(False, "initialising", True, bad, outside)
-    if bad and settings.patience and lasted(bad, settings.patience):
-        return Belief(False, "lost", True, bad, outside)
-    if bad and (lasted(bad, 2) or not settings.patience):
-        return Belief(True, "recovering", True, bad, outside)
-    name = "initialising" if track.age_s == 0 else "tracking"
-    return Belief(True, name, lasted(outside, 2), bad, outside)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from toftrack.compute.backend import Backend
 from toftrack.compute.transfer import on_device, on_host
-from toftrack.errors import ToftrackError
 from toftrack.gestures.recognition import Gestures
+from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
 from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
@@ -26,13 +26,12 @@ from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.belief import CalibratedBelief
 from toftrack.tracking.effort import Effort
-from toftrack.tracking.life_cycle import LostSettings
 from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
-from toftrack.tracking.search import LastSeen, Start
-from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit
-from toftrack.tracking.side_belief import SideFit
-from toftrack.tracking.size_fit import HandFit, SizeBelief
+from toftrack.tracking.prior import LastSeen, Prior
+from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit, first_belief
+from toftrack.tracking.side_belief import SideBelief, SideFit
+from toftrack.tracking.state import TrackerState
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
@@ -40,7 +39,28 @@ the 90 % region of a joint hold the truth in about 93 % of the frames of rendere
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
 _HANDS = 32
-"""Hands that are kept made; a fit of the size tries no more."""
+"""Hands that are kept made."""
+
+
+@dataclass(frozen=True)
+class Hand:
+    """The hand of a configuration: a shape, and how it is fitted to the user.
+
+    sides: how its side is found out; None where it is told.
+    """
+
+    shape: HandShape
+    adapt: ShapeFit
+    sides: SideFit | None
+
+
+def make_hand(shape: str, side: str, length_m: float, adapt: ShapeFit, sides: SideFit) -> Hand:
+    """See toftrack.hand.make_hand_shape; only shape="auto" is fitted, and only side="auto" found
+    out: it begins as a right hand.
+    """
+    made = make_hand_shape(shape, "right" if side == "auto" else side, length_m)
+    adapt = replace(adapt, fixed=shape != "auto")
+    return Hand(made, adapt, sides if side == "auto" else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +74,7 @@ class SizedHand:
     scorer: Scorer
     refiner: Refiner
     first: HandShape
-    worn: tuple[float, ...] = ()
+    worn: tuple[float, ...]
 
     @cached_property
     def derivatives(self) -> tuple[Tensor, Tensor]:
@@ -63,16 +83,13 @@ class SizedHand:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackerModel:
-    """The parts of a tracker, on the CPU but for those that the back end makes.
+class FilterModel:
+    """What every tracker has: a hand, its pose space, and particles that are compared with images.
 
-    shape: the hand as configured, before any of its size was fitted.
-    refinement: None leaves the filter's estimate as it is.
-    fit: of the size alone, where there are no networks; None leaves the hand as it is.
-    adapt: of the shape, by what the networks say; None likewise.
-    sides: how the side is found out, by the networks; None where it was told.
+    All is on the CPU but for those parts that the back end makes.
+
+    shape: the hand as configured, before it was fitted.
     gestures: None tells none.
-    relocaliser: None searches for starts, and challenges no track.
     """
 
     shape: HandShape
@@ -80,22 +97,26 @@ class TrackerModel:
     segmentation: NearestSurface
     likelihood: FMeasure
     filter: FilterSettings
-    refinement: Refinement | None
-    start: Start
-    lost: LostSettings | CalibratedBelief
-    fit: HandFit | None
     gestures: Gestures | None
     backend: Backend
-    relocaliser: Relocaliser | None = None
-    adapt: ShapeFit | None = None
-    sides: SideFit | None = None
 
-    def __post_init__(self) -> None:
-        if isinstance(self.lost, CalibratedBelief) and self.relocaliser is None:
-            raise ToftrackError(
-                "lost=calibrated judges by what the networks say, but relocation=none has none;"
-                " give lost=score as well, or relocation=network"
-            )
+    def first_state(self, seed: int) -> TrackerState:
+        """Before any frame."""
+        generator = torch.Generator().manual_seed(seed)
+        return TrackerState(generator.get_state(), self.shape.side, first_belief())
+
+    def spending(self, effort: Effort) -> FilterModel:
+        """The same tracker with less effort; itself where nothing is left out."""
+        return self
+
+    @property
+    def fits(self) -> bool:
+        """Whether the hand's shape is fitted to the user."""
+        return False
+
+    def fitted(self, side: str, belief: ShapeBelief) -> HandShape:
+        """The hand of a side, with how sure the fit is of it if there is one."""
+        return self.hand(side, belief).shape
 
     @property
     def device(self) -> torch.device:
@@ -109,19 +130,6 @@ class TrackerModel:
     @cached_property
     def _space_there(self) -> PoseSpace:
         return self.space.to(self.device)
-
-    def spending(self, effort: Effort) -> TrackerModel:
-        """The same tracker with less effort; itself where nothing is left out."""
-        return self._spending(effort)
-
-    @cached_property
-    def _spending(self) -> Callable[[Effort], TrackerModel]:
-        return lru_cache(partial(_spending, self))
-
-    @property
-    def rivals(self) -> int:
-        """How many of the networks' poses compete with a track."""
-        return 0 if self.relocaliser is None else self.relocaliser.settings.rivals
 
     @cached_property
     def sigmas(self) -> Tensor:
@@ -144,20 +152,12 @@ class TrackerModel:
         space = self.space if self.device.type == "cpu" else self._space_there
         return latent_density(space) if self.filter.density else None
 
-    @cached_property
-    def poses(self) -> Tensor:
-        """(M, 21) rad, natural poses, to take single fingers from."""
-        return natural_poses()
-
-    def hand(self, side: str, belief: SizeBelief | ShapeBelief | None) -> SizedHand:
-        """The hand of a side in the size or the shape that is believed in."""
-        if isinstance(belief, ShapeBelief):
-            return self._hands(side, 1.0, belief.worn)
-        ratio = 1.0 if belief is None or self.fit is None else belief.ratio(self.fit)
-        return self._hands(side, ratio, ())
+    def hand(self, side: str, belief: ShapeBelief) -> SizedHand:
+        """The hand of a side in the shape that is believed in."""
+        return self._hands(side, belief.worn)
 
     @cached_property
-    def _hands(self) -> Callable[[str, float, tuple[float, ...]], SizedHand]:
+    def _hands(self) -> Callable[[str, tuple[float, ...]], SizedHand]:
         return lru_cache(_HANDS)(partial(_sized_hand, self.shape, self.backend))
 
     def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
@@ -178,24 +178,69 @@ class TrackerModel:
         return particle, state[0, 6:] - self.space.decode(particle[:, 6:])[0]
 
 
+@dataclass(frozen=True, eq=False)
+class TrackerModel(FilterModel):
+    """The parts of the tracker with networks.
+
+    prior: what speaks for a hand besides the image and the networks.
+    adapt: how the shape is fitted, by what the networks say.
+    sides: how the side is found out, by the networks; None where it was told.
+    """
+
+    relocaliser: Relocaliser
+    refinement: Refinement
+    prior: Prior
+    lost: CalibratedBelief
+    adapt: ShapeFit
+    sides: SideFit | None = None
+
+    def first_state(self, seed: int) -> TrackerState:
+        """See FilterModel."""
+        sides = None if self.sides is None else SideBelief()
+        return replace(super().first_state(seed), sides=sides)
+
+    def spending(self, effort: Effort) -> TrackerModel:
+        """See FilterModel."""
+        return self._spending(effort)
+
+    @cached_property
+    def _spending(self) -> Callable[[Effort], TrackerModel]:
+        return lru_cache(partial(_spending, self))
+
+    @property
+    def fits(self) -> bool:
+        """See FilterModel."""
+        return not self.adapt.fixed
+
+    def fitted(self, side: str, belief: ShapeBelief) -> HandShape:
+        """See FilterModel; None is said of the fit before anything was fitted."""
+        shape = super().fitted(side, belief)
+        if not (self.fits and belief.poses):
+            return shape
+        return replace(shape, fitted=belief.summary(self.adapt))
+
+    @cached_property
+    def poses(self) -> Tensor:
+        """(M, 21) rad, natural poses, to take single fingers from."""
+        return natural_poses()
+
+
 def _spending(model: TrackerModel, effort: Effort) -> TrackerModel:
     if effort == Effort(effort.threads):
         return model
-
-    refinement, relocaliser = model.refinement, model.relocaliser
-    if refinement is not None:
-        refinement = replace(refinement, swaps=math.ceil(effort.swaps * refinement.swaps))
-    if relocaliser is not None:
-        told = relocaliser.settings
-        told = replace(
-            told,
-            every=max(told.every, effort.every),
-            search=max(told.search, effort.search),
-            rivals=_least(told.rivals, effort.rivals),
-            places=_least(told.places, effort.places),
-        )
-        relocaliser = replace(relocaliser, settings=told)
-    made = replace(model, refinement=refinement, relocaliser=relocaliser)
+    told, refinement = model.relocaliser.settings, model.refinement
+    told = replace(
+        told,
+        every=max(told.every, effort.every),
+        search=max(told.search, effort.search),
+        rivals=_least(told.rivals, effort.rivals),
+        places=_least(told.places, effort.places),
+    )
+    made = replace(
+        model,
+        refinement=replace(refinement, swaps=math.ceil(effort.swaps * refinement.swaps)),
+        relocaliser=replace(model.relocaliser, settings=told),
+    )
     vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the effort
     return made
 
@@ -205,10 +250,10 @@ def _least(count: int, most: int | None) -> int:
 
 
 def _sized_hand(
-    shape: HandShape, backend: Backend, side: str, ratio: float, worn: tuple[float, ...]
+    shape: HandShape, backend: Backend, side: str, worn: tuple[float, ...]
 ) -> SizedHand:
     first = shape.of_side(side)
-    sized = shaped(first, torch.tensor(worn)) if worn else first.scaled(ratio)
+    sized = shaped(first, torch.tensor(worn))
     return SizedHand(sized, backend.make_scorer(sized), backend.make_refiner(sized), first, worn)
 
 
@@ -217,36 +262,19 @@ class ObservedFrame:
     """A frame that may show a hand, and the hand looked for: the judge of hypotheses.
 
     evidence: on the model's device.
-    glance: what the networks say of the hand.  seen: the hand as it was last believed.
-    other: another hand that is tracked as well.
     """
 
     observation: Observation
     evidence: Evidence
     hand: SizedHand
-    model: TrackerModel
-    glance: Glance | None = None
-    seen: LastSeen | None = None
-    other: OtherHand | None = None
+    model: FilterModel
 
-    @property
-    def hidden(self) -> bool:
-        """Whether something hides part of the hand."""
-        occluder = self.observation.occluder
-        if self.model.relocaliser is None:
-            return bool(occluder.any())
-        return int(occluder.sum()) > _HIDDEN * int(self.observation.hand.sum())
-
-    def counts(self, states: Tensor, evidence: Evidence | None = None) -> Counts:
-        """(N, 27) hands, on the CPU or the model's device, counted there and told where they are.
-
-        evidence: instead of the frame's own, on the model's device.
-        """
-        evidence = evidence or self.evidence
+    def counts(self, states: Tensor) -> Counts:
+        """(N, 27) hands, on the CPU or the model's device, counted there and told here."""
         if states.device.type != "cpu":
-            return self.hand.scorer(states, evidence)
+            return self.hand.scorer(states, self.evidence)
         there = on_device(states, self.model.device)
-        return Counts(*on_host(*self.hand.scorer(there, evidence)))
+        return Counts(*on_host(*self.hand.scorer(there, self.evidence)))
 
     def log_scores(self, states: Tensor, coverage: float | None = None) -> Tensor:
         """(N, 27) hands to (N,) what they are weighed by, see FMeasure.log_score."""
@@ -257,6 +285,32 @@ class ObservedFrame:
         return float(self.model.likelihood.score(self.counts(state)))
 
 
+@dataclass(frozen=True, eq=False)
+class LookedFrame(ObservedFrame):
+    """The same, with what else is known of the hand.
+
+    glance: what the networks say of it; None in a frame in which they do not look.
+    seen: the hand as it was last believed.
+    other: another hand that is tracked as well.
+    """
+
+    model: TrackerModel
+    glance: Glance | None
+    seen: LastSeen | None
+    other: OtherHand | None
+
+    @property
+    def hidden(self) -> bool:
+        """Whether something hides part of the hand."""
+        hand, occluder = self.observation.hand, self.observation.occluder
+        return int(occluder.sum()) > _HIDDEN * int(hand.sum())
+
+
+def evidence_of(observation: Observation, model: FilterModel) -> Evidence:
+    """Of an observation that is not empty, on the model's device."""
+    return model.likelihood.evidence(observation).to(model.device)
+
+
 def observed(
     observation: Observation,
     hand: SizedHand,
@@ -264,7 +318,7 @@ def observed(
     glance: Glance | None = None,
     seen: LastSeen | None = None,
     other: OtherHand | None = None,
-) -> ObservedFrame:
-    """A segmented frame, which is not empty; its evidence is on the model's device."""
-    evidence = model.likelihood.evidence(observation).to(model.device)
-    return ObservedFrame(observation, evidence, hand, model, glance, seen, other)
+) -> LookedFrame:
+    """A segmented frame, which is not empty."""
+    evidence = evidence_of(observation, model)
+    return LookedFrame(observation, evidence, hand, model, glance, seen, other)

@@ -1,4 +1,4 @@
-"""Refinement in the tracker: hypotheses of a start, and the estimate of a frame."""
+"""Refinement in the tracker: the estimate of a frame, and what takes its place."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from toftrack.compute.pace import FRAME_S
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.contest import rivals_of, scored, settled, with_other_fingers
-from toftrack.tracking.life_cycle import log_odds
-from toftrack.tracking.model import ObservedFrame
-from toftrack.tracking.relocating import candidates, landmarks_of
+from toftrack.tracking.life_cycle import lasted, log_odds, longer
+from toftrack.tracking.model import LookedFrame
+from toftrack.tracking.relocating import candidates, landmarks_of, track_of
 from toftrack.tracking.signs import out_of_sight
 from toftrack.tracking.state import Contender, Track
 
@@ -23,16 +23,6 @@ _COVERED = 0.6
 """Share of the joints behind something from which on a hand stays where it was."""
 _UNSEEN = 0.3
 """Share of the joints that must be out of sight for the networks not to be heard."""
-
-
-def improved(particles: Tensor, frame: ObservedFrame) -> Tensor:
-    """Hypotheses (N, 6 + d) brought onto the seen points, each by itself, and back to particles."""
-    model, refiner = frame.model, frame.hand.refiner
-    cfg = model.refinement
-    if cfg is None:
-        return particles
-    states, seen = model.decode(particles), seen_points(frame.observation)
-    return model.encode(refiner(states, states[:, 6:], seen, cfg))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,31 +41,47 @@ class Refined:
 
 
 def refined(
-    track: Track, mean: Tensor, dt_s: float, frame: ObservedFrame, generator: torch.Generator
+    track: Track, mean: Tensor, dt_s: float, frame: LookedFrame, generator: torch.Generator
 ) -> Refined:
     """The frame's estimate from the filter's mean (1, 6 + d)."""
     model = frame.model
     pose = model.decode(mean, track.offset)
-    if model.refinement is None:
+    if not model.refinement.iterations:
         return Refined(pose, track.trend)
-    if track.pose is not None and model.relocaliser is not None and _covered(track.pose, frame):
+    if _covered(track.pose, frame):
         return Refined(track.pose, None)
     outcome = _onto_points(pose, track, dt_s, frame, generator)
-    if track.pose is None:
-        return replace(outcome, trend=track.trend)
     steadying, motions = model.refinement.steadying, model.backend.motions
     steady, trend = steadied(outcome.pose, track.pose, track.trend, dt_s, steadying, motions)
     return replace(outcome, pose=steady, trend=trend)
 
 
+def challenged(
+    track: Track, outcome: Refined, dt_s: float, frame: LookedFrame
+) -> tuple[Track, Tensor, Tensor | None]:
+    """The track, the pose (1, 27) and the trend to go on with, after a rival was heard.
+
+    A rival takes over when it was better for a while; never while something hides the hand.
+    """
+    settings, rival = frame.model.relocaliser.settings, outcome.rival
+    track = replace(track, contender=outcome.contender)
+    if frame.glance is None:
+        return track, outcome.pose, outcome.trend
+    if rival is None or frame.hidden:
+        return replace(track, challenged_s=0.0), outcome.pose, outcome.trend
+    since = longer(track.challenged_s, dt_s)
+    if track.age_s > 0 and not lasted(since, settings.rival_frames):
+        return replace(track, challenged_s=since), outcome.pose, outcome.trend
+    return replace(track_of(rival, frame.model), believed=track.believed), rival, None
+
+
 def _onto_points(
-    state: Tensor, track: Track, dt_s: float, frame: ObservedFrame, generator: torch.Generator
+    state: Tensor, track: Track, dt_s: float, frame: LookedFrame, generator: torch.Generator
 ) -> Refined:
     """The filter's hand (1, 27) brought onto the seen points, and what speaks against it."""
     refiner, cfg = frame.hand.refiner, frame.model.refinement
-    assert cfg is not None
-    seen, before = seen_points(frame.observation), track.pose
-    glance = None if before is not None and _mostly_unseen(state, frame) else frame.glance
+    seen = seen_points(frame.observation)
+    glance = None if _mostly_unseen(state, frame) else frame.glance
     frame = replace(frame, glance=glance)
     landmarks = None if glance is None else landmarks_of(glance, frame.model)
 
@@ -84,20 +90,18 @@ def _onto_points(
 
     # The pose of the last frame stands until another one is clearly better: what the image does
     # not decide, such as a hidden finger, must not flicker. A contender moves along with it.
-    starts = [state]
-    if before is not None:
-        starts.insert(0, torch.cat((state[:, :6], before[:, 6:]), 1))
-    own = len(starts)
+    starts = [torch.cat((state[:, :6], track.pose[:, 6:]), 1), state]
     if track.contender is not None:
         starts.append(torch.cat((state[:, :6], track.contender.pose[:, 6:]), 1))
     mine = len(starts)
-    likely = state[:0] if glance is None else candidates(glance, frame, frame.model.rivals)
+    rivals = frame.model.relocaliser.settings.rivals
+    likely = state[:0] if glance is None else candidates(glance, frame, rivals)
     hears, swaps = (True, True) if frame.hidden else turns(track, cfg.sure)
     heard = likely if hears else likely[:0]
     tried = scored(onto_points(torch.cat((*starts, heard))), frame)
-    first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[own - 1] else own - 1
+    first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[1] else 1
     rows = torch.arange(len(tried.scores), device=state.device)
-    found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[own:mine]), None
+    found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[2:mine]), None
     if len(heard):
         near, rival = rivals_of(found, tried.rows(rows[mine:]), frame)
         others = others.and_(near)
@@ -115,14 +119,14 @@ def turns(track: Track, sure: float) -> tuple[bool, bool]:
 
     Both, but in turn where a track is believed and nothing challenges it.
     """
-    calm = track.challenged_s == 0 and track.pose is not None
-    if not calm or sure == 1 or track.log_odds is None or track.log_odds < log_odds(sure):
+    believed = sure < 1 and track.log_odds is not None and track.log_odds >= log_odds(sure)
+    if track.challenged_s > 0 or not believed:
         return True, True
     first = round(track.age_s / FRAME_S) % 2 == 0
     return first, not first
 
 
-def _covered(state: Tensor, frame: ObservedFrame) -> bool:
+def _covered(state: Tensor, frame: LookedFrame) -> bool:
     """Whether something hides so much of a hand (1, 27) that it is best left where it was.
 
     What is still seen about it belongs to the thing that hides it, as often as not.
@@ -131,7 +135,7 @@ def _covered(state: Tensor, frame: ObservedFrame) -> bool:
     return out_of_sight(joints, image.depth_m, image.k)[1] > _COVERED
 
 
-def _mostly_unseen(state: Tensor, frame: ObservedFrame) -> bool:
+def _mostly_unseen(state: Tensor, frame: LookedFrame) -> bool:
     """Whether so much of a hand (1, 27) is out of sight that the networks know less than a track.
 
     What is hidden or cut off moves on as it did; the networks see another hand in the rest of it.

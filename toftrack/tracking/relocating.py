@@ -20,9 +20,9 @@ from toftrack.relocation.relocaliser import SAME_PLACE_M, Glance, RelocationSett
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.following import displacement
 from toftrack.tracking.life_cycle import lasted, log_odds
-from toftrack.tracking.model import ObservedFrame, SizedHand, TrackerModel
+from toftrack.tracking.model import LookedFrame, SizedHand, TrackerModel
 from toftrack.tracking.other_hand import OtherHand, touching
-from toftrack.tracking.search import LastSeen
+from toftrack.tracking.prior import LastSeen
 from toftrack.tracking.side_belief import OTHER_SIDE, look_due
 from toftrack.tracking.state import Track, TrackerState
 
@@ -56,13 +56,11 @@ def glanced(
     other: OtherHand | None = None,
 ) -> tuple[Track | None, Glance | None]:
     """The track to go on with, and what the networks say of the hand: where it is, or at the best
-    place of all; None where there are no networks, or no hand, or no need to look.
+    place of all; None where there is no hand, or no need to look.
 
     A track that is doubted gives way to a hand that is found elsewhere, not where the other one is.
     """
     relocaliser, track, side = model.relocaliser, state.track, state.side
-    if relocaliser is None:
-        return track, None
     best = None
     if search_due(state, model):
         likely = partial(_reachable, state.seen, track, other)
@@ -92,7 +90,7 @@ def glancing(
     there a hand, is it this one, of which side; or where they need not look.
     """
     relocaliser, track = model.relocaliser, state.track
-    if relocaliser is None or track is None or track.doubted:
+    if track is None or track.doubted:
         return None
     if _sure(track, relocaliser.settings, dt_s) or look_due(state.sides, model.sides, True, dt_s):
         return None
@@ -111,7 +109,7 @@ def _expected_centre(track: Track, dt_s: float, model: TrackerModel) -> np.ndarr
 
 def search_due(state: TrackerState, model: TrackerModel) -> bool:
     """Whether the whole image is searched: while no hand is believed, and not each time if told."""
-    if model.relocaliser is None or (state.track is not None and not state.track.doubted):
+    if state.track is not None and not state.track.doubted:
         return False
     frames = model.relocaliser.settings.search
     return frames == 1 or lasted(state.unsearched_s, frames)
@@ -170,7 +168,6 @@ def expected_of(glance: Glance) -> Expected:
 
 def landmarks_of(glance: Glance, model: TrackerModel) -> Landmarks:
     """The network's joints as the refinement takes them."""
-    assert model.relocaliser is not None
     cfg, found = model.relocaliser.settings, glance.landmarks
     sigma = (cfg.landmark_sigmas * found.sigma_m).clamp(min=cfg.landmark_m)
     return Landmarks(found.points_m, sigma / max(cfg.landmark_weight, _NO_WEIGHT))
@@ -185,20 +182,19 @@ def hypotheses(glance: Glance, hand: SizedHand, count: int) -> tuple[Tensor, Ten
     return kept.states(ratio).to(device), kept.log_probability.to(device)
 
 
-def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
+def candidates(glance: Glance, frame: LookedFrame, count: int) -> Tensor:
     """(H, 27) the networks' poses of the hand: the likeliest, and the likeliest bent to the votes.
 
     The votes are more exact than the hypotheses where a finger is seen, but no pose by themselves.
     """
     model = frame.model
     states, _ = hypotheses(glance, frame.hand, count)
-    if model.refinement is None:
+    if not model.refinement.iterations:
         return states
     bent = states[:_BENT]
     nothing = SeenPoints(
         states.new_zeros(0, 3), states.new_zeros(0, 0, 2), frame.observation.k, (0, 0)
     )
-    assert model.relocaliser is not None
     weight = max(model.relocaliser.settings.landmark_weight, _NO_WEIGHT)
     sigma = glance.landmarks.sigma_m.clamp(min=_BENT_M) / weight
     votes = Landmarks(glance.landmarks.points_m, sigma)
@@ -206,17 +202,15 @@ def candidates(glance: Glance, frame: ObservedFrame, count: int) -> Tensor:
     return torch.cat((frame.hand.refiner(bent, bent[:, 6:], nothing, freely, votes), states))
 
 
-def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
+def joints_word(joints_m: Tensor, frame: LookedFrame) -> Tensor:
     """(N,) what speaks against joints (N, 21, 3) besides the image, beside log scores; at most 0.
 
     Fingers that are in one another or in another hand, and joints that are not where the networks'
     votes are.
     """
     model, glance = frame.model, frame.glance
-    overlap = 0.0 if model.refinement is None else model.refinement.overlap
-    votes, weight = None, 0.0
-    if model.relocaliser is not None and glance is not None:
-        votes, weight = landmarks_of(glance, model), model.relocaliser.settings.votes
+    overlap, weight = model.refinement.overlap, model.relocaliser.settings.votes
+    votes = None if glance is None else landmarks_of(glance, model)
     length = frame.hand.shape.hand_length_m
     word = -model.backend.joints_penalty(joints_m, length, overlap, votes, weight)
     if frame.other is not None and frame.other.pixels is not None:
@@ -225,7 +219,7 @@ def joints_word(joints_m: Tensor, frame: ObservedFrame) -> Tensor:
 
 
 def known_scores(
-    states: Tensor, joints_m: Tensor, frame: ObservedFrame, coverage: float | None = None
+    states: Tensor, joints_m: Tensor, frame: LookedFrame, coverage: float | None = None
 ) -> Tensor:
     """Log scores (N,) of hands (N, 27) with all that is known besides the image.
 
@@ -233,8 +227,8 @@ def known_scores(
     networks for a hand is that for the hypothesis which is most like it.
     """
     relocaliser, glance = frame.model.relocaliser, frame.glance
-    assert relocaliser is not None and glance is not None
-    prior = frame.model.start.prior(frame.observation, frame.seen)
+    assert glance is not None
+    prior = frame.model.prior(frame.observation, frame.seen)
     away = joints_m[:, None] - glance.joints_m.to(joints_m.device)
     likest = away.norm(dim=-1).mean(-1).argmin(1)
     word = glance.log_probability.to(joints_m.device)[likest].clamp(min=_LEAST_WORD)
@@ -242,19 +236,19 @@ def known_scores(
     return frame.log_scores(states, coverage) + prior(states) + word
 
 
-def begun(frame: ObservedFrame) -> Track:
+def begun(frame: LookedFrame) -> Track:
     """A track that begins with the best of the networks' poses."""
     return track_of(best_start(frame)[0], frame.model)
 
 
-def best_start(frame: ObservedFrame) -> tuple[Tensor, float]:
+def best_start(frame: LookedFrame) -> tuple[Tensor, float]:
     """The best (1, 27) of the networks' poses, as they are and brought onto the seen points, and
     what is known of it, log scale.
     """
     model, glance = frame.model, frame.glance
-    assert model.relocaliser is not None and glance is not None
+    assert glance is not None
     states = candidates(glance, frame, model.relocaliser.settings.hypotheses)
-    if model.refinement is not None:
+    if model.refinement.iterations:
         seen, landmarks = seen_points(frame.observation), landmarks_of(glance, model)
         better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, landmarks)
         states = torch.cat((states, better))
@@ -269,6 +263,5 @@ def track_of(pose: Tensor, model: TrackerModel) -> Track:
     n = model.filter.particles
     particles = on_device(particle, model.device).repeat(n, 1)
     weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)
-    carry = 0.0 if model.refinement is None else model.refinement.carry
     still = particle.new_zeros(particle.shape[1])
-    return Track(particles, weights, particle, still, carry * off, pose)
+    return Track(particles, weights, particle, still, model.refinement.carry * off, pose)

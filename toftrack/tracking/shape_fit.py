@@ -58,7 +58,10 @@ much, and so many of its standard deviations."""
 
 @dataclass(frozen=True)
 class ShapeFit:
-    """How the shape is fitted; see conf/hand for what each does."""
+    """How the shape is fitted; see conf/hand for what each does.
+
+    fixed: it is not, and stays as it is configured.
+    """
 
     sure_m: float
     length_sigma: float
@@ -67,6 +70,7 @@ class ShapeFit:
     certain_poses: float
     contradiction: float
     memory: float
+    fixed: bool = False
 
     def __post_init__(self) -> None:
         for name in ("sure_m", "length_sigma", "votes", "certain_poses", "contradiction"):
@@ -154,7 +158,7 @@ class ShapeBelief:
 
     def frozen(self, fit: ShapeFit) -> bool:
         """Whether the hand is known so well that no more is learned."""
-        return self.poses >= fit.certain_poses
+        return fit.fixed or self.poses >= fit.certain_poses
 
     def summary(self, fit: ShapeFit) -> Fitted:
         """For the file of the shape."""
@@ -169,12 +173,12 @@ def first_belief() -> ShapeBelief:
     return ShapeBelief(torch.zeros(_COUNT), population, _no_poses(), (0.0,) * _COUNT)
 
 
-def told(belief: ShapeBelief, length_m: float, first: HandShape) -> ShapeBelief:
+def told(belief: ShapeBelief, length_m: float, fit: ShapeFit, first: HandShape) -> ShapeBelief:
     """Before any estimate, when somebody else says how long the hand is: it is worn so long.
 
     first: the hand whose components are 0.
     """
-    if belief.poses:
+    if belief.poses or fit.fixed:
         return belief
     sigma = POPULATION_SIGMA[0]
     log_length = math.log(length_m / first.hand_length_m)
@@ -207,7 +211,7 @@ def contradicted(
     error = fit.length_sigma**2 * (fit.alike + (1 - fit.alike) / max(heard, 1e-9))
     expected = math.sqrt(error + float(belief.covariance[0, 0]))
     if heard > 1 and abs(off / heard) > fit.contradiction * expected:
-        return told(first_belief(), glance.length_m, first)
+        return told(first_belief(), glance.length_m, fit, first)
     return replace(belief, off=off, heard=heard)
 
 

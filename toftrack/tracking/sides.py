@@ -19,9 +19,8 @@ from toftrack.tracking import shape_fit
 from toftrack.tracking.model import TrackerModel, observed
 from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.relocating import best_start, expected_of
-from toftrack.tracking.shape_fit import ShapeBelief
+from toftrack.tracking.shape_fit import first_belief
 from toftrack.tracking.side_belief import OTHER_SIDE, look_due, probability
-from toftrack.tracking.size_fit import SizeBelief
 from toftrack.tracking.state import Track, TrackerState
 
 _BEHIND_M = (0.12, 0.55)
@@ -58,7 +57,6 @@ def sided(
     belief = replace(belief, unlooked_s=belief.unlooked_s + dt_s)
     if glance is None or not due or glance.present < _LEAST_PRESENT:
         return replace(state, sides=belief), track, glance
-    assert model.relocaliser is not None
     side, other = state.side, OTHER_SIDE[state.side]
     centre = glance.centre_m.numpy()
     mirrored = model.relocaliser.glance(image.depth_m, image.k, centre[None], other)[0]
@@ -68,8 +66,7 @@ def sided(
     belief = belief.looked(gain, _body_m(image, centre), fit)
     if probability(belief, side) >= _SWITCHED:
         return replace(state, sides=belief), track, glance
-    forgotten = None if state.size is None else shape_fit.first_belief()
-    state = replace(state, side=other, sides=belief, size=forgotten, gesture=None, refused=0)
+    state = replace(state, side=other, sides=belief, size=first_belief(), gesture=None)
     return state, None, mirrored
 
 
@@ -102,16 +99,8 @@ def _known(
     observation = model.segmentation(image.depth_m, image.k, expected_of(glance), theirs)
     if observation.empty:
         return -math.inf
-    hand = model.hand(side, _size(glance, state.size, track, model))
+    size = state.size
+    if track is None:
+        size = shape_fit.told(size, glance.length_m, model.adapt, model.shape)
+    hand = model.hand(side, size)
     return best_start(observed(observation, hand, model, glance, other=other))[1]
-
-
-def _size(
-    glance: Glance,
-    size: SizeBelief | ShapeBelief | None,
-    track: Track | None,
-    model: TrackerModel,
-) -> SizeBelief | ShapeBelief | None:
-    if track is None and isinstance(size, ShapeBelief):
-        return shape_fit.told(size, glance.length_m, model.shape)
-    return size

@@ -56,7 +56,7 @@ def placed(
 ) -> Placed | None:
     """A slot's hand dt_s after its last pose; None where there is none."""
     track = slot.track
-    if track is None or track.pose is None:
+    if track is None:
         return None
     pose = track.pose
     if dt_s > 0:

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.estimate import Estimate
+from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import GestureState
 from toftrack.relocation.relocaliser import Glance
 from toftrack.render.segmentation import Expected, Observation
-from toftrack.tracking.search import LastSeen
+from toftrack.tracking.prior import LastSeen
 from toftrack.tracking.shape_fit import ShapeBelief
 from toftrack.tracking.side_belief import SideBelief
 from toftrack.tracking.signs import Signs
-from toftrack.tracking.size_fit import SizeBelief
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +41,12 @@ class Track:
     mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a second.
     offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
         displaced by it.
-    pose: (1, 27) the last refined hand, None at the start.
+    pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see steadying.
     contender: another pose that may take its place, None where there is none.
     age_s: how long it has been followed, 0 before the first frame.
-    bad_s: how long its score has been low.  outside_s: how long it has been out of the pose space.
-        The first frame of each counts FRAME_S, so that one alone says the same at any rate.
+    bad_s: how long it has been doubted much. The first frame counts FRAME_S, so that one alone says
+        the same at any rate.
     challenged_s: how long a pose of the networks has been better.
     log_odds: that the estimate is right, smoothed over time; None where nobody says.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
@@ -60,12 +60,11 @@ class Track:
     mean: Tensor
     velocity: Tensor
     offset: Tensor
-    pose: Tensor | None = None
+    pose: Tensor
     trend: Tensor | None = None
     contender: Contender | None = None
     age_s: float = 0.0
     bad_s: float = 0.0
-    outside_s: float = 0.0
     challenged_s: float = 0.0
     log_odds: float | None = None
     doubted: bool = False
@@ -82,11 +81,10 @@ class TrackerState:
 
     generator: the state of the random generator, as torch.Generator.get_state() gives it.
     side: "right" or "left", whose hand is followed.
-    sides: how sure that is; None where it was told.
+    size: what is believed of the hand's shape.
+    sides: how sure the side is; None where it was told.
     track: None while there is no hand to follow.
     seen: the last hand that was believed.
-    size: what is believed of the hand's size, or of its whole shape; None where it is not fitted.
-    refused: how many starts in a row were not believed.
     gesture: smoothed probabilities of the gestures.
     last: the last estimate that there was.
     unsearched_s: how long ago the whole image was searched for a hand.
@@ -96,16 +94,27 @@ class TrackerState:
 
     generator: Tensor
     side: str
+    size: ShapeBelief
     sides: SideBelief | None = None
     track: Track | None = None
     seen: LastSeen | None = None
-    size: SizeBelief | ShapeBelief | None = None
-    refused: int = 0
     gesture: GestureState | None = None
     last: Estimate | None = None
     unsearched_s: float = math.inf
     next_index: int = 0
     timestamp_s: float | None = None
+
+    def at(self, image: DepthImage) -> TrackerState:
+        """The state as time goes on to an image."""
+        before, seen = self.timestamp_s, self.seen
+        passed = 0.0 if before is None else max(0.0, image.timestamp_s - before)
+        return replace(
+            self,
+            seen=None if seen is None else replace(seen, age_s=seen.age_s + passed),
+            unsearched_s=self.unsearched_s + passed,
+            next_index=image.index + 1,
+            timestamp_s=image.timestamp_s,
+        )
 
 
 @dataclass(frozen=True, eq=False)

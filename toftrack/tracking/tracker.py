@@ -16,11 +16,20 @@ from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.scoring import Scorer
 from toftrack.tracking.effort import Pace, Timekeeper
-from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.shape_fit import ShapeBelief
-from toftrack.tracking.size_fit import SizeBelief
+from toftrack.tracking.model import FilterModel, TrackerModel
+from toftrack.tracking.paper import PaperModel, paper_step
 from toftrack.tracking.state import StepInfo, Track, TrackerState
-from toftrack.tracking.step import first_state, step
+from toftrack.tracking.step import step
+
+
+def stepped(
+    state: TrackerState, image: DepthImage, model: FilterModel
+) -> tuple[TrackerState, StepInfo, Estimate]:
+    """One frame of one hand, by the tracker that a model is of: see step and paper_step."""
+    if isinstance(model, PaperModel):
+        return paper_step(state, image, model)
+    assert isinstance(model, TrackerModel)
+    return step(state, image, model)
 
 
 class Tracker:
@@ -33,14 +42,14 @@ class Tracker:
 
     def __init__(
         self,
-        model: TrackerModel,
+        model: FilterModel,
         seed: int = 0,
         pace: Pace | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`."""
         self.model, self.time = model, Timekeeper(pace, clock)
-        self.state: TrackerState = first_state(model, seed)
+        self.state: TrackerState = model.first_state(seed)
         self.info: StepInfo | None = None
 
     def step(
@@ -68,7 +77,8 @@ class Tracker:
         timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
         image = DepthImage(depth_m, k, index, timestamp_s)
         with at_most(effort.threads):
-            self.state, self.info, estimate = step(self.state, image, self.model.spending(effort))
+            model = self.model.spending(effort)
+            self.state, self.info, estimate = stepped(self.state, image, model)
         return replace(estimate, compute_s=self.time.took_s())
 
     def restart(self, side: str | None = None) -> None:
@@ -87,7 +97,7 @@ class Tracker:
     @property
     def fitted(self) -> HandShape:
         """The same hand, with how sure the fit is of it."""
-        return fitted_hand(self.state, self.model)
+        return self.model.fitted(self.state.side, self.state.size)
 
     @property
     def scorer(self) -> Scorer:
@@ -115,23 +125,13 @@ class Tracker:
         return None if self.info is None or self.info.observation.empty else self.info
 
 
-def fitted_hand(state: TrackerState, model: TrackerModel) -> HandShape:
-    """The hand of a state, with how sure the fit is of it; None before anything was fitted."""
-    shape, belief, fit = model.hand(state.side, state.size).shape, state.size, model.adapt
-    if isinstance(belief, ShapeBelief) and fit is not None and belief.poses:
-        return replace(shape, fitted=belief.summary(fit))
-    if isinstance(belief, SizeBelief) and model.fit is not None and belief.frames:
-        return replace(shape, fitted=belief.summary(model.fit))
-    return shape
-
-
-def restarted(state: TrackerState, model: TrackerModel, side: str | None = None) -> TrackerState:
+def restarted(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
     """A state that has seen nothing, but for its random and frame numbers; of a side if one is
     given, which is told from then on.
 
     Raises ToftrackError for an unknown side.
     """
-    first = first_state(model, 0)
+    first = model.first_state(0)
     if side is not None:
         first = replace(first, side=model.shape.of_side(side).side, sides=None)
     elif state.sides is None:

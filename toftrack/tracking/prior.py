@@ -1,12 +1,15 @@
-"""A hand hangs on an arm, and the arm goes on until the image ends.
+"""What speaks for and against a hand besides the image of it: its arm, and how it was seen last.
 
-The silhouette of a hand with its forearm looks much like that of a hand the other way round. But
-there the arm would have to be where the fingers end, and the image shows the background; or the
-fingers would be where the arm leaves the image.
+A hand hangs on an arm, and the arm goes on until the image ends. The silhouette of a hand with its
+forearm looks much like that of a hand the other way round. But there the arm would have to be where
+the fingers end, and the image shows the background; or the fingers would be where the arm leaves
+the image.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.rotations import rotvec_to_rotmat
+from toftrack.checks import check_number
+from toftrack.compute.rotations import rotvec_geodesic_distance, rotvec_to_rotmat
 from toftrack.render.segmentation import Observation
 
 _ALONG_M = (0.05, 0.07, 0.09)
@@ -43,13 +47,57 @@ class ArmSight:
     k: Tensor
 
 
-def border_pixels(observation: Observation) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the blob's pixels at the border of the image."""
-    hand = observation.hand.cpu().numpy()
-    border = np.zeros_like(hand)
-    border[[0, -1], :] = border[:, [0, -1]] = True
-    v, u = np.nonzero(hand & border)
-    return v, u
+@dataclass(frozen=True)
+class LastSeen:
+    """The hand as it was last believed.
+
+    particle: (1, 6 + d).  age_s: how long ago.
+    """
+
+    particle: Tensor
+    age_s: float
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A hand hangs on an arm, and it does not turn round all at once; see conf/start/prior.yaml.
+
+    forearm: taken from the log score of a hand whose forearm cannot be.
+    memory: added to the log score of a hand that is turned as it was before it was lost ...
+    memory_rad: ... with less the farther it has turned since (standard deviation) ...
+    memory_s: ... and the longer ago it was (to 1/e).
+    """
+
+    forearm: float
+    memory: float
+    memory_rad: float
+    memory_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("forearm", "memory"):
+            check_number(f"start.{name}", getattr(self, name), 0)
+        for name in ("memory_rad", "memory_s"):
+            check_number(f"start.{name}", getattr(self, name), 0, above=True)
+
+    def __call__(
+        self, observation: Observation, last: LastSeen | None
+    ) -> Callable[[Tensor], Tensor]:
+        """In a frame: hypotheses (N, 6 + d) to (N,), added to their log scores.
+
+        last: the hand as it was last believed, if it ever was.
+        """
+        sight = arm_sight(observation)
+
+        def log_prior(particles: Tensor) -> Tensor:
+            known = -self.forearm * forearm_conflict(particles, sight)
+            if last is not None:
+                before = last.particle[:, 3:6].expand(len(particles), -1)
+                turned = rotvec_geodesic_distance(particles[:, 3:6], before)
+                likeness = torch.exp(-0.5 * (turned / self.memory_rad).square())
+                known = known + self.memory * math.exp(-last.age_s / self.memory_s) * likeness
+            return known
+
+        return log_prior
 
 
 def arm_sight(observation: Observation) -> ArmSight:
@@ -61,7 +109,10 @@ def arm_sight(observation: Observation) -> ArmSight:
     gap = cv2.distanceTransform(
         background.cpu().numpy().view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5
     )
-    v, u = border_pixels(observation)
+    hand = observation.hand.cpu().numpy()
+    border = np.zeros_like(hand)
+    border[[0, -1], :] = border[:, [0, -1]] = True
+    v, u = np.nonzero(hand & border)
     some = slice(None, None, max(1, -(-len(v) // _EXITS)))
     rows, columns = (torch.from_numpy(index[some].copy()).to(depth.device) for index in (v, u))
     z = depth[rows, columns]

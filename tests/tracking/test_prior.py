@@ -1,4 +1,4 @@
-"""A hand hangs on an arm: hypotheses whose arm cannot be."""
+"""A hand hangs on an arm, and does not turn round all at once: hypotheses that cannot be."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import roma
 import torch
-from helpers.configured import nearest_surface
+from helpers.configured import nearest_surface, prior
 from helpers.tracking import sample
 
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.forearm import arm_sight, forearm_conflict
+from toftrack.tracking.prior import LastSeen, arm_sight, forearm_conflict
 
 K = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
 
@@ -83,3 +83,28 @@ def test_the_true_hand_of_the_recording_always_has_its_arm_and_a_turned_one_neve
             turn = roma.rotmat_to_rotvec(torch.stack(columns, 1))
             x = torch.cat((torch.from_numpy(wrist).float(), turn, torch.zeros(4)))[None]
             assert (float(forearm_conflict(x, sight)) == 0) == (sign == 1)
+
+
+def test_a_hand_as_last_seen_is_preferred_and_forgotten_with_time() -> None:
+    frame = seen(scene())
+    before = torch.zeros(1, 10)
+    before[:, 2] = 0.5
+    turned = before.clone()
+    turned[:, 5] = 3.0
+    log_prior = prior(forearm=0.0)
+    both = torch.cat((before, turned))
+
+    def gain(age_s: float) -> float:
+        same, other = log_prior(frame, LastSeen(before, age_s))(both)
+        return float(same - other)
+
+    assert gain(0.0) == pytest.approx(log_prior.memory, abs=0.01)
+    assert gain(log_prior.memory_s) == pytest.approx(log_prior.memory / math.e, abs=0.01)
+    assert not log_prior(frame, None)(both).any()
+
+
+def test_an_arm_that_cannot_be_costs_what_is_set() -> None:
+    both = torch.cat((pointing(0), pointing(180)))
+    possible, turned = prior(forearm=0.4)(seen(scene()), None)(both)
+    assert (float(possible), float(turned)) == (0.0, pytest.approx(-0.4))
+    assert not prior(forearm=0.0)(seen(scene()), None)(both).any()

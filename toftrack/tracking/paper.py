@@ -1,0 +1,187 @@
+"""The paper's tracker, whole: a rough start, segmentation, the particle filter, its mean.
+
+Gudmundsson et al., "Model-based hand gesture tracking in ToF image sequences", AMDO 2010. No
+networks, no refinement, no fitting of the hand, no way back. docs/paper.md says what differs from
+print.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+
+from toftrack.checks import check_number
+from toftrack.compute.pace import elapsed_s
+from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.threads import small_operations
+from toftrack.compute.transfer import on_device
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.frames import DepthImage
+from toftrack.render.segmentation import Observation
+from toftrack.tracking.estimates import emitted, estimate_of, no_hand, particles_sigma
+from toftrack.tracking.following import Found, advanced, expected_depths, filtered
+from toftrack.tracking.life_cycle import Belief
+from toftrack.tracking.model import FilterModel, ObservedFrame, evidence_of
+from toftrack.tracking.particle_filter import Spread
+from toftrack.tracking.spans import Spans
+from toftrack.tracking.state import StepInfo, Track, TrackerState, resumed
+
+_WIDEST_PALM_M = 0.06
+"""Half the breadth of the broadest hand's palm with the ball of the thumb."""
+_DEPTH_M = 0.12
+"""How far behind the nearest surface a palm typically lies at most."""
+_DEPTH_EDGE_M = 0.04
+"""Between neighbouring pixels of one surface there is less than this."""
+_HALF_PALM_M = 0.012
+"""Half the thickness of a palm."""
+
+
+@dataclass(frozen=True)
+class RoughStart:
+    """The paper's rough manual positioning: an open palm, put by hand or where the nearest blob is.
+
+    pose: wrist translation (3, m) and rotation vector (3, rad); None takes the position from the
+        image and points the fingers up with the palm towards the camera.
+    position_m, rotation_rad: standard deviations of the particles about it.
+    """
+
+    pose: tuple[float, ...] | None
+    position_m: float
+    rotation_rad: float
+
+    def __post_init__(self) -> None:
+        if self.pose is not None and len(self.pose) != 6:
+            raise ToftrackError(
+                f"start.pose has {len(self.pose)} numbers; give six: translation in metres and"
+                " rotation vector in radians"
+            )
+        for number, value in enumerate(self.pose or ()):
+            check_number(f"start.pose[{number}]", value)
+        for name in ("position_m", "rotation_rad"):
+            check_number(f"start.{name}", getattr(self, name), 0)
+
+    def __call__(
+        self, observation: Observation, model: FilterModel, generator: torch.Generator
+    ) -> Track:
+        """A track that begins in a frame that is not empty; nothing is scored."""
+        space, n = model.space, model.filter.particles
+        reference = torch.zeros(1, 6 + space.dims)
+        rows = [label == "palm" for label in space.training_labels]
+        reference[0, 6:] = space.training_latents[rows.index(True) if True in rows else 0]
+        if self.pose is None:
+            centre = torch.from_numpy(palm_centre(observation, generator))
+            reference[0, :3] = centre - reference.new_tensor(PIVOT_M)
+        else:
+            reference[0, :6] = torch.tensor(self.pose)
+        spread = Spread(self.position_m, self.position_m, self.rotation_rad, 0.0)
+        noise = torch.randn(n, 6 + space.dims, generator=generator)
+        tangents = noise * spread.sigmas(space.lower, space.upper)
+        particles = model.backend.motions.compose(reference, tangents)
+        there = on_device(particles, model.device)
+        weights = there.new_full((n,), 1.0 / n, dtype=torch.float64)
+        mean, still = particles[:1], particles.new_zeros(6 + space.dims)
+        return Track(there, weights, mean, still, still.new_zeros(21), model.decode(mean))
+
+
+def palm_centre(observation: Observation, generator: torch.Generator) -> np.ndarray:
+    """Where the middle of the palm is, roughly, (3,) float32 metres.
+
+    It is the centre of the widest and nearest disc that is inscribed in the silhouette cut along
+    its depth edges, so that a hand in front of the body stands by itself, and no wider than a palm,
+    so that it does not lie on the body.
+    """
+    hand, depth = observation.hand.numpy(), observation.depth_m.numpy()
+    k, kernel = observation.k.numpy(), np.ones((3, 3), np.uint8)
+    far = np.where(hand, depth, depth.max()).astype(np.float32)
+    smooth = hand & (cv2.dilate(far, kernel) - cv2.erode(far, kernel) < _DEPTH_EDGE_M)
+    inside = smooth if smooth.any() else hand
+    # The border of the image counts as the silhouette's edge, or an arm that leaves the picture
+    # would be widest there.
+    focal = float(k[0, 0])
+    margin = 1 + math.ceil(_WIDEST_PALM_M * focal / max(observation.nearest_m, 0.1))
+    silhouette = np.pad(inside.astype(np.uint8), margin)
+    depths = np.pad(depth, margin, mode="edge")
+    nearness = np.exp(-(depths - observation.nearest_m) / _DEPTH_M)
+    distance = cv2.distanceTransform(silhouette, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    peaks = distance >= cv2.dilate(distance, np.ones((5, 5), np.uint8)) - 0.5
+    radius_m = distance * depths / focal
+    usable = (silhouette > 0) & peaks & (radius_m < _WIDEST_PALM_M)
+    weights = np.where(usable, radius_m**3 * nearness, 0.0)
+    if not weights.any():
+        weights = silhouette.astype(np.float64)
+    # Drawn and not used: the figures in docs/paper.md rest on the random numbers that follow.
+    drawn = torch.from_numpy(weights.ravel() / weights.max()).double()
+    torch.multinomial(drawn, 1, generator=generator)
+    row, column = np.divmod(int(weights.argmax()), weights.shape[1])
+    v, u = row - margin, column - margin
+    # Noise and flying pixels: the median of a neighbourhood, wherever it is mostly hand.
+    median = cv2.medianBlur(np.where(hand, depth, 0).astype(np.float32), 5)[v, u]
+    z = (median if median > 0 else depth[v, u]) + _HALF_PALM_M
+    return np.array(((u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z, z), np.float32)
+
+
+@dataclass(frozen=True)
+class ScoreThreshold:
+    """A frame whose estimate scores less than `score`, 0 .. 1, is flagged, and changes nothing."""
+
+    score: float
+
+    def __post_init__(self) -> None:
+        check_number("lost.score", self.score, 0, 1)
+
+    def judge(self, track: Track, score: float) -> Belief:
+        """What is thought of an estimate with a score."""
+        if score < self.score:
+            return Belief(True, "recovering", True)
+        return Belief(True, "tracking" if track.age_s > 0 else "initialising", False)
+
+
+@dataclass(frozen=True, eq=False)
+class PaperModel(FilterModel):
+    """The parts of the paper's tracker."""
+
+    start: RoughStart
+    lost: ScoreThreshold
+
+
+@small_operations()
+def paper_step(
+    state: TrackerState, image: DepthImage, model: PaperModel
+) -> tuple[TrackerState, StepInfo, Estimate]:
+    """One frame: segment, start if there is no hand yet, filter, take the mean.
+
+    A pure function: the state given stays as it is, and gives the same again. In an image without
+    anything in it, the particles wait as they were.
+    """
+    spans, generator = Spans(), resumed(state.generator)
+    dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
+    state = state.at(image)
+    track, hand = state.track, model.hand(state.side, state.size)
+    with spans("segmentation and evidence"):
+        expected = expected_depths(track, dt_s, hand, model)
+        observation = model.segmentation(image.depth_m, image.k, expected)
+        if observation.empty:
+            return no_hand(state, image, observation, model, spans)
+        frame = ObservedFrame(observation, evidence_of(observation, model), hand, model)
+    with spans("start"):
+        track = model.start(observation, model, generator) if track is None else track
+    with spans("filter: rest"):
+        particles, weights = filtered(track, dt_s, frame, generator, spans)
+        mean = model.backend.motions.mean(particles, weights)
+        pose = model.decode(mean)
+    score = frame.score(pose)
+    belief = model.lost.judge(track, score)
+    found = Found(particles, weights, mean, pose, None, *model.nearest(pose), track.offset)
+    estimate = estimate_of(image, found, score, belief, frame)
+    sigma_m = particles_sigma(estimate.joints_m, found, frame)
+    estimate = replace(estimate, joint_sigma_m=sigma_m)
+    hidden = bool(observation.occluder.any())
+    track = advanced(track, found, belief, expected if hidden else None, dt_s, model)
+    state, estimate = emitted(state, image, estimate, hand.shape, dt_s, model, spans)
+    state = replace(state, generator=generator.get_state(), track=track)
+    return state, StepInfo(observation, particles, weights, spans.seconds()), estimate
