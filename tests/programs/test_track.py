@@ -223,7 +223,7 @@ def test_a_recording_is_tracked_by_its_name_alone_and_a_killed_run_recovered(
 def test_two_hands_are_written_slot_by_slot(here, tmp_path: Path) -> None:
     status, out, err = here("hands=2", "device.stop=3", "stream=stdout", "view=video", *QUICK)
     assert status == 0, err
-    assert "up to two hands, their lengths fitted" in err and "a right hand" not in err
+    assert "up to two hands, their lengths to be fitted" in err and "a right hand" not in err
     folder = tmp_path / "out"
     result = read_results(folder / "track.npz")
     assert result["joints_m"].shape == (3, 2, 21, 3) and result["index"].shape == (3,)
