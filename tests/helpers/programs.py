@@ -22,10 +22,13 @@ QUICK = ("filter.particles=100",)
 
 @contextmanager
 def _as_a_process(folder: Path, *arguments: str) -> Iterator[None]:
-    """The folder, the arguments and the environment; and all that Hydra changes changes back."""
+    """The folder, the arguments and the environment; and all that Hydra changes changes back.
+
+    So does what Ctrl-C does, which a program that is loaded for the first time changes.
+    """
     kept, root = Singleton.get_state(), logging.getLogger()
     handlers, level, argv = list(root.handlers), root.level, sys.argv
-    raw = os.environ.pop("HYDRA_FULL_ERROR", None)
+    raw, pressed = os.environ.pop("HYDRA_FULL_ERROR", None), signal.getsignal(signal.SIGINT)
     sys.argv = list(arguments)
     try:
         with chdir(folder):
@@ -34,6 +37,7 @@ def _as_a_process(folder: Path, *arguments: str) -> Iterator[None]:
         sys.argv = argv
         if raw is not None:
             os.environ["HYDRA_FULL_ERROR"] = raw
+        signal.signal(signal.SIGINT, pressed)
         Singleton.set_state(kept)
         root.handlers[:], root.level = handlers, level
 
