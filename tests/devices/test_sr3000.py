@@ -233,14 +233,17 @@ def test_close_twice_and_open_again() -> None:
 
 
 def test_iterating_again_goes_on() -> None:
-    device = camera(stop=6)
+    # A camera without an end: frames that wait when an iteration ends are dropped, and how many had
+    # been read by then is a matter of threads.
+    device = camera(loop=True)
     with device:
-        first = [frame.index for frame, _ in zip(device, range(3), strict=False)]
+        first = [frame.index for _, frame in zip(range(3), device, strict=False)]
         gc.collect()  # the first iteration is over
-        second = [frame.index for frame in device]
+        second = [frame.index for _, frame in zip(range(3), device, strict=False)]
     assert first == [0, 1, 2]
-    assert second[-1] == 5
     assert second[0] > 2
+    assert len(second) == 3
+    assert sorted(set(second)) == second
 
 
 def test_an_exception_in_the_consumer_releases_the_camera() -> None:
