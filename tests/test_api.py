@@ -25,15 +25,15 @@ QUICK = ("filter.particles=100",)
 
 def python(code: str, *arguments: str, folder: Path) -> str:
     """What a program prints that runs in a process and folder of its own."""
-    told = subprocess.run(
+    reported = subprocess.run(
         [sys.executable, *arguments, "-c", code],
         cwd=folder,
         capture_output=True,
         text=True,
         timeout=120,
     )
-    assert told.returncode == 0, told.stderr
-    return told.stdout
+    assert reported.returncode == 0, reported.stderr
+    return reported.stdout
 
 
 def test_importing_toftrack_is_light_until_a_name_is_used(tmp_path: Path) -> None:
@@ -245,12 +245,12 @@ def test_trackers_in_threads_do_not_disturb_each_other() -> None:
 def test_a_thread_that_begins_while_another_one_computes_gets_all_of_torch_s_threads() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    told: list[int] = []
+    reported: list[int] = []
 
     def work() -> None:
         with small_operations():
-            told.append(torch.get_num_threads())
-        told.append(torch.get_num_threads())
+            reported.append(torch.get_num_threads())
+        reported.append(torch.get_num_threads())
 
     try:
         with small_operations():
@@ -258,7 +258,7 @@ def test_a_thread_that_begins_while_another_one_computes_gets_all_of_torch_s_thr
             worker = threading.Thread(target=work)
             worker.start()
             worker.join()
-        assert told == [1, 2] and torch.get_num_threads() == 2
+        assert reported == [1, 2] and torch.get_num_threads() == 2
         with small_operations():
             assert threads() == most
     finally:

@@ -36,8 +36,8 @@ def npy(array: Any) -> bytes:
 
 def header(shape: tuple[int, ...], kind: str = "<f4") -> bytes:
     content = io.BytesIO()
-    told = {"descr": kind, "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(content, told)
+    reported = {"descr": kind, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(content, reported)
     return content.getvalue()
 
 
@@ -50,7 +50,7 @@ def save(path: Path, content: dict[str, bytes | list[bytes]], method: int) -> Pa
     return path
 
 
-def told(path: Path) -> str:
+def reported(path: Path) -> str:
     """What is said, after little memory was used; tracemalloc sees what Python allocates."""
     tracemalloc.start()
     try:
@@ -88,7 +88,7 @@ def test_what_was_made_to_fill_memories_is_not_unpacked(tmp_path: Path, method: 
     shape = (128, 2**20 // 4)
     path = save(tmp_path / "bomb.npz", {"a": [header(shape), *[ZEROS] * 128]}, method)
     assert path.stat().st_size < 2**20
-    assert "'a': it would make 134 MB of" in told(path)
+    assert "'a': it would make 134 MB of" in reported(path)
 
 
 @every_packing
@@ -100,7 +100,7 @@ def test_more_than_the_directory_states_is_not_unpacked(tmp_path: Path, method: 
     at = forged.index(b"PK\x01\x02")
     forged[at + 24 : at + 28] = size
     path.write_bytes(forged)
-    assert "'a' is damaged: its checksum is wrong" in told(path)
+    assert "'a' is damaged: its checksum is wrong" in reported(path)
 
 
 @every_method
@@ -108,14 +108,14 @@ def test_a_header_that_claims_too_much_is_not_believed(tmp_path: Path, method: i
     claims = {"more": header((2**40,)), "negative": header((-1, 4)), "less": header((1,)) + ZEROS}
     for name, content in claims.items():
         path = save(tmp_path / f"{name}.npz", {"a": content}, method)
-        assert "'a'" in told(path) and "length" in told(path)
+        assert "'a'" in reported(path) and "length" in reported(path)
 
 
 @every_packing
 def test_a_header_without_end_is_not_read(tmp_path: Path, method: int) -> None:
     long = b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**27)
     path = save(tmp_path / "a.npz", {"a": [long, *[b" " * 2**20] * 128]}, method)
-    assert "'a': its header is damaged" in told(path)
+    assert "'a': its header is damaged" in reported(path)
 
 
 def edited(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
@@ -135,7 +135,7 @@ def edited(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
 )
 def test_a_damaged_header_is_told(tmp_path: Path, edit: Callable, words: str) -> None:
     content = edit(npy(np.ones((4, 5))))
-    assert words in told(save(tmp_path / "a.npz", {"a": content}, zipfile.ZIP_STORED))
+    assert words in reported(save(tmp_path / "a.npz", {"a": content}, zipfile.ZIP_STORED))
 
 
 def test_objects_are_refused(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_a_text_that_is_too_long_is_refused(tmp_path: Path) -> None:
     length = MOST_TEXT_BYTES // 4 + 1
     pieces = [header((), f"<U{length}"), *[ZEROS] * 16, bytes(4)]
     path = save(tmp_path / "a.npz", {"a": pieces}, zipfile.ZIP_DEFLATED)
-    assert "'a': it is a text of 17 MB" in told(path)
+    assert "'a': it is a text of 17 MB" in reported(path)
 
 
 def test_an_array_beyond_the_cap_is_refused(
@@ -156,7 +156,7 @@ def test_an_array_beyond_the_cap_is_refused(
 ) -> None:
     monkeypatch.setattr(archives, "MOST_BYTES", 1000)
     path = save(tmp_path / "a.npz", {n: npy(np.ones(100)) for n in "ab"}, zipfile.ZIP_STORED)
-    assert "it is larger than" in told(path)
+    assert "it is larger than" in reported(path)
     with open(path, "rb") as stream, pytest.raises(ValueError, match="at most"):
         Archive(stream).read("a", 100)
 
@@ -169,7 +169,7 @@ def test_an_unknown_compression_is_told(tmp_path: Path, method: int, words: str)
         place = forged.index(start) + at
         forged[place : place + 2] = struct.pack("<H", method)
     path.write_bytes(forged)
-    assert words in told(path)
+    assert words in reported(path)
 
 
 @every_method
@@ -200,4 +200,4 @@ def test_characters_that_are_none_are_told(kind: str, tmp_path: Path) -> None:
     assert read_archive(path)["a"].tolist() == whole.tolist()
     broken = npy(whole)[:-4] + b"\x7f\x7f\x7f\x7f"
     path = save(tmp_path / "b.npz", {"a": broken}, zipfile.ZIP_STORED)
-    assert "text is damaged" in told(path)
+    assert "text is damaged" in reported(path)

@@ -138,12 +138,12 @@ def test_a_program_that_forks_goes_on_in_both_processes(when: str) -> None:
         start_new_session=True,
     )
     try:
-        told, _ = process.communicate(timeout=2 * _LIMIT_S)
+        reported, _ = process.communicate(timeout=2 * _LIMIT_S)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-    assert told.splitlines() == ["child tracking", "parent tracking 0"]
+    assert reported.splitlines() == ["child tracking", "parent tracking 0"]
     assert process.returncode == 0
 
 

@@ -87,9 +87,9 @@ def as_python(words: list[str]) -> tuple[str, ...]:
 COMMANDS = sorted(set(commands()))
 TRACK = [words for words in COMMANDS if words[:2] == ("python", "track.py")]
 TRAIN = [words for words in COMMANDS if words[:2] == ("python", "train_pose_space.py")]
-RELOCALISER = ("python", "-m", "toftrack.programs.train_relocaliser")
+DETECTOR = ("python", "-m", "toftrack.programs.train_detector")
 """The one command of a module that takes overrides."""
-OTHERS = (RELOCALISER, ("python", "-m", "venv", ".venv"))
+OTHERS = (DETECTOR, ("python", "-m", "venv", ".venv"))
 MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m") and words not in OTHERS]
 OF_HYDRA = ("-m", "--multirun")
 
@@ -138,8 +138,8 @@ def test_a_command_composes(words: tuple[str, ...]) -> None:
 
 
 def test_the_command_that_trains_networks_is_shown_and_composes() -> None:
-    assert RELOCALISER in COMMANDS
-    assert configuration(name="train_relocaliser").poses.images > 0
+    assert DETECTOR in COMMANDS
+    assert configuration(name="train_detector").poses.images > 0
 
 
 def program(name: str) -> ModuleType:

@@ -93,9 +93,9 @@ def test_names_that_are_not_utf8_are_reported(
     ],
 )
 def test_what_cannot_be_meant_is_one_sentence(override: str, words: str) -> None:
-    with pytest.raises(ToftrackError, match=words) as told:
+    with pytest.raises(ToftrackError, match=words) as reported:
         configuration(override)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(reported.value)
 
 
 def test_an_empty_name_is_no_recording() -> None:

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import torch
 
     from toftrack.devices.base import Device
-    from toftrack.tracking.effort import Pace
     from toftrack.tracking.hands import HandsTracker
     from toftrack.tracking.model import FilterModel
+    from toftrack.tracking.quality import Pace
     from toftrack.tracking.tracker import Tracker
 
 
@@ -102,7 +102,7 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
 
 def _pace(config: DictConfig) -> Pace:
     """Who gives a budget to a tracker of their own has a camera that does not wait."""
-    from toftrack.tracking.effort import pace_within
+    from toftrack.tracking.quality import pace_within
 
     # A configuration of one's own may do without.
     return pace_within((config.get("tracker") or {}).get("budget_ms"))
@@ -119,7 +119,7 @@ def build_model(config: DictConfig) -> FilterModel:
 
     check_tracker(config)
     device = compute_device(config.compute)
-    hand, relocaliser = instantiate(config.hand), instantiate(config.relocation)
+    hand, detector = instantiate(config.hand), instantiate(config.detector)
     parts: dict[str, Any] = {
         "shape": hand.shape,
         "space": instantiate(config.pose_space),
@@ -130,11 +130,11 @@ def build_model(config: DictConfig) -> FilterModel:
         "backend": choose_backend(config.renderer, device),
         "lost": instantiate(config.lost),
     }
-    if relocaliser is None:
+    if detector is None:
         return PaperModel(**parts, start=instantiate(config.start))
     return TrackerModel(
         **parts,
-        relocaliser=relocaliser.to(device),
+        detector=detector.to(device),
         refinement=instantiate(config.refine),
         prior=instantiate(config.start),
         adapt=hand.adapt,

@@ -93,8 +93,8 @@ def test_labelled_images_are_measured_too(folder, tmp_path, capsys) -> None:
     called |= {"images": [1, 2], "called": {"1": ["palm"], "2": ["fist"]}}
     (tmp_path / "stills.json").write_text(json.dumps(called))
     bare = str(folder.parent / "bare.npz")
-    told = ["--labels", str(tmp_path / "stills.json"), "--json", str(tmp_path / "out.json")]
-    accuracy.main([bare, *told, *QUICK])
+    reported = ["--labels", str(tmp_path / "stills.json"), "--json", str(tmp_path / "out.json")]
+    accuracy.main([bare, *reported, *QUICK])
     result = json.loads((tmp_path / "out.json").read_text())
     (images,) = result["images"].values()
     assert len(result["rows"]) == 2 and set(images["by"]) == {"1", "2"}
@@ -121,10 +121,10 @@ def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> No
         ([str(folder), "hand.side=left"], "--side"),
         ([str(folder), "device=sample"], "cannot be given here"),
     ]
-    for arguments, told in cases:
+    for arguments, reported in cases:
         with pytest.raises(ToftrackError) as error:
             accuracy.main(arguments)
-        assert told in str(error.value) and "\n" not in str(error.value)
+        assert reported in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_side_that_nobody_knows_cannot_be_told(folder, tmp_path) -> None:

@@ -57,8 +57,11 @@ def test_a_small_run_writes_json(tmp_path, capsys, quick):
     assert set(frames) == expected | {"default, 640x480", "default, 1280x720"}
     assert all(0 < row["min_ms"] <= row["median_ms"] for row in frames.values())
     assert all(set(row["parts"]) == set(frame_timing.PARTS) for row in frames.values())
-    looked = {name: row["parts"]["relocaliser"] for name, row in frames.items()}
-    assert looked["default"] > 10 * looked["paper"] and looked["default, start"] > looked["default"]
+    compared = {name: row["parts"]["detector"] for name, row in frames.items()}
+    assert (
+        compared["default"] > 10 * compared["paper"]
+        and compared["default, start"] > compared["default"]
+    )
     assert frames["default"]["parts"]["refinement"] > frames["paper"]["parts"]["refinement"]
     assert 0 < frames["paper"]["parts"]["filter: scoring"] < frames["paper"]["median_ms"]
     spaces = {row["space"]: row for row in result["decoding"]}

@@ -137,7 +137,11 @@ def test_the_told_side_goes_before_the_surer_hand() -> None:
 
 def test_sides_are_measured_only_where_they_were_to_be_found() -> None:
     said = [PeerEstimate(np.zeros((21, 3)), False, "left", 0.8, 0.02)] * 3
-    told, seconds = peer_estimates(said, found_side=False)
-    assert told.side is None and told.joints_m.shape == (3, 21, 3) and list(seconds) == [0.02] * 3
+    reported, seconds = peer_estimates(said, found_side=False)
+    assert (
+        reported.side is None
+        and reported.joints_m.shape == (3, 21, 3)
+        and list(seconds) == [0.02] * 3
+    )
     found, _ = peer_estimates(said, found_side=True)
     assert list(found.side) == ["left"] * 3

@@ -95,8 +95,8 @@ def test_no_board_is_told_long_before_the_end(
     np.savez(path, depth_m=images, K=TRUE.K, amplitude=np.ones(images.shape, np.uint16))
     with pytest.raises(ToftrackError, match="found in 0 frames"):
         calibrate.main([str(path), "--board", "7x5", "--square", "0.03"])
-    told = capsys.readouterr().err
-    assert told.count("no 7x5 chequerboard seen so far, up to frame 0") == 1
+    reported = capsys.readouterr().err
+    assert reported.count("no 7x5 chequerboard seen so far, up to frame 0") == 1
 
 
 def test_report_tells_before_and_after(calibrated: tuple[Camera, Path]) -> None:

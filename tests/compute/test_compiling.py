@@ -19,10 +19,10 @@ from toftrack.compute import compiling
 from toftrack.compute.compiling import announced
 
 
-@pytest.mark.parametrize(("silent_s", "told"), [(0.0, ["compiling"]), (1000.0, [])])
+@pytest.mark.parametrize(("silent_s", "reported"), [(0.0, ["compiling"]), (1000.0, [])])
 def test_only_what_takes_long_is_announced(
     silent_s: float,
-    told: list[str],
+    reported: list[str],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -30,9 +30,9 @@ def test_only_what_takes_long_is_announced(
     caplog.set_level(logging.INFO)
     with announced("compiling"):
         deadline = time.monotonic() + 20
-        while len(caplog.messages) < len(told) and time.monotonic() < deadline:
+        while len(caplog.messages) < len(reported) and time.monotonic() < deadline:
             time.sleep(0.01)
-    assert caplog.messages == told
+    assert caplog.messages == reported
 
 
 def test_where_the_code_cannot_be_kept_it_is_said_to_be_compiled_in_every_run(
@@ -64,7 +64,7 @@ def _made_of(function: Callable, seen: set[Callable]) -> set[Callable]:
 def test_a_change_in_any_file_that_a_kernel_is_made_of_compiles_it_anew() -> None:
     kernels: dict[Callable, frozenset[str]] = {}
     for found in pkgutil.walk_packages(toftrack.__path__, "toftrack."):
-        if "numba" in found.name or found.name == "toftrack.relocation.pictures":
+        if "numba" in found.name or found.name == "toftrack.detector.pictures":
             for value in vars(importlib.import_module(found.name)).values():
                 if isinstance(value, Dispatcher) and hasattr(value, "sources"):
                     kernels[value.py_func] = value.sources

@@ -23,7 +23,7 @@ def _run(steps, weights, images):
 def outputs(builder: NetworkBuilder, first: Image, x: Tensor, last: Image) -> Tensor:
     """(C, H, W) of the last image, for x (C, H, W) in the first one."""
     network = builder.network()
-    images = np.zeros(network.room, np.float32)
+    images = np.zeros(network.capacity, np.float32)
 
     def within(image: Image) -> np.ndarray:
         shape, border = image.shape(), image.border

@@ -100,8 +100,8 @@ def test_a_damaged_kernel_is_compiled_anew_and_told_once(
     (file,) = folder.iterdir()
     damage(file)
     assert not _is_loaded()
-    (told,) = caplog.messages
-    assert "damaged" in told and str(folder) in told and "compiled anew" in told
+    (reported,) = caplog.messages
+    assert "damaged" in reported and str(folder) in reported and "compiled anew" in reported
     assert _is_loaded(), "it was mended"
 
 
@@ -110,7 +110,7 @@ def test_what_stands_in_the_way_of_a_kernel_is_told(folder: Path, caplog) -> Non
     (file,) = folder.iterdir()
     _folder_instead(file)
     assert not _is_loaded()
-    assert caplog.messages and all(str(folder) in told for told in caplog.messages)
+    assert caplog.messages and all(str(folder) in reported for reported in caplog.messages)
     assert list(folder.iterdir()) == [file]
 
 
@@ -136,8 +136,8 @@ def test_where_it_cannot_be_written_every_run_compiles_and_says_why(
     for _ in range(2):
         caplog.clear()
         assert not _is_loaded()
-        (told,) = caplog.messages
-        assert os.strerror(number) in told and "NUMBA_CACHE_DIR" in told
+        (reported,) = caplog.messages
+        assert os.strerror(number) in reported and "NUMBA_CACHE_DIR" in reported
         assert not kernel_cache.can_be_kept()
     assert not list(folder.iterdir()), "nothing half-written stays"
 
@@ -145,8 +145,8 @@ def test_where_it_cannot_be_written_every_run_compiles_and_says_why(
 def test_a_file_in_place_of_the_folder_is_told(folder: Path, caplog) -> None:
     folder.write_bytes(b"mine")
     assert not _is_loaded()
-    (told,) = caplog.messages
-    assert "neither read nor kept" in told and "NUMBA_CACHE_DIR" in told
+    (reported,) = caplog.messages
+    assert "neither read nor kept" in reported and "NUMBA_CACHE_DIR" in reported
     assert folder.read_bytes() == b"mine" and not must_be_compiled(_made())
 
 
@@ -187,9 +187,9 @@ def test_what_others_could_have_written_is_never_unpickled(
         theirs.chmod(mode)
     assert not _is_loaded()
     assert not (tmp_path / "executed").exists()
-    (told,) = caplog.messages
+    (reported,) = caplog.messages
     reason = "belongs to another user" if mode is None else "can be written by other users"
-    assert reason in told and str(folder) in told
+    assert reason in reported and str(folder) in reported
 
 
 def test_a_link_or_a_pipe_is_not_read(folder: Path, tmp_path: Path, caplog) -> None:

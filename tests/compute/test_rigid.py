@@ -79,8 +79,8 @@ def test_compiled_motions_agree_with_the_reference(size: float) -> None:
         torch.testing.assert_close(found[:, :3], expected[:, :3], atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(found[:, 6:], expected[:, 6:])
         # Rotation vectors of length pi have two signs: compare what they do.
-        turns = (roma.rotvec_to_rotmat(rows[:, 3:6]) for rows in (found, expected))
-        torch.testing.assert_close(*turns, atol=1e-5, rtol=0)
+        rotations = (roma.rotvec_to_rotmat(rows[:, 3:6]) for rows in (found, expected))
+        torch.testing.assert_close(*rotations, atol=1e-5, rtol=0)
 
 
 def test_no_particles_and_those_that_are_no_numbers() -> None:

@@ -27,8 +27,8 @@ def compared(device: str) -> None:
     def check(found: torch.Tensor, expected: torch.Tensor) -> None:
         found = found.cpu()
         # A turn by half a circle has two rotation vectors.
-        turns = (roma.rotvec_to_rotmat(each[:, 3:6].double()) for each in (found, expected))
-        torch.testing.assert_close(*turns, atol=5e-6, rtol=0)
+        rotations = (roma.rotvec_to_rotmat(each[:, 3:6].double()) for each in (found, expected))
+        torch.testing.assert_close(*rotations, atol=5e-6, rtol=0)
         assert found[:, 3:6].norm(dim=1).max() <= torch.pi + 1e-5
         for part in (slice(0, 3), slice(6, None)):
             torch.testing.assert_close(found[:, part], expected[:, part], atol=5e-6, rtol=1e-5)

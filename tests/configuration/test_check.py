@@ -16,7 +16,7 @@ from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
 WRONG = (
-    ("relocation.hypotheses=0", "relocation.hypotheses=0 .*whole number above 0"),
+    ("detector.hypotheses=0", "detector.hypotheses=0 .*whole number above 0"),
     ("refine.points=0", "refine.points=0 .*above 0"),
     ("segmentation.max_pixels=0", "max_pixels=0 .*above 0"),
     ("hand.adapt.sure_m=0", "hand.adapt.sure_m=0 .*a number above 0"),
@@ -27,8 +27,8 @@ WRONG = (
     ("filter.passes=null", "filter.passes=None .*a whole number"),
     ("refine.steadying.calm=[1]", "refine.steadying.calm=.*a number"),
     ("device.repeat=5", "device.repeat=5 .*true or false"),
-    ("relocation.places=0", "relocation.places=0 .*whole number above 0"),
-    ("relocation.least=-0.1", "relocation.least=-0.1 .*at least 0"),
+    ("detector.places=0", "detector.places=0 .*whole number above 0"),
+    ("detector.least=-0.1", "detector.least=-0.1 .*at least 0"),
     ("segmentation.reach_m=0", "segmentation.reach_m=0 .*above 0"),
     ("hands=3", "hands=3 .*whole number above 0 and at most 2"),
     ("hands=0", "hands=0 .*at most 2"),
@@ -51,10 +51,10 @@ def test_a_wrong_value_is_told_in_one_sentence(override: str, words: str) -> Non
         ("view=browser", "view.linger_s=inf"),
         ("experiment=paper", "filter.particles=10"),
         ("segmentation.reach_m=inf",),
-        ("relocation.merit=-4", "lost.intercept=-1", "lost.weights.log_score=-0.5"),
+        ("detector.merit=-4", "lost.intercept=-1", "lost.weights.log_score=-0.5"),
         ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
-        ("experiment=paper", "start.pose=[0,0,0.4,0,0,0]", "relocation=none", "start=rough"),
-        ("refine=none", "relocation.rivals=0", "start.forearm=0"),
+        ("experiment=paper", "start.pose=[0,0,0.4,0,0,0]", "detector=none", "start=rough"),
+        ("refine=none", "detector.rivals=0", "start.forearm=0"),
         ("+device.anything=-1",),
         ("~device.repeat",),
         ("gestures.file=mine.csv", "device.stop=5"),
@@ -68,8 +68,8 @@ def test_a_right_value_passes(overrides: tuple[str, ...]) -> None:
     ("overrides", "words"),
     [
         (
-            ("relocation=none",),
-            "relocation=none belongs to experiment=paper, .* give experiment=paper, or leave",
+            ("detector=none",),
+            "detector=none belongs to experiment=paper, .* give experiment=paper, or leave",
         ),
         (("lost=never",), "lost=never belongs to experiment=paper; .* leave lost=never out"),
         (("start=rough",), "start=rough belongs to experiment=paper; "),
@@ -139,8 +139,8 @@ def test_a_configuration_that_is_damaged_is_one_sentence(tmp_path, name: str, te
 def test_the_file_and_the_line_that_are_no_yaml_are_told() -> None:
     with pytest.raises(yaml.YAMLError) as error:
         yaml.safe_load("a: 1\nb: [")
-    told = sentence(error.value)
-    assert told.startswith("a file of the configuration is no YAML: ") and "line 2" in told
+    reported = sentence(error.value)
+    assert reported.startswith("a file of the configuration is no YAML: ") and "line 2" in reported
 
 
 def test_the_program_ends_without_torch_having_been_loaded(tmp_path) -> None:

@@ -131,7 +131,7 @@ def test_every_option_opens_with_a_line_about_what_it_is(group: str, option: str
 
 
 def test_the_defaults_are_options_that_there_are() -> None:
-    for name in ("config", "train_pose_space", "train_relocaliser"):
+    for name in ("config", "train_pose_space", "train_detector"):
         content = yaml.safe_load((CONF / f"{name}.yaml").read_text())
         chosen = [e for e in content.get("defaults", []) if isinstance(e, dict)]
         options = {pair for entry in chosen for pair in entry.items() if pair[1] is not None}
@@ -154,5 +154,5 @@ def test_the_same_seed_reaches_the_tracker_and_the_synthetic_device() -> None:
 
 
 def test_a_tracker_of_mixed_parts_is_not_built() -> None:
-    with pytest.raises(ToftrackError, match="relocation=none belongs to experiment=paper"):
-        build_tracker(configuration("relocation=none"))
+    with pytest.raises(ToftrackError, match="detector=none belongs to experiment=paper"):
+        build_tracker(configuration("detector=none"))

@@ -9,7 +9,7 @@ from toftrack.errors import ToftrackError
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "reported"),
     [
         ("hand.sied=left", "there is no setting hand.sied; did you mean hand.side?"),
         ("hnad.side=left", "there is no setting hnad.side; did you mean hand.side?"),
@@ -27,7 +27,7 @@ from toftrack.errors import ToftrackError
         ("seed=[1", "'seed=[1' cannot be read as a setting"),
         ("start=search", "there is no start=search any more, since the networks find hands: leave"),
         ("lost=score", "there is no lost=score any more, since the networks' signs are judged"),
-        ("start.hypotheses=9", "or give relocation.hypotheses"),
+        ("start.hypotheses=9", "or give detector.hypotheses"),
         ("start.islands=9", "there is no setting start.islands any more, since the networks"),
         (
             "lost.score=0.5",
@@ -39,7 +39,7 @@ from toftrack.errors import ToftrackError
         ),
     ],
 )
-def test_a_misspelt_override_gets_the_nearest_one(override: str, told: str) -> None:
+def test_a_misspelt_override_gets_the_nearest_one(override: str, reported: str) -> None:
     with pytest.raises(ToftrackError) as error:
         configuration(override)
-    assert told in str(error.value) and "\n" not in str(error.value)
+    assert reported in str(error.value) and "\n" not in str(error.value)

@@ -193,7 +193,7 @@ def test_other_lenses_are_a_fisheye_none_or_told(plug: Callable[..., Sdk]) -> No
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "reported"),
     [
         ({"keep": "some"}, "keep=newest or every"),
         ({"queue_frames": 1}, "queue_frames of at least 2"),
@@ -202,8 +202,8 @@ def test_other_lenses_are_a_fisheye_none_or_told(plug: Callable[..., Sdk]) -> No
         ({"bag": "none.bag"}, "no file 'none.bag'"),
     ],
 )
-def test_settings_that_make_no_sense_are_told(changes: dict[str, Any], told: str) -> None:
-    with pytest.raises(ToftrackError, match=told):
+def test_settings_that_make_no_sense_are_told(changes: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ToftrackError, match=reported):
         orbbec(**changes)
 
 

@@ -108,10 +108,10 @@ def test_code_that_cannot_be_imported_is_told(
     monkeypatch.delitem(sys.modules, "my_device", raising=False)
     with pytest.raises(HydraException) as caught:
         instantiate({"_target_": "my_device.RawImages"})
-    told = sentence(caught.value)
-    assert told.startswith("the _target_ my_device.RawImages cannot be imported (")
-    assert reason in told
-    assert "PYTHONPATH" in told
+    reported = sentence(caught.value)
+    assert reported.startswith("the _target_ my_device.RawImages cannot be imported (")
+    assert reason in reported
+    assert "PYTHONPATH" in reported
 
 
 def test_a_device_without_frames_is_told() -> None:

@@ -131,7 +131,7 @@ def test_a_camera_in_use_is_told(plug: Callable[..., Sdk]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "reported"),
     [
         ({"transport": "wifi"}, "transport=wifi is unknown"),
         ({"keep": "all"}, "keep=newest or every"),
@@ -146,8 +146,10 @@ def test_a_camera_in_use_is_told(plug: Callable[..., Sdk]) -> None:
         ({"bag": "a.bag", "transport": "emulated"}, "device.emulated.source"),
     ],
 )
-def test_senseless_settings_are_told_without_the_sdk(changes: dict[str, Any], told: str) -> None:
-    with pytest.raises(ToftrackError, match=told):
+def test_senseless_settings_are_told_without_the_sdk(
+    changes: dict[str, Any], reported: str
+) -> None:
+    with pytest.raises(ToftrackError, match=reported):
         live(**changes)
 
 

@@ -48,7 +48,7 @@ _INSTRUMENTED = (
     "toftrack.pose_space.data",
     "toftrack.pose_space.files",
     "toftrack.recordings",
-    "toftrack.relocation.weights",
+    "toftrack.detector.weights",
     "rosbags",
 )
 """Where libFuzzer sees what an input reaches."""

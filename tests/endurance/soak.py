@@ -52,7 +52,7 @@ _STARTING_S = 180.0
 """Kernels may have to be compiled first."""
 _WARM_FRAMES = 100
 """Caches and pools are filled by then; the observation begins."""
-_ENDING_S = 120.0
+_SHUTDOWN_S = 120.0
 _MOST_MEMORY = 0.05
 """Of the first quarter's memory, by which the allocator's moods may raise it."""
 _MOST_COUNT = 1
@@ -93,7 +93,7 @@ class Observation:
     visits: int
     status: int | None
     """With which the program ended; 143 is as it should be. None: it did not end."""
-    ending_s: float
+    shutdown_s: float
     """How long that took."""
     written_mb: float
     """Size of the run's files at the end."""
@@ -162,7 +162,7 @@ def _figures(samples: Sequence[Sample], arrivals: Sequence[Arrival]) -> dict[str
 def soak(
     minutes: float,
     folder: Path,
-    told: Callable[[str], None] = print,
+    reported: Callable[[str], None] = print,
     stream: str = "udp",
     overrides: Sequence[str] = (),
 ) -> Observation:
@@ -187,13 +187,13 @@ def soak(
             url = _until(lambda: _found(r"live view: (http://[^#]+)#", words), program)
             start(lambda: _watch(url, pictures, ended))
             _until(lambda: len(arrivals) > _WARM_FRAMES, program)
-            samples = _samples(program, 60 * minutes, arrivals, told)
+            samples = _samples(program, 60 * minutes, arrivals, reported)
             asked_s = time.monotonic()
             status = _ended(program)
-            ending_s = time.monotonic() - asked_s
+            shutdown_s = time.monotonic() - asked_s
     seen = tuple(arrival for arrival in arrivals if arrival.time_s >= samples[0].time_s)
     written_mb = sum(file.stat().st_size for file in (folder / "run").iterdir()) / 1e6
-    return Observation(tuple(samples), seen, *pictures, status, ending_s, written_mb)
+    return Observation(tuple(samples), seen, *pictures, status, shutdown_s, written_mb)
 
 
 def _ended(program: subprocess.Popen) -> int | None:
@@ -203,7 +203,7 @@ def _ended(program: subprocess.Popen) -> int | None:
     """
     program.terminate()
     try:
-        return program.wait(_ENDING_S)
+        return program.wait(_SHUTDOWN_S)
     except subprocess.TimeoutExpired:
         program.send_signal(signal.SIGABRT)
         program.wait()
@@ -241,9 +241,9 @@ def _threads(ended: threading.Event) -> Iterator[Callable[[Callable[[], None]], 
             thread.join()
 
 
-def _until(told: Callable[[], _T], program: subprocess.Popen) -> _T:
+def _until(reported: Callable[[], _T], program: subprocess.Popen) -> _T:
     deadline = time.monotonic() + _STARTING_S
-    while not (value := told()):
+    while not (value := reported()):
         if program.poll() is not None or time.monotonic() > deadline:
             raise RuntimeError("the tracker did not start; see err.txt in its folder")
         time.sleep(0.1)
@@ -256,7 +256,10 @@ def _found(pattern: str, words: Path) -> str:
 
 
 def _samples(
-    program: subprocess.Popen, seconds: float, arrivals: list[Arrival], told: Callable[[str], None]
+    program: subprocess.Popen,
+    seconds: float,
+    arrivals: list[Arrival],
+    reported: Callable[[str], None],
 ) -> list[Sample]:
     samples, began = [], time.monotonic()
     every_s = min(10.0, seconds / 16)
@@ -265,7 +268,7 @@ def _samples(
         if program.poll() is not None:
             raise RuntimeError(f"the tracker ended with status {program.returncode}")
         samples.append(sample := _sample(program.pid))
-        told(
+        reported(
             f"{number * every_s:6.0f} s  {sample.memory_mb:6.1f} MB  {sample.threads} threads  "
             f"{sample.handles} handles  {len(arrivals)} frames"
         )
@@ -353,7 +356,9 @@ def main() -> int:
         words = (Path(folder) / "err.txt").read_text()
     print(table(observation))
     print(f"{observation.pictures} pictures were seen in {observation.visits} visits")
-    print(f"the ending took {observation.ending_s:.1f} s; {observation.written_mb:.0f} MB of files")
+    print(
+        f"the ending took {observation.shutdown_s:.1f} s; {observation.written_mb:.0f} MB of files"
+    )
     print(*re.findall(r"sr3000: frames: .*", words)[-1:])
     problems = [
         f"{name} grew" for name in grown(observation.part(0, 4)[0], observation.part(3, 4)[0])

@@ -133,12 +133,12 @@ def _check(estimate: Estimate) -> None:
 def _follow(tracker: Tracker | HandsTracker, frames: list[tuple[tuple[Any, Any], Any]]) -> None:
     for (depth, k), timestamp_s in frames:
         try:
-            told = tracker.step(depth, k, timestamp_s=timestamp_s)
+            reported = tracker.step(depth, k, timestamp_s=timestamp_s)
         except ToftrackError as error:
             assert str(error)
             assert "\n" not in str(error)
             continue
-        for estimate in told if isinstance(told, tuple) else (told,):
+        for estimate in reported if isinstance(reported, tuple) else (reported,):
             _check(estimate)
 
 

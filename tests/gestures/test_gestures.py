@@ -62,11 +62,11 @@ def label_of(angles: np.ndarray, gestures: Gestures = GESTURES, off: float = ON)
 
 def follow(frames: list[np.ndarray], score: float = SURE) -> list[tuple[str, float]]:
     state: GestureState | None = None
-    told = []
+    reported = []
     for angles in frames:
         state, label, probability = update(state, seen(angles), score, ON, GESTURES)
-        told.append((label, probability))
-    return told
+        reported.append((label, probability))
+    return reported
 
 
 def estimate(angles: np.ndarray, name: str = "tracking", lost: bool = False) -> Estimate:
@@ -128,8 +128,8 @@ def test_a_gesture_is_told_by_its_fingers_and_thumb(
         angles = angles.copy()
         angles[[5, 9]] = np.radians([-3.0, 4.0])  # two fingers side by side
     for thumb in thumbs:
-        _, told, probability = update(None, seen(of_thumb(angles, thumb)), SURE, ON, GESTURES)
-        assert told == label, thumb
+        _, reported, probability = update(None, seen(of_thumb(angles, thumb)), SURE, ON, GESTURES)
+        assert reported == label, thumb
         assert probability > 0.6, thumb
 
 
@@ -170,8 +170,8 @@ def test_a_gesture_is_the_same_whichever_way_the_hand_is_turned(turn: int, side:
 def test_the_papers_gestures_have_their_names_whatever_the_thumb_does(
     basic: str, label: str, thumb: str | None
 ) -> None:
-    _, told, probability = update(None, seen(pose(basic, thumb)), SURE, ON, PAPER)
-    assert told == label
+    _, reported, probability = update(None, seen(pose(basic, thumb)), SURE, ON, PAPER)
+    assert reported == label
     assert probability > 0.95
 
 
@@ -260,17 +260,17 @@ def test_update_does_not_change_its_state() -> None:
 
 
 def test_the_pointing_ray_runs_along_the_index_finger() -> None:
-    _, told = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
-    assert told.gesture == "pointing_thumb"
-    assert told.pointing_origin_m == pytest.approx(told.joints_m[5])
-    assert np.linalg.norm(told.pointing_direction) == pytest.approx(1)
-    reach = told.joints_m[8] - told.joints_m[5]
-    assert np.cross(told.pointing_direction, reach) == pytest.approx(0, abs=1e-6)
-    assert told.pointing_direction @ reach > 0
-    assert told.pointing_direction[1] < -0.95, "a hand held up points up"
-    origin, _ = pointing_ray(told.joints_m)
+    _, reported = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
+    assert reported.gesture == "pointing_thumb"
+    assert reported.pointing_origin_m == pytest.approx(reported.joints_m[5])
+    assert np.linalg.norm(reported.pointing_direction) == pytest.approx(1)
+    reach = reported.joints_m[8] - reported.joints_m[5]
+    assert np.cross(reported.pointing_direction, reach) == pytest.approx(0, abs=1e-6)
+    assert reported.pointing_direction @ reach > 0
+    assert reported.pointing_direction[1] < -0.95, "a hand held up points up"
+    origin, _ = pointing_ray(reported.joints_m)
     origin += 1.0
-    assert told.pointing_origin_m == pytest.approx(told.joints_m[5]), "the ray is a copy"
+    assert reported.pointing_origin_m == pytest.approx(reported.joints_m[5]), "the ray is a copy"
 
 
 def test_only_a_pointing_hand_that_is_followed_has_a_ray() -> None:
@@ -284,36 +284,39 @@ def test_only_a_pointing_hand_that_is_followed_has_a_ray() -> None:
         Estimate(**{**vars(pointing), "state_name": "lost", "lost": True}),
         no_estimate(0, 0.0, "lost", 4, 0.0),
     ):
-        state, told = tell_gesture(GESTURES, state, lost, SPACE)
+        state, reported = tell_gesture(GESTURES, state, lost, SPACE)
         assert state is None
-        assert told.gesture == "" and math.isnan(told.gesture_probability)
-        assert math.isnan(told.pinch) and not told.pinching
-        assert np.isnan(told.pointing_origin_m).all() and np.isnan(told.pointing_direction).all()
+        assert reported.gesture == "" and math.isnan(reported.gesture_probability)
+        assert math.isnan(reported.pinch) and not reported.pinching
+        assert (
+            np.isnan(reported.pointing_origin_m).all()
+            and np.isnan(reported.pointing_direction).all()
+        )
 
 
 def test_a_followed_hand_out_of_the_pose_space_is_other() -> None:
-    _, told = tell_gesture(GESTURES, None, estimate(fingers(1, 2), "tracking", True), SPACE)
-    assert told.lost and told.gesture == "other"
+    _, reported = tell_gesture(GESTURES, None, estimate(fingers(1, 2), "tracking", True), SPACE)
+    assert reported.lost and reported.gesture == "other"
 
 
 def test_without_gestures_there_are_no_labels() -> None:
-    state, told = tell_gesture(None, None, estimate(pose("gun")), SPACE)
-    assert state is None and told.gesture == "" and math.isnan(told.gesture_probability)
+    state, reported = tell_gesture(None, None, estimate(pose("gun")), SPACE)
+    assert state is None and reported.gesture == "" and math.isnan(reported.gesture_probability)
 
 
 def test_results_carry_the_gesture_and_the_ray(tmp_path: Path) -> None:
-    _, told = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
+    _, reported = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
     with ResultWriter(tmp_path, {}, ["joint"] * 21) as writer:
-        writer.append((told,))
+        writer.append((reported,))
         writer.append((no_estimate(1, 0.04, "lost", 4, 0.0),))
     found = read_results(tmp_path / "track.npz")
     assert found["gesture"].tolist() == ["pointing_thumb", ""]
-    assert found["pinch"][0] == pytest.approx(told.pinch) and np.isnan(found["pinch"][1])
+    assert found["pinch"][0] == pytest.approx(reported.pinch) and np.isnan(found["pinch"][1])
     assert found["pinching"].tolist() == [False, False]
-    assert found["pointing_direction"][0] == pytest.approx(told.pointing_direction)
+    assert found["pointing_direction"][0] == pytest.approx(reported.pointing_direction)
     assert np.isnan(found["pointing_origin_m"][1]).all()
     lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
-    assert lines[0]["pointing_origin_m"] == pytest.approx(told.pointing_origin_m.tolist())
+    assert lines[0]["pointing_origin_m"] == pytest.approx(reported.pointing_origin_m.tolist())
     assert lines[1]["pointing_direction"] == [None] * 3
 
 
@@ -503,12 +506,12 @@ def test_the_configurations_make_the_defaults() -> None:
 def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
     scene = sample()
     rows = range(55, 98)  # from the palm on; "" until the hand is found
-    told = follow_scene(scene.cut(*rows))
-    labels = [one.gesture for one in told]
+    reported = follow_scene(scene.cut(*rows))
+    labels = [one.gesture for one in reported]
     assert "palm" in labels[:6] and set(labels[:6]) <= {"palm", ""}
     assert labels[-10:] == ["pointing_thumb"] * 10
-    assert min(one.gesture_probability for one in told[-10:]) > 0.9
-    last = told[-1]
+    assert min(one.gesture_probability for one in reported[-10:]) > 0.9
+    last = reported[-1]
     reach = scene.joints_m[rows[-1], 8] - scene.joints_m[rows[-1], 5]
     cosine = last.pointing_direction @ reach / np.linalg.norm(reach)
     assert cosine > math.cos(math.radians(15))

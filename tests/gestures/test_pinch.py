@@ -28,11 +28,11 @@ def joints(open_part: float, length_m: float = 0.19) -> np.ndarray:
 
 
 def follow(values: list[float], frames: float = 1.0) -> list[bool]:
-    state, told = PinchState(), []
+    state, reported = PinchState(), []
     for value in values:
         state = update_pinch(state, value, SETTINGS, frames)
-        told.append(state.pinching)
-    return told
+        reported.append(state.pinching)
+    return reported
 
 
 def test_a_pinch_goes_from_1_to_0_as_the_fingers_open() -> None:
@@ -61,9 +61,9 @@ def test_pads_that_lie_on_each_other_touch_as_tips_that_meet() -> None:
 def test_a_pinch_that_trembles_about_a_threshold_begins_and_ends_once() -> None:
     rng = np.random.default_rng(0)
     way = np.concatenate((np.linspace(0, 1, 60), np.linspace(1, 0, 60)))
-    told = follow((way + rng.normal(0, 0.06, 120)).clip(0, 1).tolist())
-    assert sum(a != b for a, b in zip(told, told[1:], strict=False)) == 2
-    assert not told[0] and told[60] and not told[-1]
+    reported = follow((way + rng.normal(0, 0.06, 120)).clip(0, 1).tolist())
+    assert sum(a != b for a, b in zip(reported, reported[1:], strict=False)) == 2
+    assert not reported[0] and reported[60] and not reported[-1]
 
 
 def test_one_odd_frame_is_no_pinch_and_ends_none() -> None:

@@ -231,10 +231,10 @@ def test_a_radius_is_the_distance_to_the_hand_s_own_skin() -> None:
 
 
 def test_quaternions_are_those_of_any_rotation() -> None:
-    turns = np.random.default_rng(0).normal(size=(200, 4))
+    turned = np.random.default_rng(0).normal(size=(200, 4))
     # Half and quarter turns about the axes, and none.
-    turns = np.r_[turns, np.eye(4), np.eye(4) + np.eye(4)[3], np.eye(4) - np.eye(4)[3] + 1e-12]
-    rotations = Rotation.from_quat(turns).as_matrix()
+    turned = np.r_[turned, np.eye(4), np.eye(4) + np.eye(4)[3], np.eye(4) - np.eye(4)[3] + 1e-12]
+    rotations = Rotation.from_quat(turned).as_matrix()
     found = _quaternions(rotations.reshape(-1, 9))
     assert np.allclose(Rotation.from_quat(found).as_matrix(), rotations)
     assert (found[:, 3] >= 0).all() and np.allclose(np.linalg.norm(found, axis=1), 1)

@@ -82,10 +82,10 @@ def ours() -> list[str]:
     return [t.name for t in threading.enumerate() if t.name.startswith("browser-")]
 
 
-def eventually(told: Callable[[], object]) -> object:
+def eventually(reported: Callable[[], object]) -> object:
     """Wait until `told` says something true."""
     deadline = time.monotonic() + PATIENCE_S
-    while not (value := told()):
+    while not (value := reported()):
         assert time.monotonic() < deadline
         time.sleep(0.01)
     return value

@@ -10,15 +10,15 @@ import hydra
 from helpers.tracking import configuration
 from omegaconf import OmegaConf
 
+from toftrack.detector.hand_detector import DetectorSettings
 from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.steadying import Steadying
-from toftrack.relocation.relocaliser import RelocationSettings
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import NearestSurface
-from toftrack.tracking.belief import CalibratedBelief
+from toftrack.tracking.confidence import ConfidenceModel
+from toftrack.tracking.handedness_estimate import HandednessSettings
 from toftrack.tracking.paper import RoughStart
 from toftrack.tracking.prior import Prior
-from toftrack.tracking.side_belief import SideFit
 
 
 @cache
@@ -57,19 +57,19 @@ def rough_start(**changes: Any) -> RoughStart:
     return replace(_part("start", "rough"), **changes)
 
 
-def calibrated_belief(**changes: Any) -> CalibratedBelief:
+def calibrated_belief(**changes: Any) -> ConfidenceModel:
     """conf/lost/calibrated.yaml"""
     return replace(_part("lost", "calibrated"), **changes)
 
 
-def relocation_settings(**changes: Any) -> RelocationSettings:
-    """conf/relocation/network.yaml, without its weights"""
-    config = OmegaConf.to_container(configuration("relocation=network").relocation)
+def detector_settings(**changes: Any) -> DetectorSettings:
+    """conf/detector/network.yaml, without its weights"""
+    config = OmegaConf.to_container(configuration("detector=network").detector)
     assert isinstance(config, dict)
     del config["_target_"], config["weights"]
-    return replace(RelocationSettings(**config), **changes)
+    return replace(DetectorSettings(**config), **changes)
 
 
-def side_fit(**changes: Any) -> SideFit:
+def side_fit(**changes: Any) -> HandednessSettings:
     """hand.sides."""
     return replace(_part("hand").sides, **changes)

@@ -59,10 +59,10 @@ class Profile:
 
     def get_distortion(self) -> SimpleNamespace:
         names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-        told = SimpleNamespace(**dict(zip(names, self._lens, strict=True)))
+        reported = SimpleNamespace(**dict(zip(names, self._lens, strict=True)))
         if self._model is not None:  # the SDK before 2.1 does not tell it
-            told.model = self._model
-        return told
+            reported.model = self._model
+        return reported
 
 
 class Profiles:

@@ -17,6 +17,8 @@ from helpers.tracking import run
 
 from toftrack.camera import Camera
 from toftrack.configuration.compose import configuration, configuration_folder
+from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.weights import _checksum, load_weights, save_weights
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
@@ -37,8 +39,6 @@ from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.unfinished import Facts, UnfinishedRecording, recover_recording
-from toftrack.relocation.network import Finder, PoseNet
-from toftrack.relocation.weights import _checksum, load_weights, save_weights
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 3
 _MOST_FRAMES = 4

@@ -13,7 +13,7 @@ import pytest
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.shape_space import COMPONENTS
 from toftrack.output.advice import LostFrame, RunFacts
-from toftrack.output.hand_doubts import length_doubt, looked_doubt
+from toftrack.output.hand_doubts import apparent_doubt, length_doubt
 from toftrack.programs.main import main
 from toftrack.recordings.store import packaged_sample
 
@@ -54,8 +54,8 @@ def test_hands_of_people_and_unsure_fits_are_not_doubted(shape: HandShape) -> No
 
 
 def test_how_long_a_lost_hand_looked_counts_where_most_was_lost_and_it_was_seen_often() -> None:
-    seen = LostFrame("searching", 0.9, 0.3, 0.5, 2.0, 900, False, looked_m=0.226)
-    unseen = dataclasses.replace(seen, looked_m=None)
+    seen = LostFrame("searching", 0.9, 0.3, 0.5, 2.0, 900, False, apparent_m=0.226)
+    unseen = dataclasses.replace(seen, apparent_m=None)
 
     def mean(often: int, seldom: int, tracked: int) -> float | None:
         facts = RunFacts()
@@ -63,12 +63,12 @@ def test_how_long_a_lost_hand_looked_counts_where_most_was_lost_and_it_was_seen_
             facts = facts.with_lost(frame)
         for _ in range(tracked):
             facts = facts.tracked(None)
-        return facts.mean_looked_m()
+        return facts.mean_apparent_m()
 
     assert mean(20, 10, 5) == pytest.approx(0.226)
     assert mean(20, 10, 30) is None and mean(9, 0, 0) is None and mean(11, 69, 0) is None
-    assert "looks 226 mm long" in looked_doubt(0.226, K)
-    assert looked_doubt(0.209, K) == looked_doubt(0.145, K) == ""
+    assert "looks 226 mm long" in apparent_doubt(0.226, K)
+    assert apparent_doubt(0.209, K) == apparent_doubt(0.145, K) == ""
 
 
 def tracked(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[dict, str]:

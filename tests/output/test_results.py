@@ -272,10 +272,10 @@ def test_the_table_has_a_dash_where_nothing_was_judged(tmp_path: Path) -> None:
         line.split("  ", 1)
         for line in metrics_table(write(tmp_path, done, hidden).summary).split("\n")
     )
-    told = {name: text.strip() for name, text in rows.items()}
-    assert told["usable"] == "- % of the 0 visible frames" and told["first right"] == "-"
-    assert told["false alarms"] == told["frames below 40 mm"] == "- %"
-    assert told["frames"] == "6, 0 of them lost, 3 dropped"
+    reported = {name: text.strip() for name, text in rows.items()}
+    assert reported["usable"] == "- % of the 0 visible frames" and reported["first right"] == "-"
+    assert reported["false alarms"] == reported["frames below 40 mm"] == "- %"
+    assert reported["frames"] == "6, 0 of them lost, 3 dropped"
 
 
 def test_run_json_is_there_from_the_start(tmp_path: Path) -> None:
@@ -304,14 +304,14 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_lives(tmp_path: P
 class FullDisk:
     """Takes so many bytes of a file."""
 
-    def __init__(self, file: io.FileIO, room: int) -> None:
-        self._file, self._room = file, room
+    def __init__(self, file: io.FileIO, capacity: int) -> None:
+        self._file, self._capacity = file, capacity
 
     def write(self, data: memoryview) -> int:
-        if not self._room:
+        if not self._capacity:
             raise OSError(errno.ENOSPC, "No space left on device")
-        count = self._file.write(data[: self._room])
-        self._room -= count
+        count = self._file.write(data[: self._capacity])
+        self._capacity -= count
         return count
 
     def __getattr__(self, name: str) -> Any:
@@ -374,9 +374,9 @@ def test_what_takes_long_shows_how_far_it_is(
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(records, "_SOON_S", 0)
     recover(tmp_path)
-    told = capsys.readouterr().err
-    assert "reading the lines" in told
-    assert "writing the results" in told
+    reported = capsys.readouterr().err
+    assert "reading the lines" in reported
+    assert "writing the results" in reported
 
 
 def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
@@ -413,7 +413,7 @@ def test_a_run_json_that_is_damaged_is_told(tmp_path: Path, changes: dict[str, A
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "told"),
+    ("field", "value", "reported"),
     [
         ("index", None, "has no 'index'"),
         ("joints_m", [[0, 0, 0]], "shape"),
@@ -423,7 +423,7 @@ def test_a_run_json_that_is_damaged_is_told(tmp_path: Path, changes: dict[str, A
     ],
 )
 def test_a_first_line_that_is_damaged_is_named(
-    tmp_path: Path, field: str, value: object, told: str
+    tmp_path: Path, field: str, value: object, reported: str
 ) -> None:
     write(tmp_path, [estimate(0)])
     path = tmp_path / "track.jsonl"
@@ -432,7 +432,7 @@ def test_a_first_line_that_is_damaged_is_named(
     path.write_text(json.dumps({k: v for k, v in line.items() if v is not None or k != field}))
     with open(path, "a") as stream:
         stream.write("\n")
-    with pytest.raises(ToftrackError, match=told):
+    with pytest.raises(ToftrackError, match=reported):
         recover(tmp_path)
 
 
@@ -477,8 +477,8 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     assert content["compute_s"][2:4].tolist() == [0, 0]
     assert content["metadata"]["held_frames"] == [4, 5]
     assert content["dropped"].tolist() == [False, False, True, True, False, False]
-    told = ["tracking", "tracking", "dropped", "dropped", "tracking", "tracking"]
-    assert content["state_name"].tolist() == told
+    reported = ["tracking", "tracking", "dropped", "dropped", "tracking", "tracking"]
+    assert content["state_name"].tolist() == reported
     assert content["lost"].tolist() == [estimate(i).lost for i in rows]
     # A dropped frame has no line: its number is missing.
     assert [line["index"] for line in read_lines_of(tmp_path)] == [2, 3, 6, 7]

@@ -104,15 +104,15 @@ with StdoutStream(None, 25) as stream:
     stream.send((no_estimate(1, 0.0, 'lost', 4, 0.0),))
 print("after")
 """
-    told = subprocess.run(
+    reported = subprocess.run(
         [sys.executable, "-c", script],
         capture_output=True,
         text=True,
         timeout=120,
     )
-    first, second = told.stdout.splitlines()
+    first, second = reported.stdout.splitlines()
     assert json.loads(first)["index"] == 1 and second == "after"
-    assert "printed" in told.stderr and "from below" in told.stderr
+    assert "printed" in reported.stderr and "from below" in reported.stderr
 
 
 def test_a_reader_that_falls_behind_gets_the_newest_and_whole_lines(

@@ -85,8 +85,8 @@ def test_a_line_lists_the_hands_that_are_there_each_with_slot_and_side(tmp_path:
     lines = lines_of(tmp_path)
     assert all(tuple(line) == ("index", "timestamp_s", "compute_s", "hands") for line in lines)
     assert set(FRAME_FIELDS) | set(HAND_FIELDS) == set(LINE_FIELDS)
-    told = [[(one["slot"], one["side"]) for one in line["hands"]] for line in lines]
-    assert told[0] == [(0, "left")] and told[3] == [(0, "left"), (1, "right")]
+    reported = [[(one["slot"], one["side"]) for one in line["hands"]] for line in lines]
+    assert reported[0] == [(0, "left")] and reported[3] == [(0, "left"), (1, "right")]
     assert set(lines[3]["hands"][1]) == {"slot", *HAND_FIELDS}
     assert lines[5]["hands"][1]["lost"] is True, "a doubted hand is listed"
     assert json.loads(json_line((vacant(7), vacant(7))))["hands"] == []
@@ -94,8 +94,8 @@ def test_a_line_lists_the_hands_that_are_there_each_with_slot_and_side(tmp_path:
 
 def test_chosen_fields_stand_where_they_belong() -> None:
     line = json.loads(json_line((vacant(3), hand(3, 1)), ("index", "lost", "gesture")))
-    told = {"slot": 1, "side": "right", "lost": False, "gesture": "fist"}
-    assert line == {"index": 3, "hands": [told]}
+    reported = {"slot": 1, "side": "right", "lost": False, "gesture": "fist"}
+    assert line == {"index": 3, "hands": [reported]}
 
 
 def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_path: Path) -> None:
@@ -223,6 +223,6 @@ def test_advice_counts_a_slot_only_where_it_had_a_hand() -> None:
         watch.see((vacant(i), vacant(i)), depth, nothing)
         watch.see((hand(i, 0), replace(hand(i, 1), lost=True)), depth, nothing)
     assert (watch.facts[0].lost, watch.facts[0].frames) == (6, 16)
-    told = watch.advice(None)
-    assert told and all(sentence.startswith("Slot 1: ") for sentence in told)
-    assert not any("hand.side" in sentence for sentence in told)
+    reported = watch.advice(None)
+    assert reported and all(sentence.startswith("Slot 1: ") for sentence in reported)
+    assert not any("hand.side" in sentence for sentence in reported)

@@ -25,7 +25,7 @@ from toftrack.programs.sweeps import FailedJobs
 
 
 @pytest.fixture(autouse=True)
-def hangups_are_heard() -> Iterator[None]:
+def hangups_are_handled() -> Iterator[None]:
     """Also where the tests were started so that they outlive their terminal."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
@@ -224,7 +224,7 @@ def test_jobs_that_fail_in_other_processes_are_counted(app: Path) -> None:
 
 
 def test_the_programs_count_jobs_that_failed_elsewhere() -> None:
-    for name in ("config", "train_pose_space", "train_relocaliser"):
+    for name in ("config", "train_pose_space", "train_detector"):
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = compose(name, return_hydra_config=True)
         assert isinstance(instantiate(config.hydra.callbacks.failed_jobs), FailedJobs)

@@ -25,7 +25,7 @@ from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import PngFolderWriter, read_png_folder
 from toftrack.recordings.srs import read_srs
 
-TOLD = BareFacts((30.0, 30.0, 16.0, 12.0))
+REPORTED = BareFacts((30.0, 30.0, 16.0, 12.0))
 EMULATED = ("device.transport=emulated", "device.emulated.fps=500")
 
 
@@ -106,7 +106,7 @@ def test_convert_errors(srs: Path, tmp_path: Path) -> None:
         ((srs, tmp_path / "a.npz", None, 25), "25 MHz"),
         ((srs, tmp_path / "a", None, 20, 2.0), "--unit"),
         (
-            (srs, tmp_path / "b", tmp_path / "camera.json", 20, None, False, None, TOLD),
+            (srs, tmp_path / "b", tmp_path / "camera.json", 20, None, False, None, REPORTED),
             "--camera and --intrinsics both",
         ),
     ):

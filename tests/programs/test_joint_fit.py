@@ -7,28 +7,28 @@ import pytest
 
 from toftrack.hand.regions import REGION_90
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
-from toftrack.tracking.joint_belief import JOINT_SIGNS
+from toftrack.tracking.joint_confidence import JOINT_FEATURES
 
 FRAMES = 600
-UNSURE, DOUBT = JOINT_SIGNS.index("unsure"), JOINT_SIGNS.index("doubt")
+UNSURE, DOUBT = JOINT_FEATURES.index("unsure"), JOINT_FEATURES.index("doubt")
 
 
 @pytest.fixture(scope="module")
 def rows() -> JointRows:
     """Errors that grow with one sign, three times as large along the ray as else; long tails."""
     rng = np.random.default_rng(0)
-    signs = rng.normal(size=(FRAMES, 21, len(JOINT_SIGNS)))
+    features = rng.normal(size=(FRAMES, 21, len(JOINT_FEATURES)))
     tails = np.sqrt(4 / rng.chisquare(4, (FRAMES, 21, 1)))
-    size = np.exp(0.7 * signs[..., UNSURE : UNSURE + 1]) * [1.5, 0.5, 0.5]
+    size = np.exp(0.7 * features[..., UNSURE : UNSURE + 1]) * [1.5, 0.5, 0.5]
     error = rng.normal(size=(FRAMES, 21, 3)) * tails * size
-    near = rng.random((FRAMES, 21)) < 1 / (1 + np.exp(2 * signs[..., DOUBT]))
-    return JointRows(signs, error, near, np.ones(FRAMES, bool))
+    near = rng.random((FRAMES, 21)) < 1 / (1 + np.exp(2 * features[..., DOUBT]))
+    return JointRows(features, error, near, np.ones(FRAMES, bool))
 
 
 def test_the_fit_finds_what_made_the_errors(rows: JointRows) -> None:
     belief = fitted_joint_belief(rows)
     assert belief.weights["unsure"][:3] == pytest.approx([0.7] * 3, abs=0.08)
-    others = [belief.weights[name][:3] for name in JOINT_SIGNS if name != "unsure"]
+    others = [belief.weights[name][:3] for name in JOINT_FEATURES if name != "unsure"]
     assert np.abs(others).max() < 0.1
     assert belief.weights["doubt"][3] == pytest.approx(-2, abs=0.3)
     ray, along, across, _ = belief.kinds["pip"]
@@ -38,9 +38,9 @@ def test_the_fit_finds_what_made_the_errors(rows: JointRows) -> None:
 
 def test_regions_hold_nine_of_ten_whatever_the_sign(rows: JointRows) -> None:
     belief = fitted_joint_belief(rows)
-    sigma = 100 * np.stack([belief.judge(signs)[0] for signs in rows.signs])
+    sigma = 100 * np.stack([belief.judge(features)[0] for features in rows.features])
     inside = np.sqrt(np.square(rows.error_cm / sigma).sum(2)) <= REGION_90
-    for part in (rows.signs[..., UNSURE] < -0.5, rows.signs[..., UNSURE] > 0.5):
+    for part in (rows.features[..., UNSURE] < -0.5, rows.features[..., UNSURE] > 0.5):
         assert inside[part].mean() == pytest.approx(0.9, abs=0.02)
 
 

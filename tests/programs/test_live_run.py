@@ -41,10 +41,10 @@ def summary_of(folder: Path) -> dict:
 def test_a_run_that_was_too_slow_says_so(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run(tmp_path, Late(every=5, live=True), *OVERRIDES)
     out, err = capsys.readouterr()
-    told = summary_of(tmp_path)
-    assert told["realtime"]["dropped_frames"] == told["dropped_frames"] == 12
-    assert told["realtime"]["tracked_frames"] == FEW
-    assert told["realtime"]["longest_gap_s"] == pytest.approx(0.2)
+    reported = summary_of(tmp_path)
+    assert reported["realtime"]["dropped_frames"] == reported["dropped_frames"] == 12
+    assert reported["realtime"]["tracked_frames"] == FEW
+    assert reported["realtime"]["longest_gap_s"] == pytest.approx(0.2)
     notes = [line for line in err.splitlines() if line.startswith("note: ")]
     assert len(notes) == 1
     assert notes[0].startswith(

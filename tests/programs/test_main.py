@@ -46,7 +46,7 @@ def test_every_command_is_a_function_that_there_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["trak"], "did you mean toftrack track?"),
         (["hand.side=left"], "did you mean toftrack track hand.side=left?"),
@@ -54,10 +54,10 @@ def test_every_command_is_a_function_that_there_is() -> None:
         (["xyz"], "give one of track, train"),
     ],
 )
-def test_a_command_that_there_is_not_is_told(words, told, capsys) -> None:
+def test_a_command_that_there_is_not_is_told(words, reported, capsys) -> None:
     assert front.main(words) == 1
     err = capsys.readouterr().err
-    assert err.startswith("error: there is no command") and told in err and err.count("\n") == 1
+    assert err.startswith("error: there is no command") and reported in err and err.count("\n") == 1
 
 
 def test_a_program_s_status_and_errors_are_those_of_the_command(capsys, tmp_path) -> None:
@@ -127,15 +127,15 @@ def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missi
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["a.npz", "b.npz"], "two recordings, 'a.npz' and 'b.npz'"),
         (["${x}.npz"], "rename the file"),
         (["a.npz", "device=sr3000"], "device=sr3000 and the recording 'a.npz'"),
     ],
 )
-def test_what_cannot_be_one_recording_is_told(words: list[str], told: str) -> None:
-    with pytest.raises(ToftrackError, match=told):
+def test_what_cannot_be_one_recording_is_told(words: list[str], reported: str) -> None:
+    with pytest.raises(ToftrackError, match=reported):
         with_recording(words, *KNOWN)
 
 

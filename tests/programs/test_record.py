@@ -191,9 +191,9 @@ def test_at_the_limit_the_command_ends_well(
         path = tmp_path / name
         settings = (kind, "device.transport=emulated", "device.emulated.fps=200")
         assert record(str(path), *settings, "--limit", "0.0004") == 0
-        told = capsys.readouterr()
-        assert "it has 0.0004 GB, its limit" in told.err
-        assert f"{path}: " in told.out
+        reported = capsys.readouterr()
+        assert "it has 0.0004 GB, its limit" in reported.err
+        assert f"{path}: " in reported.out
         assert 0.0004e9 <= path.stat().st_size < 0.0008e9
         assert Replay(path).frames > 2
 
@@ -217,9 +217,9 @@ def test_its_errors_are_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert record(*arguments) == 1
-    told = capsys.readouterr().err
-    assert words in told
-    assert told.startswith("error: ") and told.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert words in reported
+    assert reported.startswith("error: ") and reported.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 

@@ -137,7 +137,7 @@ def test_dropped_frames_are_told_alike_by_lines_results_and_exports(
 def test_results_of_older_versions_tell_dropped_frames_too(hands: int, tmp_path: Path) -> None:
     write(tmp_path / "run", [0, 1, 4, 5], hands)
     path = tmp_path / "run" / "track.npz"
-    told = read_results(path)
+    reported = read_results(path)
     with np.load(path) as archive:
         older = {name: archive[name] for name in archive.files if name != "dropped"}
     older["state_name"] = np.where(
@@ -145,8 +145,8 @@ def test_results_of_older_versions_tell_dropped_frames_too(hands: int, tmp_path:
     )
     np.savez(path, **older)
     again = read_results(path)
-    np.testing.assert_array_equal(again["dropped"], told["dropped"])
-    np.testing.assert_array_equal(again["state_name"], told["state_name"])
+    np.testing.assert_array_equal(again["dropped"], reported["dropped"])
+    np.testing.assert_array_equal(again["state_name"], reported["state_name"])
     del older["index"], older["state_name"]
     np.savez(path, **older)
     assert not read_results(path)["dropped"].any()

@@ -72,8 +72,8 @@ def save(path: Path, drop: tuple[str, ...] = (), **changes: object) -> Path:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str, str]:
     """The output folder, status, standard output and standard error of one ordinary run."""
     folder = tmp_path_factory.mktemp("whole")
-    told = programs.call("device.stop=12", "hydra.run.dir=deep/er", *QUICK, folder=folder)
-    return folder / "deep" / "er", *told
+    reported = programs.call("device.stop=12", "hydra.run.dir=deep/er", *QUICK, folder=folder)
+    return folder / "deep" / "er", *reported
 
 
 def test_a_run_writes_its_files_directly_into_its_folder(whole) -> None:
@@ -133,8 +133,8 @@ def test_track_jsonl_says_the_same_a_line_a_frame(whole) -> None:
     assert [line["index"] for line in lines] == list(range(12))
     exact = ("joints_m", "lost", "state", "latent", "score", "covariance", "timestamp_s")
     for name in (*exact, "confidence", "outside_rad", "side", "state_name", "index"):
-        told = np.array([line[name] for line in lines], result[name].dtype)
-        assert np.array_equal(told, result[name]), name
+        reported = np.array([line[name] for line in lines], result[name].dtype)
+        assert np.array_equal(reported, result[name]), name
     assert {line["state_name"] for line in lines} <= STATES.keys()
 
 
@@ -228,8 +228,8 @@ def test_two_hands_are_written_slot_by_slot(here, tmp_path: Path) -> None:
     result = read_results(folder / "track.npz")
     assert result["joints_m"].shape == (3, 2, 21, 3) and result["index"].shape == (3,)
     assert not result["lost"].all(1).any() and result["metadata"]["config"]["hands"] == 2
-    told = (folder / "track.jsonl").read_text()
-    first = json.loads(told.splitlines()[0])["hands"][0]
+    reported = (folder / "track.jsonl").read_text()
+    first = json.loads(reported.splitlines()[0])["hands"][0]
     assert first["slot"] in (0, 1) and first["side"] in ("right", "left")
     for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
         assert HandShape.load(folder / name).side in ("right", "left"), slot
@@ -276,10 +276,10 @@ def test_a_bad_recording_is_one_clear_sentence(
     tmp_path, name: str, drop, changes: dict, words: str
 ) -> None:
     path = save(tmp_path / "bad.npz", drop, **changes)
-    with pytest.raises(ToftrackError) as told:
+    with pytest.raises(ToftrackError) as reported:
         Replay(path)
-    assert words in str(told.value) and "bad.npz" in str(told.value)
-    assert "\n" not in str(told.value)
+    assert words in str(reported.value) and "bad.npz" in str(reported.value)
+    assert "\n" not in str(reported.value)
 
 
 def test_a_bad_recording_ends_the_program_before_it_writes(here, tmp_path) -> None:
@@ -311,7 +311,7 @@ def test_a_pickle_by_itself_is_refused_and_not_loaded(tmp_path) -> None:
 
 
 def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here, tmp_path) -> None:
-    def told(path: str | Path) -> str:
+    def reported(path: str | Path) -> str:
         with pytest.raises(ToftrackError) as error:
             load_pose_space(path)
         return str(error.value)
@@ -322,9 +322,9 @@ def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here
         arrays = dict(archive)
     arrays["header"] = np.array(str(arrays["header"]).replace('"version": 1', '"version": 99'))
     np.savez(newer, **arrays)
-    assert "version 99" in told(newer)
-    assert "no pose-space file" in told(tmp_path / "gone.npz")
-    assert "not a pose-space file" in told(__file__)
+    assert "version 99" in reported(newer)
+    assert "no pose-space file" in reported(tmp_path / "gone.npz")
+    assert "not a pose-space file" in reported(__file__)
     status, _, err = here("pose_space.file=small.npz")
     assert status == 1 and "3-dimensional" in err and "pose_space.dims=3" in err
     assert err.count("\n") == 1

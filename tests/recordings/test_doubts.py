@@ -16,7 +16,7 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames import checked_image
 from toftrack.output.advice import Watch
-from toftrack.output.hand_doubts import length_doubt, looked_doubt
+from toftrack.output.hand_doubts import apparent_doubt, length_doubt
 from toftrack.recordings.doubts import lens_doubt, times_doubt
 from toftrack.recordings.npz import read_recording
 
@@ -132,6 +132,6 @@ def test_no_recording_at_hand_is_doubted(folder: str) -> None:
             depth = device.camera.rectify(frame.depth, frame.radial)
             made = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
             watch.see(made, depth, tracker.insights)
-        k, (looked_m,) = device.camera.K, watch.looked_m()
+        k, (apparent_m,) = device.camera.K, watch.apparent_m()
         assert length_doubt(tracker.fitted[0], k) == "", path.name
-        assert looked_m is None or looked_doubt(looked_m, k) == "", path.name
+        assert apparent_m is None or apparent_doubt(apparent_m, k) == "", path.name

@@ -25,7 +25,7 @@ def test_a_damaged_header_is_told(header: str, tmp_path: Path) -> None:
     text = header.encode() + b"\n"
     path = tmp_path / "stack.npy"
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(4608))
-    with pytest.raises(ToftrackError) as told:
+    with pytest.raises(ToftrackError) as reported:
         open_recording(path)
-    assert str(path) in str(told.value)
-    assert "\n" not in str(told.value)
+    assert str(path) in str(reported.value)
+    assert "\n" not in str(reported.value)

@@ -229,15 +229,15 @@ def test_pickled_objects_are_refused(tmp_path: Path, key: str) -> None:
     assert not Canary.woken
 
 
-@pytest.mark.parametrize("told", ["", "timestamp_s"])
-def test_frames_that_are_counted_last_are_told(tmp_path: Path, told: str) -> None:
+@pytest.mark.parametrize("reported", ["", "timestamp_s"])
+def test_frames_that_are_counted_last_are_told(tmp_path: Path, reported: str) -> None:
     depth = np.full((48, 64, 20), 0.6, np.float32)
     camera = np.array([[70.0, 0, 32], [0, 70.0, 24], [0, 0, 1]])
-    times = {"timestamp_s": np.arange(20.0)} if told else {}
+    times = {"timestamp_s": np.arange(20.0)} if reported else {}
     path = tmp_path / "recording.npz"
     np.savez(path, depth_m=depth, K=camera, **times)
     assert "(rows, columns, frames)" in complaint(path)
-    if told:
+    if reported:
         return
     # As many frames as rows, and a time for each: K alone does not decide.
     np.savez(path, depth_m=depth, K=camera, timestamp_s=np.arange(48.0))

@@ -28,7 +28,7 @@ from toftrack.recordings.store import open_recording
 
 K = np.array([[252.0, 0, 166.0], [0, 253.0, 140.0], [0, 0, 1]])
 ABOUT = calibration(K, 512, (96, 90))
-TOLD = BareFacts((30.0, 31.0, 15.5, 11.5))
+REPORTED = BareFacts((30.0, 31.0, 15.5, 11.5))
 
 
 def words(count: int = 7, size: tuple[int, int] = (24, 32)) -> np.ndarray:
@@ -80,10 +80,10 @@ def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
 def test_a_published_calibration_gives_the_published_intrinsics(tmp_path: Path) -> None:
     # Of one Azure Kinect, narrow and unbinned: fx, fy, cx, cy as its SDK tells them.
     lens = ABOUT["CalibrationInformation"]["Cameras"][1]["Intrinsics"]
-    told = (0.51296979188919067, 0.51692354679107666, 0.4927808940410614, 0.49290284514427185)
+    reported = (0.51296979188919067, 0.51692354679107666, 0.4927808940410614, 0.49290284514427185)
     about = calibration(K, 1024, (192, 180))
     lens = about["CalibrationInformation"]["Cameras"][1]["Intrinsics"]
-    lens["ModelParameters"][:4] = told
+    lens["ModelParameters"][:4] = reported
     path = write_kinect(tmp_path / "a.mkv", np.ones((1, 576, 640), np.uint16), about=about)
     camera = open_recording(path).camera
     expected = [[504.6076, 0, 332.7811], [0, 504.7325, 348.8297], [0, 0, 1]]
@@ -158,7 +158,7 @@ def test_whatever_bytes_are_damaged_it_is_read_or_told(
     for seed in range(24):
         path.write_bytes(damaged(content, seed))
         with contextlib.suppress(ToftrackError):
-            store = open_recording(path, bare=TOLD)
+            store = open_recording(path, bare=REPORTED)
             for number in range(len(store)):
                 store.image(number)
 
@@ -226,7 +226,7 @@ def test_lossless_grey_videos_are_depth_in_millimetres(
     tmp_path: Path, name: str, codec: str, pixels: str
 ) -> None:
     pixels_in = words()
-    store = open_recording(write_grey(tmp_path / name, pixels_in, codec, pixels), bare=TOLD)
+    store = open_recording(write_grey(tmp_path / name, pixels_in, codec, pixels), bare=REPORTED)
     assert len(store) == 7
     for number, image in enumerate(pixels_in):
         depth, amplitude = store.image(number)
@@ -281,7 +281,7 @@ def test_colour_video_and_what_is_no_video_are_told(tmp_path: Path) -> None:
 )
 def test_stacks_are_depth(tmp_path: Path, stack: np.ndarray, factor: float) -> None:
     np.save(tmp_path / "a.npy", stack)
-    store = open_recording(tmp_path / "a.npy", bare=TOLD)
+    store = open_recording(tmp_path / "a.npy", bare=REPORTED)
     images = stack.reshape(-1, 24, 32)
     assert len(store) == len(images)
     np.testing.assert_allclose(store.image(len(images) - 1)[0], images[-1] * factor, rtol=1e-6)
@@ -301,7 +301,7 @@ def test_stacks_are_depth(tmp_path: Path, stack: np.ndarray, factor: float) -> N
 def test_stacks_of_another_kind_are_told(tmp_path: Path, stack: np.ndarray, complaint: str) -> None:
     np.save(tmp_path / "a.npy", stack, allow_pickle=True)
     with pytest.raises(ToftrackError, match=complaint):
-        open_recording(tmp_path / "a.npy", bare=TOLD)
+        open_recording(tmp_path / "a.npy", bare=REPORTED)
 
 
 def test_damaged_stacks_are_told(tmp_path: Path) -> None:
@@ -310,7 +310,7 @@ def test_damaged_stacks_are_told(tmp_path: Path) -> None:
     for part in (b"", content[:7], content[:50], content[:-9], b"nonsense" * 30):
         (tmp_path / "a.npy").write_bytes(part)
         with pytest.raises(ToftrackError, match="a.npy' is no .npy of numbers, or was cut off"):
-            open_recording(tmp_path / "a.npy", bare=TOLD)
+            open_recording(tmp_path / "a.npy", bare=REPORTED)
 
 
 @pytest.mark.parametrize("name", ["a.oni", "a.ply", "a.png", "a.xef", "a.h5"])

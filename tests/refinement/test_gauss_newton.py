@@ -23,7 +23,7 @@ from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
 from toftrack.refinement.gauss_newton import (
     JOINT_FRAME,
-    Landmarks,
+    Keypoints,
     Refinement,
     TorchRefiner,
     point_jacobian,
@@ -245,7 +245,7 @@ def test_landmarks_alone_bring_the_hand_to_them() -> None:
     refiner = TorchRefiner(default_hand_shape())
     truth = joints_of(true_states()[0][None])[0]
     starts = torch.cat([disturbed(0, seed) for seed in range(4)])
-    marks = Landmarks(truth, torch.full((21,), 0.002))
+    marks = Keypoints(truth, torch.full((21,), 0.002))
     settings = refinement(iterations=15, angle_rad=2.0)
     found = refiner(starts, starts[:, 6:], nothing_seen(), settings, marks)
     assert (off_mm(starts, truth) > 8).all()
@@ -255,7 +255,7 @@ def test_landmarks_alone_bring_the_hand_to_them() -> None:
 def test_each_hypothesis_may_have_landmarks_of_its_own() -> None:
     refiner = TorchRefiner(default_hand_shape())
     starts, goals = disturbed(0, 0).repeat(2, 1), joints_of(true_states()[:2])
-    marks = Landmarks(goals, torch.full((2, 21), 0.003))
+    marks = Keypoints(goals, torch.full((2, 21), 0.003))
     found = refiner(starts, starts[:, 6:], nothing_seen(), refinement(iterations=25), marks)
     assert off_mm(found, goals)[0] < off_mm(starts, goals)[0] / 3
     assert off_mm(found, goals)[1] < off_mm(starts, goals)[1] / 2
@@ -267,15 +267,15 @@ def test_unknown_landmarks_count_as_none_and_a_wrong_one_little() -> None:
     plain = refiner(start, start[:, 6:], seen, SETTINGS)
     points, sigma = joints_of(start)[0] + 0.05, torch.full((21,), torch.inf)
     assert torch.equal(
-        refiner(start, start[:, 6:], seen, SETTINGS, Landmarks(points, sigma)), plain
+        refiner(start, start[:, 6:], seen, SETTINGS, Keypoints(points, sigma)), plain
     )
     sigma[3] = 0.005
     points[3] = torch.nan
     assert torch.equal(
-        refiner(start, start[:, 6:], seen, SETTINGS, Landmarks(points, sigma)), plain
+        refiner(start, start[:, 6:], seen, SETTINGS, Keypoints(points, sigma)), plain
     )
     points[3] = 0.3
-    wrong = refiner(start, start[:, 6:], seen, SETTINGS, Landmarks(points, sigma))
+    wrong = refiner(start, start[:, 6:], seen, SETTINGS, Keypoints(points, sigma))
     assert (off_mm(wrong, joints_of(plain)[0]) < 1).all()
 
 

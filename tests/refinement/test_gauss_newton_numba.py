@@ -15,7 +15,7 @@ from torch import Tensor
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.refinement.gauss_newton import Landmarks, Refiner, TorchRefiner
+from toftrack.refinement.gauss_newton import Keypoints, Refiner, TorchRefiner
 from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.closed_form import render_range_images
@@ -101,7 +101,7 @@ def test_it_agrees_with_the_reference_about_landmarks(own: bool) -> None:
     without = compiled(starts, starts[:, 6:], seen, SETTINGS)
     nothing = replace(seen, points_m=torch.zeros(0, 3))
     for what in (seen, nothing):
-        marks = Landmarks(points, sigma)
+        marks = Keypoints(points, sigma)
         found = compiled(starts, starts[:, 6:], what, SETTINGS, marks)
         check_joints(shape, found, reference(starts, starts[:, 6:], what, SETTINGS, marks))
         assert (error_m(compiled, found, without) > 1e-4).all()

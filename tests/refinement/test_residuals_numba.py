@@ -19,9 +19,9 @@ from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement import gauss_newton_numba
 from toftrack.refinement import residuals_numba as compiled
 from toftrack.refinement.gauss_newton import (
-    Landmarks,
+    Keypoints,
     Residuals,
-    landmark_residuals,
+    keypoint_residuals,
     nearest_ellipsoids,
     point_jacobian,
     point_residuals,
@@ -230,10 +230,10 @@ def test_landmarks_add_up_as_in_the_reference(side: str) -> None:
     points = posed.pose.joints_m + 0.02 * torch.randn(1, 21, 3, generator=g)
     sigma = 0.003 + 0.02 * torch.rand(1, 21, generator=g, dtype=torch.float64)
     sigma[0, 5], points[0, 9] = torch.inf, torch.nan
-    marks = Landmarks(points, sigma)
+    marks = Keypoints(points, sigma)
     wrenches = no_wrenches()
     _add_landmarks(points[0].numpy(), sigma[0].numpy(), posed.hand, wrenches)
-    expected = landmark_residuals(posed.pose, marks.of_each(1), posed.shape)
+    expected = keypoint_residuals(posed.pose, marks.of_each(1), posed.shape)
     check_sums(assembled(wrenches, posed), expected, 1e-5)
 
 

@@ -87,8 +87,8 @@ def test_frames_are_those_of_the_skeleton(side: str) -> None:
     frames, valid, _, _ = compiled(side, rows)
     pose = forward_kinematics(rows.double(), default_hand_shape(side=side).to(torch.float64))
     assert valid.all()
-    turns = frames[:, :9].reshape(16, 3, 3, LANES).transpose(3, 0, 1, 2)
-    np.testing.assert_allclose(turns, pose.frames.numpy(), atol=1e-5)
+    rotations = frames[:, :9].reshape(16, 3, 3, LANES).transpose(3, 0, 1, 2)
+    np.testing.assert_allclose(rotations, pose.frames.numpy(), atol=1e-5)
     origins = frames[:, 9:].transpose(2, 0, 1)
     np.testing.assert_allclose(origins, pose.origins_m.numpy(), atol=1e-5)  # 0.01 mm
 

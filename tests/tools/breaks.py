@@ -46,7 +46,7 @@ def _turned_index(degrees: float) -> Iterator[None]:
 BREAKS = {
     "keypoints off": Break(
         "the networks' votes for joints neither judge nor pull a pose",
-        ("relocation.votes=0", "relocation.landmark_weight=0"),
+        ("detector.keypoints=0", "detector.keypoint_weight=0"),
     ),
     "finger's axis": Break(
         "the index finger bends about an axis turned by 5 degrees",
@@ -57,7 +57,7 @@ BREAKS = {
     ),
     "hysteresis off": Break(
         "another pose or finger need not lead for a while before it takes over",
-        ("relocation.rival_gain=0", "relocation.rival_frames=1", "refine.swap_gain=0"),
+        ("detector.rival_gain=0", "detector.rival_frames=1", "refine.swap_gain=0"),
     ),
     "other side": Break("the other hand's side is told", other_side=True),
     "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),

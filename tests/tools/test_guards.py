@@ -59,7 +59,7 @@ def test_the_strangers_are_not_what_the_guards_track() -> None:
 def test_other_poses_and_fingers_must_lead_for_a_while() -> None:
     """What "hysteresis off" turns off, and the guards hardly see."""
     cfg = configuration()
-    assert cfg.relocation.rival_frames >= 3 and cfg.relocation.rival_gain >= 0.02
+    assert cfg.detector.rival_frames >= 3 and cfg.detector.rival_gain >= 0.02
     assert cfg.refine.swap_gain >= 0.03
 
 

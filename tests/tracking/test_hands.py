@@ -29,10 +29,10 @@ def followed(scene: TwoHands, *overrides: str) -> list[tuple[Estimate, ...]]:
     return [tracker.step(depth, scene.k, i, i / 25) for i, depth in enumerate(scene.depth_m)]
 
 
-def errors_mm(told: list[tuple[Estimate, ...]], scene: TwoHands) -> np.ndarray:
+def errors_mm(reported: list[tuple[Estimate, ...]], scene: TwoHands) -> np.ndarray:
     """(T, 2) errors of the right hand and of the left one, in whichever slot; NaN where lost."""
-    errors = np.full((len(told), 2), np.nan)
-    for t, estimates in enumerate(told):
+    errors = np.full((len(reported), 2), np.nan)
+    for t, estimates in enumerate(reported):
         for estimate in estimates:
             hand = ("right", "left").index(estimate.side) if estimate.side else 0
             if not estimate.lost:
@@ -79,8 +79,8 @@ def test_a_slot_without_a_hand_is_lost_and_empty() -> None:
 
 def test_one_hand_is_not_seen_twice() -> None:
     tracker, scene = tracker_of("hands=2"), sample()
-    told = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(0, 60, 3)]
-    assert sum(not estimates[1].lost for estimates in told) == 0
+    reported = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(0, 60, 3)]
+    assert sum(not estimates[1].lost for estimates in reported) == 0
 
 
 def test_a_told_side_is_that_of_the_first_slot_and_the_other_one_is_of_the_other(

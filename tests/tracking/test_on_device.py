@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 import torch
 from helpers.accelerator import DEVICE, Counts, pretended_device
-from helpers.configured import refinement, relocation_settings
+from helpers.configured import detector_settings, refinement
 from helpers.pretended_triton import pretended_triton
 from helpers.tracking import errors_mm, follow, make_tracker, sample
 
+from toftrack.detector.hand_detector import make_detector
 from toftrack.estimate import Estimate
 from toftrack.hand.shape import default_hand_shape
-from toftrack.refinement.gauss_newton import Landmarks, TorchRefiner
+from toftrack.refinement.gauss_newton import Keypoints, TorchRefiner
 from toftrack.refinement.seen_points import SeenPoints
-from toftrack.relocation.relocaliser import make_relocaliser
 from toftrack.tracking import particle_filter
 
 FRAMES = 8
-SETTLED = 4
+SELECTED = 4
 """From this frame on nothing is made for the first time."""
 pretended = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 
@@ -58,7 +58,7 @@ def followed() -> tuple[list[Estimate], list[Asked]]:
 def test_a_frame_waits_for_the_device_a_few_times(
     followed: tuple[list[Estimate], list[Asked]],
 ) -> None:
-    asked = followed[1][SETTLED:]
+    asked = followed[1][SELECTED:]
     # Where the other side is looked at, too, it is three times more.
     assert max(frame.waits for frame in asked) <= 10
     assert min(frame.waits for frame in asked) <= 7
@@ -127,11 +127,11 @@ def test_refinement_in_torch_waits_for_nothing() -> None:
     surface = joints[0].repeat(20, 1) + 0.005 * torch.randn(420, 3, generator=generator)
     k = torch.tensor([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
     nearest = torch.rand(60, 60, 2, generator=generator) * 60
-    votes = joints[1] + 0.01, torch.full((21,), 0.01)
+    keypoints = joints[1] + 0.01, torch.full((21,), 0.01)
 
     def refined(device: torch.device, iterations: int) -> torch.Tensor:
         seen = SeenPoints(surface.to(device), nearest.to(device), k.to(device), (144, 176))
-        landmarks = Landmarks(*(part.to(device) for part in votes))
+        landmarks = Keypoints(*(part.to(device) for part in keypoints))
         refiner = TorchRefiner(shape.to(device))
         cfg = refinement(iterations=iterations)
         there = states.to(device)
@@ -152,18 +152,18 @@ def test_refinement_in_torch_waits_for_nothing() -> None:
 
 @pretended
 def test_the_networks_answer_from_the_device_in_one_copy() -> None:
-    scene, settings = sample(), asdict(relocation_settings())
-    relocaliser = make_relocaliser(**settings)
+    scene, settings = sample(), asdict(detector_settings())
+    detector = make_detector(**settings)
     centre = scene.joints_m[0, [0, 9]].mean(0)[None]
-    here = relocaliser.glance(scene.depth_m[0], scene.k, centre, "right")[0]
-    places = relocaliser.search(scene.depth_m[0], scene.k, "right")
+    here = detector.detect(scene.depth_m[0], scene.k, centre, "right")[0]
+    places = detector.search(scene.depth_m[0], scene.k, "right")
     with pretended_device() as counts:
-        there = make_relocaliser(**settings).to(DEVICE)
-        with counts.within("glance"):
-            glance = there.glance(scene.depth_m[0], scene.k, centre, "right")[0]
+        there = make_detector(**settings).to(DEVICE)
+        with counts.within("detect"):
+            detection = there.detect(scene.depth_m[0], scene.k, centre, "right")[0]
         found = there.search(scene.depth_m[0], scene.k, "right")
-    assert counts.waits["glance"] == 1
-    torch.testing.assert_close(glance.joints_m, here.joints_m, atol=1e-4, rtol=0)
+    assert counts.waits["detect"] == 1
+    torch.testing.assert_close(detection.joints_m, here.joints_m, atol=1e-4, rtol=0)
     assert len(found) == len(places) > 0
     np.testing.assert_allclose(found[0].centre_m, places[0].centre_m, atol=1e-4)
 
@@ -203,7 +203,7 @@ def test_cuda_tracks_as_the_cpu_does_and_its_passes_wait_for_nothing(
     on_cpu = errors_mm(follow(scene, "compute=cpu"), scene)
     tracker, estimates = make_tracker("compute=cuda"), []
     for i, depth in enumerate(scene.depth_m):
-        if i == SETTLED:  # from here on torch itself says where the host waits
+        if i == SELECTED:  # from here on torch itself says where the host waits
             _passes_within(monkeypatch, _waiting_forbidden)
         estimates.append(tracker.step(depth, scene.k, i, i / 25))
     there = errors_mm(estimates, scene)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from toftrack.compute.pace import FRAME_S
-from toftrack.tracking.refining import turns
+from toftrack.tracking.refining import rotations
 from toftrack.tracking.state import Track
 
 
@@ -19,7 +19,7 @@ def track(frames: int, **changes: object) -> Track:
 
 
 def test_a_believed_hand_is_tried_in_turn() -> None:
-    found = [turns(track(frames), 0.9) for frames in range(1, 7)]
+    found = [rotations(track(frames), 0.9) for frames in range(1, 7)]
     assert found == [(False, True), (True, False)] * 3
 
 
@@ -27,8 +27,8 @@ def test_a_believed_hand_is_tried_in_turn() -> None:
     "changes", [{"log_odds": 0.0}, {"log_odds": None}, {"challenged_s": FRAME_S}]
 )
 def test_a_hand_that_is_doubted_or_challenged_is_tried_in_both_ways(changes: dict) -> None:
-    assert all(turns(track(frames, **changes), 0.9) == (True, True) for frames in range(1, 5))
+    assert all(rotations(track(frames, **changes), 0.9) == (True, True) for frames in range(1, 5))
 
 
 def test_nothing_is_left_out_where_that_is_asked_for() -> None:
-    assert all(turns(track(frames), 1.0) == (True, True) for frames in range(1, 5))
+    assert all(rotations(track(frames), 1.0) == (True, True) for frames in range(1, 5))

@@ -7,30 +7,30 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.relocating import glance_of
+from helpers.detection import detection_of
 from helpers.tracking import make_tracker
 
+from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.shape_space import POPULATION_SIGMA, shape_derivatives, shaped
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.refinement.gauss_newton import Landmarks
-from toftrack.relocation.relocaliser import Glance
+from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.tracking import shape_fit
-from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit, first_belief, votes_system
+from toftrack.tracking.shape_fit import ShapeEstimate, ShapeFit, first_shape, keypoints_system
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 FIT = ShapeFit(
     sure_m=0.004,
     length_sigma=0.03,
-    votes=4.0,
+    keypoints=4.0,
     alike=0.65,
     certain_poses=12,
     contradiction=3.5,
     memory=20,
 )
-VOTES_OFF = torch.tensor(shape_fit._VOTES_OFF)
+VOTES_OFF = torch.tensor(shape_fit._KEYPOINTS_OFF)
 BETWEEN_FINGERS = torch.tensor([0.05, 0.06, 0.0, 0.0, -0.05, 0.04])
 
 
@@ -44,37 +44,37 @@ def poses(count: int, seed: int = 0) -> torch.Tensor:
     return states
 
 
-def glance(shape: HandShape, state: torch.Tensor, sigma_m: float = 0.004) -> Glance:
+def detection(shape: HandShape, state: torch.Tensor, sigma_m: float = 0.004) -> Detection:
     """What networks would say that see every joint of a hand (1, 27), and err as they do."""
     joints = forward_kinematics(state, shaped(shape, VOTES_OFF)).joints_m[0]
     log_size = math.log(shape.hand_length_m / DEFAULT_HAND_LENGTH_M)
-    votes = Landmarks(joints, torch.full((21,), sigma_m))
-    return replace(glance_of(state, log_size, shape.side), landmarks=votes)
+    keypoints = Keypoints(joints, torch.full((21,), sigma_m))
+    return replace(detection_of(state, log_size, shape.side), landmarks=keypoints)
 
 
 def fitted(
-    belief: ShapeBelief,
+    belief: ShapeEstimate,
     shape: HandShape,
     states: torch.Tensor,
     sigma_m: float = 0.004,
     fit: ShapeFit = FIT,
-) -> ShapeBelief:
+) -> ShapeEstimate:
     """After believed estimates of a hand, whose poses are right: so many frames of each pose that
     one is looked at.
     """
     first = default_hand_shape(side=shape.side)
     for state in states[:, None].repeat_interleave(shape_fit._EVERY, 0):
-        seen = glance(shape, state, sigma_m)
+        seen = detection(shape, state, sigma_m)
         belief = shape_fit.contradicted(belief, seen, fit, first)
-        worn = torch.tensor(belief.worn)
-        votes = Landmarks(seen.landmarks.points_m, seen.landmarks.sigma_m.clamp(min=0.008))
+        applied = torch.tensor(belief.applied)
+        keypoints = Keypoints(seen.landmarks.points_m, seen.landmarks.sigma_m.clamp(min=0.008))
         belief = shape_fit.learned(
             belief,
             state,
-            shaped(first, worn),
-            shape_derivatives(first, worn),
+            shaped(first, applied),
+            shape_derivatives(first, applied),
             seen,
-            votes,
+            keypoints,
             fit,
             first,
         )
@@ -86,8 +86,8 @@ def test_votes_say_by_how_much_a_hand_is_another(side: str) -> None:
     first, state = default_hand_shape(side=side), poses(1)
     none = torch.zeros(6)
     joints = forward_kinematics(state, shaped(first, 0.2 * BETWEEN_FINGERS)).joints_m[0]
-    votes = Landmarks(joints, torch.full((21,), 0.002))
-    information, vector = votes_system(state, first, shape_derivatives(first, none), votes)
+    keypoints = Keypoints(joints, torch.full((21,), 0.002))
+    information, vector = keypoints_system(state, first, shape_derivatives(first, none), keypoints)
     # Thickness moves no joint.
     assert information[3].abs().max() < 1e-3 * information.diagonal().max()
     assert torch.linalg.eigvalsh(information).min() > -1e-3 * information.diagonal().max()
@@ -99,10 +99,10 @@ def test_votes_say_by_how_much_a_hand_is_another(side: str) -> None:
 
 def test_a_hand_is_found_in_different_poses_and_the_fit_says_how_surely() -> None:
     shape = shaped(default_hand_shape(), BETWEEN_FINGERS)
-    belief = fitted(first_belief(), shape, poses(16))
-    worn = shaped(default_hand_shape(), torch.tensor(belief.worn))
-    assert worn.hand_length_m == pytest.approx(shape.hand_length_m, rel=0.04)
-    off = (worn.bone_lengths_m.sum(1) / shape.bone_lengths_m.sum(1)).log()
+    belief = fitted(first_shape(), shape, poses(16))
+    applied = shaped(default_hand_shape(), torch.tensor(belief.applied))
+    assert applied.hand_length_m == pytest.approx(shape.hand_length_m, rel=0.04)
+    off = (applied.bone_lengths_m.sum(1) / shape.bone_lengths_m.sum(1)).log()
     before = default_hand_shape().scaled(math.exp(0.05)).bone_lengths_m.sum(1)
     assert off.square().mean() < 0.6 * (before / shape.bone_lengths_m.sum(1)).log().square().mean()
     sigma = belief.summary(FIT).sigma
@@ -112,67 +112,70 @@ def test_a_hand_is_found_in_different_poses_and_the_fit_says_how_surely() -> Non
 
 def test_one_pose_seen_again_and_again_counts_once() -> None:
     shape, state = default_hand_shape(0.17), poses(1)
-    once = fitted(first_belief(), shape, state)
-    often = fitted(first_belief(), shape, state.repeat(30, 1))
+    once = fitted(first_shape(), shape, state)
+    often = fitted(first_shape(), shape, state.repeat(30, 1))
     assert often.poses == pytest.approx(once.poses)
     assert often.covariance[0, 0] == pytest.approx(float(once.covariance[0, 0]), rel=0.1)
-    other = fitted(first_belief(), shape, poses(30))
+    other = fitted(first_shape(), shape, poses(30))
     assert other.poses > 5 * once.poses
     assert other.covariance[0, 0] < once.covariance[0, 0]
 
 
 def test_a_hand_that_is_hardly_seen_says_little() -> None:
     shape = default_hand_shape(0.16)
-    assert fitted(first_belief(), shape, poses(3), sigma_m=0.03).poses == 0
-    sure, unsure = (fitted(first_belief(), shape, poses(3), sigma) for sigma in (0.004, 0.007))
+    assert fitted(first_shape(), shape, poses(3), sigma_m=0.03).poses == 0
+    sure, unsure = (fitted(first_shape(), shape, poses(3), sigma) for sigma in (0.004, 0.007))
     assert unsure.covariance[0, 0] > 1.5 * sure.covariance[0, 0]
 
 
 def test_a_hand_is_frozen_when_it_is_certain() -> None:
     fit = replace(FIT, certain_poses=3.9)
     shape = default_hand_shape(0.18)
-    belief = fitted(first_belief(), shape, poses(10), fit=fit)
+    belief = fitted(first_shape(), shape, poses(10), fit=fit)
     assert belief.frozen(fit) and belief.poses == pytest.approx(4, rel=1e-3)
-    longer = default_hand_shape(0.185)
-    assert fitted(belief, longer, poses(5, seed=1), fit=fit).worn == belief.worn
+    extended = default_hand_shape(0.185)
+    assert fitted(belief, extended, poses(5, seed=1), fit=fit).applied == belief.applied
 
 
 def test_another_person_s_hand_is_noticed_and_fitted_anew() -> None:
     fit = replace(FIT, certain_poses=6)
-    belief = fitted(first_belief(), default_hand_shape(0.20), poses(12), fit=fit)
+    belief = fitted(first_shape(), default_hand_shape(0.20), poses(12), fit=fit)
     assert belief.frozen(fit)
     after = fitted(belief, default_hand_shape(0.15), poses(14, seed=1), fit=fit)
-    worn = shaped(default_hand_shape(), torch.tensor(after.worn))
-    assert worn.hand_length_m == pytest.approx(0.15, rel=0.04)
+    applied = shaped(default_hand_shape(), torch.tensor(after.applied))
+    assert applied.hand_length_m == pytest.approx(0.15, rel=0.04)
 
 
 def test_a_single_odd_look_reopens_nothing() -> None:
-    belief = fitted(first_belief(), default_hand_shape(0.19), poses(12))
+    belief = fitted(first_shape(), default_hand_shape(0.19), poses(12))
     once = fitted(belief, default_hand_shape(0.15), poses(1, seed=1))
     assert once.poses >= belief.poses
 
 
 def test_the_network_s_length_is_worn_until_estimates_say_better() -> None:
     first = default_hand_shape()
-    said = shape_fit.told(first_belief(), 0.16, FIT, first)
-    assert shaped(first, torch.tensor(said.worn)).hand_length_m == pytest.approx(0.16, rel=1e-4)
+    said = shape_fit.with_network_length(first_shape(), 0.16, FIT, first)
+    assert shaped(first, torch.tensor(said.applied)).hand_length_m == pytest.approx(0.16, rel=1e-4)
     for absurd in (1e-3, 10.0):
-        worn = shape_fit.told(first_belief(), absurd, FIT, first).worn
-        assert abs(worn[0]) <= 3 * POPULATION_SIGMA[0]
-    known = fitted(first_belief(), default_hand_shape(0.18), poses(3))
-    assert shape_fit.told(known, 0.15, FIT, first) is known
+        applied = shape_fit.with_network_length(first_shape(), absurd, FIT, first).applied
+        assert abs(applied[0]) <= 3 * POPULATION_SIGMA[0]
+    known = fitted(first_shape(), default_hand_shape(0.18), poses(3))
+    assert shape_fit.with_network_length(known, 0.15, FIT, first) is known
 
 
 def test_the_shape_in_use_changes_in_steps_only() -> None:
-    belief = fitted(first_belief(), default_hand_shape(0.18), poses(6))
+    belief = fitted(first_shape(), default_hand_shape(0.18), poses(6))
     nearly = fitted(belief, default_hand_shape(0.1803), poses(3, seed=1))
-    assert nearly.worn == belief.worn and not torch.equal(nearly.mean, belief.mean)
+    assert nearly.applied == belief.applied and not torch.equal(nearly.mean, belief.mean)
 
 
 def test_a_fixed_hand_stays_whatever_is_seen_of_another() -> None:
     fit, shape = replace(FIT, fixed=True), default_hand_shape(0.16)
-    assert shape_fit.told(first_belief(), 0.16, fit, default_hand_shape()).worn == (0.0,) * 6
-    assert fitted(first_belief(), shape, poses(3), fit=fit).worn == (0.0,) * 6
+    assert (
+        shape_fit.with_network_length(first_shape(), 0.16, fit, default_hand_shape()).applied
+        == (0.0,) * 6
+    )
+    assert fitted(first_shape(), shape, poses(3), fit=fit).applied == (0.0,) * 6
 
 
 def test_only_auto_is_fitted() -> None:
@@ -183,7 +186,7 @@ def test_only_auto_is_fitted() -> None:
     assert fitted_hand.side == "left" and fitted_hand.fitted is None, "nothing was fitted yet"
 
 
-@pytest.mark.parametrize("name", ["sure_m", "length_sigma", "votes", "certain_poses", "memory"])
+@pytest.mark.parametrize("name", ["sure_m", "length_sigma", "keypoints", "certain_poses", "memory"])
 def test_impossible_settings_are_refused(name: str) -> None:
     with pytest.raises(ToftrackError, match=f"hand.adapt.{name}=0"):
         replace(FIT, **{name: 0})

@@ -106,7 +106,7 @@ def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() 
         value = getattr(tracker.state, field.name)
         if field.name == "size":
             assert torch.equal(value.mean, fresh.size.mean)
-            assert (value.worn, value.frames) == (fresh.size.worn, 0)
+            assert (value.applied, value.frames) == (fresh.size.applied, 0)
         else:
             assert value is kept.get(field.name, value) or value == kept[field.name]
             if field.name not in kept:
@@ -121,7 +121,7 @@ def test_what_a_step_saw_is_told_with_the_time_of_its_stages() -> None:
     estimate = tracked(tracker, scene, range(1))[0]
     seconds = tracker.insight.seconds
     stages = {"segmentation and evidence", "start", "filter: scoring", "filter: rest"}
-    assert stages | {"relocaliser", "refinement", "rest"} == set(seconds)
+    assert stages | {"detector", "refinement", "rest"} == set(seconds)
     assert all(value > 0 for value in seconds.values())
     assert sum(seconds.values()) <= estimate.compute_s
     assert tracker.insight.particles.shape == (80, 10)

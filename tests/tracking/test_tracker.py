@@ -237,8 +237,8 @@ def test_a_setting_that_makes_no_sense_is_one_clear_error(override: str, words: 
     with pytest.raises(Exception) as caught:
         make_tracker(override)
     chain = (caught.value, caught.value.__cause__)
-    told = [str(error) for error in chain if isinstance(error, ToftrackError)]
-    assert told and words in told[0]
+    reported = [str(error) for error in chain if isinstance(error, ToftrackError)]
+    assert reported and words in reported[0]
 
 
 def test_a_filter_of_another_size_tracks_too() -> None:

@@ -142,14 +142,14 @@ def test_before_the_first_frame_and_after_the_last_the_page_is_told_so(monkeypat
 def test_who_waits_is_told_of_the_end_at_once(view) -> None:
     view.show(moments()[0])
     facts, _ = next_picture(view, {})
-    told: list[dict] = []
+    reported: list[dict] = []
     path = f"moment?run={facts['run']}&after={facts['version']}"
-    visitor = threading.Thread(target=lambda: told.append(get(view, path)[0]))
+    visitor = threading.Thread(target=lambda: reported.append(get(view, path)[0]))
     visitor.start()
     eventually(lambda: view._picture._waiting)
     view.close()
     visitor.join()
-    assert told[0]["phase"] == "stopped"
+    assert reported[0]["phase"] == "stopped"
 
 
 def test_commands_arrive_in_order_and_once(view) -> None:

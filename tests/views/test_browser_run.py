@@ -42,15 +42,15 @@ from toftrack.views.browser.view import BrowserView
 def test_frames_with_an_end_wait_for_a_visitor_but_not_for_ever(capsys, monkeypatch) -> None:
     found = re.compile(r"live view: (http://127\.0\.0\.1:\d+/)#")
     # Reading captured output empties it, and would lose what is written at that moment.
-    told = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", told)
+    reported = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", reported)
     views: list[BrowserView] = []
     thread = threading.Thread(
         target=lambda: views.append(browser_view("", 25.0, 100, port=0, wait_s=PATIENCE_S))
     )
     thread.start()
-    eventually(lambda: found.search(told.getvalue()))
-    urlopen(found.search(told.getvalue())[1] + "moment", timeout=PATIENCE_S).close()
+    eventually(lambda: found.search(reported.getvalue()))
+    urlopen(found.search(reported.getvalue())[1] + "moment", timeout=PATIENCE_S).close()
     thread.join(PATIENCE_S)
     views[0].close()
     browser_view("", 25.0, 100, port=0, wait_s=0.01).close()

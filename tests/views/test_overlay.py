@@ -75,13 +75,13 @@ def other_hand(**changes: object) -> Estimate:
     """Another one, 10 cm to the left and 10 cm farther away, of a left hand that is nearly sure."""
     one = hand()
     joints = one.joints_m + np.array([-0.1, 0, 0.1], np.float32)
-    told = {"joints_m": joints, "state": np.zeros(27, np.float32), "side": "left"}
-    return dataclasses.replace(one, **told | {"side_probability": 0.83} | changes)
+    reported = {"joints_m": joints, "state": np.zeros(27, np.float32), "side": "left"}
+    return dataclasses.replace(one, **reported | {"side_probability": 0.83} | changes)
 
 
 def present(**changes: object) -> Estimate:
-    told = {"state": np.zeros(27, np.float32), "side": "right", "side_probability": 1.0}
-    return dataclasses.replace(hand(), **told | changes)
+    reported = {"state": np.zeros(27, np.float32), "side": "right", "side_probability": 1.0}
+    return dataclasses.replace(hand(), **reported | changes)
 
 
 def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -209,14 +209,15 @@ def test_lost_is_red_and_tracking_is_not() -> None:
 def test_the_caption_changes_with_the_frame() -> None:
     one, other = (dataclasses.replace(hand(), index=index) for index in (123456, 654321))
     first, second = (
-        sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (told,), (None,), 3))[0] for told in (one, other)
+        sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (reported,), (None,), 3))[0]
+        for reported in (one, other)
     )
     assert (first[:, : 3 * W] != second[:, : 3 * W]).any()
     assert (first[:, 3 * W :] == second[:, 3 * W :]).all()
 
 
 LONG = {"gesture": "pointing_thumb", "pinching": True, "confidence": 0.99, "index": 12345}
-TOLD: dict[str, tuple[Estimate, ...]] = {
+REPORTED: dict[str, tuple[Estimate, ...]] = {
     "tracking": (dataclasses.replace(hand(), **LONG),),
     "searching": (dataclasses.replace(lost_hand(), state_name="searching", index=12345),),
     "doubted": (dataclasses.replace(hand(lost=True), **LONG),),
@@ -225,9 +226,9 @@ TOLD: dict[str, tuple[Estimate, ...]] = {
 }
 
 
-@pytest.mark.parametrize("told", TOLD.values(), ids=TOLD)
-def test_captions_can_be_read_in_a_filmstrip_of_1280_px(told: tuple[Estimate, ...]) -> None:
-    panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, told, (None,) * len(told), 3)
+@pytest.mark.parametrize("reported", REPORTED.values(), ids=REPORTED)
+def test_captions_can_be_read_in_a_filmstrip_of_1280_px(reported: tuple[Estimate, ...]) -> None:
+    panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, reported, (None,) * len(reported), 3)
     strip = filmstrip([film_tile(panel)] * 10)
     small = cv2.resize(strip, (1280, round(strip.shape[0] * 1280 / strip.shape[1])))
     scale = small.shape[1] / strip.shape[1]
@@ -236,7 +237,7 @@ def test_captions_can_be_read_in_a_filmstrip_of_1280_px(told: tuple[Estimate, ..
     for top in (gap, gap + body):
         caption = small[round(top) + 1 :, round(gap) + 1 : round(gap + tile_px) - 1]
         caption = caption[: round(CAPTION_PX / (3 * W) * tile_px) - 2].min(-1) > 150
-        if len(told) > 1:
+        if len(reported) > 1:
             caption[:, :18] = False  # the slot's mark
         rows, columns = np.flatnonzero(caption.any(1)), np.flatnonzero(caption.any(0))
         assert rows[-1] - rows[0] + 1 >= 9

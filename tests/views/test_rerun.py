@@ -125,8 +125,8 @@ def test_every_frames_estimate_can_be_read_back(written: Path) -> None:
     for moment in moments():
         estimate = moment.estimates[0]
         number = estimate.index
-        told = [estimate.score, estimate.confidence, float(estimate.lost)]
-        assert scores[number] == pytest.approx(told, nan_ok=True)
+        reported = [estimate.score, estimate.confidence, float(estimate.lost)]
+        assert scores[number] == pytest.approx(reported, nan_ok=True)
         assert pinches[number] == pytest.approx([estimate.pinch], nan_ok=True)
         assert latent[number] == pytest.approx(estimate.latent)
         assert times[number] == pytest.approx(1e3 * estimate.compute_s)
@@ -147,8 +147,8 @@ def test_ellipsoids_have_the_sizes_of_the_hand_on_either_side(rerun_view) -> Non
     assert sizes[0].shape == (len(hand_surface(one.shape)), 3) and (sizes[0] > 0).all()
     np.testing.assert_allclose(sizes[0], sizes[1], rtol=1e-5)
     for hand in (right, left):
-        turns = np.array(hand.quaternions.as_arrow_array().to_pylist())
-        np.testing.assert_allclose(np.linalg.norm(turns, axis=1), 1, atol=1e-5)
+        rotations = np.array(hand.quaternions.as_arrow_array().to_pylist())
+        np.testing.assert_allclose(np.linalg.norm(rotations, axis=1), 1, atol=1e-5)
 
 
 def test_depth_comes_back_in_metres_and_with_its_pinhole(written: Path) -> None:

@@ -51,9 +51,9 @@ VARIANTS: dict[str, Variant] = {
     "no-refinement": Variant("no refinement", ("refine=none",)),
     "no-votes": Variant(
         "no keypoints: neither refinement nor choice hears the networks' votes",
-        ("relocation.votes=0", "relocation.landmark_weight=0"),
+        ("detector.keypoints=0", "detector.keypoint_weight=0"),
     ),
-    "no-rivals": Variant("no rivals", ("relocation.rivals=0",)),
+    "no-rivals": Variant("no rivals", ("detector.rivals=0",)),
     "no-exchange": Variant("no exchanged fingers", ("refine.swaps=0",)),
     "no-overlap": Variant("fingers may be in one another", ("refine.overlap=0",)),
     "side-found": Variant("the side found out", (), "auto"),

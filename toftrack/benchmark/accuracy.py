@@ -41,7 +41,7 @@ from toftrack.safe_files import write_whole
 
 _TIMED_BESIDE = "milliseconds were measured beside other processes of this run"
 
-_TOLD_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smooth", "hydra")
+_GIVEN_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smooth", "hydra")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -102,7 +102,7 @@ def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], lis
     overrides = [word for word in words if "=" in word and not Path(word).exists()]
     for word in overrides:
         key = word.split("=")[0].lstrip("+~")
-        if key == "hand.side" or key.split(".")[0] in _TOLD_ELSEWHERE:
+        if key == "hand.side" or key.split(".")[0] in _GIVEN_ELSEWHERE:
             raise ToftrackError(
                 f"{word} cannot be given here: recordings are named, with the camera that they "
                 "have, sides, seeds and hands are told by --side, --seeds and --hands, and nothing "

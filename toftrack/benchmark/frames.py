@@ -26,7 +26,7 @@ SIZES = ((640, 480), (1280, 720))
 """Columns and rows of larger images, in which the frames of the first configuration are timed."""
 BUDGET_MS = {
     "rectification": 0.1,
-    "relocaliser": 1.5,
+    "detector": 1.5,
     "segmentation and evidence": 0.6,
     "filter: scoring": 1.5,
     "filter: rest": 1.0,

@@ -128,16 +128,16 @@ class Peer:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         try:
-            told = json.loads(line)
+            reported = json.loads(line)
         except ValueError:
-            told = {"error": self._last_words()}
-        if "ready" in told:
-            versions: Mapping[str, Any] = told["ready"]
+            reported = {"error": self._last_words()}
+        if "ready" in reported:
+            versions: Mapping[str, Any] = reported["ready"]
             return versions
         self.close()
         raise ToftrackError(
             f"the environment of --peer-python {self.python} has no usable {self.name} "
-            f"({told.get('error')}); {MAKE_ENVIRONMENT}"
+            f"({reported.get('error')}); {MAKE_ENVIRONMENT}"
         )
 
     def _send(self, data: bytes) -> None:

@@ -99,8 +99,8 @@ def chosen(found: Any, side: str) -> tuple[Any, str, float] | None:
     hands = []
     rows = zip(found.multi_hand_landmarks or (), found.multi_handedness or (), strict=True)
     for landmarks, handedness in rows:
-        told = handedness.classification[0]
-        hands.append((landmarks, SIDES[told.label], float(told.score)))
+        reported = handedness.classification[0]
+        hands.append((landmarks, SIDES[reported.label], float(reported.score)))
     meant = [hand for hand in hands if side in ("", hand[1])]
     return max(meant, key=lambda hand: hand[2]) if meant else None
 
@@ -120,9 +120,9 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
     _say(sink, {"ready": versions | {"python": sys.version.split()[0]}})
     hand: Any = None
     for line in iter(source.readline, b""):
-        told = json.loads(line)
-        if "begin" in told:
-            begin = told["begin"]
+        reported = json.loads(line)
+        if "begin" in reported:
+            begin = reported["begin"]
             height, width = begin["size"]
             k, side = np.array(begin["k"]).reshape(3, 3), begin["side"]
             hand = hands(**SETTINGS)

@@ -259,26 +259,26 @@ def _tracked(
 ) -> tuple[Estimates, np.ndarray, list[PeerEstimate]]:
     """What the tracker says, the seconds of its frames, and what a peer says after each of them."""
     tracker = _tracker(job, side)
-    told: list[tuple[Estimate, ...]] = []
+    reported: list[tuple[Estimate, ...]] = []
     others: list[PeerEstimate] = []
     for frame in device:
         depth = device.camera.rectify(frame.depth, frame.radial)
-        told.append(tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s))
+        reported.append(tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s))
         if peer is not None:
             assert frame.amplitude is not None
             others.append(peer.step(depth, frame.amplitude))
-    seconds = np.array([frame[0].compute_s for frame in told])
-    return estimates_of(told, found_side=job.side == "auto"), seconds, others
+    seconds = np.array([frame[0].compute_s for frame in reported])
+    return estimates_of(reported, found_side=job.side == "auto"), seconds, others
 
 
-def estimates_of(told: Sequence[Sequence[Estimate]], found_side: bool) -> Estimates:
+def estimates_of(reported: Sequence[Sequence[Estimate]], found_side: bool) -> Estimates:
     """What was said in T frames of each slot; with one slot without its axis.
 
     found_side: whether the side was found out.
     """
 
     def column(name: str) -> np.ndarray:
-        values = np.array([[getattr(one, name) for one in frame] for frame in told])
+        values = np.array([[getattr(one, name) for one in frame] for frame in reported])
         return values[:, 0] if values.shape[1] == 1 else values
 
     sides = ("side", "side_probability") if found_side else ()
@@ -302,11 +302,11 @@ def _stills(job: Job, labels: Stills) -> Iterator[tuple[str, dict[str, Any]]]:
             depth = device.camera.rectify(frame.depth, frame.radial)
             tracker = _tracker(job, labels.side)
             for index in range(labels.shown_frames):
-                told = tracker.step(depth, device.camera.K, index, index / device.fps)
-            if len(told) != 1:
+                reported = tracker.step(depth, device.camera.K, index, index / device.fps)
+            if len(reported) != 1:
                 raise ToftrackError("labelled images are of one hand; leave out --hands 2")
-            figures = still_row(told[0].gesture, told[0].lost, labels.called[shown])
-            about = {"kind": "stills", "shown": shown, "gesture": told[0].gesture}
+            figures = still_row(reported[0].gesture, reported[0].lost, labels.called[shown])
+            about = {"kind": "stills", "shown": shown, "gesture": reported[0].gesture}
             yield f"{job.name}#{number:04d}", about | figures
 
 

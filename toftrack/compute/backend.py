@@ -16,7 +16,7 @@ from toftrack.compute.redraw import Redraw
 
 if TYPE_CHECKING:
     from toftrack.hand.shape import HandShape
-    from toftrack.refinement.gauss_newton import Landmarks, Refiner
+    from toftrack.refinement.gauss_newton import Keypoints, Refiner
     from toftrack.render.scoring import Scorer
 
 
@@ -52,6 +52,6 @@ class Backend:
     name: str
     device: torch.device
     motions: Motions
-    joints_penalty: Callable[[Tensor, float, float, Landmarks | None, float], Tensor]
+    joints_penalty: Callable[[Tensor, float, float, Keypoints | None, float], Tensor]
     make_scorer: Callable[[HandShape], Scorer]
     make_refiner: Callable[[HandShape], Refiner]

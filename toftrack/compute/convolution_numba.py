@@ -89,7 +89,7 @@ class Network(NamedTuple):
 
     steps: np.ndarray
     weights: np.ndarray
-    room: int
+    capacity: int
 
 
 class NetworkBuilder:
@@ -98,17 +98,17 @@ class NetworkBuilder:
     def __init__(self) -> None:
         self._steps: list[Step] = []
         self._weights: list[np.ndarray] = []
-        self._placed = self._room = 0
+        self._placed = self._capacity = 0
 
     def network(self) -> Network:
         """What was laid out."""
         steps = np.array(self._steps, np.int64)
-        return Network(steps, np.concatenate(self._weights), self._room)
+        return Network(steps, np.concatenate(self._weights), self._capacity)
 
     def image(self, high: int, wide: int, channels: int, border: int = 0) -> Image:
         """Room for an image whose channels take so much memory, see `padded`."""
-        image = Image(self._room, high, wide, channels, border)
-        self._room += int(np.prod(image.shape()))
+        image = Image(self._capacity, high, wide, channels, border)
+        self._capacity += int(np.prod(image.shape()))
         return image
 
     def layer(
@@ -220,8 +220,8 @@ def _emit(builder, pixels: int, vectors: int, data: list, numbers: list) -> None
     for pixel, number in each:
         found = builder.load(total[pixel, number])
         positive = builder.select(builder.fcmp_ordered(">", found, zero), found, zero)
-        told = builder.select(relu, positive, found)
-        builder.store(told, output(pixel, number), align=4)
+        activated = builder.select(relu, positive, found)
+        builder.store(activated, output(pixel, number), align=4)
 
 
 def _spread(builder, value: ir.Value, vector: ir.VectorType) -> ir.Value:

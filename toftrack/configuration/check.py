@@ -35,15 +35,15 @@ _ABOVE_ZERO = frozenset(
     gestures.thumb_rad gestures.tips_palms
     hands
     hand.adapt.certain_poses hand.adapt.contradiction hand.adapt.length_sigma hand.adapt.memory
-    hand.adapt.sure_m hand.adapt.votes
+    hand.adapt.sure_m hand.adapt.keypoints
     hand.length_m
     likelihood.beta likelihood.tolerance_m
     lost.joints.scale
     pose_space.dims
     record_limit_gb
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
-    relocation.hypotheses relocation.landmark_m relocation.landmark_sigmas relocation.places
-    relocation.rival_frames relocation.rival_m
+    detector.hypotheses detector.keypoint_m detector.keypoint_sigmas detector.places
+    detector.rival_frames detector.rival_m
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
@@ -56,12 +56,12 @@ _AT_MOST = {"hands": 2, "filter.particles": 100_000, "filter.passes": 1000, "see
 """More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""
-_LOG_ODDS = ("lost.intercept", "lost.weights.", "lost.joints.odds", "relocation.merit")
+_LOG_ODDS = ("lost.intercept", "lost.weights.", "lost.joints.odds", "detector.merit")
 """How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
 _OF_NETWORKS = {
     "start._target_": ("toftrack.tracking.prior.Prior", "start=prior"),
-    "lost._target_": ("toftrack.tracking.belief.CalibratedBelief", "lost=calibrated"),
+    "lost._target_": ("toftrack.tracking.confidence.ConfidenceModel", "lost=calibrated"),
     "hand.shape": ("auto", "hand.shape=auto"),
     "hand.side": ("auto", "hand.side=auto"),
 }
@@ -71,7 +71,7 @@ _OF_PAPER = {
     "lost._target_": ("toftrack.tracking.paper.ScoreThreshold", "lost=never"),
 }
 """Likewise the paper's."""
-_NO_NETWORKS = "toftrack.relocation.relocaliser.no_relocaliser"
+_NO_NETWORKS = "toftrack.detector.hand_detector.no_detector"
 
 
 def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> None:
@@ -99,7 +99,7 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
 
 def check_tracker(config: DictConfig) -> None:
     """Raise ToftrackError where parts of the paper's tracker and of the other one are mixed."""
-    without = OmegaConf.select(config, "relocation._target_") == _NO_NETWORKS
+    without = OmegaConf.select(config, "detector._target_") == _NO_NETWORKS
     given = [
         choice
         for key, (value, choice) in (_OF_NETWORKS if without else _OF_PAPER).items()
@@ -112,8 +112,8 @@ def check_tracker(config: DictConfig) -> None:
     some = ", ".join(given)
     if without and {"start=prior", "lost=calibrated"} <= set(given):
         raise ToftrackError(
-            "relocation=none belongs to experiment=paper, the tracker without networks; give"
-            " experiment=paper, or leave relocation=none out"
+            "detector=none belongs to experiment=paper, the tracker without networks; give"
+            " experiment=paper, or leave detector=none out"
         )
     if without:
         raise ToftrackError(

@@ -39,8 +39,8 @@ def sentence(error: BaseException) -> str:
             "name, and that its module lies beside the program or on PYTHONPATH"
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
-        told = next((cause for cause in chain if str(cause).strip()), error)
-        return better_sentence(chain) or _of_config(told) or type(error).__name__
+        reported = next((cause for cause in chain if str(cause).strip()), error)
+        return better_sentence(chain) or _of_config(reported) or type(error).__name__
     text = _one_line(str(error))
     name = type(error).__name__
     return f"unexpected {name}{f': {text}' if text else ''} ({FULL_ERROR}=1 shows the traceback)"

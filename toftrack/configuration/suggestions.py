@@ -17,7 +17,7 @@ _MOST = 12
 _OR_PAPER = "or give experiment=paper, the tracker without networks"
 _GONE = {
     "start=search": f"the networks find hands: leave it out, {_OR_PAPER}",
-    "start.hypotheses": "the networks find hands: leave it out, or give relocation.hypotheses",
+    "start.hypotheses": "the networks find hands: leave it out, or give detector.hypotheses",
     **dict.fromkeys(
         (
             *("start.islands", "start.samples", "start.improved", "start.coverage"),
@@ -70,8 +70,8 @@ def _of_syntax(error: OverrideParseException) -> str:
 
 def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     group, _, word = missing.rpartition("/")
-    if told := _GONE.get(f"{group}={word}"):
-        return f"there is no {group}={word} any more, since {told}"
+    if reported := _GONE.get(f"{group}={word}"):
+        return f"there is no {group}={word} any more, since {reported}"
     if not group or not options:
         return None
     likely = nearest(word, options)
@@ -80,20 +80,24 @@ def _of_choice(missing: str, options: Sequence[str]) -> str | None:
 
 
 def _of_key(chain: Sequence[BaseException]) -> str | None:
-    told = re.match(r"Could not override '([^']+)'", str(chain[0]))
+    reported = re.match(r"Could not override '([^']+)'", str(chain[0]))
     for error in chain:
         parent = getattr(error, "parent_node", None)
-        if told and isinstance(error, OmegaConfBaseException) and isinstance(parent, DictConfig):
-            return _unknown_key(told[1], parent)
+        if (
+            reported
+            and isinstance(error, OmegaConfBaseException)
+            and isinstance(parent, DictConfig)
+        ):
+            return _unknown_key(reported[1], parent)
     return None
 
 
 def _unknown_key(key: str, parent: DictConfig) -> str:
     root = parent._get_root()
     assert isinstance(root, DictConfig)
-    for gone, told in _GONE.items():
+    for gone, reported in _GONE.items():
         if f"{key}.".startswith(f"{gone}."):
-            return f"there is no setting {key} any more, since {told}"
+            return f"there is no setting {key} any more, since {reported}"
     keys = [name for name in _keys(root) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]

@@ -37,7 +37,7 @@ class FrameNumbers:
 
 
 @contextlib.contextmanager
-def told(
+def reported_errors(
     what: str, remedy: str, errors: tuple[type[Exception], ...] = (RuntimeError,)
 ) -> Iterator[None]:
     """Errors of the SDK become one sentence: what, the SDK's words, and what to do."""

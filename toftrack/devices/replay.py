@@ -63,8 +63,8 @@ class Replay(BaseDevice):
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=FILE.npz")
-        told = BareFacts(intrinsics)
-        store = open_recording(path, camera_file, modulation_mhz, bare=told)
+        given = BareFacts(intrinsics)
+        store = open_recording(path, camera_file, modulation_mhz, bare=given)
         self._set_up(store, path, start, stop, realtime, repeat, camera_file, intrinsics)
 
     def _set_up(
@@ -85,13 +85,13 @@ class Replay(BaseDevice):
         self._range = _checked_range(start, stop, len(self._recording), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         camera = store.camera
-        told = BareFacts(intrinsics).camera(camera.width, camera.height)
-        if told is not None and camera_file is not None:
+        given = BareFacts(intrinsics).camera(camera.width, camera.height)
+        if given is not None and camera_file is not None:
             raise ToftrackError(
                 "camera.file and device.intrinsics both tell the lens; leave one out"
             )
-        if told is not None:
-            camera = told
+        if given is not None:
+            camera = given
         elif camera_file is not None:
             camera = Camera.load_for(camera_file, camera.width, camera.height, f"'{path}'")
         found = doubts(store, camera)

@@ -237,10 +237,10 @@ def _thickness(points: np.ndarray, ways: np.ndarray, flesh: Ellipsoids) -> np.nd
 def _bar_itzhack() -> np.ndarray:
     """(10, 16): a rotation's 9 numbers and a 1 to the 16 of 4 q q', q = x y z w."""
     terms = np.zeros((10, 4, 4))
-    signs = np.array([[1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1]])
+    signum = np.array([[1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1]])
     terms[9] = np.eye(4)
     for axis in range(3):
-        terms[4 * axis, range(4), range(4)] = signs[:, axis]
+        terms[4 * axis, range(4), range(4)] = signum[:, axis]
         after, before = (axis + 1) % 3, (axis + 2) % 3
         for row, column, sign in ((before, after, 1), (after, before, -1)):
             terms[3 * row + column, [axis, 3], [3, axis]] = sign

@@ -43,9 +43,9 @@ _STEP = 0.01
 def shaped(first: HandShape, components: Tensor) -> HandShape:
     """The hand whose components (6,) are these, where `first` has none; of its device and dtype."""
     length, fingers, breadth, thickness, thumb, outer = components.to(first.base_m)
-    longer = outer * first.base_m.new_tensor(_OUTER) + 0.5 * fingers
-    longer[0] += thumb
-    bones = first.bone_lengths_m * longer.exp()[:, None]
+    log_factor = outer * first.base_m.new_tensor(_OUTER) + 0.5 * fingers
+    log_factor[0] += thumb
+    bones = first.bone_lengths_m * log_factor.exp()[:, None]
     base = first.base_m * torch.stack((breadth, -0.5 * fingers, breadth)).exp()
     middle = base[2].norm() + bones[2].sum()
     scale = length.exp() * first.hand_length_m / middle

@@ -14,12 +14,12 @@ import numpy as np
 from toftrack.estimate import STATES, Estimate, is_vacant
 from toftrack.tracking.state import StepInfo
 
-_LOOKED_AT_PX = 5000
+_INSPECTED_PX = 5000
 """So many pixels of an image are enough to say how far things are."""
 _HARDLY = 0.01
 """A share of pixels that is none."""
 _MOST = 0.5
-_FEWEST_LOOKS, _LOOKS, _PRESENT = 10, 0.25, 0.9
+_FEWEST_DETECTIONS, _DETECTIONS, _PRESENT = 10, 0.25, 0.9
 """Lost frames that must say how long the hand looked: so many, and such a share. So sure must the
 networks be that there is one."""
 _FEWEST_PX = 150
@@ -50,7 +50,7 @@ class LostFrame:
     farthest_m: float
     hand_px: int
     other_side: bool | None
-    looked_m: float | None = None
+    apparent_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class RunFacts:
     """The networks said which hand it looked like."""
     other_side: int = 0
     """That was the other one."""
-    looked: int = 0
+    detections: int = 0
     """The networks said how long it looked."""
-    looked_m: float = 0.0
+    apparent_m: float = 0.0
     """The sum of that."""
     tracked_judged: int = 0
     """The same of frames that were not lost."""
@@ -115,16 +115,16 @@ class RunFacts:
             small=self.small + (0 < frame.hand_px < _FEWEST_PX),
             judged=self.judged + (frame.other_side is not None),
             other_side=self.other_side + (frame.other_side is True),
-            looked=self.looked + (frame.looked_m is not None),
-            looked_m=self.looked_m + (frame.looked_m or 0.0),
+            detections=self.detections + (frame.apparent_m is not None),
+            apparent_m=self.apparent_m + (frame.apparent_m or 0.0),
         )
 
-    def mean_looked_m(self) -> float | None:
+    def mean_apparent_m(self) -> float | None:
         """How long the hand looked, where most of a run was lost and enough was seen to say so."""
-        enough = max(_FEWEST_LOOKS, _LOOKS * self.lost)
-        if self.lost <= _MOST * self.frames or self.looked < enough:
+        enough = max(_FEWEST_DETECTIONS, _DETECTIONS * self.lost)
+        if self.lost <= _MOST * self.frames or self.detections < enough:
             return None
-        return self.looked_m / self.looked
+        return self.apparent_m / self.detections
 
 
 def lost_frame(
@@ -134,7 +134,7 @@ def lost_frame(
 
     depth_m: (H, W) metres.  insight: of the tracker.  reach_m: nothing beyond is a hand.
     """
-    step = max(1, round(math.sqrt(depth_m.size / _LOOKED_AT_PX)))
+    step = max(1, round(math.sqrt(depth_m.size / _INSPECTED_PX)))
     few = depth_m[::step, ::step]
     readings = few[np.isfinite(few) & (few > 0)]
     nearest, farthest = np.percentile(readings, (2, 98)) if len(readings) else (np.nan, np.nan)
@@ -146,18 +146,18 @@ def lost_frame(
         farthest_m=float(farthest),
         hand_px=0 if insight is None else int(insight.observation.hand.sum()),
         other_side=_other_side(insight),
-        looked_m=_looked_m(insight),
+        apparent_m=_apparent_m(insight),
     )
 
 
 def _other_side(insight: StepInfo | None) -> bool | None:
-    signs = None if insight is None else insight.signs
-    return None if signs is None else signs.other_side > 0
+    features = None if insight is None else insight.features
+    return None if features is None else features.other_side > 0
 
 
-def _looked_m(insight: StepInfo | None) -> float | None:
-    glance = None if insight is None else insight.glance
-    return None if glance is None or glance.present < _PRESENT else glance.length_m
+def _apparent_m(insight: StepInfo | None) -> float | None:
+    detection = None if insight is None else insight.detection
+    return None if detection is None or detection.present < _PRESENT else detection.length_m
 
 
 class Watch:
@@ -195,9 +195,9 @@ class Watch:
             return facts.with_lost(lost_frame(estimate, depth_m, insight, self.reach_m))
         return facts.tracked(_other_side(insight))
 
-    def looked_m(self) -> tuple[float | None, ...]:
+    def apparent_m(self) -> tuple[float | None, ...]:
         """Of RunFacts.mean_looked_m, for each slot."""
-        return tuple(facts.mean_looked_m() for facts in self.facts)
+        return tuple(facts.mean_apparent_m() for facts in self.facts)
 
     def advice(self, side: str | None) -> tuple[str, ...]:
         """Of the function of that name, for each slot."""

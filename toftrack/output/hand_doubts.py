@@ -18,7 +18,7 @@ _SMALLEST_M, _LARGEST_M = 0.145, 0.210
 one man in a hundred (ANSUR II)."""
 _SIGMAS = 2.0
 """So sure must a fit be that the hand lies beyond."""
-_LOOKED_M = (0.135, 0.215)
+_APPARENT_M = (0.135, 0.215)
 """Likewise of what the networks say of a hand that was lost, whose lengths stay nearer to the
 usual."""
 
@@ -35,9 +35,9 @@ def length_doubt(shape: HandShape, k: np.ndarray) -> str:
     return _sentence(f"the fitted hand is {1e3 * length:.0f} mm long", length, k)
 
 
-def looked_doubt(length_m: float, k: np.ndarray) -> str:
+def apparent_doubt(length_m: float, k: np.ndarray) -> str:
     """Likewise by the mean length that the networks gave a hand that was lost in most frames."""
-    if _LOOKED_M[0] <= length_m <= _LOOKED_M[1]:
+    if _APPARENT_M[0] <= length_m <= _APPARENT_M[1]:
         return ""
     return _sentence(f"the hand looks {1e3 * length_m:.0f} mm long", length_m, k)
 

@@ -105,7 +105,7 @@ def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Itera
         yield f"{root}/gesture", [("s", hand["gesture"]), ("f", probability)]
         yield f"{root}/pinch", [("f", hand["pinch"]), ("i", int(hand["pinching"]))]
     ray = [*hand["pointing_origin_m"], *hand["pointing_direction"]]
-    if _known(ray):
+    if _finite(ray):
         yield f"{root}/pointing", _floats(ray)
     if "joints" in parts:
         yield from _listed(f"{root}/joint", JOINT_NAMES, hand["joints_m"])
@@ -119,7 +119,7 @@ def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Itera
 
 def _listed(root: str, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Iterator[Message]:
     for name, row in zip(names, rows, strict=True):
-        if _known(row):
+        if _finite(row):
             yield f"{root}/{name}", _floats(row)
 
 
@@ -127,7 +127,7 @@ def _floats(values: Sequence[float]) -> list[tuple[str, Any]]:
     return [("f", value) for value in values]
 
 
-def _known(values: Sequence[float | None]) -> bool:
+def _finite(values: Sequence[float | None]) -> bool:
     return all(value is not None and math.isfinite(value) for value in values)
 
 

@@ -56,11 +56,11 @@ class RealTime:
         if self.dropped <= _MANY * came:
             return ""
         took_ms = 1e3 * self.busy_s / max(1, self.tracked)
-        effort = f", {self.reduced} of them with reduced effort" if self.reduced else ""
+        quality = f", {self.reduced} of them with reduced effort" if self.reduced else ""
         return (
             f"{self.dropped} of {came} frames were dropped: the machine was too slow for "
             f"{self.fps:g} frames/s, a frame took {took_ms:.0f} ms ({self.tracked} were tracked"
-            f"{effort}). Let nothing else compute beside it, draw less (view=none), or ask the "
+            f"{quality}). Let nothing else compute beside it, draw less (view=none), or ask the "
             "camera for fewer frames or smaller images."
         )
 

@@ -209,8 +209,8 @@ def _check(hand: Mapping[str, Any], needed: Set[str]) -> None:
 def _hands(line: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Those of a line that is of several; none of another one, which is told of later."""
     hands = line.get("hands")
-    told = hands if isinstance(hands, list) else []
-    return [hand for hand in told if isinstance(hand, dict)]
+    reported = hands if isinstance(hands, list) else []
+    return [hand for hand in reported if isinstance(hand, dict)]
 
 
 def _vacant(hand: Mapping[str, Any]) -> dict[str, Any]:

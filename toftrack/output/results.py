@@ -79,7 +79,7 @@ class ResultWriter:
         """How many were appended."""
         self.realtime: RealTime | None = None
         """How a live run kept up, for summary.json; to be set before the writer is closed."""
-        self.looked_m: Sequence[float | None] = ()
+        self.apparent_m: Sequence[float | None] = ()
         """Of Watch.looked_m, for summary.json; to be set likewise."""
         self._truth = truth
         self._facts = {
@@ -134,7 +134,7 @@ class ResultWriter:
             with self._records or records_of(self.folder, self._facts) as records:
                 realtime = None if self.realtime is None else self.realtime.summary()
                 self.summary = finish(
-                    self.folder, self._facts, self._truth, records, realtime, self.looked_m
+                    self.folder, self._facts, self._truth, records, realtime, self.apparent_m
                 )
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
@@ -175,7 +175,7 @@ def finish(
     truth: Truth | None,
     records: Records,
     realtime: dict[str, Any] | None = None,
-    looked_m: Sequence[float | None] = (),
+    apparent_m: Sequence[float | None] = (),
 ) -> dict[str, Any]:
     """Make track.npz and summary.json of a run's frames; returns the summary.
 
@@ -195,7 +195,7 @@ def finish(
         "metadata": np.array(json.dumps(metadata)),
     } | facts_for_readers(metadata)
     summary = summarise(records, len(rows), int(dropped.sum()), folder, metadata)
-    summary["doubts"] = run_doubts(records, folder, metadata, looked_m)
+    summary["doubts"] = run_doubts(records, folder, metadata, apparent_m)
     if realtime is not None:
         summary["realtime"] = realtime
     if truth is not None and len(rows):
@@ -236,11 +236,11 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         DROPPED: dropped,
     }
     if dropped.any() and "state_name" in records.names:
-        changed["state_name"] = _told_dropped(records.column("state_name", rows), dropped)
+        changed["state_name"] = _reported_dropped(records.column("state_name", rows), dropped)
     return rows, changed
 
 
-def _told_dropped(state_names: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+def _reported_dropped(state_names: np.ndarray, dropped: np.ndarray) -> np.ndarray:
     """(T,) or (T, S) texts that say it where a frame was; a slot without a hand says nothing."""
     of_frame = dropped.reshape(-1, *(1,) * (state_names.ndim - 1))
     return np.where(of_frame & (state_names != ""), DROPPED, state_names)
@@ -296,8 +296,8 @@ def _dropped(arrays: dict[str, np.ndarray], content: dict[str, Any]) -> dict[str
         return {DROPPED: np.zeros(count, bool)}
     dropped = np.isin(content["index"], np.array(held, np.int64))
     names = content.get("state_name")
-    told = {} if names is None else {"state_name": _told_dropped(names, dropped)}
-    return {DROPPED: dropped} | told
+    reported = {} if names is None else {"state_name": _reported_dropped(names, dropped)}
+    return {DROPPED: dropped} | reported
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:

@@ -229,9 +229,9 @@ def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
     """Frame numbers and state names for the rows of track.npz, which also has dropped frames."""
     try:
         with open_to_read(path) as stream:
-            told = [parse_json(line) for line in stream.read().decode("utf-8").splitlines()]
-        index = np.array([int(line["index"]) for line in told])
-        names = [str(line["state_name"]) for line in told]
+            given = [parse_json(line) for line in stream.read().decode("utf-8").splitlines()]
+        index = np.array([int(line["index"]) for line in given])
+        names = [str(line["state_name"]) for line in given]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ToftrackError(f"'{path}' cannot be read ({error}); run track.py again") from None
     if len(index) and (np.diff(index) >= 1).all():
@@ -259,8 +259,8 @@ def open_footage(run: Run, recording: str | Path | None = None) -> Footage | Non
     if opened is None:
         return None
     store, name = opened
-    told = BareFacts(device.get("intrinsics"))
-    camera = told.camera(store.camera.width, store.camera.height) or store.camera
+    given = BareFacts(device.get("intrinsics"))
+    camera = given.camera(store.camera.width, store.camera.height) or store.camera
     if about.get("camera_file"):
         camera = Camera.load(run.found(about["camera_file"]))
     rows = _rows(run, store, camera, about, device, name)

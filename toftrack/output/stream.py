@@ -114,7 +114,7 @@ class StdoutStream:
         os.dup2(self._descriptor, _STDOUT)
         os.close(self._descriptor)
         dropped = self._dropped + len(self._lines) + bool(self._rest)
-        told(self._sent, "to standard output", dropped, "the reader was too slow")
+        report_dropped(self._sent, "to standard output", dropped, "the reader was too slow")
 
     def _write(self, until: float) -> None:
         """Write what waits; give up when there is no room for more, at that time at the latest."""
@@ -122,8 +122,8 @@ class StdoutStream:
             if not self._rest:
                 self._rest = self._lines.popleft()
             patience = max(0.0, until - time.monotonic())
-            _, room, _ = select.select((), (self._descriptor,), (), patience)
-            if not room:
+            _, writable, _ = select.select((), (self._descriptor,), (), patience)
+            if not writable:
                 return
             # So much is sure to fit in; the pipe's own non-blocking mode would be that of all the
             # programs that share it.
@@ -187,7 +187,7 @@ class UdpStream:
         self._socket.close()
         self._socket = None
         host, port = self._address[:2]
-        told(self._sent, f"to {host} port {port}", self._dropped, self._reason)
+        report_dropped(self._sent, f"to {host} port {port}", self._dropped, self._reason)
 
 
 def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
@@ -219,7 +219,7 @@ def _claim_stdout() -> int:
     return own
 
 
-def told(sent: int, where: str, dropped: int, reason: str) -> None:
+def report_dropped(sent: int, where: str, dropped: int, reason: str) -> None:
     """Log how many estimates were sent at the end of a stream."""
     why = f" ({reason})" if dropped else ""
     _log.info("stream: %d estimates sent %s, %d dropped%s", sent, where, dropped, why)

@@ -22,7 +22,7 @@ from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
 from toftrack.output.coverage import Coverage
 from toftrack.output.evaluation import evaluate
-from toftrack.output.hand_doubts import length_doubt, looked_doubt
+from toftrack.output.hand_doubts import apparent_doubt, length_doubt
 from toftrack.output.measures import Estimates, Measured, measured
 from toftrack.output.records import Records
 from toftrack.recordings.doubts import times_doubt
@@ -103,7 +103,7 @@ def run_doubts(
     records: Records,
     folder: Path,
     metadata: dict[str, Any],
-    looked_m: Sequence[float | None] = (),
+    apparent_m: Sequence[float | None] = (),
 ) -> list[str]:
     """What speaks against a run's input, a sentence each: what its device found, the frames' times
     where the device did not look at them, and how long the fitted hands are.
@@ -111,14 +111,16 @@ def run_doubts(
     looked_m: of the slots, how long the hand looked where it was mostly lost; () where the run did
     not say.
     """
-    told = (metadata.get("device") or {}).get("doubts")
-    found = [times_doubt(records.column("timestamp_s"))] if told is None else list(told)
+    configured = (metadata.get("device") or {}).get("doubts")
+    found = [times_doubt(records.column("timestamp_s"))] if configured is None else list(configured)
     k = (metadata.get("camera") or {}).get("K")
     if _fits(metadata) and k is not None:
-        for slot, looked in zip_longest(range(records.slots), looked_m):
+        for slot, apparent in zip_longest(range(records.slots), apparent_m):
             shape = _shape(folder, slot)
             fitted = "" if shape is None else length_doubt(shape, np.array(k))
-            found.append(fitted or ("" if looked is None else looked_doubt(looked, np.array(k))))
+            found.append(
+                fitted or ("" if apparent is None else apparent_doubt(apparent, np.array(k)))
+            )
     return list(filter(None, found))
 
 
@@ -153,8 +155,12 @@ def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of a track without its side where that was told: it is no finding then."""
     probability = arrays.get("side_probability", np.ones(0))
     known = probability[np.isfinite(probability)]
-    told = bool((known == 1).all())
-    return {name: array for name, array in arrays.items() if not (told and name.startswith("side"))}
+    configured = bool((known == 1).all())
+    return {
+        name: array
+        for name, array in arrays.items()
+        if not (configured and name.startswith("side"))
+    }
 
 
 def _metrics(

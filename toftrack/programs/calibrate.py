@@ -47,7 +47,7 @@ class Calibration:
     pairs: DepthPairs
     amplitudes: list[np.ndarray]
     """Of the lens's views."""
-    looked_at: int
+    searched: int
     """Frames that were searched for the board."""
 
 
@@ -147,7 +147,7 @@ def calibrate(
 def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> list[View]:
     """The frames of these numbers that show the board; says so soon where none does."""
     views: list[View] = []
-    began, told = time.monotonic(), False
+    began, reported = time.monotonic(), False
     bar = tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5)
     for number in bar:
         amplitude = store.image(number)[1]
@@ -155,8 +155,8 @@ def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> li
         corners = calibration.find_corners(amplitude, board)
         if corners is not None:
             views.append(View(int(number), corners))
-        elif not views and not told and time.monotonic() - began > _HOPE_S:
-            told = True
+        elif not views and not reported and time.monotonic() - began > _HOPE_S:
+            reported = True
             bar.write(
                 f"no {board[0]}x{board[1]} chequerboard seen so far, up to frame {number}; it must "
                 "be wholly in view, and --board its inner corners, columns x rows (Ctrl-C ends)",
@@ -207,7 +207,7 @@ def _facts(result: Calibration, start: Camera) -> dict[str, Any]:
         }
 
     return {
-        "frames_searched": result.looked_at,
+        "frames_searched": result.searched,
         "frames_used": len(result.lens.views),
         "nearest_m": float(pairs.true_m.min()),
         "farthest_m": float(pairs.true_m.max()),

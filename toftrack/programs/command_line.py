@@ -32,7 +32,7 @@ from omegaconf import DictConfig
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
 from toftrack.json_text import read_json
-from toftrack.programs import endings
+from toftrack.programs import shutdown
 from toftrack.safe_files import write_whole
 
 
@@ -73,12 +73,12 @@ def run(main: Callable[[], object]) -> int:
     _program.tracebacks = os.environ.get(FULL_ERROR) == "1"
     _program.failed_jobs.clear()
     try:
-        with endings.obeyed(), _hydra_raises():
+        with shutdown.obeyed(), _hydra_raises():
             status = main()
     except KeyboardInterrupt as end:
-        endings.say("interrupted: what was done until then is kept", sys.stderr)
-        endings.forget_streams()
-        return endings.exit_status(end)
+        shutdown.say("interrupted: what was done until then is kept", sys.stderr)
+        shutdown.forget_streams()
+        return shutdown.exit_status(end)
     except SystemExit as end:  # of Hydra's options, as --help, and of its argument parser
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)

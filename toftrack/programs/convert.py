@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.recordings.bare import NOTHING_TOLD, BareFacts
+from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.npy import NpyStack
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.npz_stream import write_npz_streamed
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--fps", type=float, help="frames a second of bare images (25)")
     options = parser.parse_args(arguments)
-    told = options.intrinsics
+    given = options.intrinsics
     count = convert(
         options.source,
         options.target,
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.unit,
         options.overwrite,
         options.topic,
-        BareFacts(None if told is None else tuple(told), options.source_unit, options.fps),
+        BareFacts(None if given is None else tuple(given), options.source_unit, options.fps),
     )
     print(f"{options.target}: {count} frames")
 
@@ -90,7 +90,7 @@ def convert(
     unit_m: float | None = None,
     overwrite: bool = False,
     topic: str | None = None,
-    bare: BareFacts = NOTHING_TOLD,
+    bare: BareFacts = NOTHING_GIVEN,
 ) -> int:
     """Convert a recording, frame by frame; returns the number of frames.
 

@@ -1,4 +1,4 @@
-"""The fit of a JointBelief to errors that are known; a part of fit_belief."""
+"""The fit of a JointBelief to errors that are known; a part of fit_confidence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from toftrack.hand.regions import REGION_90
-from toftrack.tracking.joint_belief import JOINT_SIGNS, KIND_OF_JOINT, KINDS, JointBelief
+from toftrack.tracking.joint_confidence import JOINT_FEATURES, KIND_OF_JOINT, KINDS, JointConfidence
 
 _TAILS = 4.0
 """Degrees of freedom of the Student t that errors are taken for: wrong fingers are no outliers of a
@@ -33,7 +33,7 @@ class JointRows(NamedTuple):
     counted: (T,) the hand is there and the estimate not flagged lost.
     """
 
-    signs: np.ndarray
+    features: np.ndarray
     error_cm: np.ndarray
     near: np.ndarray
     counted: np.ndarray
@@ -43,7 +43,7 @@ class JointRows(NamedTuple):
         return JointRows(*(values[rows] for values in self))
 
 
-def fitted_joint_belief(rows: JointRows) -> JointBelief:
+def fitted_joint_belief(rows: JointRows) -> JointConfidence:
     """The belief that suits the rows best.
 
     Standard deviations are those of Student's t, which says how errors differ; then all three of a
@@ -52,35 +52,35 @@ def fitted_joint_belief(rows: JointRows) -> JointBelief:
     kinds, which hold for rendered hands only.
     """
     used = rows.of(rows.counted)
-    design, unit = _design(used.signs)
+    design, unit = _design(used.features)
     error = used.error_cm.reshape(-1, 3)
     sigma = _fit_spread(design, error)
     off = np.sqrt(np.square(error * np.exp(-design @ sigma)).sum(1))
     sigma += _fit_quantile(design, np.log(np.maximum(off, 1e-3) / REGION_90), sigma.min(1))[:, None]
-    every, every_unit = _design(rows.signs)
+    every, every_unit = _design(rows.features)
     odds = _fit_odds(every, rows.near.reshape(-1))
     table = np.column_stack((_plain(sigma, unit), _plain(odds[:, None], every_unit)))
     lines = [[round(float(value), 3) + 0.0 for value in row] for row in table]
-    return JointBelief(
+    return JointConfidence(
         scale=1.0,
         odds=0.0,
         kinds=dict(zip(KINDS, lines, strict=False)),
-        weights=dict(zip(JOINT_SIGNS, lines[len(KINDS) :], strict=True)),
+        weights=dict(zip(JOINT_FEATURES, lines[len(KINDS) :], strict=True)),
     )
 
 
-def _design(signs: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+def _design(features: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """(N, K + S) kinds and signs in standard deviations; means and deviations of the signs."""
-    flat = signs.reshape(-1, signs.shape[-1])
+    flat = features.reshape(-1, features.shape[-1])
     mean, spread = flat.mean(0), flat.std(0) + 1e-9
-    kinds = np.eye(len(KINDS))[np.tile(KIND_OF_JOINT, len(signs))]
+    kinds = np.eye(len(KINDS))[np.tile(KIND_OF_JOINT, len(features))]
     return np.concatenate((kinds, (flat - mean) / spread), 1), (mean, spread)
 
 
 def _plain(weights: np.ndarray, unit: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Weights (K + S, C) for signs as they are."""
-    kinds, signs = weights[: len(KINDS)], weights[len(KINDS) :] / unit[1][:, None]
-    return np.concatenate((kinds - unit[0] @ signs, signs))
+    kinds, features = weights[: len(KINDS)], weights[len(KINDS) :] / unit[1][:, None]
+    return np.concatenate((kinds - unit[0] @ features, features))
 
 
 def _fit_spread(design: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -127,16 +127,16 @@ def _minimised(
     loss: Callable[[np.ndarray], tuple[float, np.ndarray]], least: np.ndarray, shrink: float
 ) -> np.ndarray:
     """Weights (K + S, C); those of signs are shrunk, and at least `least`."""
-    shape, signs = least.shape, slice(len(KINDS), None)
+    shape, features = least.shape, slice(len(KINDS), None)
 
     def shrunk(flat: np.ndarray) -> tuple[float, np.ndarray]:
         weights = flat.reshape(shape)
         value, slope = loss(weights)
-        slope[signs] += 2 * shrink * weights[signs]
-        return value + shrink * float(np.square(weights[signs]).sum()), slope.ravel()
+        slope[features] += 2 * shrink * weights[features]
+        return value + shrink * float(np.square(weights[features]).sum()), slope.ravel()
 
     lower = np.full(shape, -np.inf)
-    lower[signs] = least[signs]
+    lower[features] = least[features]
     bounds = [(low, None) for low in lower.ravel()]
     start = np.maximum(np.zeros(shape), lower).ravel()
     found = minimize(shrunk, start, jac=True, bounds=bounds, method="L-BFGS-B")

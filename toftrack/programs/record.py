@@ -28,9 +28,9 @@ from toftrack.configuration.compose import configuration, configuration_folder, 
 from toftrack.devices.base import Device
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
-from toftrack.programs import endings
-from toftrack.programs.endings import ENDINGS, EndedError
+from toftrack.programs import shutdown
 from toftrack.programs.recording_argument import quoted
+from toftrack.programs.shutdown import SHUTDOWN_SIGNALS, EndedError
 from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsWriter
@@ -109,17 +109,17 @@ def record_frames(
         with device, tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
             began = time.monotonic()
             for count, frame in enumerate(device, 1):
-                with endings.not_now():
+                with shutdown.not_now():
                     recorder.put(frame, wait=True)
                 bar.update()
                 late = seconds is not None and time.monotonic() - began >= seconds
                 if recorder.ended is not None or count == frames or late:
                     break
     finally:
-        with endings.not_now():
+        with shutdown.not_now():
             recorder.close()
             if recorder.words():
-                endings.say(recorder.words(), sys.stdout)
+                shutdown.say(recorder.words(), sys.stdout)
     if recorder.failed:
         raise ToftrackError(recorder.ended)
     if recorder.ended is not None:
@@ -198,7 +198,7 @@ class _Signals:
 
     def __enter__(self) -> _Signals:
         if threading.current_thread() is threading.main_thread():
-            for number in ENDINGS:
+            for number in SHUTDOWN_SIGNALS:
                 if signal.getsignal(number) != signal.SIG_IGN:  # as by nohup
                     self._before[number] = signal.signal(number, self._stop)
         return self

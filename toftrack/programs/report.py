@@ -102,8 +102,8 @@ def _read_run(path: Path, folder: Path) -> Run:
         )
     if not isinstance(summary, dict):
         return Run(name, overrides, {}, "its summary.json is not one of track.py")
-    told = summary.get("error")
-    return Run(name, overrides, _flat(summary), None if told is None else _printable(str(told)))
+    varied = summary.get("error")
+    return Run(name, overrides, _flat(summary), None if varied is None else _printable(str(varied)))
 
 
 def _split(override: str) -> tuple[str, str]:
@@ -135,10 +135,10 @@ def error_figure(runs: Sequence[Run]) -> str:
 
 def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
     """Groups in the order of their first run, with the mean and the spread of a figure."""
-    told = _telling(runs)
+    varied = _telling(runs)
     groups: dict[str, Group] = {}
     for run in runs:
-        settings = " ".join(f"{key}={run.overrides.get(key, '-')}" for key in told) or "all alike"
+        settings = " ".join(f"{key}={run.overrides.get(key, '-')}" for key in varied) or "all alike"
         groups.setdefault(settings, Group(settings)).runs.append(run)
     for group in groups.values():
         _summarise(group, figure)
@@ -246,9 +246,9 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     failed = [run for run in runs if run.error is not None]
     if failed:
         print(f"\n{len(failed)} of {len(runs)} jobs failed:")
-        told = {key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1}
+        varied = {key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1}
         for run in failed:
-            changed = " ".join(f"{k}={value}" for k, value in run.overrides.items() if k in told)
+            changed = " ".join(f"{k}={value}" for k, value in run.overrides.items() if k in varied)
             print(f"  {run.name} ({changed}): {run.error}")
     written = [folder / "sweep.csv"]
     points = [

@@ -40,7 +40,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
         "device": device.description,
         "pose_space": {"kind": tracker.space.kind, "dims": tracker.space.dims},
         "hand_shape": {
-            "side": told_side(config, shape.side) or "auto",
+            "side": configured_side(config, shape.side) or "auto",
             "fitted": tracker.model.fits,
             "thickness": shape.thickness,
             "hand_length_m": shape.hand_length_m,
@@ -58,13 +58,13 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
     }
 
 
-def told_side(config: Mapping[str, Any], side: str) -> str | None:
+def configured_side(config: Mapping[str, Any], side: str) -> str | None:
     """The side that was told; None where either hand may come, or both.
 
     config: of the run.  side: of the hand that is looked for.
     """
-    told = config.get("hands", 1) == 1 and (config.get("hand") or {}).get("side") != "auto"
-    return side if told else None
+    configured = config.get("hands", 1) == 1 and (config.get("hand") or {}).get("side") != "auto"
+    return side if configured else None
 
 
 def opening(metadata: dict[str, Any], device: Device) -> str:

@@ -29,13 +29,13 @@ from toftrack.output.realtime import RealTime
 from toftrack.output.results import ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
-from toftrack.programs import endings
-from toftrack.programs.ahead import ready_tracker
-from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata, told_side
+from toftrack.programs import shutdown
+from toftrack.programs.precompile import ready_tracker
+from toftrack.programs.run_facts import ShapeFiles, configured_side, opening, run_metadata
 from toftrack.recordings.recorder import Recorder
 from toftrack.tracking.conventions import in_all_conventions
-from toftrack.tracking.effort import Pace
 from toftrack.tracking.hands import HandsTracker
+from toftrack.tracking.quality import Pace
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 
 _log = logging.getLogger(__name__)
@@ -73,8 +73,8 @@ def _track(config: DictConfig, device: Device, stream: Stream, recorder: Recorde
     try:
         return _run(config, device, parts)
     finally:  # a live run that lost the hand ends by an interruption
-        for sentence in _notes(parts, told_side(config, tracker.shapes[0].side)):
-            endings.say(f"note: {sentence}", sys.stderr)
+        for sentence in _notes(parts, configured_side(config, tracker.shapes[0].side)):
+            shutdown.say(f"note: {sentence}", sys.stderr)
 
 
 def _pace(configured: Pace, device: Device) -> Pace:
@@ -110,14 +110,14 @@ def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
                 ended = end
     summary = results.summary or {}
     if summary.get("frames"):
-        endings.say(metrics_table(summary), sys.stdout)
-        endings.say(_told_files(folder), sys.stdout)
+        shutdown.say(metrics_table(summary), sys.stdout)
+        shutdown.say(_reported_files(folder), sys.stdout)
     if parts.recorder is not None and parts.recorder.words():
-        endings.say(f"  {parts.recorder.words()}", sys.stdout)
+        shutdown.say(f"  {parts.recorder.words()}", sys.stdout)
     said = metadata["device"].get("doubts", ())  # by the device itself
     for doubt in summary.get("doubts", ()):
         if doubt not in said:
-            endings.say(f"note: {doubt}", sys.stderr)
+            shutdown.say(f"note: {doubt}", sys.stderr)
     if ended is not None:
         raise ended
     if not summary.get("frames"):
@@ -147,9 +147,9 @@ def _follow(device: Device, results: ResultWriter, view: View, parts: _Parts) ->
     except ReaderGoneError as gone:
         print(f"{gone}: tracking ends here", file=sys.stderr)
     finally:
-        with endings.not_now():
+        with shutdown.not_now():
             results.realtime = parts.realtime if device.live else None
-            results.looked_m = parts.watch.looked_m()
+            results.apparent_m = parts.watch.apparent_m()
             try:
                 parts.shapes.save(last=True)
             finally:
@@ -165,7 +165,7 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
     with progress() as bar:
         for frame in device:
             began_s = time.perf_counter()
-            with endings.not_now():
+            with shutdown.not_now():
                 if parts.recorder is not None:  # first: whatever it may do to the tracker
                     parts.recorder.put(frame, wait=not device.live)
                 for command in view.commands():
@@ -227,6 +227,6 @@ def _sure_words(estimate: Estimate) -> str:
     return ", ".join(filter(None, (confidence_words(estimate.confidence), estimate.state_name)))
 
 
-def _told_files(folder: Path) -> str:
+def _reported_files(folder: Path) -> str:
     written = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix != ".log")
     return "\n".join([f"results: {folder}", *(f"  {path}" for path in written)])

@@ -56,7 +56,7 @@ def _four_numbers(values: object) -> bool:
     return numbers and all(map(math.isfinite, values)) and min(values[0], values[1]) > 0
 
 
-NOTHING_TOLD = BareFacts()
+NOTHING_GIVEN = BareFacts()
 
 
 def bare_camera(
@@ -68,9 +68,9 @@ def bare_camera(
     """
     if camera_file is not None:
         return Camera.load_for(camera_file, width, height, f"'{path}'")
-    told = bare.camera(width, height)
-    if told is not None:
-        return told
+    given = bare.camera(width, height)
+    if given is not None:
+        return given
     beside = path.parent / _BESIDE
     if beside.exists():
         return Camera.load_for(beside, width, height, f"'{path}'")

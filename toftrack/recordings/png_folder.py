@@ -131,8 +131,8 @@ def read_png_folder(
     facts = _facts(folder / _CAMERA, content, unit_m, fps)
     if camera_file is not None:
         camera = Camera.load(camera_file)
-    elif told := BareFacts(intrinsics).camera(*_png_size(depth[0])):
-        camera = told
+    elif configured := BareFacts(intrinsics).camera(*_png_size(depth[0])):
+        camera = configured
     elif content is not None:
         camera = Camera.from_dict(content, folder / _CAMERA)
     else:

@@ -172,7 +172,7 @@ class Recorder:
         else:
             if self._file.bytes >= self._limit_gb * _GIGABYTE:
                 self._end(f"it has {self._limit_gb:g} GB, its limit", failed=False)
-            elif not self._file.has_room(_SPARE_BYTES):
+            elif not self._file.has_space(_SPARE_BYTES):
                 self._end("the disk is nearly full", failed=False)
 
     def _write(self, frame: Frame) -> None:
@@ -236,16 +236,16 @@ class Recorder:
         try:
             if self.frames:
                 finish(self._part, self.path, self._overwrite)
-                told = f"the recording '{self.path}' ends after {self.frames} frames: {why}"
+                reported = f"the recording '{self.path}' ends after {self.frames} frames: {why}"
             else:
                 self._part.unlink(missing_ok=True)
-                told = f"the recording '{self.path}' was not made: {why}"
+                reported = f"the recording '{self.path}' was not made: {why}"
         except (OSError, ToftrackError) as error:
-            failed, told = True, str(error)
+            failed, reported = True, str(error)
         self.failed = failed
         if why or failed:
-            self.ended = told
-            self._tell(told)
+            self.ended = reported
+            self._tell(reported)
 
 
 def without_whereabouts(facts: dict[str, Any]) -> dict[str, Any]:

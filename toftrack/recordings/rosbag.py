@@ -176,7 +176,7 @@ class _Bag:
     def reader(self) -> Any:
         """The opened reader of rosbags."""
         if self._reader is None:
-            with self._told():
+            with self._reported():
                 make = self._one.Reader if self._is_one else self._two.Reader
                 reader = make(storage_of(self.path))
                 reader.open()
@@ -204,12 +204,12 @@ class _Bag:
         reader = self.reader()
         connections = [c for c in reader.connections if (c.topic, c.msgtype) == (name, kind)]
         parse = self._types.deserialize_ros1 if self._is_one else self._types.deserialize_cdr
-        with self._told():
+        with self._reported():
             for _, recorded_ns, data in reader.messages(connections, start=start_ns or None):
                 yield recorded_ns, parse(data, kind)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _reported(self) -> Iterator[None]:
         """What rosbags says of a damaged bag becomes one sentence; it raises errors of any kind."""
         try:
             yield

@@ -13,7 +13,7 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.recordings.bag_names import is_bag
-from toftrack.recordings.bare import NOTHING_TOLD, BareFacts
+from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.npy import read_npy
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import read_png_folder
@@ -82,7 +82,7 @@ def open_recording(
     camera_file: str | Path | None = None,
     modulation_mhz: int = DEFAULT_MODULATION_MHZ,
     topic: str | None = None,
-    bare: BareFacts = NOTHING_TOLD,
+    bare: BareFacts = NOTHING_GIVEN,
 ) -> FrameStore:
     """Open a recording, whose kind follows from its name.
 

@@ -129,7 +129,7 @@ class UnfinishedRecording:
         self._write((head, *pieces, _CHECK.pack(check)))
         self._sums, self.frames = sums, self.frames + 1
 
-    def has_room(self, spare_bytes: int) -> bool:
+    def has_space(self, spare_bytes: int) -> bool:
         """Whether the disk would take the `.npz`, too, and leave so much to others."""
         return shutil.disk_usage(self.path.parent).free > self.bytes + spare_bytes
 

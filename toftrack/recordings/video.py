@@ -188,12 +188,12 @@ def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
     grey = [index for index, _, pixels in kinds if pixels in _GREY]
     if len(grey) == 1:
         return grey[0]
-    told = ", ".join(f"{codec} {pixels}" for _, codec, pixels in kinds) or "no video at all"
+    codecs = ", ".join(f"{codec} {pixels}" for _, codec, pixels in kinds) or "no video at all"
     if grey:
         raise ToftrackError(f"'{path}' has {len(grey)} tracks of grey 16-bit images; keep one")
     raise ToftrackError(
-        f"'{path}' is a video of colour or 8-bit images ({told}), from which depth cannot be had; "
-        "give the depth images: lossless grey of 16 bits (ffmpeg -c:v ffv1 -pix_fmt gray16le), "
+        f"'{path}' is a video of colour or 8-bit images ({codecs}), from which depth cannot be had;"
+        " give the depth images: lossless grey of 16 bits (ffmpeg -c:v ffv1 -pix_fmt gray16le), "
         "16-bit PNG, or .npy"
     )
 

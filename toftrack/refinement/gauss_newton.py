@@ -118,7 +118,7 @@ class Refinement:
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
+class Keypoints:
     """Where the joints are, as somebody else found them.
 
     points_m: (21, 3) in the camera frame, the same for all hypotheses, or (N, 21, 3).
@@ -128,12 +128,12 @@ class Landmarks:
     points_m: Tensor
     sigma_m: Tensor
 
-    def of_each(self, n: int) -> Landmarks:
+    def of_each(self, n: int) -> Keypoints:
         """(n, 21, 3) and (n, 21); what is no number becomes a joint that was not found."""
         points = self.points_m.expand(n, 21, 3)
         known = points.isfinite().all(-1) & (self.sigma_m > 0)
         sigma = torch.where(known, self.sigma_m, torch.inf)
-        return Landmarks(torch.where(known[..., None], points, 0.0), sigma)
+        return Keypoints(torch.where(known[..., None], points, 0.0), sigma)
 
 
 class Refiner(Protocol):
@@ -145,7 +145,7 @@ class Refiner(Protocol):
         prior_angles: Tensor,
         seen: SeenPoints,
         settings: Refinement,
-        landmarks: Landmarks | None = None,
+        landmarks: Keypoints | None = None,
     ) -> Tensor:
         """See refine."""
 
@@ -167,7 +167,7 @@ class TorchRefiner:
         prior_angles: Tensor,
         seen: SeenPoints,
         settings: Refinement,
-        landmarks: Landmarks | None = None,
+        landmarks: Keypoints | None = None,
     ) -> Tensor:
         """See refine."""
         return refine(states, prior_angles, seen, self.shape, self.surface, settings, landmarks)
@@ -215,7 +215,7 @@ def refine(
     shape: HandShape,
     surface: HandSurface,
     settings: Refinement,
-    landmarks: Landmarks | None = None,
+    landmarks: Keypoints | None = None,
 ) -> Tensor:
     """Bring N hands onto the seen points, each by itself.
 
@@ -238,7 +238,7 @@ def refine(
             silhouette_residuals(pose, seen, shape, settings),
         ]
         if landmarks is not None:
-            parts.append(landmark_residuals(pose, landmarks, shape))
+            parts.append(keypoint_residuals(pose, landmarks, shape))
         rows, values = (torch.cat(part, 1) for part in zip(*parts, strict=True))
         step = _step(rows, values, refined[:, 6:] - prior_angles, settings)
         refined = _moved(refined, step)
@@ -341,7 +341,7 @@ def silhouette_residuals(
     return Residuals(rows * weight[..., None], gap.mT.flatten(1) * weight)
 
 
-def landmark_residuals(pose: HandPose, landmarks: Landmarks, shape: HandShape) -> Residuals:
+def keypoint_residuals(pose: HandPose, landmarks: Keypoints, shape: HandShape) -> Residuals:
     """Of the joints: how far they are from their landmarks, along each of the camera's axes.
 
     landmarks: of each of the N hands, see Landmarks.of_each.

@@ -20,7 +20,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement import gauss_newton, residuals_numba, seen_points
-from toftrack.refinement.gauss_newton import Landmarks, Refinement
+from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.residuals_numba import (
     add_landmarks,
     add_points,
@@ -197,7 +197,7 @@ class CompiledRefiner:
         prior_angles: Tensor,
         seen: SeenPoints,
         settings: Refinement,
-        landmarks: Landmarks | None = None,
+        landmarks: Keypoints | None = None,
     ) -> Tensor:
         """See gauss_newton.refine."""
         names = ("reach_m", "point_m", "silhouette_px", "angle_rad", "damping")
@@ -211,7 +211,7 @@ class CompiledRefiner:
         prior_angles: Tensor,
         seen: SeenPoints,
         numbers: tuple,
-        landmarks: Landmarks | None,
+        landmarks: Keypoints | None,
     ) -> Tensor:
         n = len(states)
         if landmarks is None:

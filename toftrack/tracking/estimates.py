@@ -19,16 +19,16 @@ from toftrack.render.segmentation import Observation
 from toftrack.tracking import particle_filter
 from toftrack.tracking.conventions import in_all_conventions
 from toftrack.tracking.following import Found
-from toftrack.tracking.joint_belief import propagated_sigma
-from toftrack.tracking.life_cycle import Belief
+from toftrack.tracking.handedness_estimate import probability
+from toftrack.tracking.joint_confidence import propagated_sigma
+from toftrack.tracking.life_cycle import Status
 from toftrack.tracking.model import FilterModel, ObservedFrame
-from toftrack.tracking.side_belief import probability
 from toftrack.tracking.spans import Spans
 from toftrack.tracking.state import StepInfo, TrackerState
 
 
 def estimate_of(
-    image: DepthImage, found: Found, score: float, belief: Belief, frame: ObservedFrame
+    image: DepthImage, found: Found, score: float, belief: Status, frame: ObservedFrame
 ) -> Estimate:
     """What is told of a frame, but for its joints' deviations and what `emitted` adds."""
     model, mean, particles = frame.model, found.mean, found.particles

@@ -12,7 +12,7 @@ from toftrack.compute.pace import FRAME_S
 from toftrack.compute.transfer import on_device
 from toftrack.render.segmentation import Expected
 from toftrack.tracking import particle_filter
-from toftrack.tracking.life_cycle import Belief, lasted, longer
+from toftrack.tracking.life_cycle import Status, extended, reached
 from toftrack.tracking.model import FilterModel, ObservedFrame, SizedHand
 from toftrack.tracking.particle_filter import FilterSettings
 from toftrack.tracking.prior import LastSeen
@@ -56,11 +56,11 @@ def filtered(
         with spans("filter: scoring"):
             return frame.log_scores(states)
 
-    ahead = displacement(track, dt_s, model.filter)
-    there = on_device(ahead[None], model.device)
+    predicted = displacement(track, dt_s, model.filter)
+    there = on_device(predicted[None], model.device)
     particles = model.backend.motions.compose(track.particles, there)
     sigmas = width * particle_filter.widened(
-        model.sigmas, dt_s / FRAME_S, ahead, model.filter.rest, model.filter.speed_gain
+        model.sigmas, dt_s / FRAME_S, predicted, model.filter.rest, model.filter.speed_gain
     )
     return particle_filter.annealed(
         particles,
@@ -117,7 +117,7 @@ def drawn_to(found: Found, carry: float, model: FilterModel) -> Found:
 def advanced(
     track: Track,
     found: Found,
-    belief: Belief,
+    belief: Status,
     expected: Expected | None,
     dt_s: float,
     model: FilterModel,
@@ -140,7 +140,7 @@ def advanced(
         offset=found.carried,
         pose=found.pose,
         trend=found.trend,
-        age_s=longer(track.age_s, dt_s),
+        age_s=extended(track.age_s, dt_s),
         bad_s=belief.bad_s,
         log_odds=belief.log_odds,
         doubted=belief.lost,
@@ -150,10 +150,10 @@ def advanced(
 
 
 def remembered(
-    seen: LastSeen | None, track: Track, belief: Belief, probation: int
+    seen: LastSeen | None, track: Track, belief: Status, probation: int
 ) -> LastSeen | None:
     """The last hand that was believed, as of this frame; a new track waits `probation` frames."""
-    if belief.lost or not lasted(track.age_s, probation + 1):
+    if belief.lost or not reached(track.age_s, probation + 1):
         return seen
     return LastSeen(track.mean, 0.0)
 
@@ -164,13 +164,13 @@ def expected_depths(
     """Where the hand is looked for, dt_s after the last frame; None where there is none."""
     if track is None:
         return None
-    ahead = displacement(track, dt_s, model.filter)
-    state = model.decode(model.backend.motions.compose(track.mean, ahead[None]))
+    predicted = displacement(track, dt_s, model.filter)
+    state = model.decode(model.backend.motions.compose(track.mean, predicted[None]))
     nearest, farthest = map(float, hand.refiner.joints(state)[0, :, 2].aminmax())
     if track.expected is not None:
         # A hidden finger is free to move in front of what hides it, which would then be taken for
         # the hand: while something hides the hand, it comes nearer only as its middle does.
-        approach = _APPROACH_M_S * dt_s + max(0.0, -float(ahead[2]))
+        approach = _APPROACH_M_S * dt_s + max(0.0, -float(predicted[2]))
         nearest = max(nearest, track.expected.nearest_m - approach)
     middle = hand.refiner.joints(state)[0].mean(0)
     return Expected(nearest, farthest, tuple(middle.tolist()))

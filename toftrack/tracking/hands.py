@@ -23,9 +23,9 @@ from toftrack.pose_space.base import PoseSpace
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Scorer
 from toftrack.render.segmentation import reduce_image
-from toftrack.tracking.effort import Pace, Timekeeper
+from toftrack.tracking.handedness_estimate import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
-from toftrack.tracking.side_belief import OTHER_SIDE
+from toftrack.tracking.quality import Pace, Timekeeper
 from toftrack.tracking.slots import (
     believed,
     exchanged,
@@ -60,7 +60,7 @@ class HandsState:
     """
 
     slots: tuple[TrackerState, ...]
-    unsought_s: float = math.inf
+    second_search_age_s: float = math.inf
     one_s: float = 0.0
 
 
@@ -84,10 +84,10 @@ def step_hands(
     size = (depth_m.shape[0], depth_m.shape[1])
     hands = [placed(slot, model, k, size, dt_s) for slot in slots]
     infos: list[StepInfo | None] = [None, None]
-    told: list[Estimate | None] = [None, None]
-    unsought_s = state.unsought_s + dt_s
+    reported: list[Estimate | None] = [None, None]
+    second_search_age_s = state.second_search_age_s + dt_s
     vacant = [slot.track is None for slot in slots]
-    sought = all(vacant) or unsought_s >= _SOUGHT_S
+    sought = all(vacant) or second_search_age_s >= _SOUGHT_S
     for mine in sorted((0, 1), key=lambda slot: -sureness(slots[slot])):
         theirs = 1 - mine
         if vacant[mine] and not sought:
@@ -95,28 +95,28 @@ def step_hands(
             continue
         other = seen_beside(slots[theirs], hands[theirs], hands[mine], depth_m)
         partner = partnered(slots[mine], slots[theirs], model)
-        slots[mine], infos[mine], told[mine] = step(partner, image, model, other)
+        slots[mine], infos[mine], reported[mine] = step(partner, image, model, other)
         hands[mine] = placed(slots[mine], model, k, size)
-    unsought_s = 0.0 if sought else unsought_s
+    second_search_age_s = 0.0 if sought else second_search_age_s
     one_s = state.one_s + dt_s if of_one_hand(hands) else 0.0
     if one_s and (one_s > _ONE_S or not all(believed(slot) for slot in slots)):
         worse = min((0, 1), key=lambda slot: sureness(slots[slot]))
         slots[worse], one_s = replace(slots[worse], track=None), 0.0
     for slot in (0, 1):
         if _in_vain(slots[slot], slots[1 - slot]):
-            unsought_s = 0.0 if known_side(slots[slot]) else -_AGAIN_S
+            second_search_age_s = 0.0 if known_side(slots[slot]) else -_AGAIN_S
             slots[slot] = replace(slots[slot], track=None)
     if in_wrong_slot(before, slots):
         slots = exchanged(before, slots)
         infos.reverse()
-        told.reverse()
+        reported.reverse()
     dims = model.space.dims
     nothing = no_estimate(image.index, image.timestamp_s, "lost", dims, math.nan)
     estimates = tuple(
         nothing if estimate is None or slot.track is None else estimate
-        for slot, estimate in zip(slots, told, strict=True)
+        for slot, estimate in zip(slots, reported, strict=True)
     )
-    return HandsState(tuple(slots), unsought_s, one_s), tuple(infos), estimates
+    return HandsState(tuple(slots), second_search_age_s, one_s), tuple(infos), estimates
 
 
 def _in_vain(slot: TrackerState, other: TrackerState) -> bool:
@@ -169,13 +169,13 @@ class HandsTracker:
         began_s: float | None = None,
     ) -> tuple[Estimate, ...]:
         """One frame, see Tracker.step; an estimate a slot. One without a hand is lost and NaN."""
-        effort = self.time.begin(began_s)
+        quality = self.time.begin(began_s)
         depth_m, k = checked_image(depth_m, k)
         index = self.states[0].next_index if index is None else index
         timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
         image = DepthImage(depth_m, k, index, timestamp_s)
-        model = self.model.spending(effort)
-        with at_most(effort.threads):
+        model = self.model.at_quality(quality)
+        with at_most(quality.threads):
             if len(self.states) == 2 and isinstance(model, TrackerModel):
                 self.state, self.infos, estimates = step_hands(self.state, image, model)
             else:

@@ -9,7 +9,7 @@ from toftrack.compute.pace import FRAME_S
 
 
 @dataclass(frozen=True)
-class Belief:
+class Status:
     """What is thought of a frame's estimate.
 
     kept: the track goes on.  state_name, lost: as Estimate has them.
@@ -31,12 +31,12 @@ def log_odds(probability: float) -> float:
     return math.log(probability / (1 - probability))
 
 
-def lasted(seconds: float, frames: float) -> bool:
+def reached(seconds: float, frames: float) -> bool:
     """Whether something has gone on for so many frames of FRAME_S; half a frame is forgiven."""
     return seconds > (frames - 0.5) * FRAME_S
 
 
-def longer(seconds: float, dt_s: float) -> float:
+def extended(seconds: float, dt_s: float) -> float:
     """What has gone on for so long, a frame later; where it begins, that frame is FRAME_S."""
     return seconds + dt_s if seconds else FRAME_S
 
@@ -45,4 +45,4 @@ def bad_for(seconds: float, dt_s: float) -> float:
     """As `longer`, of what is to end a track: what was dropped between two frames was not bad, so
     that a frame counts twice FRAME_S at most.
     """
-    return longer(seconds, min(dt_s, 2 * FRAME_S))
+    return extended(seconds, min(dt_s, 2 * FRAME_S))

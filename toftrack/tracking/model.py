@@ -12,6 +12,7 @@ from torch import Tensor
 
 from toftrack.compute.backend import Backend
 from toftrack.compute.transfer import on_device, on_host
+from toftrack.detector.hand_detector import Detection, HandDetector
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
@@ -20,17 +21,16 @@ from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.data.natural_poses import natural_poses
 from toftrack.pose_space.density import LatentDensity, latent_density
 from toftrack.refinement.gauss_newton import Refinement, Refiner
-from toftrack.relocation.relocaliser import Glance, Relocaliser
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
-from toftrack.tracking.belief import CalibratedBelief
-from toftrack.tracking.effort import Effort
+from toftrack.tracking.confidence import ConfidenceModel
+from toftrack.tracking.handedness_estimate import HandednessEstimate, HandednessSettings
 from toftrack.tracking.other_hand import OtherHand
 from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
 from toftrack.tracking.prior import LastSeen, Prior
-from toftrack.tracking.shape_fit import ShapeBelief, ShapeFit, first_belief
-from toftrack.tracking.side_belief import SideBelief, SideFit
+from toftrack.tracking.quality import Quality
+from toftrack.tracking.shape_fit import ShapeEstimate, ShapeFit, first_shape
 from toftrack.tracking.state import TrackerState
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
@@ -51,10 +51,12 @@ class Hand:
 
     shape: HandShape
     adapt: ShapeFit
-    sides: SideFit | None
+    sides: HandednessSettings | None
 
 
-def make_hand(shape: str, side: str, length_m: float, adapt: ShapeFit, sides: SideFit) -> Hand:
+def make_hand(
+    shape: str, side: str, length_m: float, adapt: ShapeFit, sides: HandednessSettings
+) -> Hand:
     """See toftrack.hand.make_hand_shape; only shape="auto" is fitted, and only side="auto" found
     out: it begins as a right hand.
     """
@@ -74,12 +76,12 @@ class SizedHand:
     scorer: Scorer
     refiner: Refiner
     first: HandShape
-    worn: tuple[float, ...]
+    applied: tuple[float, ...]
 
     @cached_property
     def derivatives(self) -> tuple[Tensor, Tensor]:
         """How roots and bones change with the components, on the CPU, see shape_derivatives."""
-        return shape_derivatives(self.first.to("cpu"), torch.tensor(self.worn))
+        return shape_derivatives(self.first.to("cpu"), torch.tensor(self.applied))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +105,9 @@ class FilterModel:
     def first_state(self, seed: int) -> TrackerState:
         """Before any frame."""
         generator = torch.Generator().manual_seed(seed)
-        return TrackerState(generator.get_state(), self.shape.side, first_belief())
+        return TrackerState(generator.get_state(), self.shape.side, first_shape())
 
-    def spending(self, effort: Effort) -> FilterModel:
+    def at_quality(self, quality: Quality) -> FilterModel:
         """The same tracker with less effort; itself where nothing is left out."""
         return self
 
@@ -114,7 +116,7 @@ class FilterModel:
         """Whether the hand's shape is fitted to the user."""
         return False
 
-    def fitted(self, side: str, belief: ShapeBelief) -> HandShape:
+    def fitted(self, side: str, belief: ShapeEstimate) -> HandShape:
         """The hand of a side, with how sure the fit is of it if there is one."""
         return self.hand(side, belief).shape
 
@@ -152,9 +154,9 @@ class FilterModel:
         space = self.space if self.device.type == "cpu" else self._space_there
         return latent_density(space) if self.filter.density else None
 
-    def hand(self, side: str, belief: ShapeBelief) -> SizedHand:
+    def hand(self, side: str, belief: ShapeEstimate) -> SizedHand:
         """The hand of a side in the shape that is believed in."""
-        return self._hands(side, belief.worn)
+        return self._hands(side, belief.applied)
 
     @cached_property
     def _hands(self) -> Callable[[str, tuple[float, ...]], SizedHand]:
@@ -187,32 +189,32 @@ class TrackerModel(FilterModel):
     sides: how the side is found out, by the networks; None where it was told.
     """
 
-    relocaliser: Relocaliser
+    detector: HandDetector
     refinement: Refinement
     prior: Prior
-    lost: CalibratedBelief
+    lost: ConfidenceModel
     adapt: ShapeFit
-    sides: SideFit | None = None
+    sides: HandednessSettings | None = None
 
     def first_state(self, seed: int) -> TrackerState:
         """See FilterModel."""
-        sides = None if self.sides is None else SideBelief()
+        sides = None if self.sides is None else HandednessEstimate()
         return replace(super().first_state(seed), sides=sides)
 
-    def spending(self, effort: Effort) -> TrackerModel:
+    def at_quality(self, quality: Quality) -> TrackerModel:
         """See FilterModel."""
-        return self._spending(effort)
+        return self._at_quality(quality)
 
     @cached_property
-    def _spending(self) -> Callable[[Effort], TrackerModel]:
-        return lru_cache(partial(_spending, self))
+    def _at_quality(self) -> Callable[[Quality], TrackerModel]:
+        return lru_cache(partial(_at_quality, self))
 
     @property
     def fits(self) -> bool:
         """See FilterModel."""
         return not self.adapt.fixed
 
-    def fitted(self, side: str, belief: ShapeBelief) -> HandShape:
+    def fitted(self, side: str, belief: ShapeEstimate) -> HandShape:
         """See FilterModel; None is said of the fit before anything was fitted."""
         shape = super().fitted(side, belief)
         if not (self.fits and belief.poses):
@@ -225,21 +227,21 @@ class TrackerModel(FilterModel):
         return natural_poses()
 
 
-def _spending(model: TrackerModel, effort: Effort) -> TrackerModel:
-    if effort == Effort(effort.threads):
+def _at_quality(model: TrackerModel, quality: Quality) -> TrackerModel:
+    if quality == Quality(quality.threads):
         return model
-    told, refinement = model.relocaliser.settings, model.refinement
-    told = replace(
-        told,
-        every=max(told.every, effort.every),
-        search=max(told.search, effort.search),
-        rivals=_least(told.rivals, effort.rivals),
-        places=_least(told.places, effort.places),
+    reported, refinement = model.detector.settings, model.refinement
+    reported = replace(
+        reported,
+        every=max(reported.every, quality.every),
+        search=max(reported.search, quality.search),
+        rivals=_least(reported.rivals, quality.rivals),
+        places=_least(reported.places, quality.places),
     )
     made = replace(
         model,
-        refinement=replace(refinement, swaps=math.ceil(effort.swaps * refinement.swaps)),
-        relocaliser=replace(model.relocaliser, settings=told),
+        refinement=replace(refinement, swaps=math.ceil(quality.swaps * refinement.swaps)),
+        detector=replace(model.detector, settings=reported),
     )
     vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the effort
     return made
@@ -250,11 +252,11 @@ def _least(count: int, most: int | None) -> int:
 
 
 def _sized_hand(
-    shape: HandShape, backend: Backend, side: str, worn: tuple[float, ...]
+    shape: HandShape, backend: Backend, side: str, applied: tuple[float, ...]
 ) -> SizedHand:
     first = shape.of_side(side)
-    sized = shaped(first, torch.tensor(worn))
-    return SizedHand(sized, backend.make_scorer(sized), backend.make_refiner(sized), first, worn)
+    sized = shaped(first, torch.tensor(applied))
+    return SizedHand(sized, backend.make_scorer(sized), backend.make_refiner(sized), first, applied)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +288,7 @@ class ObservedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class LookedFrame(ObservedFrame):
+class DetectedFrame(ObservedFrame):
     """The same, with what else is known of the hand.
 
     glance: what the networks say of it; None in a frame in which they do not look.
@@ -295,7 +297,7 @@ class LookedFrame(ObservedFrame):
     """
 
     model: TrackerModel
-    glance: Glance | None
+    detection: Detection | None
     seen: LastSeen | None
     other: OtherHand | None
 
@@ -315,10 +317,10 @@ def observed(
     observation: Observation,
     hand: SizedHand,
     model: TrackerModel,
-    glance: Glance | None = None,
+    detection: Detection | None = None,
     seen: LastSeen | None = None,
     other: OtherHand | None = None,
-) -> LookedFrame:
+) -> DetectedFrame:
     """A segmented frame, which is not empty."""
     evidence = evidence_of(observation, model)
-    return LookedFrame(observation, evidence, hand, model, glance, seen, other)
+    return DetectedFrame(observation, evidence, hand, model, detection, seen, other)

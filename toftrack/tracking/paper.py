@@ -25,7 +25,7 @@ from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.estimates import emitted, estimate_of, no_hand, particles_sigma
 from toftrack.tracking.following import Found, advanced, expected_depths, filtered
-from toftrack.tracking.life_cycle import Belief
+from toftrack.tracking.life_cycle import Status
 from toftrack.tracking.model import FilterModel, ObservedFrame, evidence_of
 from toftrack.tracking.particle_filter import Spread
 from toftrack.tracking.spans import Spans
@@ -134,11 +134,11 @@ class ScoreThreshold:
     def __post_init__(self) -> None:
         check_number("lost.score", self.score, 0, 1)
 
-    def judge(self, track: Track, score: float) -> Belief:
+    def judge(self, track: Track, score: float) -> Status:
         """What is thought of an estimate with a score."""
         if score < self.score:
-            return Belief(True, "recovering", True)
-        return Belief(True, "tracking" if track.age_s > 0 else "initialising", False)
+            return Status(True, "recovering", True)
+        return Status(True, "tracking" if track.age_s > 0 else "initialising", False)
 
 
 @dataclass(frozen=True, eq=False)

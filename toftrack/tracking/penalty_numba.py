@@ -9,7 +9,7 @@ from torch import Tensor
 from toftrack.compute.compiling import called, entry_point
 from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
-from toftrack.refinement.gauss_newton import Landmarks
+from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.tracking import penalty
 from toftrack.tracking.penalty import FAR_SIGMAS
 
@@ -20,8 +20,8 @@ def joints_penalty(
     joints_m: Tensor,
     hand_length_m: float,
     overlap_weight: float,
-    votes: Landmarks | None,
-    votes_weight: float,
+    keypoints: Keypoints | None,
+    keypoints_weight: float,
 ) -> Tensor:
     """See penalty.joints_penalty; on the CPU, in float32."""
     out = torch.empty(len(joints_m))
@@ -31,9 +31,9 @@ def joints_penalty(
         joints_m.to("cpu", torch.float32).contiguous().numpy(),
         hand_length_m,
         float(overlap_weight),
-        _NONE if votes is None else votes.points_m.float().contiguous().numpy(),
-        _NO_SIGMA if votes is None else votes.sigma_m.float().contiguous().numpy(),
-        float(votes_weight),
+        _NONE if keypoints is None else keypoints.points_m.float().contiguous().numpy(),
+        _NO_SIGMA if keypoints is None else keypoints.sigma_m.float().contiguous().numpy(),
+        float(keypoints_weight),
         out.numpy(),
     )
     return out
@@ -43,7 +43,7 @@ _NONE, _NO_SIGMA = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
 
 
 @_cached
-def penalise(joints, hand_length_m, overlap_weight, points, sigma, votes_weight, out):
+def penalise(joints, hand_length_m, overlap_weight, points, sigma, keypoints_weight, out):
     """joints: (N, 21, 3), points: (21, 3) and sigma: (21,), or both empty, out: (N,); float32."""
     hand = np.empty((21, 3))
     for n in range(len(joints)):
@@ -62,4 +62,4 @@ def penalise(joints, hand_length_m, overlap_weight, points, sigma, votes_weight,
             # Of a sigma that is infinite nothing is known.
             away += off / (1 + off / FAR_SIGMAS**2) / 21
         # Every finger's overlap with all others holds each pair twice.
-        out[n] = 0.5 * overlap_weight * of_finger.sum() + votes_weight * away
+        out[n] = 0.5 * overlap_weight * of_finger.sum() + keypoints_weight * away

@@ -10,11 +10,11 @@ from torch import Tensor
 from toftrack.compute.pace import FRAME_S
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.contest import rivals_of, scored, settled, with_other_fingers
-from toftrack.tracking.life_cycle import lasted, log_odds, longer
-from toftrack.tracking.model import LookedFrame
-from toftrack.tracking.relocating import candidates, landmarks_of, track_of
-from toftrack.tracking.signs import out_of_sight
+from toftrack.tracking.detect import candidates, keypoints_of, track_of
+from toftrack.tracking.features import out_of_sight
+from toftrack.tracking.life_cycle import extended, log_odds, reached
+from toftrack.tracking.model import DetectedFrame
+from toftrack.tracking.select import rivals_of, scored, select, with_other_fingers
 from toftrack.tracking.state import Contender, Track
 
 _EXCHANGED = 4
@@ -41,7 +41,7 @@ class Refined:
 
 
 def refined(
-    track: Track, mean: Tensor, dt_s: float, frame: LookedFrame, generator: torch.Generator
+    track: Track, mean: Tensor, dt_s: float, frame: DetectedFrame, generator: torch.Generator
 ) -> Refined:
     """The frame's estimate from the filter's mean (1, 6 + d)."""
     model = frame.model
@@ -57,33 +57,33 @@ def refined(
 
 
 def challenged(
-    track: Track, outcome: Refined, dt_s: float, frame: LookedFrame
+    track: Track, outcome: Refined, dt_s: float, frame: DetectedFrame
 ) -> tuple[Track, Tensor, Tensor | None]:
     """The track, the pose (1, 27) and the trend to go on with, after a rival was heard.
 
     A rival takes over when it was better for a while; never while something hides the hand.
     """
-    settings, rival = frame.model.relocaliser.settings, outcome.rival
+    settings, rival = frame.model.detector.settings, outcome.rival
     track = replace(track, contender=outcome.contender)
-    if frame.glance is None:
+    if frame.detection is None:
         return track, outcome.pose, outcome.trend
     if rival is None or frame.hidden:
         return replace(track, challenged_s=0.0), outcome.pose, outcome.trend
-    since = longer(track.challenged_s, dt_s)
-    if track.age_s > 0 and not lasted(since, settings.rival_frames):
+    since = extended(track.challenged_s, dt_s)
+    if track.age_s > 0 and not reached(since, settings.rival_frames):
         return replace(track, challenged_s=since), outcome.pose, outcome.trend
     return replace(track_of(rival, frame.model), believed=track.believed), rival, None
 
 
 def _onto_points(
-    state: Tensor, track: Track, dt_s: float, frame: LookedFrame, generator: torch.Generator
+    state: Tensor, track: Track, dt_s: float, frame: DetectedFrame, generator: torch.Generator
 ) -> Refined:
     """The filter's hand (1, 27) brought onto the seen points, and what speaks against it."""
     refiner, cfg = frame.hand.refiner, frame.model.refinement
     seen = seen_points(frame.observation)
-    glance = None if _mostly_unseen(state, frame) else frame.glance
-    frame = replace(frame, glance=glance)
-    landmarks = None if glance is None else landmarks_of(glance, frame.model)
+    detection = None if _mostly_unseen(state, frame) else frame.detection
+    frame = replace(frame, detection=detection)
+    landmarks = None if detection is None else keypoints_of(detection, frame.model)
 
     def onto_points(starts: Tensor) -> Tensor:
         return refiner(starts, starts[:, 6:], seen, cfg, landmarks)
@@ -94,15 +94,15 @@ def _onto_points(
     if track.contender is not None:
         starts.append(torch.cat((state[:, :6], track.contender.pose[:, 6:]), 1))
     mine = len(starts)
-    rivals = frame.model.relocaliser.settings.rivals
-    likely = state[:0] if glance is None else candidates(glance, frame, rivals)
-    hears, swaps = (True, True) if frame.hidden else turns(track, cfg.sure)
-    heard = likely if hears else likely[:0]
-    tried = scored(onto_points(torch.cat((*starts, heard))), frame)
+    rivals = frame.model.detector.settings.rivals
+    likely = state[:0] if detection is None else candidates(detection, frame, rivals)
+    considers, swaps = (True, True) if frame.hidden else rotations(track, cfg.sure)
+    considered = likely if considers else likely[:0]
+    tried = scored(onto_points(torch.cat((*starts, considered))), frame)
     first = 0 if tried.scores[0] + cfg.keep_gain >= tried.scores[1] else 1
     rows = torch.arange(len(tried.scores), device=state.device)
     found, others, rival = tried.rows(rows[first : first + 1]), tried.rows(rows[2:mine]), None
-    if len(heard):
+    if len(considered):
         near, rival = rivals_of(found, tried.rows(rows[mine:]), frame)
         others = others.and_(near)
     swapped = state[:0]
@@ -110,11 +110,11 @@ def _onto_points(
         swapped = with_other_fingers(found, likely[:_EXCHANGED, 6:], frame, cfg, generator)
     if len(swapped):
         others = others.and_(scored(torch.cat((swapped, onto_points(swapped))), frame))
-    pose, contender = settled(found, others, track, dt_s, frame)
+    pose, contender = select(found, others, track, dt_s, frame)
     return Refined(pose, None, rival, contender)
 
 
-def turns(track: Track, sure: float) -> tuple[bool, bool]:
+def rotations(track: Track, sure: float) -> tuple[bool, bool]:
     """Whether the networks' poses are heard in a frame, and whether other fingers are tried.
 
     Both, but in turn where a track is believed and nothing challenges it.
@@ -126,7 +126,7 @@ def turns(track: Track, sure: float) -> tuple[bool, bool]:
     return first, not first
 
 
-def _covered(state: Tensor, frame: LookedFrame) -> bool:
+def _covered(state: Tensor, frame: DetectedFrame) -> bool:
     """Whether something hides so much of a hand (1, 27) that it is best left where it was.
 
     What is still seen about it belongs to the thing that hides it, as often as not.
@@ -135,7 +135,7 @@ def _covered(state: Tensor, frame: LookedFrame) -> bool:
     return out_of_sight(joints, image.depth_m, image.k)[1] > _COVERED
 
 
-def _mostly_unseen(state: Tensor, frame: LookedFrame) -> bool:
+def _mostly_unseen(state: Tensor, frame: DetectedFrame) -> bool:
     """Whether so much of a hand (1, 27) is out of sight that the networks know less than a track.
 
     What is hidden or cut off moves on as it did; the networks see another hand in the rest of it.

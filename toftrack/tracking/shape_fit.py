@@ -28,11 +28,11 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.rotations import rotvec_to_rotmat
+from toftrack.detector.hand_detector import Detection
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.refinement.gauss_newton import Landmarks, landmark_residuals
-from toftrack.relocation.relocaliser import Glance
+from toftrack.refinement.gauss_newton import Keypoints, keypoint_residuals
 
 _COUNT = len(COMPONENTS)
 _ANGLE_RAD = 0.25
@@ -46,7 +46,7 @@ _EVERY = 3
 _ENOUGH, _ENOUGH_FRAMES, _SURER = 1.5, 3, 1.2
 """Weight of the frames of a key pose from which on no more are looked at; or their number, from
 which on only frames that count so many times as much are: a look costs a millisecond."""
-_VOTES_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
+_KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
 """By how much the votes put the components wrong: means of uncertain places shorten the fingers. Of
 rendered sequences of other hands, like what is said above."""
 _LEAST = 0.02
@@ -65,7 +65,7 @@ class ShapeFit:
 
     sure_m: float
     length_sigma: float
-    votes: float
+    keypoints: float
     alike: float
     certain_poses: float
     contradiction: float
@@ -73,7 +73,7 @@ class ShapeFit:
     fixed: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("sure_m", "length_sigma", "votes", "certain_poses", "contradiction"):
+        for name in ("sure_m", "length_sigma", "keypoints", "certain_poses", "contradiction"):
             check_number(f"hand.adapt.{name}", getattr(self, name), 0, above=True)
         check_number("hand.adapt.alike", self.alike, 0, 1)
         check_number("hand.adapt.memory", self.memory, 1)
@@ -108,7 +108,7 @@ class KeyPoses:
         row = int(far.argmin())
         return row, float(far[row])
 
-    def heard(self, row: int, weight: float) -> bool:
+    def considered(self, row: int, weight: float) -> bool:
         """Whether a key pose has said enough for a frame of this weight to add little."""
         total, frames = float(self.weight[row]), float(self.frames[row])
         often = frames >= _ENOUGH_FRAMES and weight < _SURER * total / frames
@@ -136,7 +136,7 @@ def _no_poses() -> KeyPoses:
 
 
 @dataclass(frozen=True, eq=False)
-class ShapeBelief:
+class ShapeEstimate:
     """What is believed of the user's hand.
 
     mean, covariance: (6,) and (6, 6) of the components.  poses: how many sure, different poses it
@@ -150,10 +150,10 @@ class ShapeBelief:
     mean: Tensor
     covariance: Tensor
     keys: KeyPoses
-    worn: tuple[float, ...]
+    applied: tuple[float, ...]
     poses: float = 0.0
     off: float = 0.0
-    heard: float = 0.0
+    considered: float = 0.0
     frames: int = 0
 
     def frozen(self, fit: ShapeFit) -> bool:
@@ -167,13 +167,15 @@ class ShapeBelief:
         return Fitted(COMPONENTS, mean, covariance, self.poses, self.frozen(fit))
 
 
-def first_belief() -> ShapeBelief:
+def first_shape() -> ShapeEstimate:
     """Before any frame was seen: the population."""
     population = torch.tensor(POPULATION_SIGMA).square().diag()
-    return ShapeBelief(torch.zeros(_COUNT), population, _no_poses(), (0.0,) * _COUNT)
+    return ShapeEstimate(torch.zeros(_COUNT), population, _no_poses(), (0.0,) * _COUNT)
 
 
-def told(belief: ShapeBelief, length_m: float, fit: ShapeFit, first: HandShape) -> ShapeBelief:
+def with_network_length(
+    belief: ShapeEstimate, length_m: float, fit: ShapeFit, first: HandShape
+) -> ShapeEstimate:
     """Before any estimate, when somebody else says how long the hand is: it is worn so long.
 
     first: the hand whose components are 0.
@@ -182,89 +184,89 @@ def told(belief: ShapeBelief, length_m: float, fit: ShapeFit, first: HandShape) 
         return belief
     sigma = POPULATION_SIGMA[0]
     log_length = math.log(length_m / first.hand_length_m)
-    worn = min(max(log_length, -3 * sigma), 3 * sigma)
+    applied = min(max(log_length, -3 * sigma), 3 * sigma)
     mean = belief.mean.clone()
-    mean[0] = worn
-    return replace(belief, mean=mean, worn=(worn, *belief.worn[1:]))
+    mean[0] = applied
+    return replace(belief, mean=mean, applied=(applied, *belief.applied[1:]))
 
 
-def weight_of(glance: Glance, fit: ShapeFit) -> float:
+def weight_of(detection: Detection, fit: ShapeFit) -> float:
     """How much a look at the hand counts, at most 1."""
-    sigma = float(glance.landmarks.sigma_m.square().mean().sqrt())
+    sigma = float(detection.landmarks.sigma_m.square().mean().sqrt())
     weight = min(1.0, (fit.sure_m / max(sigma, 1e-6)) ** 4)
     return weight if math.isfinite(weight) else 0.0
 
 
 def contradicted(
-    belief: ShapeBelief, glance: Glance, fit: ShapeFit, first: HandShape
-) -> ShapeBelief:
+    belief: ShapeEstimate, detection: Detection, fit: ShapeFit, first: HandShape
+) -> ShapeEstimate:
     """The belief after one more frame, believed or not; begun anew where looks contradict it."""
     belief = replace(belief, frames=belief.frames + 1)
     if not belief.poses or belief.frames % _EVERY:
         return belief
-    weight = weight_of(glance, fit) * glance.present
+    weight = weight_of(detection, fit) * detection.present
     keep = 1 - 1 / fit.memory
-    log_length = math.log(glance.length_m / first.hand_length_m)
+    log_length = math.log(detection.length_m / first.hand_length_m)
     off = keep * belief.off + weight * (log_length - float(belief.mean[0]))
-    heard = keep * belief.heard + weight
+    considered = keep * belief.considered + weight
     # What a frame of weight 1 errs, of which `alike` stays however many are heard.
-    error = fit.length_sigma**2 * (fit.alike + (1 - fit.alike) / max(heard, 1e-9))
+    error = fit.length_sigma**2 * (fit.alike + (1 - fit.alike) / max(considered, 1e-9))
     expected = math.sqrt(error + float(belief.covariance[0, 0]))
-    if heard > 1 and abs(off / heard) > fit.contradiction * expected:
-        return told(first_belief(), glance.length_m, fit, first)
-    return replace(belief, off=off, heard=heard)
+    if considered > 1 and abs(off / considered) > fit.contradiction * expected:
+        return with_network_length(first_shape(), detection.length_m, fit, first)
+    return replace(belief, off=off, considered=considered)
 
 
 def learned(
-    belief: ShapeBelief,
+    belief: ShapeEstimate,
     state: Tensor,
     shape: HandShape,
     derivatives: tuple[Tensor, Tensor],
-    glance: Glance,
-    votes: Landmarks,
+    detection: Detection,
+    keypoints: Keypoints,
     fit: ShapeFit,
     first: HandShape,
-) -> ShapeBelief:
+) -> ShapeEstimate:
     """The belief after a believed estimate; everything on the CPU.
 
     state: (1, 27).  shape: the hand worn.  derivatives: see shape_derivatives.
-    votes: the glance's, as the refinement takes them.  first: the hand whose components are 0.
+    keypoints: the glance's, as the refinement takes them.  first: the hand whose components are 0.
     """
     if belief.frozen(fit) or (belief.poses and belief.frames % _EVERY):
         return belief
-    weight = weight_of(glance, fit)
+    weight = weight_of(detection, fit)
     if weight < _LEAST:
         return belief
     row, far = belief.keys.nearest(state)
     known = far <= 1
-    if known and belief.keys.heard(row, weight):
+    if known and belief.keys.considered(row, weight):
         return belief
     if not known and len(belief.keys.weight) == _KEYS:
         row = int((belief.keys.square / belief.keys.weight).argmin())
         if float(belief.keys.square[row] / belief.keys.weight[row]) >= weight:
             return belief
-    information, vector = votes_system(state, shape, derivatives, votes)
-    told_here = torch.tensor(belief.worn) - torch.tensor(_VOTES_OFF)
+    information, vector = keypoints_system(state, shape, derivatives, keypoints)
+    reported_here = torch.tensor(belief.applied) - torch.tensor(_KEYPOINTS_OFF)
     # The network's length and its votes rest on the same image: each counts half.
-    vector = 0.5 * fit.votes * (information @ told_here + vector)
-    information = 0.5 * fit.votes * information
+    vector = 0.5 * fit.keypoints * (information @ reported_here + vector)
+    information = 0.5 * fit.keypoints * information
     precision = 0.5 / fit.length_sigma**2
     information[0, 0] += precision
-    vector[0] += precision * math.log(glance.length_m / first.hand_length_m)
+    vector[0] += precision * math.log(detection.length_m / first.hand_length_m)
     keys = _kept(belief.keys, row, known, state, weight, information, vector)
     return _posterior(replace(belief, keys=keys), fit)
 
 
-def votes_system(
-    state: Tensor, shape: HandShape, derivatives: tuple[Tensor, Tensor], votes: Landmarks
+def keypoints_system(
+    state: Tensor, shape: HandShape, derivatives: tuple[Tensor, Tensor], keypoints: Keypoints
 ) -> tuple[Tensor, Tensor]:
     """What votes for the joints say of the components, the pose (1, 27) marginalised.
 
     Returns the precision (6, 6) and the precision times the change of the components (6,).
     """
     pose = forward_kinematics(state, shape)
-    votes = votes.of_each(1)
-    found = landmark_residuals(pose, votes, shape)
+    keypoints = keypoints.of_each(1)
+    found = keypoint_residuals(pose, keypoints, shape)
     by_shape = _joint_derivatives(pose.frames[0], derivatives)  # (63, 6)
     # The same robust weights as the pose's rows have: a translation's derivative is the weight.
     weight = found.rows[0, :, :3].abs().sum(1)
@@ -327,14 +329,14 @@ def _kept(
     return KeyPoses(*fields)
 
 
-def _posterior(belief: ShapeBelief, fit: ShapeFit) -> ShapeBelief:
+def _posterior(belief: ShapeEstimate, fit: ShapeFit) -> ShapeEstimate:
     """Mean, covariance and the hand in use by the key poses that there are."""
     poses, information, vector = belief.keys.summed()
     shared = 1 / (1 + fit.alike * max(poses - 1, 0.0))
     precision = torch.tensor(POPULATION_SIGMA).square().reciprocal().diag() + shared * information
     covariance = torch.linalg.inv(precision)
     mean = covariance @ (shared * vector)
-    off = (mean - torch.tensor(belief.worn)).abs()
+    off = (mean - torch.tensor(belief.applied)).abs()
     least = (_STEP_SIGMAS * covariance.diagonal().sqrt()).clamp(min=_STEP)
-    worn = tuple(mean.tolist()) if bool((off > least).any()) else belief.worn
-    return replace(belief, mean=mean, covariance=covariance, poses=poses, worn=worn)
+    applied = tuple(mean.tolist()) if bool((off > least).any()) else belief.applied
+    return replace(belief, mean=mean, covariance=covariance, poses=poses, applied=applied)

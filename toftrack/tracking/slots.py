@@ -13,9 +13,9 @@ from torch import Tensor
 
 from toftrack.render.model_image import model_range_image
 from toftrack.tracking.following import displacement
+from toftrack.tracking.handedness_estimate import HandednessEstimate
 from toftrack.tracking.model import SizedHand, TrackerModel
 from toftrack.tracking.other_hand import OtherHand, explained, palm_centre_m, touching
-from toftrack.tracking.side_belief import SideBelief
 from toftrack.tracking.state import TrackerState
 
 _BELIEVED = 20.0
@@ -60,8 +60,8 @@ def placed(
         return None
     pose = track.pose
     if dt_s > 0:
-        ahead = displacement(track, dt_s, model.filter)[None]
-        moved = model.backend.motions.compose(track.mean, ahead) - track.mean
+        predicted = displacement(track, dt_s, model.filter)[None]
+        moved = model.backend.motions.compose(track.mean, predicted) - track.mean
         pose = torch.cat((pose[:, :3] + moved[:, :3], pose[:, 3:]), 1)
     return Placed(pose, model.hand(slot.side, slot.size), k, size)
 
@@ -98,7 +98,7 @@ def partnered(slot: TrackerState, other: TrackerState, model: TrackerModel) -> T
     """A slot's state, with what the other hand's side says of its own."""
     if model.sides is None or slot.sides is None or other.sides is None:
         return slot
-    known = other.sides if believed(other) else SideBelief()
+    known = other.sides if believed(other) else HandednessEstimate()
     return replace(slot, sides=slot.sides.beside(known, model.sides))
 
 

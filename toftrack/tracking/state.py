@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.detector.hand_detector import Detection
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import GestureState
-from toftrack.relocation.relocaliser import Glance
 from toftrack.render.segmentation import Expected, Observation
+from toftrack.tracking.features import ConfidenceFeatures
+from toftrack.tracking.handedness_estimate import HandednessEstimate
 from toftrack.tracking.prior import LastSeen
-from toftrack.tracking.shape_fit import ShapeBelief
-from toftrack.tracking.side_belief import SideBelief
-from toftrack.tracking.signs import Signs
+from toftrack.tracking.shape_fit import ShapeEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Track:
     log_odds: that the estimate is right, smoothed over time; None where nobody says.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
     unlooked_s: how long ago the networks looked at it.  signs: of the last estimate.
-    joint_signs: (21, S) likewise, see JOINT_SIGNS; None where there are none.
+    joint_signs: (21, S) likewise, see JOINT_FEATURES; None where there are none.
     expected: depths where the hand was looked for in the last frame, if something hid part of it.
     """
 
@@ -69,9 +69,9 @@ class Track:
     log_odds: float | None = None
     doubted: bool = False
     believed: bool = False
-    unlooked_s: float = 0.0
-    signs: Signs | None = None
-    joint_signs: np.ndarray | None = None
+    undetected_time_s: float = 0.0
+    features: ConfidenceFeatures | None = None
+    joint_features: np.ndarray | None = None
     expected: Expected | None = None
 
 
@@ -94,13 +94,13 @@ class TrackerState:
 
     generator: Tensor
     side: str
-    size: ShapeBelief
-    sides: SideBelief | None = None
+    size: ShapeEstimate
+    sides: HandednessEstimate | None = None
     track: Track | None = None
     seen: LastSeen | None = None
     gesture: GestureState | None = None
     last: Estimate | None = None
-    unsearched_s: float = math.inf
+    search_age_s: float = math.inf
     next_index: int = 0
     timestamp_s: float | None = None
 
@@ -111,7 +111,7 @@ class TrackerState:
         return replace(
             self,
             seen=None if seen is None else replace(seen, age_s=seen.age_s + passed),
-            unsearched_s=self.unsearched_s + passed,
+            search_age_s=self.search_age_s + passed,
             next_index=image.index + 1,
             timestamp_s=image.timestamp_s,
         )
@@ -132,9 +132,9 @@ class StepInfo:
     particles: Tensor
     weights: Tensor
     seconds: Mapping[str, float]
-    signs: Signs | None = None
-    joint_signs: np.ndarray | None = None
-    glance: Glance | None = None
+    features: ConfidenceFeatures | None = None
+    joint_features: np.ndarray | None = None
+    detection: Detection | None = None
 
 
 def resumed(generator: Tensor) -> torch.Generator:

@@ -15,9 +15,9 @@ from toftrack.frames import DepthImage, checked_image
 from toftrack.hand.shape import HandShape
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.scoring import Scorer
-from toftrack.tracking.effort import Pace, Timekeeper
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
+from toftrack.tracking.quality import Pace, Timekeeper
 from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.step import step
 
@@ -71,13 +71,13 @@ class Tracker:
 
         Raises ToftrackError when the image or k has the wrong shape, type or unit.
         """
-        effort = self.time.begin(began_s)
+        quality = self.time.begin(began_s)
         depth_m, k = checked_image(depth_m, k)
         index = self.state.next_index if index is None else index
         timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
         image = DepthImage(depth_m, k, index, timestamp_s)
-        with at_most(effort.threads):
-            model = self.model.spending(effort)
+        with at_most(quality.threads):
+            model = self.model.at_quality(quality)
             self.state, self.info, estimate = stepped(self.state, image, model)
         return replace(estimate, compute_s=self.time.took_s())
 

@@ -244,8 +244,8 @@ def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
     for slot, (one, half) in enumerate(zip(estimates, halves, strict=True)):
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), SLOT_RGB[slot][::-1], -1)
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), _WHITE, 1)
-        told = _state(one) if one.lost else gesture_words(one) or _state(one)
-        facts = [told, side_words(one), confidence_words(one.confidence)]
+        reported = _state(one) if one.lost else gesture_words(one) or _state(one)
+        facts = [reported, side_words(one), confidence_words(one.confidence)]
         facts = ["no hand"] if is_vacant(one) else facts
         _write_line(half, facts if slot else [number, *facts], 38)
     return np.hstack(halves)
@@ -263,13 +263,13 @@ def _write_line(half: np.ndarray, facts: Sequence[str], x: int) -> None:
     """White text, in place, from x on. Where it does not fit it is smaller, but first the last
     facts are left out.
     """
-    room = half.shape[1] - x - 8
+    width_px = half.shape[1] - x - 8
     facts = [fact for fact in facts if fact]
-    while len(facts) > 1 and _text_size(facts, _LEAST)[0] > room:
+    while len(facts) > 1 and _text_size(facts, _LEAST)[0] > width_px:
         facts.pop()
     size = _LARGEST
     # Step by step, because not every OpenCV's text grows in proportion.
-    while size > 0.2 and _text_size(facts, size)[0] > room:
+    while size > 0.2 and _text_size(facts, size)[0] > width_px:
         size -= 0.02
     place = (x, (CAPTION_PX + _text_size(facts, size)[1]) // 2)
     text, thick = _GAP.join(facts), _thickness(size)

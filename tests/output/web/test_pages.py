@@ -42,14 +42,14 @@ def page(browser: Any) -> Iterator[Any]:
     assert browser.get_log("browser") == []
 
 
-def shown(browser: Any, told: str, send: Callable[[], None]) -> Any:
+def shown(browser: Any, reported: str, send: Callable[[], None]) -> Any:
     """Send until the page says something true in JavaScript, which is returned."""
     deadline = time.monotonic() + PATIENCE_S
     while True:
         send()
-        if value := browser.execute_script(f"return {told}"):
+        if value := browser.execute_script(f"return {reported}"):
             return value
-        assert time.monotonic() < deadline, told
+        assert time.monotonic() < deadline, reported
         time.sleep(0.02)
 
 
@@ -60,13 +60,13 @@ def picture(browser: Any) -> np.ndarray:
     return np.ptp(image, axis=2) > 25  # skin is coloured, the ground is not
 
 
-def settled(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
+def select(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
     def send() -> None:
         stream.send((estimate,))
 
-    told = f"window.drawn?.index === {estimate.index}"
+    reported = f"window.drawn?.index === {estimate.index}"
     for _ in range(40):  # the view follows the hand smoothly
-        shown(browser, told, send)
+        shown(browser, reported, send)
     # A frame that is asked for is drawn before this is answered.
     browser.execute_async_script("requestAnimationFrame(() => setTimeout(arguments[0], 50))")
     return picture(browser)
@@ -74,17 +74,17 @@ def settled(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
 
 def test_the_hand_is_drawn_bends_and_turns_grey_when_it_is_lost(stream: Any, page: Any) -> None:
     page.get(stream.url)
-    open_hand = settled(page, stream, hand_estimate(1))
+    open_hand = select(page, stream, hand_estimate(1))
     rows, columns = np.nonzero(open_hand)
     assert open_hand.mean() > 0.03 and np.ptp(rows) > 250 and np.ptp(columns) > 150
     assert "frame 1" in page.find_element("tag name", "header").text
     assert page.execute_script("return document.body.dataset.phase") == "live"
-    fist = settled(page, stream, hand_estimate(2, bent=1.2))
+    fist = select(page, stream, hand_estimate(2, bent=1.2))
     assert np.ptp(np.nonzero(fist)[0]) < 0.8 * np.ptp(rows)
-    lost = settled(page, stream, replace(hand_estimate(3), lost=True))
+    lost = select(page, stream, replace(hand_estimate(3), lost=True))
     assert lost.mean() < 0.01  # grey has no colour
     assert "lost" in page.find_element("tag name", "header").text
-    left = settled(page, stream, hand_estimate(4, "left"))
+    left = select(page, stream, hand_estimate(4, "left"))
     assert left.mean() > 0.03
 
 
@@ -158,5 +158,5 @@ def test_the_pages_say_when_the_tracker_has_gone(browser: Any, tmp_path: Path) -
     gone = "document.body.dataset.phase === 'broken'"
     shown(browser, gone, lambda: None)
     browser.get("data:,")
-    told = browser.get_log("browser")  # by the browser itself, which the page cannot help
-    assert all("ERR_CONNECTION_REFUSED" in entry["message"] for entry in told)
+    reported = browser.get_log("browser")  # by the browser itself, which the page cannot help
+    assert all("ERR_CONNECTION_REFUSED" in entry["message"] for entry in reported)

@@ -47,9 +47,9 @@ def listening(stream: WebSocketStream, **headers: str) -> Any:
     return opened
 
 
-def eventually(told: Callable[[], object]) -> None:
+def eventually(reported: Callable[[], object]) -> None:
     deadline = time.monotonic() + PATIENCE_S
-    while not told():
+    while not reported():
         assert time.monotonic() < deadline
         time.sleep(0.005)
 
@@ -166,9 +166,9 @@ def test_trouble_of_the_server_is_told_once_in_a_while(
             {"message": "no more descriptors", "exception": OSError(24, "Too many open files")},
         )
     eventually(lambda: stream._run(_nothing()) is None)
-    told = [record for record in caplog.records if "no more descriptors" in record.getMessage()]
-    assert len(told) == 1 and told[0].exc_info is None
-    assert "Too many open files" in told[0].getMessage()
+    reported = [record for record in caplog.records if "no more descriptors" in record.getMessage()]
+    assert len(reported) == 1 and reported[0].exc_info is None
+    assert "Too many open files" in reported[0].getMessage()
 
 
 async def _nothing() -> None: ...
@@ -215,9 +215,9 @@ def test_nothing_is_made_while_nobody_listens(
 )
 def test_pages_of_other_sites_may_not_listen(stream: WebSocketStream, headers: dict) -> None:
     upgrade = {"Upgrade": "websocket", "Connection": "Upgrade"}
-    status, _, told = answer(stream, "/stream", **headers, **upgrade)
+    status, _, reported = answer(stream, "/stream", **headers, **upgrade)
     assert status == 403 and not stream._clients
-    assert "stream.origins" in told or "localhost only" in told
+    assert "stream.origins" in reported or "localhost only" in reported
 
 
 def test_its_own_pages_and_those_that_are_named_may_listen() -> None:

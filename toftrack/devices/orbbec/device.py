@@ -14,7 +14,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
-from toftrack.devices.live import FrameNumbers, check_live, recording_index_error, told
+from toftrack.devices.live import FrameNumbers, check_live, recording_index_error, reported_errors
 from toftrack.devices.orbbec import sdk
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
@@ -75,13 +75,15 @@ class Orbbec(BaseDevice):
         self._errors = sdk.errors(ob)
         if path is not None:
             owner = f"'{bag}'"
-            with told(f"{owner} is not a recording of an Orbbec camera", _OTHER, self._errors):
+            with reported_errors(
+                f"{owner} is not a recording of an Orbbec camera", _OTHER, self._errors
+            ):
                 device, number = ob.PlaybackDevice(str(path)), ""
         else:
             device, number = sdk.find_camera(ob, None if serial is None else str(serial))
             owner = "the camera"
         remedy = _BUSY if path is None else _OTHER
-        with told(f"{owner} cannot be used", remedy, self._errors):
+        with reported_errors(f"{owner} cannot be used", remedy, self._errors):
             pipeline = ob.Pipeline(device)
             self._streams = sdk.choose_streams(ob, pipeline, (width, height, fps), infrared, owner)
             depth = self._streams.depth
@@ -126,7 +128,7 @@ class Orbbec(BaseDevice):
         what = "the Orbbec camera was found, but cannot be started"
         if self._path is not None:
             what = f"'{self._path}' cannot be replayed"
-        with told(what, _BUSY if self._path is None else _OTHER, self._errors):
+        with reported_errors(what, _BUSY if self._path is None else _OTHER, self._errors):
             self._pipeline.start(config, self._put)
         self._running = True
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import told
+from toftrack.devices.live import reported_errors
 from toftrack.errors import ToftrackError
 
 _PIXELS = ("Y16", "Z16")
@@ -68,7 +68,7 @@ def find_camera(ob: ModuleType, serial: str | None) -> tuple[Any, str]:
 
     Raises ToftrackError when there is none, or several and none is chosen.
     """
-    with told("the Orbbec cameras cannot be listed", "plug them in again", errors(ob)):
+    with reported_errors("the Orbbec cameras cannot be listed", "plug them in again", errors(ob)):
         devices = ob.Context().query_devices()
         numbers = serials(devices)
     listed = ", ".join(sorted(numbers))
@@ -84,7 +84,7 @@ def find_camera(ob: ModuleType, serial: str | None) -> tuple[Any, str]:
     for index, number in enumerate(numbers):
         # A number on the command line loses its zeros.
         if serial is None or number.lstrip("0") == serial.lstrip("0"):
-            with told(
+            with reported_errors(
                 "the Orbbec camera was found, but cannot be opened",
                 "close other programs that use it, and on Linux install its udev rules",
                 errors(ob),

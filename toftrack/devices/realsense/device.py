@@ -13,7 +13,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
-from toftrack.devices.live import FrameNumbers, check_live, recording_index_error, told
+from toftrack.devices.live import FrameNumbers, check_live, recording_index_error, reported_errors
 from toftrack.devices.realsense import sdk
 from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
 from toftrack.errors import ToftrackError
@@ -81,7 +81,9 @@ class RealSense(BaseDevice):
         self._emulator: EmulatedCamera | None = None
         size = None
         if path is not None:
-            with told(f"'{bag}' is not a recording of a RealSense", "choose another file"):
+            with reported_errors(
+                f"'{bag}' is not a recording of a RealSense", "choose another file"
+            ):
                 device, owner = rs.context().load_device(str(path)), f"'{bag}'"
         elif transport == "emulated":
             self._emulator = EmulatedCamera(rs, emulated)
@@ -89,7 +91,9 @@ class RealSense(BaseDevice):
         else:
             device = sdk.find_camera(rs, None if serial is None else str(serial))
             size, owner = (width, height, fps), "the camera"
-        with told(f"{owner} cannot be used", _BUSY if path is None else "choose another file"):
+        with reported_errors(
+            f"{owner} cannot be used", _BUSY if path is None else "choose another file"
+        ):
             self._streams = sdk.choose_streams(rs, device, size, infrared, owner)
             if preset is not None:
                 sdk.set_preset(rs, self._streams.sensor, preset)
@@ -166,7 +170,7 @@ class RealSense(BaseDevice):
     def _open_camera(self, pipeline: Any, config: Any) -> None:
         # The frames are kept, so that waiting ones do not use up the few that the SDK has.
         queue = self._rs.frame_queue(self._capacity, True)
-        with told("the RealSense camera was found, but cannot be started", _BUSY):
+        with reported_errors("the RealSense camera was found, but cannot be started", _BUSY):
             pipeline.start(config, queue)
         emulator = self._emulator
         if emulator is not None:
@@ -177,7 +181,7 @@ class RealSense(BaseDevice):
 
     def _open_recording(self, pipeline: Any, config: Any) -> None:
         rs = self._rs
-        with told(f"'{self._path}' cannot be replayed", "choose another file"):
+        with reported_errors(f"'{self._path}' cannot be replayed", "choose another file"):
             playback = config.resolve(rs.pipeline_wrapper(pipeline)).get_device().as_playback()
             # Not at its own pace, the SDK waits for each frame to be taken.
             playback.set_real_time(self._realtime)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import told
+from toftrack.devices.live import reported_errors
 from toftrack.errors import ToftrackError
 
 _WORST_FIT_PX = 0.5
@@ -54,7 +54,9 @@ def _preload_libusb() -> None:
 
 def find_camera(rs: ModuleType, serial: str | None) -> Any:
     """The plugged-in camera of that serial number, the only one for None; else ToftrackError."""
-    with told("the RealSense cameras cannot be listed", "unplug them and plug them in again"):
+    with reported_errors(
+        "the RealSense cameras cannot be listed", "unplug them and plug them in again"
+    ):
         found = {_info(rs, device, "serial_number"): device for device in rs.context().devices}
     listed = ", ".join(sorted(found))
     if not found:
@@ -214,5 +216,5 @@ def set_preset(rs: ModuleType, sensor: Any, name: str) -> None:
             f"the camera has no preset {name}; set device.preset to one of "
             f"{', '.join(['null', *names])}"
         )
-    with told(f"the camera does not take the preset {name}", "set device.preset=null"):
+    with reported_errors(f"the camera does not take the preset {name}", "set device.preset=null"):
         sensor.set_option(option, names[name.lower()])

@@ -141,7 +141,7 @@ class UsbTransport:
 
     def _find(self) -> usb.core.Device:
         ids = {parse_id(text) for text in self._settings.ids}
-        looked_for = known_ids(self._settings.ids)
+        names = known_ids(self._settings.ids)
         try:
             found = list(
                 usb.core.find(
@@ -152,14 +152,14 @@ class UsbTransport:
             )
         except usb.core.NoBackendError:
             raise ToftrackError(
-                f"no SR3000 can be looked for on USB (ids {looked_for}), because the library "
+                f"no SR3000 can be looked for on USB (ids {names}), because the library "
                 "libusb-1.0 is not installed: install it (Debian, Ubuntu: apt install "
                 "libusb-1.0-0), use the vendor's library with device.transport=libmesasr, or try "
                 "without a camera with device.transport=emulated"
             ) from None
         except usb.core.USBError as error:
             raise ToftrackError(
-                f"the USB devices cannot be listed to find an SR3000 ({looked_for}): {error}; "
+                f"the USB devices cannot be listed to find an SR3000 ({names}): {error}; "
                 "check that this user may use USB, or try without a camera with "
                 "device.transport=emulated"
             ) from error
@@ -170,7 +170,7 @@ class UsbTransport:
         if not found:
             wanted = "" if self._serial is None else f" with the serial number {self._serial}"
             raise ToftrackError(
-                f"no SR3000{wanted} was found on USB (looked for the ids {looked_for}): plug it in "
+                f"no SR3000{wanted} was found on USB (looked for the ids {names}): plug it in "
                 "and switch it on (lsusb must list it), use the vendor's library with "
                 "device.transport=libmesasr, or try without a camera with "
                 "device.transport=emulated"

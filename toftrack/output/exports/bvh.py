@@ -13,7 +13,7 @@ from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.output.exports.motion import HandMotion
 
 _CM = 100.0
-_TURNS = "Zrotation Xrotation Yrotation"
+_ROTATIONS = "Zrotation Xrotation Yrotation"
 _LEFT_OUT = ("palm",)
 """It does not move by itself."""
 
@@ -25,8 +25,10 @@ def bvh_of(motion: HandMotion) -> str:
     _describe(OPENXR_JOINT_NAMES.index("wrist"), 0, motion, lines, order)
     seconds = float(np.median(np.diff(motion.time_s))) if len(motion.time_s) > 1 else 1 / 25
     lines += ["MOTION", f"Frames: {len(motion.time_s)}", f"Frame Time: {seconds:.6f}"]
-    turns = Rotation.from_quat(motion.turn[:, order].reshape(-1, 4)).as_euler("ZXY", degrees=True)
-    angles = np.unwrap(turns.reshape(len(motion.time_s), -1), axis=0, period=360)
+    rotations = Rotation.from_quat(motion.turn[:, order].reshape(-1, 4)).as_euler(
+        "ZXY", degrees=True
+    )
+    angles = np.unwrap(rotations.reshape(len(motion.time_s), -1), axis=0, period=360)
     rows = np.concatenate((_CM * motion.offset_m[:, order[0]], angles), 1)
     lines += [" ".join(f"{value:.4f}" for value in row) for row in rows]
     return "\n".join(lines) + "\n"
@@ -49,7 +51,7 @@ def _describe(
         lines += [f"{indent}End Site", f"{indent}{{", place, f"{indent}}}"]
         return
     order.append(joint)
-    channels = f"6 Xposition Yposition Zposition {_TURNS}" if not depth else f"3 {_TURNS}"
+    channels = f"6 Xposition Yposition Zposition {_ROTATIONS}" if not depth else f"3 {_ROTATIONS}"
     kind = "JOINT" if depth else "ROOT"
     lines += [f"{indent}{kind} {motion.name(OPENXR_JOINT_NAMES[joint])}", f"{indent}{{", place]
     lines.append(f"{indent}  CHANNELS {channels}")

@@ -112,8 +112,8 @@ def _motion(
     if not tracked.any():
         return None
     side = np.asarray(hand.get("side", np.full(len(tracked), shape.side)))
-    told = list(side[tracked])
-    shape = shape.of_side(max(SIDES, key=told.count) if any(told) else shape.side)
+    reported = list(side[tracked])
+    shape = shape.of_side(max(SIDES, key=reported.count) if any(reported) else shape.side)
     held = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked)), -1))
     held = np.where(held < 0, tracked.argmax(), held)
     there = openxr_hand(hand["joints_m"], hand["state"], openxr_rig(shape))
@@ -126,14 +126,14 @@ def _motion(
     offset, turn = relative(there.position_m[held], there.orientation[held])
     position, turned = rest_joints(shape)
     rest_offset, _ = relative(position[None], turned[None])
-    return HandMotion(slot, time_s, tracked, offset, _smooth_signs(turn), rest_offset[0], shape)
+    return HandMotion(slot, time_s, tracked, offset, _smooth_signum(turn), rest_offset[0], shape)
 
 
-def _smooth_signs(turn: np.ndarray) -> np.ndarray:
+def _smooth_signum(turn: np.ndarray) -> np.ndarray:
     """(T, 26, 4) quaternions, each with the sign that lies nearer to the one before."""
     agree = np.einsum("tjq,tjq->tj", turn[1:], turn[:-1]) >= 0
-    signs = np.cumprod(np.where(agree, 1.0, -1.0), axis=0)
-    return np.concatenate((turn[:1], turn[1:] * signs[..., None]))
+    signum = np.cumprod(np.where(agree, 1.0, -1.0), axis=0)
+    return np.concatenate((turn[:1], turn[1:] * signum[..., None]))
 
 
 def _times(timestamp_s: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from typing import Any, Self
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
-from toftrack.output.stream import known_fields, told
+from toftrack.output.stream import known_fields, report_dropped
 from toftrack.output.web.visitors import called_by_a_known_name, refused
 
 _log = logging.getLogger(__name__)
@@ -63,8 +63,8 @@ _BACKLOG = 32
 """Connections that the system keeps, and that are accepted at a time."""
 _MOST_SENT_BYTES = 4096
 """In a message of a client, which nobody looks at; who sends a longer one is cut off."""
-_TOLD_EVERY_S = 60.0
-_LAST_WORDS_S = 1.0
+_REPORTED_EVERY_S = 60.0
+_CLOSING_S = 1.0
 """How long the lines that still wait at the end have to leave."""
 _PAUSE_S = 0.01
 
@@ -109,7 +109,7 @@ class WebSocketStream:
         self._open: dict[Any, None] = {}
         """Every connection, the oldest first."""
         self._half_open: dict[Any, None] = {}
-        self._told_s = -math.inf
+        self._reported_s = -math.inf
         self._sent = self._dropped = 0
         self.url = ""
         """Of the first page, within the `with`."""
@@ -144,7 +144,9 @@ class WebSocketStream:
     def __exit__(self, *exception: Any) -> None:
         self._run(self._close())
         self._end_thread()
-        told(self._sent, f"to clients of {self.url}", self._dropped, "a client was too slow")
+        report_dropped(
+            self._sent, f"to clients of {self.url}", self._dropped, "a client was too slow"
+        )
 
     def _run(self, work: Any) -> Any:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
@@ -165,13 +167,13 @@ class WebSocketStream:
             backlog=_BACKLOG,
             compression=None,  # of short messages to near clients it would only take time
             max_size=_MOST_SENT_BYTES,
-            close_timeout=_LAST_WORDS_S,
+            close_timeout=_CLOSING_S,
             server_header="toftrack",
             logger=_quiet_log(),
         )
 
     async def _close(self) -> None:
-        deadline = self._loop.time() + _LAST_WORDS_S
+        deadline = self._loop.time() + _CLOSING_S
         while any(client.lines for client in self._clients) and self._loop.time() < deadline:
             await asyncio.sleep(_PAUSE_S)
         self._dropped += sum(len(client.lines) for client in self._clients)
@@ -179,7 +181,7 @@ class WebSocketStream:
             connection.transport.abort()
         self._server.close()
         try:
-            await asyncio.wait_for(self._server.wait_closed(), _LAST_WORDS_S)
+            await asyncio.wait_for(self._server.wait_closed(), _CLOSING_S)
         except TimeoutError:
             # Who does not read does not say goodbye either.
             for connection in list(self._open):
@@ -205,8 +207,8 @@ class WebSocketStream:
 
     def _trouble(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """What the event loop complains of, as that there are no descriptors any more."""
-        if loop.time() >= self._told_s + _TOLD_EVERY_S:
-            self._told_s = loop.time()
+        if loop.time() >= self._reported_s + _REPORTED_EVERY_S:
+            self._reported_s = loop.time()
             reason = context.get("exception") or "unknown reason"
             _log.warning("stream=websocket: %s (%s)", context.get("message"), reason)
 

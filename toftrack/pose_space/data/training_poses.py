@@ -87,8 +87,8 @@ def _transformation(first: str, second: str, done: float) -> Tensor:
     leads = [0.0] * len(_THUMB["out"])
     for finger in _CURLED:
         leads += [_LEAD[finger] + joint for joint in _JOINT_LEAD]
-    ahead = torch.tensor(leads, dtype=torch.float64).exp() * done
-    return torch.lerp(basic_pose(first), basic_pose(second), ahead / (ahead + 1 - done))
+    progress = torch.tensor(leads, dtype=torch.float64).exp() * done
+    return torch.lerp(basic_pose(first), basic_pose(second), progress / (progress + 1 - done))
 
 
 def synthetic_training_poses() -> TrainingPoses:

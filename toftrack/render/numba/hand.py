@@ -49,10 +49,10 @@ LEFT, TOP, RIGHT, BOTTOM = range(4)
 @compiled
 def _sin_cos(x):
     """Float32 sine and cosine (Cephes' polynomials) of a vector."""
-    turns = down(x * np.float32(2 / math.pi) + _HALF)
-    r = x - turns * np.float32(1.5703125)
-    r = r - turns * np.float32(4.837512969970703125e-4)
-    r = r - turns * np.float32(7.54978995489188216e-8)
+    rotations = down(x * np.float32(2 / math.pi) + _HALF)
+    r = x - rotations * np.float32(1.5703125)
+    r = r - rotations * np.float32(4.837512969970703125e-4)
+    r = r - rotations * np.float32(7.54978995489188216e-8)
     s = r * r
     sine = np.float32(-1.9515295891e-4) * s + np.float32(8.3321608736e-3)
     sine = (sine * s - np.float32(1.6666654611e-1)) * s * r + r
@@ -60,7 +60,7 @@ def _sin_cos(x):
     cosine = (cosine * s + np.float32(4.166664568298827e-2)) * s * s - _HALF * s
     cosine = cosine + _ONE
     # The quarter of the circle, 0 .. 3; in the odd ones they change places.
-    quarter = turns - np.float32(4.0) * down(turns * np.float32(0.25))
+    quarter = rotations - np.float32(4.0) * down(rotations * np.float32(0.25))
     odd = (quarter - _TWO) * (quarter - _TWO) - _ONE
     odd = _HALF - odd * odd
     a, b = where_above(odd, cosine, sine), where_above(odd, sine, cosine)

@@ -50,7 +50,7 @@ _MOST_CONNECTIONS = 64
 """Who waits for news or is answered; further ones push out who asks nothing."""
 _MOST_COMMAND_BYTES = 1000
 _BREATH_S = 0.1
-_LAST_WORDS_S = 1.0
+_CLOSING_S = 1.0
 """How long answers may take that are under way when the server closes."""
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
@@ -114,9 +114,9 @@ class BrowserServer:
         self._server.server_close()
         # Who waits for the next request sees the end of the connection, who sends goes on.
         self._server.hang_up(socket.SHUT_RD)
-        if not self._server.all_gone(_LAST_WORDS_S):
+        if not self._server.all_gone(_CLOSING_S):
             self._server.hang_up(socket.SHUT_RDWR)
-            self._server.all_gone(_LAST_WORDS_S)
+            self._server.all_gone(_CLOSING_S)
 
 
 @dataclass

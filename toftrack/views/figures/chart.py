@@ -53,9 +53,9 @@ def wrapped(text: str, width: int, size: float = 0.5) -> list[str]:
     """Lines of whole words, none wider than so many pixels unless a single word is."""
     lines: list[str] = []
     for word in text.split():
-        longer = f"{lines[-1]} {word}" if lines else word
-        if lines and text_width(longer, size) <= width:
-            lines[-1] = longer
+        extended = f"{lines[-1]} {word}" if lines else word
+        if lines and text_width(extended, size) <= width:
+            lines[-1] = extended
         else:
             lines.append(word)
     return lines

@@ -1,4 +1,4 @@
-"""Pictures of the relocaliser's training: what it sees, and how its error falls."""
+"""Pictures of the detector's training: what it sees, and how its error falls."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import torch
 
-from toftrack.relocation.images import crop_images, wide_images
-from toftrack.relocation.shapes import shape_bank
+from toftrack.detector.images import crop_images, wide_images
+from toftrack.detector.shapes import shape_bank
 from toftrack.views.figures.chart import BLUE, VERMILLION, Axes, canvas, legend, titled
 
 _CROPS, _COLUMNS, _SIDE = 24, 8, 128
@@ -54,13 +54,13 @@ def course_figure(course: list[dict[str, Any]]) -> np.ndarray:
     """Mean joint errors on fresh training images over their number, BGR."""
     picture = canvas(420, 760)
     images = np.array([row["images"] for row in course]) / 1e3
-    votes = np.array([row["votes_mm"] for row in course])
+    keypoints = np.array([row["votes_mm"] for row in course])
     joints = np.array([row["joints_mm"] for row in course])
-    top = float(max(joints.max(), votes.max(), 1.0))
-    low = float(min(joints.min(), votes.min(), top / 2))
+    top = float(max(joints.max(), keypoints.max(), 1.0))
+    low = float(min(joints.min(), keypoints.min(), top / 2))
     axes = Axes(70, 730, 60, 360, (0.0, float(images[-1])), (low * 0.9, top * 1.1), log_y=True)
     axes.draw(picture, "thousand images", "mean joint error, mm")
     axes.line(picture, images, joints, VERMILLION)
-    axes.line(picture, images, votes, BLUE)
+    axes.line(picture, images, keypoints, BLUE)
     legend(picture, (("likeliest hypothesis", VERMILLION), ("votes", BLUE)), (330, 40))
     return titled(picture, "Training of the pose network", "On images never seen before.")

@@ -73,7 +73,7 @@ class Entities:
         self._stream = stream
         self._likelihood = likelihood
         self._pinholes: dict[str, tuple[bytes, int, int]] = {}
-        self._told: dict[int, tuple[str, ...]] = {}
+        self._reported: dict[int, tuple[str, ...]] = {}
         self._named: set[int] = set()
         """Slots whose plots have names."""
         self._log_constants()
@@ -219,9 +219,9 @@ class Entities:
 
     def _log_changes(self, estimate: Estimate, slot: int) -> None:
         now = (estimate.state_name, gesture_words(estimate), str(estimate.lost))
-        if now == self._told.get(slot):
+        if now == self._reported.get(slot):
             return
-        self._told[slot] = now
+        self._reported[slot] = now
         which = "second hand" if slot else ""
         lost = "lost" if estimate.lost else ""
         words = (which, lost, state_words(estimate), gesture_words(estimate))
@@ -243,16 +243,16 @@ def ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
     hand, _ = parted(posed_hand(estimate.state, shape))
     axes = hand.axes_m[0]
     sizes = axes.norm(dim=-2)
-    turns = axes / sizes[:, None]
+    rotations = axes / sizes[:, None]
     # A left hand's frames are mirrored. An ellipsoid does not mind turning an axis around.
-    turns[..., 0] *= torch.linalg.det(turns).sign()[:, None]
+    rotations[..., 0] *= torch.linalg.det(rotations).sign()[:, None]
     bones = cpu_surface(shape).frame_index[:-1]
     palette = torch.tensor((_PALM_RGB, *FINGER_RGB))
     colours = palette[torch.where(bones > 0, 1 + (bones - 1) // 3, 0)].numpy()
     return rr.Ellipsoids3D(
         centers=hand.centres_m[0].numpy(),
         half_sizes=sizes.numpy(),
-        quaternions=roma.rotmat_to_unitquat(turns).numpy(),
+        quaternions=roma.rotmat_to_unitquat(rotations).numpy(),
         colors=[_LOST_RGB] if estimate.lost else colours,
         fill_mode="majorwireframe",
     )

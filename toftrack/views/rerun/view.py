@@ -20,7 +20,7 @@ from toftrack.views.rerun.entities import Entities, blueprint, rr
 FILE_NAME = "track.rrd"
 
 _log = logging.getLogger(__name__)
-_FRAMES_AHEAD = 30
+_QUEUED_FRAMES = 30
 """How many frames the tracker may be ahead of what is logged."""
 _ANSWER_S = 5.0
 """How long a viewer may take to answer."""
@@ -73,7 +73,7 @@ class RerunView:
             except (OSError, *_RERUN_ERRORS) as error:
                 raise _unwritable(self._path) from error
         self._entities = Entities(self._stream, likelihood)
-        self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_FRAMES_AHEAD)
+        self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_QUEUED_FRAMES)
         self._left_out = 0
         self._failure: Exception | None = None
         # A daemon, because nothing frees a thread that waits for a viewer that is stuck.

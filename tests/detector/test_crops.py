@@ -1,0 +1,217 @@
+"""What the networks see: the same of a scene at any resolution, and something of any image."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.detection import alone, clean_picture, intrinsics, one_hand, small_networks
+from helpers.tracking import sample
+
+from toftrack.detector import proposals, proposals_numba
+from toftrack.detector.crops import (
+    CROP,
+    CROP_M,
+    WIDE_F_PX,
+    WIDE_LARGEST_PX,
+    crop,
+    crop_rotation,
+    wide,
+)
+from toftrack.detector.proposals import NetworkOutput, find_hands, mirrored
+from toftrack.detector.weights import load_weights
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+run_pose_network = proposals_numba.run_pose_network
+
+K = intrinsics(200.0, 144, 176)
+PRECOMPILED = np.array([[0.0, 0.0, 0.45]])
+
+
+def numbers(seen: NetworkOutput) -> dict[str, torch.Tensor]:
+    return {name: getattr(seen, name) for name in NetworkOutput.__dataclass_fields__}
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.2, -0.1, 0.4), (-0.3, 0.3, 0.3)])
+def test_a_crop_looks_along_the_ray_to_its_centre(centre: tuple[float, float, float]) -> None:
+    rotation = crop_rotation(np.array(centre))
+    assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    assert rotation[:, 2] == pytest.approx(np.array(centre) / np.linalg.norm(centre))
+
+
+def test_a_crop_shows_depths_about_its_centre() -> None:
+    """A plate across the crop's axis, aside of the camera's: as far everywhere, but not in Z."""
+    centre = np.array([0.12, -0.05, 0.5])
+    distance = np.linalg.norm(centre)
+    normal = centre / distance
+    rays = np.stack(np.meshgrid(np.arange(176), np.arange(144)), -1) - K[:2, 2]
+    rays = np.concatenate((rays / K[0, 0], np.ones((144, 176, 1))), -1)
+    depth = ((distance + 0.03) / (rays @ normal)).astype(np.float32)
+    image, _ = crop(depth, K, centre)
+    assert image.shape == (3, CROP, CROP) and image.dtype == np.float32
+    u, v = (K @ centre)[:2] / centre[2]
+    assert u > 120 and v < 60, "the image cuts the right of the crop"
+    inner = image[:, 12:-8, 8:40]
+    # Readings lie up to half a pixel, 1.3 mm, beside where they are taken to be.
+    assert inner[0] == pytest.approx(0.03 / (CROP_M / 2), abs=0.02)
+    assert (inner[1] == 1).all() and (inner[2] == 0).all()
+
+
+def test_what_is_not_in_the_cube_is_told_from_what_is_not_read() -> None:
+    depth = np.full((144, 176), 2.0, np.float32)
+    depth[:, :88] = 0.0
+    image, _ = crop(depth, K, PRECOMPILED[0])
+    assert (image[1] == 0).all()
+    assert (image[2, :, : CROP // 2 - 1] == 1).all() and (image[2, :, CROP // 2 + 1 :] == 0).all()
+    assert (image[0] == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_scene_at_two_resolutions_gives_the_same_crop(seed: int) -> None:
+    place = (0.05, -0.04, 0.5)
+    scene = alone(one_hand(seed, place))
+    crops = []
+    for scale in (1, 2, 3):
+        height, width = 144 * scale, 176 * scale
+        k = intrinsics(200.0 * scale, height, width)
+        depth = clean_picture(scene, k, height, width)[0][0]
+        crops.append(crop(depth, k, np.array(place))[0])
+    for other in crops[1:]:
+        # Pixels on the outline fall to either side.
+        assert np.median(np.abs(other - crops[0])[:2]) < 0.01
+        assert np.abs(other - crops[0]).mean() < 0.03
+
+
+def test_the_whole_image_keeps_its_rays() -> None:
+    for focal, height, width in ((200.0, 144, 176), (365.0, 424, 512), (60.0, 50, 80)):
+        k = intrinsics(focal, height, width)
+        depth = np.zeros((height, width), np.float32)
+        row, column = int(0.7 * height), int(0.3 * width)
+        near = max(1, math.ceil(focal / WIDE_F_PX))
+        depth[row - near : row + near + 1, column - near : column + near + 1] = 0.8
+        image, new_k = wide(depth, k)
+        assert image.shape[:2] == (1, 2) and image.shape[2] % 8 == image.shape[3] % 8 == 0
+        v, u = image[0, 1].nonzero().double().mean(0).tolist()
+        ray = ((u - new_k[0, 2]) / new_k[0, 0], (v - new_k[1, 2]) / new_k[1, 1])
+        true = ((column - k[0, 2]) / focal, (row - k[1, 2]) / focal)
+        assert ray == pytest.approx(true, abs=1.0 / WIDE_F_PX)
+
+
+def test_a_view_as_wide_as_the_sky_is_seen_small() -> None:
+    k = intrinsics(2.0, 144, 176)
+    image, new_k = wide(np.full((144, 176), 0.5, np.float32), k)
+    assert image.shape[2:] == (WIDE_LARGEST_PX, WIDE_LARGEST_PX)
+    assert new_k[0, 0] == pytest.approx(2.0 * WIDE_LARGEST_PX / 176)
+    assert new_k[1, 2] == pytest.approx((WIDE_LARGEST_PX - 1) / 2)
+
+
+@pytest.mark.parametrize("frame", [0, 40])
+def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int) -> None:
+    scene = sample().cut(frame)
+    pose, _ = small_networks()
+    centres = scene.joints_m[0, [0, 9]]
+    flip = np.array([-1.0, 1.0, 1.0])
+    depth, k = mirrored(scene.depth_m[0], scene.k)
+    right = numbers(run_pose_network(pose, scene.depth_m[0], scene.k, centres, "right"))
+    left = numbers(run_pose_network(pose, depth, k, centres * flip, "left"))
+    turn = torch.tensor([1.0, -1.0, -1.0])
+    for name, value in right.items():
+        reported = left[name]
+        if name in ("pivot_m", "joints_m", "votes_m"):
+            reported = reported * torch.from_numpy(flip).float()
+        elif name == "rotvec":
+            reported = reported * turn
+        assert torch.allclose(reported, value, atol=1e-5), name
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("network", ["trained", "random"])
+def test_the_compiled_look_says_what_the_reference_says(side: str, network: str) -> None:
+    """Of hands, of places at the border, and of places beside the image."""
+    pose = load_weights()[0] if network == "trained" else small_networks()[0]
+    for frame in (0, 30, 60):
+        scene = sample().cut(frame)
+        centres = np.concatenate((scene.joints_m[0, [0, 9]], [[0.2, 0.0, 0.45], [2.0, 0.1, 0.3]]))
+        reported = run_pose_network(pose, scene.depth_m[0], scene.k, centres, side)
+        expected = proposals.run_pose_network(pose, scene.depth_m[0], scene.k, centres, side)
+        for name, value in numbers(expected).items():
+            # The file's weights hold the limits of the angles and the cells' places in half
+            # precision, which only the reference uses.
+            assert torch.allclose(numbers(reported)[name], value, atol=1e-3, rtol=1e-3), name
+
+
+def test_a_mirror_twice_is_the_image() -> None:
+    scene = sample().cut(0)
+    once = mirrored(scene.depth_m[0], scene.k)
+    depth, k = mirrored(*once)
+    assert np.array_equal(depth, scene.depth_m[0]) and np.array_equal(k, scene.k)
+    assert not np.array_equal(once[0], depth)
+
+
+def strange_images() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Images that no camera should take, and their intrinsics."""
+    flat = np.full((144, 176), 0.5, np.float32)
+    holes = np.where(np.random.default_rng(0).random((144, 176)) < 0.5, np.nan, flat)
+    oblong = np.array([[35.0, 0, 88.0], [0, 900.0, 71.5], [0, 0, 1]])
+    beside = np.array([[200.0, 0, -300.0], [0, 200.0, 500.0], [0, 0, 1]])
+    return {
+        "3 x 3": (flat[:3, :3], intrinsics(200.0, 3, 3)),
+        "one pixel": (flat[:1, :1], intrinsics(200.0, 1, 1)),
+        "one row": (flat[:1], intrinsics(200.0, 1, 176)),
+        "no readings": (np.zeros_like(flat), K),
+        "no numbers": (np.full_like(flat, np.nan), K),
+        "some numbers": (holes.astype(np.float32), K),
+        "infinite": (np.full_like(flat, np.inf), K),
+        "filled by a hand": (np.full_like(flat, 0.45), K),
+        "at the lens": (np.full_like(flat, 1e-3), K),
+        "wide-angled": (flat, intrinsics(40.0, 144, 176)),
+        "telescopic": (flat, intrinsics(5000.0, 144, 176)),
+        "pixels that are not square": (flat, oblong),
+        "focal length of a pixel": (flat, intrinsics(1.0, 144, 176)),
+        "focal length of a millionth": (flat, intrinsics(1e-6, 144, 176)),
+        "optical axis beside the image": (flat, beside),
+        "large": (np.full((1200, 1600), 0.6, np.float32), intrinsics(1400.0, 1200, 1600)),
+    }
+
+
+@pytest.mark.parametrize("name", list(strange_images()))
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_of_any_image_something_finite_is_said(name: str, side: str) -> None:
+    depth, k = strange_images()[name]
+    pose, finder = small_networks()
+    for least in (0.0, 0.5):
+        for places in find_hands(finder, depth, k, 3, least).values():
+            assert places.centre_m.shape == (len(places.probability), 3)
+            assert len(places.probability) <= 3
+            assert np.isfinite(places.centre_m).all() and (places.centre_m[:, 2] > 0).all()
+    for what, value in numbers(run_pose_network(pose, depth, k, PRECOMPILED, side)).items():
+        assert value.isfinite().all(), what
+
+
+@pytest.mark.parametrize(
+    "centre",
+    [(0.198, 0.0, 0.45), (0.0, -0.16, 0.45), (2.0, 0.0, 0.3), (0, 0, 0.01), (-5.0, 3.0, 0.2)],
+)
+def test_centres_at_the_border_and_beyond_it(centre: tuple[float, float, float]) -> None:
+    pose, _ = small_networks()
+    depth = sample().depth_m[0]
+    for side in ("right", "left"):
+        found = run_pose_network(pose, depth, sample().k, np.array([centre]), side)
+        assert all(value.isfinite().all() for value in numbers(found).values())
+    image, _ = crop(depth, sample().k, np.array(centre))
+    assert np.isfinite(image).all()
+    if abs(centre[0]) > 1:
+        assert (image[2] == 1).all(), "nothing is read there"
+
+
+def test_the_hypotheses_are_sorted_and_within_what_a_hand_can() -> None:
+    pose, _ = small_networks()
+    seen = run_pose_network(
+        pose, sample().depth_m[0], sample().k, sample().joints_m[0, [9]], "right"
+    )
+    assert (seen.log_probability.diff(dim=1) <= 0).all()
+    assert 0 < float(seen.log_probability.exp().sum()) < 1 + 1e-5
+    assert (seen.error_m > 0).all() and (seen.sigma_m > 0).all()

@@ -1,0 +1,175 @@
+"""What the tracker is told by the networks: glances, their states, and searches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import roma
+import torch
+from helpers.configured import detector_settings
+from helpers.detection import small_networks
+from helpers.tracking import sample
+
+from toftrack.compute.rigid import PIVOT_M
+from toftrack.detector import hand_detector as module
+from toftrack.detector.hand_detector import Detection, HandDetector, merit
+from toftrack.detector.proposals import Places
+from toftrack.errors import ToftrackError
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+HEIGHT, WIDTH = sample().depth_m.shape[1:]
+
+
+def detector(**changes: float) -> HandDetector:
+    return HandDetector(*small_networks(), detector_settings(**changes))
+
+
+def detection(side: str = "right", frame: int = 0) -> Detection:
+    scene = sample().cut(frame)
+    return detector().detect(scene.depth_m[0], scene.k, scene.joints_m[0, [9]], side)[0]
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_states_are_the_hypotheses_as_a_hand_has_them(side: str) -> None:
+    seen = detection(side)
+    for row in (0, 7, 11):
+        ratio = float(seen.log_size[row].exp())
+        shape = default_hand_shape(side=side).scaled(ratio)
+        joints = forward_kinematics(seen.states(ratio)[row : row + 1], shape).joints_m[0]
+        assert float((joints - seen.joints_m[row]).norm(dim=1).max()) < 1e-3
+
+
+@pytest.mark.parametrize("ratio", [0.8, 1.0, 1.3])
+def test_the_middle_of_the_palm_stays_whatever_the_size(ratio: float) -> None:
+    seen = detection()
+    states = seen.states(ratio)
+    assert states.shape == (len(seen.pivot_m), 27)
+    turned = roma.rotvec_to_rotmat(states[:, 3:6]) @ (torch.tensor(PIVOT_M) * ratio)
+    assert torch.allclose(states[:, :3] + turned, seen.pivot_m, atol=1e-6)
+    assert torch.equal(states[:, 6:], seen.angles)
+
+
+def test_only_the_first_hypotheses_are_kept() -> None:
+    seen = detection()
+    kept = seen.first(3)
+    assert len(kept.pivot_m) == len(kept.angles) == len(kept.log_probability) == 3
+    assert torch.equal(kept.joints_m, seen.joints_m[:3])
+    assert kept.landmarks is seen.landmarks and kept.present == seen.present
+    assert torch.equal(kept.centre_m, seen.centre_m)
+
+
+def test_a_hand_s_length_is_the_mean_of_the_hypotheses() -> None:
+    seen = detection()
+    weights = seen.log_probability.exp()
+    length = 0.19 * math.exp(float((weights * seen.log_size).sum() / weights.sum()))
+    assert seen.length_m == pytest.approx(length, rel=1e-4)
+
+
+def test_nowhere_to_look_gives_nothing() -> None:
+    assert detector().detect(sample().depth_m[0], sample().k, np.zeros((0, 3)), "right") == []
+
+
+def found_at(*right: tuple[float, float, float], left: tuple = ()) -> dict[str, Places]:
+    """What a finder may have said; each place with a lower probability."""
+
+    def places(centres: tuple) -> Places:
+        chances = 0.9 * 0.8 ** np.arange(len(centres))
+        return Places(np.array(centres, np.float32).reshape(-1, 3), chances.astype(np.float32))
+
+    return {"right": places(right), "left": places(left)}
+
+
+def searched(monkeypatch: pytest.MonkeyPatch, found: dict[str, Places], **changes: float):
+    """Detection of a search where the finder said so, and where the networks looked."""
+    inspected: list[np.ndarray] = []
+    here = detector(**changes)
+    monkeypatch.setattr(module, "find_hands", lambda *given: found)
+    plain = module.run_pose_network
+
+    def run_pose_network(pose, depth_m, k, centres_m, side):
+        inspected.append(np.array(centres_m))
+        return plain(pose, depth_m, k, centres_m, side)
+
+    monkeypatch.setattr(module, "run_pose_network", run_pose_network)
+    return here.search(sample().depth_m[0], sample().k, "right"), inspected
+
+
+def test_a_search_looks_twice_at_places_that_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = found_at((0, 0, 0.4), (0.02, 0, 0.4), (0.2, 0, 0.5), left=((0, -0.2, 0.5),))
+    detections, inspected = searched(monkeypatch, found, merit=-1e6, places=3)
+    assert len(inspected) == 2 and len(detections) == 3
+    assert inspected[0] == pytest.approx(np.array([(0, 0, 0.4), (0.2, 0, 0.5), (0, -0.2, 0.5)]))
+    assert 1 <= len(inspected[1]) <= 3
+    away = np.linalg.norm(inspected[1][:, None] - inspected[0], axis=-1).min(1)
+    assert (away > 0).all(), "about the palms that the first one found"
+
+
+def test_a_search_looks_at_no_more_places_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = found_at((0, 0, 0.4), (0.2, 0, 0.5), (-0.2, 0, 0.5))
+    assert len(searched(monkeypatch, found, merit=-1e6, places=1)[0]) == 1
+
+
+def test_what_does_not_look_like_a_hand_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = found_at((0, 0, 0.4), (0.2, 0, 0.5))
+    assert searched(monkeypatch, found, merit=1e6)[0] == []
+    assert searched(monkeypatch, found_at())[0] == []
+
+
+def test_the_best_place_comes_first_and_what_is_known_besides_counts() -> None:
+    here = detector(merit=-1e6, least=0.0)
+    depth, k = sample().depth_m[0], sample().k
+    plain = here.search(depth, k, "right")
+    assert len(plain) >= 2
+    last = plain[-1].centre_m.numpy()
+
+    def likely(centre_m: np.ndarray) -> float:
+        return 100.0 if np.linalg.norm(centre_m - last) < 1e-4 else 0.0
+
+    assert here.search(depth, k, "right", likely)[0].centre_m.numpy() == pytest.approx(last)
+
+
+def test_merit_rises_with_all_that_speaks_for_a_hand() -> None:
+    seen = detection()
+    assert merit(seen, 0.9) > merit(seen, 0.3) > merit(seen, 0.0) > -math.inf
+    for better in (
+        {"present": min(1.0, 2 * seen.present)},
+        {"right_side": min(1.0, 2 * seen.right_side)},
+        {"error_m": seen.error_m / 2},
+    ):
+        assert merit(replace(seen, **better), 0.5) > merit(seen, 0.5)
+    nothing = replace(seen, present=0.0, right_side=0.0)
+    assert math.isfinite(merit(nothing, 0.0))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.zeros((HEIGHT, WIDTH)), np.full((HEIGHT, WIDTH), np.nan), np.full((3, 3), 0.4)],
+    ids=["no readings", "no numbers", "3 x 3"],
+)
+def test_strange_images_are_searched_without_an_error(image: np.ndarray) -> None:
+    here = detector(merit=-1e6, least=0.0)
+    for side in ("right", "left"):
+        for seen in here.search(image.astype(np.float32), sample().k, side):
+            assert seen.joints_m.isfinite().all() and seen.landmarks.points_m.isfinite().all()
+
+
+def test_settings_are_checked() -> None:
+    for name, value in {
+        "places": 0,
+        "hypotheses": 1.5,
+        "rivals": -1,
+        "least": 2.0,
+        "merit": math.nan,
+        "prior": -0.1,
+        "rival_m": 0.0,
+        "rival_frames": 0,
+        "keypoint_m": 0.0,
+    }.items():
+        with pytest.raises(ToftrackError, match=f"detector.{name}="):
+            detector_settings(**{name: value})

@@ -1,0 +1,99 @@
+"""Training images: what is said of them is what they show."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+import torch
+from helpers.detection import small_bank
+
+from toftrack.detector.crops import CROP, CROP_M
+from toftrack.detector.images import (
+    WIDE_SIZE,
+    Crops,
+    WideImages,
+    crop_images,
+    wide_images,
+)
+from toftrack.detector.network import PARTS, SEGMENTS
+from toftrack.hand.skeleton import ANGLE_LIMITS
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+N = 48
+
+
+@pytest.fixture(scope="module")
+def crops() -> Crops:
+    return crop_images(N, small_bank(), torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def images() -> WideImages:
+    return wide_images(N, small_bank(), torch.Generator().manual_seed(0))
+
+
+def test_crops_are_complete(crops: Crops) -> None:
+    assert crops.image.shape == (N, 3, CROP, CROP)
+    assert crops.image[:, 0].abs().max() <= 1
+    assert crops.image[:, 1:].min() >= 0 and crops.image[:, 1:].max() <= 1
+    for field in fields(crops):
+        value = getattr(crops, field.name)
+        assert len(value) == N and value.isfinite().all(), field.name
+    low, high = torch.tensor(ANGLE_LIMITS).unbind(1)
+    assert (crops.angles >= low).all() and (crops.angles <= high).all()
+    assert crops.parts.min() >= -1 and crops.parts.max() < SEGMENTS
+    assert crops.parts.shape == (N, PARTS, PARTS)
+    assert 0.6 < crops.present.float().mean() < 1
+    assert 0.4 < crops.right.float().mean() < 0.95
+
+
+def test_joints_lie_on_what_the_crop_shows(crops: Crops) -> None:
+    """Where a crop's part is the hand, the depth is about that of its joints."""
+    hand = crops.parts == 1
+    big = torch.nn.functional.avg_pool2d(crops.image[:, :1], CROP // PARTS)[:, 0]
+    use = crops.present & (hand.sum((1, 2)) > 60)
+    seen = torch.stack([(big[i][hand[i]].median()) for i in use.nonzero()[:, 0]]) * (CROP_M / 2)
+    middle = crops.joints_m[use][:, :, 2].mean(1)
+    assert (seen - middle).abs().median() < 0.025
+    # And each is in the crop where its joints are, seen from the crop's centre.
+    rows = hand.float() * torch.linspace(-0.5, 0.5, PARTS)[:, None] * CROP_M
+    seen_y = rows.sum((1, 2)) / hand.sum((1, 2)).clamp(min=1)
+    assert (seen_y[use] - crops.joints_m[use][:, :, 1].mean(1)).abs().median() < 0.03
+
+
+def test_absent_hands_are_beside_the_crop_s_middle(crops: Crops) -> None:
+    away = crops.pivot_m.norm(dim=1)
+    assert (away[crops.present] < 0.16).all()
+
+
+def test_whole_images_are_complete(images: WideImages) -> None:
+    assert images.image.shape == (N, 2, *WIDE_SIZE)
+    assert images.image.min() >= 0 and images.image.max() <= 1
+    for field in fields(images):
+        assert getattr(images, field.name).isfinite().all(), field.name
+    assert (images.seen >= 0).all() and images.seen.max() < 3
+    assert 0.5 < (images.seen[:, 0] > 0.15).float().mean() < 1, "some without a raised hand"
+    assert images.left.any() and not images.left.all()
+
+
+def test_hands_are_seen_where_it_is_said(images: WideImages) -> None:
+    """At a hand's cell, something is about as near as the hand."""
+    good = 0
+    use = (images.seen[:, 0] > 0.6).nonzero()[:, 0].tolist()
+    for i in use:
+        u, v = ((images.cell[i, 0] + 0.5) * 4 - 0.5).round().long().tolist()
+        if not (0 <= u < WIDE_SIZE[1] and 0 <= v < WIDE_SIZE[0]):
+            continue
+        near = images.image[i, 0, max(0, v - 2) : v + 3, max(0, u - 2) : u + 3] * 1.6
+        good += bool(((near - images.depth_m[i, 0]).abs() < 0.07).any())
+    assert good > 0.8 * len(use)
+
+
+@pytest.mark.parametrize("make", [crop_images, wide_images])
+def test_a_seed_gives_the_same_images(make) -> None:
+    one, two, other = (
+        make(4, small_bank(), torch.Generator().manual_seed(seed)).image for seed in (1, 1, 2)
+    )
+    assert torch.equal(one, two) and not torch.equal(one, other)

@@ -1,0 +1,73 @@
+"""Training from nothing: the same from a seed, and by one command."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.tracking import ROOT
+
+from toftrack.detector.training import Schedule, train_finder, train_poses
+from toftrack.detector.weights import load_weights
+from toftrack.errors import ToftrackError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("train", [train_poses, train_finder])
+def test_a_seed_gives_the_same_weights(train) -> None:
+    one, two, other = (train(TINY, 6, seed) for seed in (0, 0, 1))
+    for key, value in one[0].state_dict().items():
+        assert torch.equal(value, two[0].state_dict()[key]), key
+    weights = [network.state_dict()["heads.weight"] for network, _ in (one, other)]
+    assert not torch.equal(*weights)
+    assert one[1][-1]["images"] == 24 and len(one[1]) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"images": 0}, "images of a network must be a whole number above 0"),
+        ({"batch": 2.5}, "batch of a network must be"),
+        ({"width": -1}, "width of a network must be"),
+        ({"rate": 1.5}, "rate of a network must be between 0 and 1"),
+    ],
+)
+def test_a_schedule_that_cannot_be_is_refused(change: dict, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        Schedule(**{"images": 8, "batch": 8, "rate": 0.002, "width": 4, **change})
+
+
+def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "toftrack.programs.train_detector"]
+    return subprocess.run(
+        [*line, f"hydra.run.dir={folder}", *overrides], cwd=ROOT, capture_output=True, text=True
+    )
+
+
+@pytest.mark.slow
+def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> None:
+    sizes = ("poses.images=256", "finder.images=256", "poses.batch=32", "finder.batch=32")
+    done = command(tmp_path, *sizes, "shapes=6", "poses.width=4", "finder.width=8")
+    assert done.returncode == 0, done.stderr
+    for name in ("detector.npz", "images.png", "course.png", "summary.json"):
+        assert (tmp_path / name).stat().st_size > 0
+        assert name in done.stdout
+    *_, about = load_weights(tmp_path / "detector.npz")
+    assert (about["pose_images"], about["finder_images"], about["shapes"]) == (256, 256, 6)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["poses"][-1]["images"] == summary["finder"][-1]["images"] == 256
+    assert "poses" in done.stderr and "finder" in done.stderr, "progress bars"
+
+
+def test_the_program_refuses_what_cannot_be(tmp_path: Path) -> None:
+    done = command(tmp_path, "shapes=0")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("error: shapes")

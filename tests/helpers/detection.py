@@ -1,0 +1,133 @@
+"""What the tests of the detector share: small networks, told ones, scenes with one hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import numpy as np
+import torch
+from helpers.configured import detector_settings
+
+from toftrack.compute.rigid import rotated_pivot
+from toftrack.detector.hand_detector import Detection
+from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
+from toftrack.detector.scenes import HAND, Dice, Hands, Scenes, posed_hands
+from toftrack.detector.shapes import ShapeBank, shape_bank
+from toftrack.detector.weights import make_ready
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.refinement.gauss_newton import Keypoints
+
+FARTHEST_M = 7.9
+"""Nothing is drawn beyond 8 m."""
+
+
+def dice(seed: int = 0) -> Dice:
+    return Dice(torch.Generator().manual_seed(seed))
+
+
+@cache
+def small_bank() -> ShapeBank:
+    return shape_bank(12, torch.Generator().manual_seed(0))
+
+
+@cache
+def small_networks() -> tuple[PoseNet, Finder]:
+    """Untrained ones, ready for use."""
+    torch.manual_seed(0)
+    pose, finder = PoseNet(4), Finder(8)
+    make_ready(pose)
+    make_ready(finder)
+    return pose, finder
+
+
+def one_hand(seed: int, pivot_m: tuple[float, float, float], left: bool = False) -> Hands:
+    """A random hand about a place, without its forearm."""
+    place, side = torch.tensor([pivot_m]), torch.tensor([left])
+    hands = posed_hands(small_bank(), place, side, dice(seed), HAND)
+    return cut_off(hands)
+
+
+def cut_off(hands: Hands) -> Hands:
+    """The same hands without forearms."""
+    hands.labels[hands.labels != HAND] = -1
+    return hands
+
+
+def alone(hands: Hands) -> Scenes:
+    """Hands and nothing else."""
+    planes = torch.tensor([[[0.0, 0.0, 1.0, torch.inf]]]).expand(len(hands.labels), 1, 4)
+    return Scenes(hands.centres_m, hands.axes_m, hands.labels, planes)
+
+
+def clean_sensors(n: int) -> torch.Tensor:
+    """(n, SENSOR_TERMS) that read everything as it is."""
+    terms = torch.zeros(n, SENSOR_TERMS)
+    terms[:, RANGE] = FARTHEST_M
+    return terms
+
+
+def lens_of(k: np.ndarray, height: int, width: int, n: int = 1) -> Lens:
+    """A pinhole with square pixels for each of n pictures."""
+
+    def each(value: float) -> torch.Tensor:
+        return torch.full((n,), float(value))
+
+    return Lens(each(k[0, 0]), each(k[0, 2]), each(k[1, 2]), each(width), each(height))
+
+
+def intrinsics(focal: float, height: int, width: int) -> np.ndarray:
+    """(3, 3) of a camera that looks straight ahead."""
+    return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+
+
+def clean_picture(
+    scenes: Scenes, k: np.ndarray, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and labels, (N, H, W) each, by a camera without noise."""
+    n = len(scenes.labels)
+    lens = lens_of(k, height, width, n)
+    return take_pictures(scenes, lens, clean_sensors(n), (height, width), dice(1))
+
+
+def detection_of(states: torch.Tensor, log_size: float = 0.0, side: str = "right") -> Detection:
+    """What a network that is sure would say: hands (H, 27) of one size, the first the likeliest."""
+    count = len(states)
+    shape = default_hand_shape(side=side).scaled(math.exp(log_size))
+    joints = forward_kinematics(states, shape).joints_m
+    pivot = rotated_pivot(states[:, 3:6]) * math.exp(log_size)
+    return Detection(
+        pivot_m=states[:, :3] + pivot,
+        rotvec=states[:, 3:6],
+        angles=states[:, 6:],
+        joints_m=joints,
+        log_size=torch.full((count,), log_size),
+        log_probability=torch.log_softmax(-2.0 * torch.arange(count), 0),
+        error_m=torch.full((count,), 0.01),
+        landmarks=Keypoints(joints[0], torch.full((21,), 0.005)),
+        present=0.99,
+        right_side=0.95,
+    )
+
+
+class FixedDetector:
+    """In the networks' place: says what it is told to, and remembers what it was asked."""
+
+    def __init__(self, found: Sequence[Detection] = (), **settings: float) -> None:
+        self.settings = detector_settings(**settings)
+        self.found = list(found)
+        self.compared: list[np.ndarray] = []
+        self.likely: Callable[[np.ndarray], float] | None = None
+
+    def search(self, depth_m, k, side, likely) -> list[Detection]:
+        self.likely = likely
+        return self.found
+
+    def detection(self, depth_m, k, centres_m, side) -> list[Detection]:
+        self.compared.append(np.array(centres_m))
+        states = torch.zeros(len(centres_m), 27)
+        states[:, :3] = torch.from_numpy(np.asarray(centres_m)).float()
+        return [detection_of(state[None], side=side) for state in states]

@@ -1,0 +1,87 @@
+"""Ctrl-C in the first second: whatever is being imported, the status is 130, with no traceback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+_AT_IMPORT = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == os.environ["INTERRUPT_AT"]:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+"""
+
+
+def interrupted(tmp_path: Path, moment: str, *words: str) -> subprocess.CompletedProcess:
+    """A program that gets SIGINT where it begins to import a module."""
+    (tmp_path / "sitecustomize.py").write_text(_AT_IMPORT)
+    places = os.pathsep.join((str(tmp_path), str(ROOT)))
+    return subprocess.run(
+        [sys.executable, *words],
+        env=os.environ | {"PYTHONPATH": places, "INTERRUPT_AT": moment},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize(
+    "moment", ["toftrack.programs.main", "hydra", "omegaconf", "toftrack.devices.sample", "torch"]
+)
+@pytest.mark.parametrize("program", [("-m", "toftrack", "track"), (str(ROOT / "track.py"),)])
+def test_an_interrupt_while_tracking_is_loaded(
+    tmp_path: Path, program: tuple[str, ...], moment: str
+) -> None:
+    words = (*program, "view=none", f"hydra.run.dir={tmp_path / 'run'}")
+    reported = interrupted(tmp_path, moment, *words)
+    assert reported.returncode == 130, reported.stderr
+    assert "Traceback" not in reported.stderr and "interrupted" in reported.stderr
+
+
+@pytest.mark.parametrize(
+    "name", "record convert calibrate evaluate figures gesture report benchmark".split()
+)
+def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
+    moment = "toftrack.benchmark.scoring" if name == "benchmark" else "hydra"
+    reported = interrupted(tmp_path, moment, "-m", f"toftrack.{name}", "x")
+    assert (reported.returncode, reported.stderr) == (130, "interrupted\n")
+
+
+def test_the_command_begins_where_interrupts_are_heard_first() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["scripts"]["toftrack"] == "toftrack.__main__:main"
+    for name in ("toftrack/__main__.py", "track.py", "train_pose_space.py"):
+        first = (ROOT / name).read_text(encoding="utf-8").split("import ", 2)
+        assert first[2].startswith("toftrack.early_interrupt")
+
+
+def test_an_ignored_interrupt_stays_ignored(tmp_path: Path) -> None:
+    """As after nohup, or in the background of a script."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        reported = interrupted(tmp_path, "hydra", "-m", "toftrack.report", str(tmp_path / "none"))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert reported.returncode == 1 and "no folder" in reported.stderr
+
+
+def test_the_library_leaves_interrupts_alone() -> None:
+    words = "import signal, toftrack; toftrack.make_device; print(signal.getsignal(signal.SIGINT))"
+    reported = subprocess.run(
+        [sys.executable, "-c", words], cwd=ROOT, capture_output=True, text=True
+    )
+    assert "default_int_handler" in reported.stdout

@@ -1,0 +1,196 @@
+"""Effort follows the time that frames take under a budget, and never without one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.detection import FixedDetector
+from helpers.tracking import configuration, make_tracker, sample
+
+from toftrack.api import build_hands_tracker
+from toftrack.compute.threads import at_most, threads
+from toftrack.errors import ToftrackError
+from toftrack.tracking.quality import LEVELS, REDUCED, Pace, Timekeeper, pace_within
+from toftrack.tracking.tracker import Tracker
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+BUDGET_S = 0.033
+EVERYTHING = len(LEVELS) - 1
+
+
+def levels(pace: Pace, took_s: Iterable[float]) -> list[int]:
+    """The level after each frame."""
+    found = []
+    for seconds in took_s:
+        pace = pace.after(seconds)
+        found.append(pace.level)
+    return found
+
+
+class Slow:
+    """A clock that goes on by so much each time that it is asked."""
+
+    def __init__(self, step_s: float) -> None:
+        self.now_s, self.step_s = 100.0, step_s
+
+    def __call__(self) -> float:
+        self.now_s += self.step_s
+        return self.now_s
+
+
+def test_effort_falls_while_frames_are_late_and_rises_when_they_are_not() -> None:
+    found = levels(Pace(BUDGET_S), [0.05] * 40)
+    assert found[0] == 0 and found[-1] == EVERYTHING
+    assert found == sorted(found)
+    back = levels(Pace(BUDGET_S, level=EVERYTHING), [0.01] * 400)
+    assert back[-1] == 0 and back == sorted(back, reverse=True)
+
+
+def test_what_is_far_too_slow_passes_over_a_level() -> None:
+    assert 1 not in levels(Pace(BUDGET_S), [0.2] * 40)
+
+
+def test_frames_that_just_fit_change_nothing() -> None:
+    for level in range(len(LEVELS)):
+        assert set(levels(Pace(BUDGET_S, level), [0.8 * BUDGET_S] * 200)) == {level}
+
+
+def test_one_late_frame_changes_nothing() -> None:
+    took = [0.6 * BUDGET_S] * 20 + [1.0] + [0.6 * BUDGET_S] * 20
+    assert set(levels(Pace(BUDGET_S), took)) == {0}
+
+
+def test_what_was_too_much_is_tried_ever_later() -> None:
+    """On a machine on which only the least effort fits."""
+    pace, tried = Pace(BUDGET_S, EVERYTHING), []
+    for number in range(1500):
+        level = pace.level
+        pace = pace.after(0.01 if level == EVERYTHING else 0.06)
+        if pace.level < level:
+            tried.append(number)
+    pauses = np.diff(tried)
+    assert len(pauses) > 2 and (pauses[1:] > 1.5 * pauses[:-1]).all()
+
+
+def test_without_a_budget_effort_never_changes() -> None:
+    assert set(levels(Pace(), [0.001, 5.0, 60.0] * 20)) == {0}
+
+
+@pytest.mark.parametrize("budget_ms", [0, -3, "fast", math.nan])
+def test_a_budget_that_is_none_is_refused(budget_ms: object) -> None:
+    with pytest.raises(ToftrackError, match=r"tracker\.budget_ms=.* is not possible"):
+        pace_within(budget_ms)  # type: ignore[arg-type]
+
+
+def test_what_is_done_after_the_step_counts_and_waiting_does_not() -> None:
+    now = [0.0]
+    time = Timekeeper(Pace(BUDGET_S), lambda: now[0])
+    for _ in range(30):
+        time.begin()
+        now[0] += 0.02
+        assert time.took_s() == pytest.approx(0.02)
+        now[0] += 0.03  # a picture is drawn
+        assert time.took_s() == pytest.approx(0.05)
+        now[0] += 10.0  # the next frame is waited for
+    assert time.pace.level == EVERYTHING
+    assert 0 < time.reduced < 30
+
+
+def test_a_frame_is_timed_from_when_its_raw_image_was_there() -> None:
+    time = Timekeeper(clock=lambda: 50.0)
+    time.begin(began_s=49.5)
+    assert time.took_s() == pytest.approx(0.5)
+
+
+def test_each_level_leaves_out_more() -> None:
+    model = make_tracker("hand.side=right").model
+    for quality in LEVELS[:REDUCED]:
+        assert model.at_quality(quality) is model
+    before = model
+    for quality in LEVELS[REDUCED:]:
+        less = model.at_quality(quality)
+        assert less is model.at_quality(quality), "made once"
+        assert less.detector.settings.every > before.detector.settings.every
+        assert less.detector.settings.search > before.detector.settings.search
+        assert less.refinement.swaps <= before.refinement.swaps
+        assert less.detector.settings.rivals <= before.detector.settings.rivals
+        assert less.filter == model.filter and less.poses is model.poses
+        shape = model.first_state(0).size
+        assert less.hand("right", shape) is model.hand("right", shape)
+        before = less
+
+
+def test_settings_that_leave_out_more_stay() -> None:
+    model = make_tracker("detector.every=6", "detector.rivals=0", "refine=none").model
+    less = model.at_quality(LEVELS[-1])
+    assert less.detector.settings.every == 6 and less.detector.settings.rivals == 0
+
+
+def test_less_effort_may_be_one_thread() -> None:
+    many = threads()
+    with at_most(1):
+        assert threads() == 1
+    with at_most(None):
+        assert threads() == many
+
+
+def test_a_recording_is_tracked_alike_however_slow_the_machine_is() -> None:
+    scene, found = sample(), []
+    for step_s in (0.001, 3.0):
+        usual = make_tracker("hand.side=right")
+        tracker = Tracker(usual.model, clock=Slow(step_s))
+        estimates = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(5)]
+        assert tracker.time.reduced == 0
+        assert estimates[-1].compute_s >= step_s
+        found.append(np.stack([estimate.joints_m for estimate in estimates]))
+    assert np.array_equal(*found)
+
+
+@pytest.mark.parametrize("hands", [1, 2])
+def test_a_slow_machine_still_tracks_with_less_effort(hands: int) -> None:
+    usual = build_hands_tracker(configuration(f"hands={hands}", "tracker.budget_ms=33"))
+    usual.time = Timekeeper(usual.time.pace, Slow(0.06))
+    scene = sample()
+    for i in range(12):
+        first, *_ = usual.step(scene.depth_m[i], scene.k, i, i / 25)
+    assert usual.time.pace.reduced and usual.time.reduced > 0
+    error_mm = 1e3 * np.linalg.norm(first.joints_m - scene.joints_m[11], axis=1).mean()
+    assert not first.lost and error_mm < 20
+
+
+@pytest.mark.parametrize(("search", "searches"), [(1, 12), (3, 4)])
+def test_the_search_is_bounded(search: int, searches: int) -> None:
+    """In an empty room the whole image is searched each so many frames."""
+
+    class Counting(FixedDetector):
+        count = 0
+
+        def search(self, depth_m, k, side, likely) -> list:
+            self.count += 1
+            return super().search(depth_m, k, side, likely)
+
+    usual = make_tracker("filter.particles=20", "hand.side=right")
+    reported = Counting(search=search)
+    tracker = Tracker(replace(usual.model, detector=reported))
+    image = np.full((72, 88), 0.9, np.float32)
+    k = np.array([[100.0, 0, 44], [0, 100.0, 36], [0, 0, 1]])
+    for i in range(12):
+        assert tracker.step(image, k, i, i / 25).lost
+    assert reported.count == searches
+
+
+def test_preparing_changes_nothing() -> None:
+    scene, found = sample(), []
+    for prepared in (False, True):
+        tracker = build_hands_tracker(configuration())
+        if prepared:
+            before = tracker.state
+            tracker.prepare()
+            assert tracker.state is before and tracker.infos == (None,)
+        found.append(tracker.step(scene.depth_m[0], scene.k, 0, 0.0)[0].joints_m)
+    assert np.array_equal(*found)

@@ -1,0 +1,241 @@
+"""The detector as the tracker uses it: where hands are, and what they look like there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.checks import check_number
+from toftrack.compute.rigid import pivot_offset
+from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.proposals import NetworkOutput, find_hands
+from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
+from toftrack.detector.weights import load_weights
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
+from toftrack.refinement.gauss_newton import Keypoints
+
+SAME_PLACE_M = 0.06
+"""Places that lie closer together are one."""
+_AGAIN = 2.0
+"""Places whose merit is so much lower than the best are not looked at again."""
+_CLEAR_M = 0.010
+"""Expected error that counts as much as a factor e in probability."""
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """How the networks' word is used; see conf/detector/network.yaml for what each does."""
+
+    places: int
+    least: float
+    merit: float
+    hypotheses: int
+    rivals: int
+    every: int
+    search: int
+    sure: float
+    prior: float
+    rival_m: float
+    rival_gain: float
+    rival_frames: int
+    keypoints: float
+    keypoint_m: float
+    keypoint_sigmas: float
+    keypoint_weight: float
+
+    def __post_init__(self) -> None:
+        for name in ("places", "hypotheses"):
+            check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
+        check_number("detector.rivals", self.rivals, 0, whole=True)
+        for name in ("every", "search"):
+            check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
+        check_number("detector.sure", self.sure, 0.5, 0.999)
+        check_number("detector.rival_frames", self.rival_frames, 1, whole=True)
+        check_number("detector.least", self.least, 0, 1)
+        check_number("detector.merit", self.merit)
+        for name in ("prior", "rival_gain", "keypoints", "keypoint_weight"):
+            check_number(f"detector.{name}", getattr(self, name), 0)
+        for name in ("rival_m", "keypoint_m", "keypoint_sigmas"):
+            check_number(f"detector.{name}", getattr(self, name), 0, above=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """What the pose network says of the hand at one place, likeliest hypothesis first.
+
+    pivot_m, rotvec, angles: (H, 3), (H, 3), (H, 21).  joints_m: (H, 21, 3) of a hand of that size.
+    log_size: (H,) of the hand's length in units of the mean adult's.
+    log_probability, error_m: (H,).
+    landmarks: the joints by the cells' votes.
+    present, right_side: probabilities that there is a hand, and that it is of the side looked for.
+    """
+
+    pivot_m: Tensor
+    rotvec: Tensor
+    angles: Tensor
+    joints_m: Tensor
+    log_size: Tensor
+    log_probability: Tensor
+    error_m: Tensor
+    landmarks: Keypoints
+    present: float
+    right_side: float
+
+    def states(self, ratio: float) -> Tensor:
+        """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
+        states = np.zeros((len(self.rotvec), 27), np.float32)
+        states[:, 3:6], states[:, 6:] = self.rotvec.numpy(), self.angles.numpy()
+        states[:, :3] = self.pivot_m.numpy() - np.float32(ratio) * pivot_offset(states[:, 3:6])
+        return torch.from_numpy(states)
+
+    @property
+    def length_m(self) -> float:
+        """The hand's length, the mean of the hypotheses'."""
+        weights = self.log_probability.softmax(0)
+        return DEFAULT_HAND_LENGTH_M * float((weights * self.log_size).sum().exp())
+
+    @property
+    def centre_m(self) -> Tensor:
+        """(3,) middle of the palm of the likeliest hypothesis."""
+        return self.pivot_m[0]
+
+    def first(self, count: int) -> Detection:
+        """With only so many hypotheses."""
+        kept = slice(None, count)
+        return Detection(
+            self.pivot_m[kept],
+            self.rotvec[kept],
+            self.angles[kept],
+            self.joints_m[kept],
+            self.log_size[kept],
+            self.log_probability[kept],
+            self.error_m[kept],
+            self.landmarks,
+            self.present,
+            self.right_side,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class HandDetector:
+    """Both networks and how they are used; images are read, and answers given, on the CPU."""
+
+    pose: PoseNet
+    finder: Finder
+    settings: DetectorSettings
+
+    def to(self, device: torch.device) -> HandDetector:
+        """The same with the networks on a device, where they are moved."""
+        return replace(self, pose=self.pose.to(device), finder=self.finder.to(device))
+
+    def detect(
+        self, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
+    ) -> list[Detection]:
+        """What a hand of a side is like at each of C places (C, 3), in their order.
+
+        depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).
+        """
+        if len(centres_m) == 0:
+            return []
+        seen = run_pose_network(self.pose, depth_m, k, centres_m, side)
+        return [_detection(seen, row) for row in range(len(seen.present))]
+
+    def start_detection(
+        self, depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, side: str
+    ) -> Callable[[], Detection]:
+        """The same at one place (3,), begun beside whatever does not need it; see looking."""
+        wait = start_pose_network(self.pose, depth_m, k, centre_m[None], side)
+        return lambda: _detection(wait(), 0)
+
+    def search(
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        side: str,
+        likely: Callable[[np.ndarray], float] = lambda centre_m: 0.0,
+    ) -> list[Detection]:
+        """Detection at all places where a hand may be, the best first; none where there is none.
+
+        likely: what is known of places (3,) besides the image, log scale.
+
+        The best places are looked at twice, the second time about the palm that was found: poses
+        are the more exact the nearer the crop's centre is to the middle of the palm.
+        """
+        cfg = self.settings
+        found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)
+        # The finder knows sides only roughly: places of the other side may be this one's as well.
+        other = "left" if side == "right" else "right"
+        centres = np.concatenate((found[side].centre_m, found[other].centre_m))
+        heat = np.concatenate((found[side].probability, 0.3 * found[other].probability))
+        order = np.argsort(-heat, kind="stable")
+        order = order[_apart(centres[order])][: cfg.places]
+        centres, heat = centres[order], heat[order]
+        detections = self.detect(depth_m, k, centres, side)
+
+        def merits() -> np.ndarray:
+            both = zip(detections, heat, strict=True)
+            return np.array([merit(g, p) + likely(g.centre_m.numpy()) for g, p in both])
+
+        first = merits()
+        good = [row for row in range(len(first)) if first[row] > first.max() - _AGAIN]
+        again = np.array([detections[row].centre_m.numpy() for row in good]).reshape(-1, 3)
+        for row, detection in zip(good, self.detect(depth_m, k, again, side), strict=True):
+            detections[row] = detection
+        second = merits()
+        order = np.argsort(-second, kind="stable")
+        return [detections[row] for row in order if second[row] > cfg.merit]
+
+
+def merit(detection: Detection, heat: float) -> float:
+    """How much speaks for a hand of the side that is looked for at a place, log scale.
+
+    heat: the finder's probability.
+    """
+    odds = math.log(max(heat, 1e-6)) + math.log(max(detection.present, 1e-6))
+    odds += 0.5 * math.log(max(detection.right_side, 1e-3))
+    unsure = float(detection.error_m[0]) + 0.5 * float(detection.landmarks.sigma_m.mean())
+    return odds - unsure / _CLEAR_M
+
+
+def _apart(centres_m: np.ndarray) -> list[int]:
+    """Rows of the first of all places that are the same, in their order."""
+    kept: list[int] = []
+    for row, centre in enumerate(centres_m):
+        if all(np.linalg.norm(centre - centres_m[other]) > SAME_PLACE_M for other in kept):
+            kept.append(row)
+    return kept
+
+
+def _detection(seen: NetworkOutput, row: int) -> Detection:
+    return Detection(
+        pivot_m=seen.pivot_m[row],
+        rotvec=seen.rotvec[row],
+        angles=seen.angles[row],
+        joints_m=seen.joints_m[row],
+        log_size=seen.log_size[row],
+        log_probability=seen.log_probability[row],
+        error_m=seen.error_m[row],
+        landmarks=Keypoints(seen.keypoints_m[row], seen.sigma_m[row]),
+        present=float(seen.present[row].sigmoid()),
+        right_side=float(seen.right[row].sigmoid()),
+    )
+
+
+def make_detector(weights: str | None = None, **settings: Any) -> HandDetector:
+    """The detector of a configuration.
+
+    weights: a file of train_detector; None = the package's.
+    Raises ToftrackError when they cannot be used.
+    """
+    pose, finder, _ = load_weights(weights)
+    return HandDetector(pose, finder, DetectorSettings(**settings))
+
+
+def no_detector() -> None:
+    """detector=none: the paper's tracker."""

@@ -1,0 +1,256 @@
+"""Training images on the fly: crops for the pose network, whole images for the finder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, channels, wide_channels
+from toftrack.detector.network import PARTS, STRIDE
+from toftrack.detector.pictures import Lens, random_sensors, take_pictures
+from toftrack.detector.scenes import (
+    BACKGROUND,
+    FOREARM,
+    HAND,
+    OTHER_FOREARM,
+    OTHER_HAND,
+    Dice,
+    Hands,
+    Scenes,
+    moved,
+    posed_hands,
+    room_behind,
+    surroundings,
+    things,
+)
+from toftrack.detector.shapes import ShapeBank
+
+_SAMPLES = 2 * CROP
+WIDE_SIZE = (80, 96)
+"""Rows and columns of the finder's training images."""
+_HAND_M2 = 0.0105
+"""About what a mean adult's hand covers from most sides."""
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Crops and what is in them, in the crop's frame about its centre.
+
+    image: (N, 3, CROP, CROP).  parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
+    present: (N,) there is a hand near the centre.  right: (N,) and it is a right one.
+    pivot_m: (N, 3).  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
+    joints_m: (N, 21, 3).
+    """
+
+    image: Tensor
+    parts: Tensor
+    present: Tensor
+    right: Tensor
+    pivot_m: Tensor
+    rotation: Tensor
+    angles: Tensor
+    log_size: Tensor
+    joints_m: Tensor
+
+
+@dataclass(frozen=True)
+class WideImages:
+    """Whole images and the hands in them: the first is raised, the second another's.
+
+    image: (N, 2, *WIDE_SIZE).  cell: (N, 2, 2) column and row of the middle of the palm in cells.
+    depth_m: (N, 2) its Z.  left: (N, 2).  seen: (N, 2) which part of the hand is in view, 0 = none.
+    """
+
+    image: Tensor
+    cell: Tensor
+    depth_m: Tensor
+    left: Tensor
+    seen: Tensor
+
+
+def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
+    """n crops: most about a hand's middle, more or less; some about something else."""
+    dice = Dice(generator)
+    distance = dice.uniform(n, low=math.log(0.27), high=math.log(1.1)).exp()
+    centre = torch.stack((torch.zeros(n), torch.zeros(n), distance), 1)
+    near = torch.where(dice.chance(0.3, n), 0.040, 0.016)[:, None] * dice.normal(n, 3)
+    away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
+    away = away * dice.uniform(n, 1, low=0.13, high=0.30)
+    present = ~dice.chance(0.16, n)
+    pivot = centre + torch.where(present[:, None], near.clamp(-0.09, 0.09), away)
+    left = dice.chance(0.3, n)
+    hands = posed_hands(bank, pivot, left, dice, HAND)
+    labels = hands.labels.clone()
+    # Most of the crops about something else: there is no hand at all, only its arm, or nothing.
+    gone = ~present & dice.chance(0.7, n)
+    pieces = labels.shape[1] - 5
+    labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
+    scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12)
+    scenes = moved(scenes, torch.where(gone[:, None], _onto_something(scenes, centre, dice), 0.0))
+
+    pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
+    side = pixels.round().clamp(36, _SAMPLES)
+    middle = (side - 1) / 2
+    lens = Lens(side * distance / CROP_M, middle, middle, side, side)
+    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_SAMPLES, _SAMPLES), dice)
+    read, seen_parts = _resampled(depth, which, side.int().numpy())
+    _cut(read, seen_parts, dice)
+    # One by one, so that each stays in the cache.
+    each = [channels(read[i : i + 1], distance[i : i + 1].numpy()) for i in range(n)]
+    image = torch.from_numpy(np.concatenate(each))
+    parts = torch.from_numpy(seen_parts).long()
+    parts[parts == OTHER_HAND] = OTHER_FOREARM
+    visible = (parts == HAND).sum((1, 2)) >= 12
+    return Crops(
+        image=image,
+        parts=parts,
+        present=present & visible,
+        right=~left,
+        pivot_m=pivot - centre,
+        rotation=hands.rotation,
+        angles=hands.angles,
+        log_size=hands.log_size,
+        joints_m=hands.joints_m - centre[:, None],
+    )
+
+
+def _onto_something(scenes: Scenes, centre_m: Tensor, dice: Dice) -> Tensor:
+    """(N, 3) by how much to move scenes so that the crop shows some thing or part of a body."""
+    drawn = (scenes.labels == BACKGROUND) | (scenes.labels == FOREARM)
+    weights = drawn.float() + 1e-6
+    one = torch.multinomial(weights, 1, generator=dice.generator)[:, 0]
+    at = scenes.centres_m[torch.arange(len(one)), one]
+    thick = scenes.axes_m[torch.arange(len(one)), one][:, 2].norm(dim=1)
+    near = at + 0.03 * dice.normal(len(one), 3)
+    near[:, 2] -= 0.8 * thick
+    return centre_m - near
+
+
+def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImages:
+    """n whole images, a sixth of them without a raised hand."""
+    dice = Dice(generator)
+    height, width = WIDE_SIZE
+    wide = dice.uniform(n, low=60, high=width).round()
+    high = (wide * dice.uniform(n, low=0.70, high=0.95)).round().clamp(max=height)
+    lens = Lens(
+        torch.full((n,), WIDE_F_PX),
+        (wide - 1) / 2 + 2.0 * dice.normal(n),
+        (high - 1) / 2 + 2.0 * dice.normal(n),
+        wide,
+        high,
+    )
+    z = dice.uniform(n, low=math.log(0.25), high=math.log(1.15)).exp()
+    u = wide * dice.uniform(n, low=-0.05, high=1.05)
+    v = high * dice.uniform(n, low=-0.05, high=1.05)
+    pivot = torch.stack(((u - lens.cx) / WIDE_F_PX * z, (v - lens.cy) / WIDE_F_PX * z, z), 1)
+    left = dice.chance(0.5, n)
+    hands = posed_hands(bank, pivot, left, dice, HAND)
+    labels = hands.labels.clone()
+    raised = ~dice.chance(0.17, n)
+    pieces = labels.shape[1] - 5
+    labels[:, :pieces] = torch.where(raised[:, None], labels[:, :pieces], -1)
+    # Without its hand, mostly no forearm is held up either.
+    no_arm = ~raised & dice.chance(0.7, n)
+    labels[:, pieces:] = torch.where(no_arm[:, None], -1, labels[:, pieces:])
+    other, other_left = _other_hands(hands, bank, dice)
+    there = dice.chance(0.35, n) & raised
+    scenes = random_scenes(
+        hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there)
+    )
+    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
+
+    cells, seen = [], []
+    shown = torch.from_numpy(which)
+    for one, label, exists in ((hands, HAND, raised), (other, OTHER_HAND, there)):
+        at = one.pivot_m[:, :2] / one.pivot_m[:, 2:] * WIDE_F_PX
+        at = at + torch.stack((lens.cx, lens.cy), 1)
+        cells.append((at + 0.5) / STRIDE - 0.5)
+        expected = _HAND_M2 * (2 * one.log_size).exp() * (WIDE_F_PX / one.pivot_m[:, 2]) ** 2
+        part = (shown == label).sum((1, 2)) / expected
+        seen.append(torch.where(exists, part, torch.zeros(n)))
+    return WideImages(
+        image=wide_channels(torch.from_numpy(depth)),
+        cell=torch.stack(cells, 1),
+        depth_m=torch.stack((hands.pivot_m[:, 2], other.pivot_m[:, 2]), 1),
+        left=torch.stack((left, other_left), 1),
+        seen=torch.stack(seen, 1),
+    )
+
+
+def _other_hands(hands: Hands, bank: ShapeBank, dice: Dice) -> tuple[Hands, Tensor]:
+    """A second hand, mostly of the other side, 10 to 40 cm away, and which of them are left."""
+    n = len(hands.pivot_m)
+    away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
+    away = away * dice.uniform(n, 1, low=0.11, high=0.40)
+    away[:, 2] *= 0.6
+    pivot = hands.pivot_m + away
+    pivot[:, 2] = pivot[:, 2].clamp(min=0.22)
+    left = dice.chance(0.5, n)
+    return posed_hands(bank, pivot, left, dice, OTHER_HAND), left
+
+
+def random_scenes(
+    hands: Hands,
+    labels: Tensor,
+    bank: ShapeBank,
+    dice: Dice,
+    others: float,
+    objects: float,
+    other: tuple[Hands, Tensor] | None = None,
+) -> Scenes:
+    """Everything around a batch of hands; another hand with probability `others`, or as given."""
+    n = len(labels)
+    if other is None:
+        other = _other_hands(hands, bank, dice)[0], dice.chance(others, n)
+    second, there = other
+    body = surroundings(hands, hands.pivot_m[:, 2], dice)
+    stuff = things(hands.pivot_m, 2, objects, dice)
+    other_labels = torch.where(there[:, None], second.labels, -1)
+    centres = (hands.centres_m, second.centres_m, body[0], stuff[0])
+    axes = (hands.axes_m, second.axes_m, body[1], stuff[1])
+    behind = (hands.pivot_m[:, 2] + 0.1).clamp(min=0.4)
+    return Scenes(
+        torch.cat(centres, 1),
+        torch.cat(axes, 1),
+        torch.cat((labels, other_labels, body[2], stuff[2]), 1),
+        room_behind(behind, dice),
+    )
+
+
+def _resampled(
+    depth: np.ndarray, which: np.ndarray, side: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures of `side` pixels at a crop's samples, and their parts, as crops.crop reads them."""
+    n = len(depth)
+    read = np.empty((n, _SAMPLES, _SAMPLES), np.float32)
+    parts = np.empty((n, PARTS, PARTS), np.int8)
+    step = _SAMPLES // PARTS
+    for i in range(n):
+        index = ((np.arange(_SAMPLES) + 0.5) * (side[i] / _SAMPLES)).astype(int)
+        read[i] = depth[i][index][:, index]
+        coarse = index[step // 2 :: step]
+        parts[i] = which[i][coarse][:, coarse]
+    return read, parts
+
+
+def _cut(read: np.ndarray, parts: np.ndarray, dice: Dice) -> None:
+    """Beyond the image's border there is nothing: a fifth of the crops are cut, in place."""
+    n = len(read)
+    which = dice.uniform(n).numpy()
+    where = dice.uniform(n, low=0.05, high=0.55).numpy()
+    for i in np.flatnonzero(which < 0.2):
+        cells = int(where[i] * PARTS)
+        for image, label, size in ((read, 0.0, cells * _SAMPLES // PARTS), (parts, -1, cells)):
+            side = int(which[i] * 20)
+            if side == 0:
+                image[i, :size] = label
+            elif side == 1:
+                image[i, -size:] = label
+            elif side == 2:
+                image[i, :, :size] = label
+            else:
+                image[i, :, -size:] = label

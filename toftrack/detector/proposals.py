@@ -1,0 +1,173 @@
+"""From depth images to hypotheses: where hands may be, and what poses they may have there.
+
+The networks know right hands. For a left one the image is mirrored before, and what was found is
+mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rotations import rotmat_to_rotvec
+from toftrack.compute.transfer import on_device, on_host
+from toftrack.detector.crops import crop, wide
+from toftrack.detector.network import STRIDE, Finder, Found, PoseNet, Proposed
+from toftrack.hand.overlap import overlap_of_each
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+
+KEPT = 12
+"""Hypotheses of a crop that are looked at further."""
+DOUBT_M = 0.06
+"""How far off a finger's outer joints may be that lies in another one, by the votes."""
+MIRROR = torch.tensor([-1.0, 1.0, 1.0])
+MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where hands of one side may be, likeliest first.
+
+    centre_m: (P, 3) middles of palms, camera frame.  probability: (P,).
+    """
+
+    centre_m: np.ndarray
+    probability: np.ndarray
+
+
+@dataclass(frozen=True)
+class NetworkOutput:
+    """What the pose network says of C crops, in the camera frame.
+
+    pivot_m: (C, H, 3) middle of the palm.  rotvec: (C, H, 3).  angles: (C, H, 21).
+    log_size: (C, H) of the hand's length in units of the mean adult's.
+    log_probability, error_m: (C, H).  Hypotheses are sorted by probability.
+    joints_m: (C, H, 21, 3) of mean hands of these sizes.
+    votes_m: (C, 21, 3) joints by the cells' votes.  sigma_m: (C, 21) their deviations.
+    present, right: (C,) logits; `right` is of the side that was looked for.
+    """
+
+    pivot_m: Tensor
+    rotvec: Tensor
+    angles: Tensor
+    log_size: Tensor
+    log_probability: Tensor
+    error_m: Tensor
+    joints_m: Tensor
+    keypoints_m: Tensor
+    sigma_m: Tensor
+    present: Tensor
+    right: Tensor
+
+
+def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image as a mirror shows it, and its intrinsics."""
+    k = k.copy()
+    k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
+    return np.ascontiguousarray(depth_m[:, ::-1]), k
+
+
+@torch.inference_mode()
+def find_hands(
+    finder: Finder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
+) -> dict[str, Places]:
+    """Where hands of either side may be: at most `most` places each, at least `least` likely.
+
+    depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
+    """
+    image, wide_k = wide(depth_m, k)
+    found = Found(*on_host(*finder(on_device(image, finder.heads.weight.device))))
+    heat = found.heat.sigmoid()
+    peaks = (heat == F.max_pool2d(heat, 3, 1, 1)) & (heat >= least)
+    places = {}
+    for channel, side in enumerate(("right", "left")):
+        row, column = peaks[0, channel].nonzero().unbind(1)
+        at = (0, channel, row, column)
+        order = heat[at].argsort(descending=True)[:most]
+        row, column = row[order], column[order]
+        at = (0, channel, row, column)
+        z = found.log_depth[at].exp().clamp(0.1, 3.0).numpy()
+        u = (column + found.column[at].clamp(-2, 2) + 0.5).numpy() * STRIDE - 0.5
+        v = (row + found.row[at].clamp(-2, 2) + 0.5).numpy() * STRIDE - 0.5
+        x, y = (u - wide_k[0, 2]) / wide_k[0, 0] * z, (v - wide_k[1, 2]) / wide_k[1, 1] * z
+        places[side] = Places(np.stack((x, y, z), 1).astype(np.float32), heat[at].numpy())
+    return places
+
+
+@torch.inference_mode()
+def run_pose_network(
+    pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
+) -> NetworkOutput:
+    """Hypotheses of a hand of one side about each of C centres (C, 3); C is at least 1."""
+    centres_m = np.asarray(centres_m, np.float64).reshape(-1, 3)
+    if side == "left":
+        depth_m, k = mirrored(depth_m, k)
+        centres_m = centres_m * MIRROR.numpy()
+    crops, crop_turns = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
+    image = torch.from_numpy(np.stack(crops)).to(memory_format=torch.channels_last)
+    p = Proposed(*on_host(*pose(on_device(image, pose.anchors.device))))
+    turn = torch.from_numpy(np.stack(crop_turns)).float()  # (C, 3, 3)
+    centre = torch.from_numpy(centres_m).float()
+    order = p.log_probability.argsort(1, descending=True)[:, :KEPT]
+
+    def ordered(values: Tensor) -> Tensor:
+        return values[torch.arange(len(order))[:, None], order]
+
+    pivot = ordered(p.pivot_m) @ turn.mT + centre[:, None]
+    rotvec = rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))
+    keypoints = p.joints_m @ turn.mT + centre[:, None]
+    if side == "left":
+        pivot, keypoints, rotvec = pivot * MIRROR, keypoints * MIRROR, rotvec * MIRROR_TURN
+    angles, log_size = ordered(p.angles), ordered(p.log_size)
+    return NetworkOutput(
+        pivot_m=pivot,
+        rotvec=rotvec,
+        angles=angles,
+        log_size=log_size,
+        log_probability=ordered(p.log_probability),
+        error_m=ordered(p.error_m),
+        joints_m=_joints(pivot, rotvec, angles, log_size, side),
+        keypoints_m=keypoints,
+        sigma_m=_sigma_m(keypoints, p.sigma_m, log_size[:, 0]),
+        present=p.present,
+        right=p.right,
+    )
+
+
+def _sigma_m(keypoints_m: Tensor, sigma_m: Tensor, log_size: Tensor) -> Tensor:
+    """(C, 21) deviations of the votes: larger where two fingers are voted for in one place.
+
+    Of a single finger that is seen the cells do not know which one it is, and say surely that it is
+    either.
+    """
+    length = DEFAULT_HAND_LENGTH_M * log_size.exp()
+    each = zip(keypoints_m, length.tolist(), strict=True)
+    overlap = torch.cat([overlap_of_each(keypoints[None], size) for keypoints, size in each])
+    doubt = DOUBT_M * overlap.clamp(max=1)  # (C, 5)
+    outer = torch.cat((doubt.new_zeros(len(doubt), 5, 1), doubt[..., None].expand(-1, -1, 3)), 2)
+    added = torch.cat((doubt.new_zeros(len(doubt), 1), outer.flatten(1)), 1)
+    return torch.hypot(sigma_m, added)
+
+
+def _joints(pivot_m: Tensor, rotvec: Tensor, angles: Tensor, log_size: Tensor, side: str) -> Tensor:
+    """(C, H, 21, 3) of mean hands scaled about the middle of the palm."""
+    flat = rotvec.flatten(0, 1), angles.flatten(0, 1)
+    states = torch.cat((torch.zeros_like(flat[0]), *flat), 1)
+    pose = forward_kinematics(states, mean_hand(side))
+    # A mirror changes nothing on the palm's middle line.
+    middle = pose.frames[:, 0] @ rotvec.new_tensor(PIVOT_M)
+    joints = (pose.joints_m - middle[:, None]).unflatten(0, log_size.shape)
+    return pivot_m[:, :, None] + joints * log_size.exp()[..., None, None]
+
+
+@lru_cache
+def mean_hand(side: str) -> HandShape:
+    """The mean adult's of a side."""
+    return default_hand_shape(side=side)

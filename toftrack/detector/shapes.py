@@ -1,0 +1,91 @@
+"""Hands of many people to train on: sizes, proportions and flesh vary, the ellipsoids with them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor
+
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
+from toftrack.hand.surface import HandSurface, hand_surface
+
+_SHORTEST_M, _LONGEST_M = 0.135, 0.215
+
+
+@dataclass(frozen=True)
+class ShapeBank:
+    """B right hands, stacked so that kinematics and surfaces of a batch need no loop.
+
+    shape: base_m (B, 5, 3), base_frames (B, 5, 3, 3), bone_lengths_m (B, 5, 3).
+    surface: centres_m (B, E + 1, 3), axes_m (B, E + 1, 3, 3), one frame_index for all.
+    log_size: (B,) logarithm of the hand's length in units of the mean adult's.
+    """
+
+    shape: HandShape
+    surface: HandSurface
+    log_size: Tensor
+
+    def rows(self, rows: Tensor) -> tuple[HandShape, HandSurface]:
+        """The hands of (N,) rows, for N states at once."""
+        shape = HandShape(
+            self.shape.base_m[rows], self.shape.base_frames[rows], self.shape.bone_lengths_m[rows]
+        )
+        surface = HandSurface(
+            self.surface.frame_index, self.surface.centres_m[rows], self.surface.axes_m[rows]
+        )
+        return shape, surface
+
+
+def shape_bank(count: int, generator: torch.Generator) -> ShapeBank:
+    """`count` random hands, 135 to 215 mm long.
+
+    The spreads are wider than those between people (coefficients of variation of 5 to 10 %, ANSUR
+    II), so that a real hand, whose surface is no set of ellipsoids, lies within them.
+    """
+    shapes, surfaces = [], []
+    for _ in range(count):
+        shape = _random_shape(generator)
+        shapes.append(shape)
+        surfaces.append(_random_surface(shape, generator))
+    stacked = HandShape(
+        torch.stack([s.base_m for s in shapes]),
+        torch.stack([s.base_frames for s in shapes]),
+        torch.stack([s.bone_lengths_m for s in shapes]),
+    )
+    surface = HandSurface(
+        surfaces[0].frame_index,
+        torch.stack([s.centres_m for s in surfaces]),
+        torch.stack([s.axes_m for s in surfaces]),
+    )
+    lengths = torch.tensor([s.hand_length_m for s in shapes])
+    return ShapeBank(stacked, surface, (lengths / DEFAULT_HAND_LENGTH_M).log())
+
+
+def _random_shape(generator: torch.Generator) -> HandShape:
+    def normal(*size: int) -> Tensor:
+        return torch.randn(*size, generator=generator)
+
+    log_length = torch.rand(1, generator=generator) * math.log(_LONGEST_M / _SHORTEST_M)
+    mean = default_hand_shape(_SHORTEST_M * math.exp(float(log_length)))
+    scale = float(mean.hand_length_m) / DEFAULT_HAND_LENGTH_M
+    palm = 1 + torch.tensor([0.08, 0.05, 0.08]) * normal(3)
+    base = mean.base_m * palm + 0.002 * scale * normal(5, 3)
+    base[0] += 0.003 * scale * normal(3)
+    lengths = 1 + 0.05 * normal(1, 1) + 0.05 * normal(5, 1) + 0.03 * normal(5, 3)
+    rotations = normal(5, 3) * math.radians(3.0)
+    rotations[0] *= 2.5
+    frames = mean.base_frames @ roma.rotvec_to_rotmat(rotations)
+    thickness = float((1 + 0.10 * normal(1)).clamp(0.75, 1.35))
+    return HandShape(base, frames, mean.bone_lengths_m * lengths, thickness)
+
+
+def _random_surface(shape: HandShape, generator: torch.Generator) -> HandSurface:
+    surface = hand_surface(shape)
+    count = len(surface.centres_m)
+    scale = shape.hand_length_m / DEFAULT_HAND_LENGTH_M
+    grown = 1 + 0.06 * torch.randn(count, 1, 3, generator=generator)
+    moved = 0.0015 * scale * torch.randn(count, 3, generator=generator)
+    return HandSurface(surface.frame_index, surface.centres_m + moved, surface.axes_m * grown)

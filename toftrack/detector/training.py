@@ -1,0 +1,214 @@
+"""Training of the detector: one process makes images, one trains; everything from a seed."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import math
+import multiprocessing
+import queue as queues
+import sys
+import time
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from toftrack.detector.images import Crops, WideImages, crop_images, wide_images
+from toftrack.detector.losses import finder_loss, pose_losses
+from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.shapes import shape_bank
+from toftrack.detector.weights import trained_weights
+from toftrack.errors import ToftrackError
+
+_READY = 6
+"""Batches that wait to be trained on."""
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+Network = TypeVar("Network", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How a network is trained; see conf/train_detector.yaml.
+
+    images: in all.  batch: images of a step.  rate: the highest learning rate.
+    width: channels of the network's first layer.
+    start: a file of weights to go on from; None begins from nothing.
+    """
+
+    images: int
+    batch: int
+    rate: float
+    width: int
+    start: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("images", "batch", "width"):
+            if not (isinstance(getattr(self, name), int) and getattr(self, name) > 0):
+                raise ToftrackError(f"{name} of a network must be a whole number above 0")
+        if not 0 < self.rate < 1:
+            raise ToftrackError("rate of a network must be between 0 and 1")
+
+
+Course = list[dict[str, Any]]
+"""How training went: a row every few thousand images, with running means of the errors."""
+
+
+def train_poses(schedule: Schedule, shapes: int, seed: int) -> tuple[PoseNet, Course]:
+    """Train the pose network; returns the average of its weights, and the course."""
+    torch.manual_seed(seed)
+    network = PoseNet(schedule.width)
+    if schedule.start is not None:
+        network.load_state_dict(trained_weights(schedule.start, "pose", schedule.width))
+    network.train().to(memory_format=torch.channels_last)
+
+    def step(crops: Crops) -> tuple[Tensor, dict[str, float]]:
+        image = crops.image.to(memory_format=torch.channels_last)
+        with torch.autocast("cpu", torch.bfloat16):
+            outputs = network.features(image)
+        losses = pose_losses(network.decode(image, *outputs), crops, network.anchors)
+        reported = {
+            "joints_mm": losses.hypothesis_mm,
+            "votes_mm": losses.keypoints_mm,
+            "within_20_mm": losses.within_20,
+            "side": losses.side,
+            "present": losses.present,
+        }
+        return losses.total, reported
+
+    return _train(network, "poses", crop_images, step, schedule, shapes, seed)
+
+
+def train_finder(schedule: Schedule, shapes: int, seed: int) -> tuple[Finder, Course]:
+    """Train the finder; returns the average of its weights, and the course."""
+    torch.manual_seed(seed)
+    network = Finder(schedule.width)
+    if schedule.start is not None:
+        network.load_state_dict(trained_weights(schedule.start, "finder", schedule.width))
+    network.train().to(memory_format=torch.channels_last)
+
+    def step(images: WideImages) -> tuple[Tensor, dict[str, float]]:
+        image = images.image.to(memory_format=torch.channels_last)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = network(image)
+        loss = finder_loss(found, images)
+        return loss, {"loss": float(loss.detach())}
+
+    return _train(network, "finder", wide_images, step, schedule, shapes, seed + 1)
+
+
+def _train(
+    network: Network,
+    name: str,
+    make: Callable[..., Any],
+    step: Callable[[Any], tuple[Tensor, dict[str, float]]],
+    schedule: Schedule,
+    shapes: int,
+    seed: int,
+) -> tuple[Network, Course]:
+    _keep_memory()
+    steps = math.ceil(schedule.images / schedule.batch)
+    optimiser = torch.optim.AdamW(network.parameters(), schedule.rate, weight_decay=0.02)
+    averaged = deepcopy(network)
+    course: Course = []
+    recent: dict[str, float] = {}
+    began = time.perf_counter()
+    bar = tqdm(total=steps * schedule.batch, unit=" images", desc=name, file=sys.stderr)
+    with bar:
+        batches = _batches(make, schedule.batch, steps, shapes, seed)
+        for number, batch in enumerate(batches):
+            warm = min(1.0, (number + 1) / 300)
+            cosine = 0.5 * (1 + math.cos(math.pi * number / steps))
+            for group in optimiser.param_groups:
+                group["lr"] = schedule.rate * warm * (0.01 + 0.99 * cosine)
+            loss, reported = step(batch)
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+            optimiser.step()
+            _average(averaged, network, min(0.998, (number + 1) / (number + 10)))
+            for key, value in reported.items():
+                recent[key] = 0.99 * recent.get(key, value) + 0.01 * value
+            bar.update(schedule.batch)
+            if (number + 1) % 100 == 0 or number + 1 == steps:
+                bar.set_postfix({k: f"{v:.3g}" for k, v in recent.items()}, refresh=False)
+                seconds = time.perf_counter() - began
+                images = (number + 1) * schedule.batch
+                course.append({"images": images, "seconds": round(seconds, 1)} | recent)
+    return averaged, course
+
+
+def _keep_memory() -> None:
+    """Ask glibc to reuse what was freed: the batches' large arrays come and go all the time, and
+    fresh pages cost more than half of the time on some machines. Elsewhere nothing happens.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        for option in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD):
+            libc.mallopt(option, 1 << 30)
+
+
+@torch.no_grad()
+def _average(averaged: nn.Module, network: nn.Module, kept: float) -> None:
+    """Exponential moving average of all weights and statistics."""
+    for old, new in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
+        if old.is_floating_point():
+            old.lerp_(new, 1 - kept)
+        else:
+            old.copy_(new)
+
+
+def _batches(
+    make: Callable[..., Any], batch: int, steps: int, shapes: int, seed: int
+) -> Iterator[Any]:
+    """Batches made by another process, in order."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue(_READY)
+    worker = context.Process(
+        target=_make_batches, args=(queue, make, batch, steps, shapes, seed), daemon=True
+    )
+    worker.start()
+    try:
+        for _ in range(steps):
+            while True:
+                try:
+                    yield _tensors(*queue.get(timeout=10))
+                    break
+                except queues.Empty:
+                    if not worker.is_alive():
+                        raise ToftrackError(
+                            "the process that makes the training images has ended; is there enough"
+                            " memory?"
+                        ) from None
+    finally:
+        worker.terminate()
+        worker.join()
+
+
+def _make_batches(
+    queue: Any, make: Callable[..., Any], batch: int, steps: int, shapes: int, seed: int
+) -> None:
+    torch.set_num_threads(1)
+    _keep_memory()
+    generator = torch.Generator().manual_seed(seed)
+    bank = shape_bank(shapes, generator)
+    for _ in range(steps):
+        queue.put(_arrays(make(batch, bank, generator)))
+
+
+def _arrays(batch: Any) -> tuple[type, list[np.ndarray]]:
+    """A batch as arrays, which travel by themselves: torch would share memory through a helper that
+    a busy machine may starve. Images in half precision, which is more than a sensor's.
+    """
+    values = [getattr(batch, field.name).numpy() for field in fields(batch)]
+    return type(batch), [v.astype(np.float16) if v.ndim == 4 else v for v in values]
+
+
+def _tensors(kind: type, arrays: list[np.ndarray]) -> Any:
+    """The batch again."""
+    return kind(*(torch.from_numpy(a.astype(np.float32) if a.ndim == 4 else a) for a in arrays))

@@ -1,0 +1,155 @@
+"""The detector's weights as a file: arrays of half precision and JSON, with a checksum."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from toftrack.archives import read_archive
+from toftrack.detector.network import Finder, PoseNet, Residual
+from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
+from toftrack.safe_files import whole_file
+
+FORMAT = "toftrack-detector"
+VERSION = 1
+DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
+_LARGEST_BYTES = 64 << 20
+_WIDEST = 256
+"""Channels; ten times those of the package's networks."""
+_AGAIN = "train them anew with python -m toftrack.programs.train_detector, or install again"
+
+
+def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any]) -> None:
+    """Write both networks; `about` says how they were trained."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, network in (("pose", pose), ("finder", finder)):
+        for key, tensor in network.state_dict().items():
+            array = tensor.detach().cpu().numpy()
+            if array.dtype.kind == "f":
+                array = array.astype(np.float16)
+            arrays[f"{name}.{key}"] = array
+    metadata = {
+        "format": FORMAT,
+        "version": VERSION,
+        "sha256": _checksum(arrays),
+        "pose_width": pose.stem[0].out_channels,
+        "finder_width": finder.heads.in_channels,
+        "about": about,
+    }
+    content: dict[str, Any] = {"metadata": np.array(json.dumps(metadata)), **arrays}
+    with whole_file(path) as stream:
+        np.savez_compressed(stream, **content)
+
+
+def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[str, Any]]:
+    """Both networks ready for use, and how they were trained; None: those of the package.
+
+    Raises ToftrackError when the file is missing, damaged, not weights or of another version.
+    """
+    arrays, metadata = _read(DEFAULT_FILE if path is None else Path(path))
+    try:
+        pose = PoseNet(_width(metadata, "pose"))
+        finder = Finder(_width(metadata, "finder"))
+        for name, network in (("pose", pose), ("finder", finder)):
+            network.load_state_dict(_tensors(arrays, name))
+    except (KeyError, TypeError, ValueError, RuntimeError):
+        raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
+    make_ready(pose)
+    make_ready(finder)
+    return pose, finder, metadata.get("about", {})
+
+
+def trained_weights(path: str | Path, name: str, width: int) -> dict[str, Tensor]:
+    """One network's weights, "pose" or "finder" of so many channels, to go on training from.
+
+    Raises ToftrackError as load_weights does, and for another width.
+    """
+    arrays, metadata = _read(Path(path))
+    if metadata.get(f"{name}_width") != width:
+        raise ToftrackError(
+            f"{path} holds weights for a width of {metadata.get(f'{name}_width')}, and the width to"
+            f" train is {width}; give the same"
+        )
+    return _tensors(arrays, name)
+
+
+def _width(metadata: dict[str, Any], name: str) -> int:
+    """Of a network; ValueError for one that would take all memory before its weights are seen."""
+    width = metadata[f"{name}_width"]
+    if type(width) is not int or not 1 <= width <= _WIDEST:
+        raise ValueError(f"a width of {width}")
+    return width
+
+
+def _tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
+    """One network's arrays as it takes them."""
+    return {
+        key.split(".", 1)[1]: torch.from_numpy(array).float()
+        if array.dtype.kind == "f"
+        else torch.from_numpy(array)
+        for key, array in arrays.items()
+        if key.startswith(name + ".")
+    }
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and metadata of a file that is whole."""
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise ToftrackError(f"{path} is too large for weights of the detector; {_AGAIN}")
+        arrays = read_archive(path)
+        metadata = parse_json(str(arrays.pop("metadata")))
+    except FileNotFoundError:
+        raise ToftrackError(f"there are no weights of the detector at {path}; {_AGAIN}") from None
+    except (OSError, ValueError, KeyError) as error:
+        raise ToftrackError(
+            f"{path} is no file of the detector's weights ({error}); {_AGAIN}"
+        ) from None
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        raise ToftrackError(f"{path} is no file of the detector's weights; {_AGAIN}")
+    if metadata.get("version") != VERSION:
+        raise ToftrackError(
+            f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"
+            f" version {VERSION}; {_AGAIN}"
+        )
+    if metadata.get("sha256") != _checksum(arrays):
+        raise ToftrackError(f"{path} is damaged, its checksum is wrong; {_AGAIN}")
+    return arrays, metadata
+
+
+def _checksum(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for key in sorted(arrays):
+        digest.update(key.encode())
+        digest.update(np.ascontiguousarray(arrays[key]).tobytes())
+    return digest.hexdigest()
+
+
+def make_ready(network: nn.Module) -> None:
+    """Make a network fit for use: no gradients, normalisation folded into the convolutions."""
+    network.eval().requires_grad_(False)
+    for module in network.modules():
+        if isinstance(module, Residual):
+            for convolution, norm in (("first", "norm_1"), ("second", "norm_2")):
+                _fold(module, convolution, norm)
+        elif isinstance(module, nn.Sequential):
+            for number in range(len(module) - 1):
+                if isinstance(module[number + 1], nn.BatchNorm2d):
+                    _fold(module, str(number), str(number + 1))
+    network.to(memory_format=torch.channels_last)
+
+
+def _fold(module: nn.Module, convolution: str, norm: str) -> None:
+    """Fold one of a module's normalisations into the convolution before it."""
+    before, after = module.get_submodule(convolution), module.get_submodule(norm)
+    assert isinstance(before, nn.Conv2d) and isinstance(after, nn.BatchNorm2d)
+    setattr(module, convolution, fuse_conv_bn_eval(before, after))
+    setattr(module, norm, nn.Identity())

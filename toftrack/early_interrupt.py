@@ -1,0 +1,22 @@
+"""Ctrl-C while a program still loads: imported before everything else, by programs alone.
+
+Within the first second nothing is written yet, and an exception would end in whatever is being
+imported: so the process ends at once, with status 130. `programs.shutdown` takes over when the
+program has begun. What comes before the first line of toftrack is Python's own. Once the program
+is done Ctrl-C does nothing any more: its status is known.
+"""
+
+import atexit
+import os
+import signal
+from types import FrameType
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(128 + number)
+
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # it may be ignored, as by nohup
+    signal.signal(signal.SIGINT, _end)
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)

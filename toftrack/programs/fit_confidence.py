@@ -1,0 +1,282 @@
+"""Fit the tracker's belief on rendered sequences, whose hands and sensors are none that it is
+judged on:
+
+python -m toftrack.programs.fit_confidence
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.special import expit
+from tqdm import tqdm
+
+from toftrack.api import make_tracker
+from toftrack.detector.sequences import Sequence, random_sequence, read_sequence, write_sequence
+from toftrack.detector.shapes import shape_bank
+from toftrack.errors import ToftrackError
+from toftrack.hand.regions import REGION_90, joint_axes
+from toftrack.programs import command_line
+from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
+from toftrack.safe_files import whole_file, write_whole
+from toftrack.tracking.features import FEATURES
+from toftrack.tracking.joint_confidence import JOINT_FEATURES
+from toftrack.tracking.model import TrackerModel
+from toftrack.views.pictures import write_picture
+
+RIGHT_M = 0.04
+"""An estimate is right when every joint is within this."""
+_SHRINK = 100.0
+"""Prior precision of the weights of signs in standard deviations, in frames."""
+_HELD_OUT = 5
+"""Every so manieth sequence is kept to check the fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What the tracker's estimates of T frames were formed from, and how right they were.
+
+    signs: (T, S).  right: (T,) every joint is within 40 mm.  joints: of each joint.
+    sequence: (T,) numbers of the sequences.
+    """
+
+    features: np.ndarray
+    right: np.ndarray
+    joints: JointRows
+    sequence: np.ndarray
+
+    def of(self, rows: np.ndarray) -> Observed:
+        """Some of the frames."""
+        joints = self.joints.of(rows)
+        return Observed(self.features[rows], self.right[rows], joints, self.sequence[rows])
+
+
+def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(
+        prog="python -m toftrack.programs.fit_confidence",
+        description="Fit lost=calibrated: prints what is fitted of its configuration.",
+    )
+    parser.add_argument("overrides", nargs="*", default=[], help="of the tracker, as for track.py")
+    parser.add_argument("--sequences", type=int, default=150, help="how many are rendered (150)")
+    parser.add_argument("--frames", type=int, default=50, help="of each (50)")
+    parser.add_argument("--seed", type=int, default=1, help="of everything random (1)")
+    parser.add_argument("--output", type=Path, default=Path("belief"), help="folder (belief)")
+    parser.add_argument(
+        "--sequences-from",
+        type=Path,
+        metavar="FOLDER",
+        help="track the sequences that an earlier run kept here, or render and keep them",
+    )
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Render, track, fit, report."""
+
+    from toftrack.views.figures.reliability import reliability_figure
+
+    asked = read_arguments(arguments)
+    asked.output.mkdir(parents=True, exist_ok=True)
+    count, sequences = _sequences(asked)
+    parts = [
+        observed(sequence, asked.overrides, asked.seed + number, number)
+        for number, sequence in enumerate(
+            tqdm(sequences, total=count, unit=" sequences", file=sys.stderr)
+        )
+    ]
+    seen = _together([part for part in parts if part is not None])
+    kept = seen.sequence % _HELD_OUT == 0
+    log_odds, summary, lines = _fitted_frames(seen, kept)
+    seen = with_doubt(seen, log_odds, _memory(asked.overrides))
+    more, joint_lines = _fitted_joints(seen, kept)
+    summary |= more
+    write_whole(asked.output / "belief.json", json.dumps(summary, indent=1) + "\n")
+    pasted = "\n".join(lines + joint_lines)
+    write_whole(asked.output / "belief.yaml", pasted + "\n")
+    picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
+    write_picture(asked.output / "reliability.png", picture)
+    with whole_file(asked.output / "signs.npz") as stream:
+        np.savez_compressed(
+            stream,
+            features=seen.features,
+            right=seen.right,
+            sequence=seen.sequence,
+            **{f"joint_{name}": values for name, values in seen.joints._asdict().items()},
+        )
+    print(f"{pasted}\n\n{_words(summary)}\nresults: {asked.output}")
+
+
+def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
+    """How many sequences, and one after the other."""
+    folder: Path | None = asked.sequences_from
+    files = [] if folder is None else sorted(folder.glob("*.npz"))
+    if files:
+        return len(files), (read_sequence(file) for file in files)
+    generator = torch.Generator().manual_seed(asked.seed)
+    bank = shape_bank(400, generator)
+
+    def rendered() -> Iterator[Sequence]:
+        for number in range(asked.sequences):
+            sequence = random_sequence(asked.frames, bank, generator)
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                write_sequence(folder / f"{number:04d}.npz", sequence)
+            yield sequence
+
+    return asked.sequences, rendered()
+
+
+def _fitted_frames(
+    seen: Observed, kept: np.ndarray
+) -> tuple[np.ndarray, dict[str, Any], list[str]]:
+    """Log odds (T,), figures about the kept frames, and the lines of the configuration."""
+    x, y = seen.features, seen.right
+    intercept, weights = fitted_weights(x[~kept], y[~kept])
+    log_odds = intercept + x @ weights
+    p = expit(log_odds[kept])
+    log_loss = -np.mean(np.log(np.where(y[kept], p, 1 - p).clip(1e-9)))
+    fitted = {name: round(float(w), 3) for name, w in zip(FEATURES, weights, strict=True)}
+    summary = {
+        "frames": len(y),
+        "right": round(float(y.mean()), 3),
+        "held_out_log_loss": round(float(log_loss), 4),
+        "held_out_wrong": round(float(((p > 0.5) != y[kept]).mean()), 4),
+        "intercept": round(intercept, 3),
+        "weights": fitted,
+    }
+    lines = [f"intercept: {summary['intercept']} # log odds where all signs are 0; fitted"]
+    lines += ["weights: # of the signs, see toftrack/tracking/features.py"]
+    return log_odds, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
+
+
+def _memory(overrides: list[str]) -> float:
+    """The part of the log odds that the tracker takes from the frames before."""
+    model = make_tracker(*overrides).model
+    if not isinstance(model, TrackerModel):
+        raise ToftrackError("fit_confidence fits lost=calibrated; leave experiment=paper out")
+    return model.lost.memory
+
+
+def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
+    """The same with the sign `doubt` of joints as newly fitted log odds (T,) of the frames make it.
+
+    As the tracker does, it smooths them within each track.
+    """
+    smooth = log_odds.copy()
+    begins = seen.features[:, FEATURES.index("young")] == 1
+    for row in range(1, len(smooth)):
+        if not begins[row] and seen.sequence[row] == seen.sequence[row - 1]:
+            smooth[row] = memory * smooth[row - 1] + (1 - memory) * log_odds[row]
+    features = seen.joints.features.copy()
+    features[..., JOINT_FEATURES.index("doubt")] = np.logaddexp(0, -smooth)[:, None]
+    return replace(seen, joints=seen.joints._replace(features=features))
+
+
+def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], list[str]]:
+    """Figures about joints in kept frames, and the lines of the configuration."""
+    belief = fitted_joint_belief(seen.joints.of(~kept))
+    check = seen.joints.of(kept)
+    reported = [belief.judge(features) for features in check.features]
+    sigma, near = np.stack([one[0] for one in reported]), np.stack([one[1] for one in reported])
+    off = np.sqrt(np.square(check.error_cm / (100 * sigma)).sum(2))[check.counted]
+    right = np.where(check.near, near, 1 - near)
+    summary = {
+        "held_out_joints_in_90_pct_region": round(100 * float((off <= REGION_90).mean()), 1),
+        "held_out_joints_near": round(float(check.near.mean()), 3),
+        "held_out_joints_said_near": round(float(near.mean()), 3),
+        "held_out_joints_log_loss": round(-float(np.log(right.clip(1e-9)).mean()), 4),
+    }
+    lines = [
+        "joints: # how far off each joint may be; see toftrack/tracking/joint_confidence.py",
+        "  _target_: toftrack.tracking.joint_confidence.JointConfidence",
+        # Not fitted on rendered sequences: what stands there may stay.
+        "  scale: 1.0 # times all standard deviations; larger holds joints oftener",
+        "  odds: 1.5 # added to all log odds; larger trusts joints more",
+        "  kinds: # log cm along ray, finger, across; log odds of being within 40 mm; fitted",
+        *_table(belief.kinds),
+        "  weights: # of the signs, see JOINT_FEATURES, likewise; fitted",
+        *_table(belief.weights),
+    ]
+    return summary, lines
+
+
+def _table(rows: Mapping[str, Iterable[float]]) -> list[str]:
+    return [f"    {name}: {list(row)}" for name, row in rows.items()]
+
+
+def _words(summary: dict[str, Any]) -> str:
+    return (
+        f"{summary['frames']} frames, {100 * summary['right']:.0f} % right; held out: log loss"
+        f" {summary['held_out_log_loss']:.3f}; 90 % regions hold"
+        f" {summary['held_out_joints_in_90_pct_region']} % of the joints"
+    )
+
+
+def fitted_weights(features: np.ndarray, right: np.ndarray) -> tuple[float, np.ndarray]:
+    """Intercept and weights (S,) of a logistic model of signs (N, S) and what was right (N,).
+
+    Only the score may speak for an estimate and all other signs against it: signs that go together
+    would otherwise get weights of both kinds, which hold for rendered hands only.
+    """
+    mean, spread = features.mean(0), features.std(0) + 1e-9
+    z, y = (features - mean) / spread, right.astype(float)
+
+    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        odds = z @ parameters[1:] + parameters[0]
+        off = 1 / (1 + np.exp(-odds)) - y
+        slope = np.concatenate(([off.sum()], z.T @ off + _SHRINK * parameters[1:]))
+        square = 0.5 * _SHRINK * np.square(parameters[1:]).sum()
+        return float((np.logaddexp(0, odds) - y * odds).sum() + square), slope
+
+    bounds = [(None, None)] + [(0, None) if name == "log_score" else (None, 0) for name in FEATURES]
+    start = np.zeros(len(FEATURES) + 1)
+    found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x
+    weights = found[1:] / spread
+    return float(found[0] - (weights * mean).sum()), weights
+
+
+def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -> Observed | None:
+    """What the tracker makes of a sequence; None where it never saw a hand."""
+    tracker = make_tracker(f"hand.side={sequence.side}", f"seed={seed}", *overrides)
+    rows = []
+    for index, depth in enumerate(sequence.depth_m):
+        estimate = tracker.step(depth, sequence.k, index, index / 25)
+        info = tracker.info
+        if info is None or info.features is None or info.joint_features is None:
+            continue
+        joints, there = estimate.joints_m.astype(np.float64), bool(sequence.visible[index])
+        off = sequence.joints_m[index] - joints
+        near = there & (np.linalg.norm(off, axis=1) < RIGHT_M)
+        error_cm = 100 * np.einsum("jab,jb->ja", joint_axes(joints), off)
+        counted = there and not estimate.lost
+        rows.append(
+            (info.features.values(), near.all(), info.joint_features, error_cm, near, counted)
+        )
+    if not rows:
+        return None
+    features, right, *joint_rows = map(np.array, zip(*rows, strict=True))
+    return Observed(features, right, JointRows(*joint_rows), np.full(len(rows), number))
+
+
+def _together(parts: list[Observed]) -> Observed:
+    joints = zip(*(part.joints for part in parts), strict=True)
+    return Observed(
+        np.concatenate([part.features for part in parts]),
+        np.concatenate([part.right for part in parts]),
+        JointRows(*map(np.concatenate, joints)),
+        np.concatenate([part.sequence for part in parts]),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(command_line.run(main))

@@ -1,0 +1,118 @@
+"""How a program ends when it is asked to: Ctrl-C, SIGTERM, or a terminal that is closed.
+
+All of them raise EndedError in the main thread, as Ctrl-C raises KeyboardInterrupt. Only the first
+one does: whoever is finishing files is left alone until somebody has asked once too often.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any, TextIO
+
+SHUTDOWN_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+"""The signals that ask a program to end; Windows has no SIGHUP."""
+_PATIENCE = 2
+"""So many further requests are let pass while files are finished."""
+_HINT = b"\nfinishing the files; once more ends at once\n"
+
+
+class EndedError(KeyboardInterrupt):
+    """Somebody asked the program to end.
+
+    number: of the signal; the program's exit status is 128 more.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+@dataclass
+class _Requests:
+    """What was asked since the program began."""
+
+    count: int = 0
+    waiting: int | None = None
+    """A signal that takes effect when what must not be interrupted is done."""
+    shields: int = 0
+
+
+_requests = _Requests()
+
+
+@contextmanager
+def obeyed() -> Iterator[None]:
+    """Within it the signals raise EndedError. A signal that is ignored, as by nohup, stays so."""
+    _requests.count, _requests.waiting = 0, None
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in SHUTDOWN_SIGNALS:
+            if signal.getsignal(number) != signal.SIG_IGN:
+                before[number] = signal.signal(number, _request)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def not_now() -> Iterator[None]:
+    """What is within is not interrupted: a signal takes effect at its end."""
+    _requests.shields += 1
+    try:
+        yield
+    finally:
+        _requests.shields -= 1
+    if _requests.waiting is not None and not _requests.shields:
+        number, _requests.waiting = _requests.waiting, None
+        raise EndedError(number)
+
+
+def exit_status(end: KeyboardInterrupt) -> int:
+    """130 for Ctrl-C, 143 for SIGTERM, 129 for a terminal that was closed."""
+    return 128 + (end.number if isinstance(end, EndedError) else signal.SIGINT)
+
+
+def say(text: str, stream: TextIO) -> None:
+    """Print a text, even where the terminal has been closed and nobody reads it any more."""
+    try:
+        print(text, file=stream, flush=True)
+    except (OSError, ValueError):
+        forget_streams()
+
+
+def forget_streams() -> None:
+    """Standard output and error lead nowhere from now on where they cannot be written.
+
+    Python would complain at its exit about what it could not write, with a status of its own.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+
+
+def _request(number: int, frame: FrameType | None) -> None:
+    _requests.count += 1
+    if _requests.count == 1 and not _requests.shields:
+        raise EndedError(number)
+    if _requests.count == 1:
+        _requests.waiting = number
+    elif _requests.count > 1 + _PATIENCE:
+        raise EndedError(number)
+    elif number == signal.SIGINT:
+        with suppress(OSError):
+            os.write(2, _HINT)  # print is not for the middle of whatever goes on

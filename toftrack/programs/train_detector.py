@@ -1,0 +1,77 @@
+"""Train the networks that find hands and propose poses, from nothing:
+
+python -m toftrack.programs.train_detector
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from toftrack.configuration.compose import configuration_folder
+from toftrack.programs import command_line
+from toftrack.safe_files import write_whole
+from toftrack.views.pictures import write_picture
+
+
+@hydra.main(
+    version_base="1.3", config_path=str(configuration_folder()), config_name="train_detector"
+)
+@command_line.sweep_job
+def main(config: DictConfig) -> float:
+    """Train, write weights and figures; returns the mean joint error of the last images, mm."""
+    return train(config)
+
+
+def train(config: DictConfig) -> float:
+    """See main; everything goes into Hydra's output folder."""
+    import torch
+
+    from toftrack.detector.training import train_finder, train_poses
+    from toftrack.detector.weights import save_weights
+    from toftrack.errors import ToftrackError
+    from toftrack.views.figures.training import course_figure, images_figure
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    poses = hydra.utils.instantiate(config.poses)
+    finder = hydra.utils.instantiate(config.finder)
+    if not (isinstance(config.shapes, int) and config.shapes > 0):
+        raise ToftrackError("shapes must be a whole number above 0: how many hands are drawn from")
+    began = time.perf_counter()
+    write_picture(folder / "images.png", images_figure(config.seed))
+    torch.set_num_threads(1)  # the other core makes the images
+    finder_network, finder_course = train_finder(finder, config.shapes, config.seed)
+    pose_network, pose_course = train_poses(poses, config.shapes, config.seed)
+    minutes = round((time.perf_counter() - began) / 60, 1)
+    about = {
+        "seed": config.seed,
+        "shapes": config.shapes,
+        "pose_images": poses.images,
+        "finder_images": finder.images,
+        "torch": torch.__version__,
+        "minutes": minutes,
+    }
+    path = folder / config.output
+    save_weights(path, pose_network, finder_network, about)
+    write_picture(folder / "course.png", course_figure(pose_course))
+    summary = about | {"poses": pose_course, "finder": finder_course}
+    write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
+    last = pose_course[-1]
+    print(
+        f"trained in {minutes} minutes; on the last training images: joints {last['votes_mm']:.1f}"
+        f" mm by votes, {last['joints_mm']:.1f} mm by the likeliest hypothesis"
+    )
+    for name in (config.output, "images.png", "course.png", "summary.json"):
+        print(f"  {folder / name}")
+    print(f"use it: toftrack track detector.weights={path}")
+    return float(last["votes_mm"])
+
+
+if __name__ == "__main__":
+    sys.exit(command_line.run(main))

@@ -1,4 +1,0 @@
-"""The learned relocaliser: finds hands in a depth image and proposes poses of them.
-
-It is trained on images of toftrack's own ellipsoid hand only; see docs/relocaliser.md.
-"""
