@@ -120,7 +120,7 @@ def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int
     turn = torch.tensor([1.0, -1.0, -1.0])
     for name, value in right.items():
         reported = left[name]
-        if name in ("pivot_m", "joints_m", "votes_m"):
+        if name in ("pivot_m", "joints_m", "keypoints_m"):
             reported = reported * torch.from_numpy(flip).float()
         elif name == "rotvec":
             reported = reported * turn

@@ -60,7 +60,7 @@ def test_only_the_first_hypotheses_are_kept() -> None:
     kept = seen.first(3)
     assert len(kept.pivot_m) == len(kept.angles) == len(kept.log_probability) == 3
     assert torch.equal(kept.joints_m, seen.joints_m[:3])
-    assert kept.landmarks is seen.landmarks and kept.present == seen.present
+    assert kept.keypoints is seen.keypoints and kept.present == seen.present
     assert torch.equal(kept.centre_m, seen.centre_m)
 
 
@@ -156,7 +156,7 @@ def test_strange_images_are_searched_without_an_error(image: np.ndarray) -> None
     here = detector(merit=-1e6, least=0.0)
     for side in ("right", "left"):
         for seen in here.search(image.astype(np.float32), sample().k, side):
-            assert seen.joints_m.isfinite().all() and seen.landmarks.points_m.isfinite().all()
+            assert seen.joints_m.isfinite().all() and seen.keypoints.points_m.isfinite().all()
 
 
 def test_settings_are_checked() -> None:

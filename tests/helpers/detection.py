@@ -107,7 +107,7 @@ def detection_of(states: torch.Tensor, log_size: float = 0.0, side: str = "right
         log_size=torch.full((count,), log_size),
         log_probability=torch.log_softmax(-2.0 * torch.arange(count), 0),
         error_m=torch.full((count,), 0.01),
-        landmarks=Keypoints(joints[0], torch.full((21,), 0.005)),
+        keypoints=Keypoints(joints[0], torch.full((21,), 0.005)),
         present=0.99,
         right_side=0.95,
     )
@@ -126,7 +126,7 @@ class FixedDetector:
         self.likely = likely
         return self.found
 
-    def detection(self, depth_m, k, centres_m, side) -> list[Detection]:
+    def detect(self, depth_m, k, centres_m, side) -> list[Detection]:
         self.compared.append(np.array(centres_m))
         states = torch.zeros(len(centres_m), 27)
         states[:, :3] = torch.from_numpy(np.asarray(centres_m)).float()

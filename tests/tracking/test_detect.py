@@ -205,8 +205,8 @@ def test_landmarks_are_trusted_no_more_than_is_set() -> None:
     model = model_with(FixedDetector(keypoint_m=0.02, keypoint_sigmas=2.0))
     detection = detection_of(hand_at(0.0))
     assert (keypoints_of(detection, model).sigma_m == 0.02).all()
-    unsure = replace(detection.landmarks, sigma_m=torch.full((21,), 0.03))
-    assert keypoints_of(replace(detection, landmarks=unsure), model).sigma_m == pytest.approx(0.06)
+    unsure = replace(detection.keypoints, sigma_m=torch.full((21,), 0.03))
+    assert keypoints_of(replace(detection, keypoints=unsure), model).sigma_m == pytest.approx(0.06)
 
 
 def test_only_likely_hypotheses_compete_and_at_least_one() -> None:

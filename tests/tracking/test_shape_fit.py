@@ -49,7 +49,7 @@ def detection(shape: HandShape, state: torch.Tensor, sigma_m: float = 0.004) -> 
     joints = forward_kinematics(state, shaped(shape, VOTES_OFF)).joints_m[0]
     log_size = math.log(shape.hand_length_m / DEFAULT_HAND_LENGTH_M)
     keypoints = Keypoints(joints, torch.full((21,), sigma_m))
-    return replace(detection_of(state, log_size, shape.side), landmarks=keypoints)
+    return replace(detection_of(state, log_size, shape.side), keypoints=keypoints)
 
 
 def fitted(
@@ -67,7 +67,7 @@ def fitted(
         seen = detection(shape, state, sigma_m)
         belief = shape_fit.contradicted(belief, seen, fit, first)
         applied = torch.tensor(belief.applied)
-        keypoints = Keypoints(seen.landmarks.points_m, seen.landmarks.sigma_m.clamp(min=0.008))
+        keypoints = Keypoints(seen.keypoints.points_m, seen.keypoints.sigma_m.clamp(min=0.008))
         belief = shape_fit.learned(
             belief,
             state,

@@ -49,7 +49,7 @@ VARIANTS: dict[str, Variant] = {
         ("filter.passes=1", "filter.speed_gain=0", *_STILL),
     ),
     "no-refinement": Variant("no refinement", ("refine=none",)),
-    "no-votes": Variant(
+    "no-keypoints": Variant(
         "no keypoints: neither refinement nor choice hears the networks' votes",
         ("detector.keypoints=0", "detector.keypoint_weight=0"),
     ),

@@ -72,7 +72,7 @@ class Detection:
     pivot_m, rotvec, angles: (H, 3), (H, 3), (H, 21).  joints_m: (H, 21, 3) of a hand of that size.
     log_size: (H,) of the hand's length in units of the mean adult's.
     log_probability, error_m: (H,).
-    landmarks: the joints by the cells' votes.
+    keypoints: the joints, each with its standard deviation.
     present, right_side: probabilities that there is a hand, and that it is of the side looked for.
     """
 
@@ -83,7 +83,7 @@ class Detection:
     log_size: Tensor
     log_probability: Tensor
     error_m: Tensor
-    landmarks: Keypoints
+    keypoints: Keypoints
     present: float
     right_side: float
 
@@ -116,7 +116,7 @@ class Detection:
             self.log_size[kept],
             self.log_probability[kept],
             self.error_m[kept],
-            self.landmarks,
+            self.keypoints,
             self.present,
             self.right_side,
         )
@@ -199,7 +199,7 @@ def merit(detection: Detection, heat: float) -> float:
     """
     odds = math.log(max(heat, 1e-6)) + math.log(max(detection.present, 1e-6))
     odds += 0.5 * math.log(max(detection.right_side, 1e-3))
-    unsure = float(detection.error_m[0]) + 0.5 * float(detection.landmarks.sigma_m.mean())
+    unsure = float(detection.error_m[0]) + 0.5 * float(detection.keypoints.sigma_m.mean())
     return odds - unsure / _CLEAR_M
 
 
@@ -221,7 +221,7 @@ def _detection(seen: NetworkOutput, row: int) -> Detection:
         log_size=seen.log_size[row],
         log_probability=seen.log_probability[row],
         error_m=seen.error_m[row],
-        landmarks=Keypoints(seen.keypoints_m[row], seen.sigma_m[row]),
+        keypoints=Keypoints(seen.keypoints_m[row], seen.sigma_m[row]),
         present=float(seen.present[row].sigmoid()),
         right_side=float(seen.right[row].sigmoid()),
     )

@@ -138,7 +138,7 @@ def _empty(count: int) -> dict[str, np.ndarray]:
         "log_probability": (KEPT,),
         "error_m": (KEPT,),
         "joints_m": (KEPT, JOINTS, 3),
-        "votes_m": (JOINTS, 3),
+        "keypoints_m": (JOINTS, 3),
         "sigma_m": (JOINTS,),
         "present": (),
         "right": (),

@@ -74,7 +74,7 @@ def train_poses(schedule: Schedule, shapes: int, seed: int) -> tuple[PoseNet, Co
         losses = pose_losses(network.decode(image, *outputs), crops, network.anchors)
         reported = {
             "joints_mm": losses.hypothesis_mm,
-            "votes_mm": losses.keypoints_mm,
+            "keypoints_mm": losses.keypoints_mm,
             "within_20_mm": losses.within_20,
             "side": losses.side,
             "present": losses.present,

@@ -20,6 +20,10 @@ from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-detector"
 VERSION = 1
+_FORMATS = (FORMAT, "toftrack-relocaliser")
+"""As files say it; the second one until the detector had its name."""
+_RENAMED = {"votes.": "keypoints."}
+"""Layers of older files, and what they are called now."""
 DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
 _LARGEST_BYTES = 64 << 20
 _WIDEST = 256
@@ -92,12 +96,20 @@ def _width(metadata: dict[str, Any], name: str) -> int:
 def _tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
     """One network's arrays as it takes them."""
     return {
-        key.split(".", 1)[1]: torch.from_numpy(array).float()
+        _layer(key.split(".", 1)[1]): torch.from_numpy(array).float()
         if array.dtype.kind == "f"
         else torch.from_numpy(array)
         for key, array in arrays.items()
         if key.startswith(name + ".")
     }
+
+
+def _layer(key: str) -> str:
+    """The name of a network's array, as it is now."""
+    for old, new in _RENAMED.items():
+        if key.startswith(old):
+            return new + key.removeprefix(old)
+    return key
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -113,7 +125,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise ToftrackError(
             f"{path} is no file of the detector's weights ({error}); {_AGAIN}"
         ) from None
-    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+    if not isinstance(metadata, dict) or metadata.get("format") not in _FORMATS:
         raise ToftrackError(f"{path} is no file of the detector's weights; {_AGAIN}")
     if metadata.get("version") != VERSION:
         raise ToftrackError(

@@ -64,13 +64,13 @@ def train(config: DictConfig) -> float:
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     last = pose_course[-1]
     print(
-        f"trained in {minutes} minutes; on the last training images: joints {last['votes_mm']:.1f}"
-        f" mm by votes, {last['joints_mm']:.1f} mm by the likeliest hypothesis"
+        f"trained in {minutes} minutes; on the last training images: joints"
+        f" {last['keypoints_mm']:.1f} mm by keypoints, {last['joints_mm']:.1f} mm by the likeliest hypothesis"
     )
     for name in (config.output, "images.png", "course.png", "summary.json"):
         print(f"  {folder / name}")
     print(f"use it: toftrack track detector.weights={path}")
-    return float(last["votes_mm"])
+    return float(last["keypoints_mm"])
 
 
 if __name__ == "__main__":

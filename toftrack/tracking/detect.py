@@ -170,7 +170,7 @@ def expected_of(detection: Detection) -> Expected:
 
 def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
     """The network's joints as the refinement takes them."""
-    cfg, found = model.detector.settings, detection.landmarks
+    cfg, found = model.detector.settings, detection.keypoints
     sigma = (cfg.keypoint_sigmas * found.sigma_m).clamp(min=cfg.keypoint_m)
     return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, _NO_WEIGHT))
 
@@ -198,8 +198,8 @@ def candidates(detection: Detection, frame: DetectedFrame, count: int) -> Tensor
         states.new_zeros(0, 3), states.new_zeros(0, 0, 2), frame.observation.k, (0, 0)
     )
     weight = max(model.detector.settings.keypoint_weight, _NO_WEIGHT)
-    sigma = detection.landmarks.sigma_m.clamp(min=_BENT_M) / weight
-    keypoints = Keypoints(detection.landmarks.points_m, sigma)
+    sigma = detection.keypoints.sigma_m.clamp(min=_BENT_M) / weight
+    keypoints = Keypoints(detection.keypoints.points_m, sigma)
     freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
     return torch.cat((frame.hand.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
 
@@ -251,8 +251,8 @@ def best_start(frame: DetectedFrame) -> tuple[Tensor, float]:
     assert detection is not None
     states = candidates(detection, frame, model.detector.settings.hypotheses)
     if model.refinement.iterations:
-        seen, landmarks = seen_points(frame.observation), keypoints_of(detection, model)
-        better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, landmarks)
+        seen, keypoints = seen_points(frame.observation), keypoints_of(detection, model)
+        better = frame.hand.refiner(states, states[:, 6:], seen, model.refinement, keypoints)
         states = torch.cat((states, better))
     scores = log_posterior(states, frame.hand.refiner.joints(states), frame, coverage=1.0)
     best = int(scores.argmax())

@@ -61,7 +61,7 @@ def confidence_features(
     """
     joints = joints_m.cpu()
     at = joints.numpy()
-    keypoints = np.linalg.norm(at - detection.landmarks.points_m.numpy(), axis=1)
+    keypoints = np.linalg.norm(at - detection.keypoints.points_m.numpy(), axis=1)
     off = np.linalg.norm(at - detection.joints_m.numpy(), axis=-1).mean(1)
     likely = off[detection.log_probability.numpy() > math.log(_LIKELY)]
     unseen, hidden = out_of_sight(joints, depth_m, k)
@@ -72,7 +72,7 @@ def confidence_features(
         pose_off=_log_cm(float(likely.min()) if len(likely) else float(off.min())),
         likeliest_off=_log_cm(float(off[0])),
         expected_error=_log_cm(float(detection.error_m[0])),
-        unsure=_log_cm(float(detection.landmarks.sigma_m.numpy().mean())),
+        unsure=_log_cm(float(detection.keypoints.sigma_m.numpy().mean())),
         absent=_log_odds(1 - detection.present),
         other_side=_log_odds(1 - detection.right_side),
         unseen=unseen,

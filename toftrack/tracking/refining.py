@@ -83,10 +83,10 @@ def _onto_points(
     seen = seen_points(frame.observation)
     detection = None if _mostly_unseen(state, frame) else frame.detection
     frame = replace(frame, detection=detection)
-    landmarks = None if detection is None else keypoints_of(detection, frame.model)
+    keypoints = None if detection is None else keypoints_of(detection, frame.model)
 
     def onto_points(starts: Tensor) -> Tensor:
-        return refiner(starts, starts[:, 6:], seen, cfg, landmarks)
+        return refiner(starts, starts[:, 6:], seen, cfg, keypoints)
 
     # The pose of the last frame stands until another one is clearly better: what the image does
     # not decide, such as a hidden finger, must not flicker. A contender moves along with it.

@@ -192,7 +192,7 @@ def with_network_length(
 
 def weight_of(detection: Detection, fit: ShapeFit) -> float:
     """How much a look at the hand counts, at most 1."""
-    sigma = float(detection.landmarks.sigma_m.square().mean().sqrt())
+    sigma = float(detection.keypoints.sigma_m.square().mean().sqrt())
     weight = min(1.0, (fit.sure_m / max(sigma, 1e-6)) ** 4)
     return weight if math.isfinite(weight) else 0.0
 

@@ -200,7 +200,7 @@ def _joints_judged(
     detection = frame.detection
     features = joint_features(
         estimate.joints_m,
-        None if detection is None else detection.landmarks,
+        None if detection is None else detection.keypoints,
         track.joint_features,
         estimate.score,
         belief.log_odds,

@@ -54,7 +54,7 @@ def course_figure(course: list[dict[str, Any]]) -> np.ndarray:
     """Mean joint errors on fresh training images over their number, BGR."""
     picture = canvas(420, 760)
     images = np.array([row["images"] for row in course]) / 1e3
-    keypoints = np.array([row["votes_mm"] for row in course])
+    keypoints = np.array([row["keypoints_mm"] for row in course])
     joints = np.array([row["joints_mm"] for row in course])
     top = float(max(joints.max(), keypoints.max(), 1.0))
     low = float(min(joints.min(), keypoints.min(), top / 2))
@@ -62,5 +62,5 @@ def course_figure(course: list[dict[str, Any]]) -> np.ndarray:
     axes.draw(picture, "thousand images", "mean joint error, mm")
     axes.line(picture, images, joints, VERMILLION)
     axes.line(picture, images, keypoints, BLUE)
-    legend(picture, (("likeliest hypothesis", VERMILLION), ("votes", BLUE)), (330, 40))
+    legend(picture, (("likeliest hypothesis", VERMILLION), ("keypoints", BLUE)), (330, 40))
     return titled(picture, "Training of the pose network", "On images never seen before.")
