@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from toftrack.hand.openxr import OPENXR_JOINT_NAMES
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.output.results import read_results
-    from toftrack.tracking.hands import HandsTracker
-    from toftrack.tracking.tracker import Tracker
+    from toftrack.tracking.tracker import HandsTracker, Tracker
 
     __version__: str
 
@@ -48,7 +47,7 @@ _PLACES = {
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
     "ToftrackError": "toftrack.errors",
-    "HandsTracker": "toftrack.tracking.hands",
+    "HandsTracker": "toftrack.tracking.tracker",
     "Tracker": "toftrack.tracking.tracker",
     "make_device": "toftrack.api",
     "make_hands_tracker": "toftrack.api",

@@ -15,11 +15,10 @@ from toftrack.errors import ToftrackError
 if TYPE_CHECKING:
     import torch
 
+    from toftrack.compute.quality import Pace
     from toftrack.devices.base import Device
-    from toftrack.tracking.hands import HandsTracker
     from toftrack.tracking.model import FilterModel
-    from toftrack.tracking.quality import Pace
-    from toftrack.tracking.tracker import Tracker
+    from toftrack.tracking.tracker import HandsTracker, Tracker
 
 
 def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Tracker:
@@ -93,7 +92,7 @@ def build_tracker(config: DictConfig) -> Tracker:
 def build_hands_tracker(config: DictConfig) -> HandsTracker:
     """The tracker of as many hands as a configuration says."""
     from toftrack.compute.threads import small_operations
-    from toftrack.tracking.hands import HandsTracker
+    from toftrack.tracking.tracker import HandsTracker
 
     hands = config.get("hands", 1)
     with small_operations():
@@ -102,7 +101,7 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
 
 def _pace(config: DictConfig) -> Pace:
     """Who gives a budget to a tracker of their own has a camera that does not wait."""
-    from toftrack.tracking.quality import pace_within
+    from toftrack.compute.quality import pace_within
 
     # A configuration of one's own may do without.
     return pace_within((config.get("tracker") or {}).get("budget_ms"))
@@ -119,9 +118,9 @@ def build_model(config: DictConfig) -> FilterModel:
 
     check_tracker(config)
     device = compute_device(config.compute)
-    hand, detector = instantiate(config.hand), instantiate(config.detector)
+    detector = instantiate(config.detector)
     parts: dict[str, Any] = {
-        "shape": hand.shape,
+        "configured": instantiate(config.hand),
         "space": instantiate(config.pose_space),
         "segmentation": instantiate(config.segmentation),
         "likelihood": instantiate(config.likelihood),
@@ -136,9 +135,8 @@ def build_model(config: DictConfig) -> FilterModel:
         **parts,
         detector=detector.to(device),
         refinement=instantiate(config.refine),
-        prior=instantiate(config.start),
-        adapt=hand.adapt,
-        sides=hand.sides,
+        weights=instantiate(config.posterior),
+        hysteresis=instantiate(config.hysteresis),
     )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from toftrack.estimate import Estimate, no_estimate
+from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
-from toftrack.tracking.conventions import in_all_conventions
 
 K = np.array([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 SIZE_PX = 176, 144

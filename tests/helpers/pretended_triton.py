@@ -15,7 +15,7 @@ from helpers.accelerator import Counts, Pretended, held
 from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.backend import Motions
+from toftrack.compute.motions import Motions
 from toftrack.compute.redraw import redraw_with
 from toftrack.hand.shape import HandShape
 from toftrack.render import scoring

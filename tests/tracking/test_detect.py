@@ -12,15 +12,15 @@ import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
 from helpers.tracking import make_tracker
+from toftrack.tracking.prior import LastSeen
+from toftrack.tracking.refining import Refined, challenged
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import SAME_PLACE_M
 from toftrack.frames import DepthImage
+from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.detect import detect, expected_of, hypotheses, keypoints_of, track_of
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.prior import LastSeen
-from toftrack.tracking.refining import Refined, challenged
-from toftrack.tracking.shape_fit import first_shape
 from toftrack.tracking.state import Track, TrackerState
 from toftrack.tracking.step import _hand_reported
 

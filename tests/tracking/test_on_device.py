@@ -18,12 +18,12 @@ from helpers.configured import detector_settings, refinement
 from helpers.pretended_triton import pretended_triton
 from helpers.tracking import errors_mm, follow, make_tracker, sample
 
+from toftrack.compute import particle_filter
 from toftrack.detector.hand_detector import make_detector
 from toftrack.estimate import Estimate
 from toftrack.hand.shape import default_hand_shape
 from toftrack.refinement.gauss_newton import Keypoints, TorchRefiner
 from toftrack.refinement.seen_points import SeenPoints
-from toftrack.tracking import particle_filter
 
 FRAMES = 8
 SELECTED = 4

@@ -6,9 +6,9 @@ import pytest
 import roma
 import torch
 
+from toftrack.compute import particle_filter as sir
 from toftrack.compute.redraw import bound, pick
 from toftrack.compute.rigid import MOTIONS, PIVOT_M, mean_rotation
-from toftrack.tracking import particle_filter as sir
 
 LOWER, UPPER = torch.tensor([-1.0, -2.0, 0.0, -0.5]), torch.tensor([1.0, 2.0, 3.0, 0.5])
 

@@ -7,8 +7,8 @@ import torch
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
+from toftrack.refinement import penalty, penalty_numba
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.tracking import penalty, penalty_numba
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -12,9 +12,9 @@ from helpers.detection import FixedDetector
 from helpers.tracking import configuration, make_tracker, sample
 
 from toftrack.api import build_hands_tracker
+from toftrack.compute.quality import LEVELS, REDUCED, Pace, Timekeeper, pace_within
 from toftrack.compute.threads import at_most, threads
 from toftrack.errors import ToftrackError
-from toftrack.tracking.quality import LEVELS, REDUCED, Pace, Timekeeper, pace_within
 from toftrack.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")

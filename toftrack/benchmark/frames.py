@@ -126,7 +126,9 @@ def _times(
         return took, {"rectification": rectifying, **tracker.info.seconds}
 
     def anew(index: int) -> tuple[float, Mapping[str, float]]:
-        tracker.state = replace(tracker.state, track=None)
+        state = tracker.state
+        hands = tuple(replace(hand, track=None) for hand in state.hands)
+        tracker.state = replace(state, hands=hands)
         return step(index)
 
     def row(what: str, found: list[tuple[float, Mapping[str, float]]]) -> FrameRow:

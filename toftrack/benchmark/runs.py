@@ -312,7 +312,7 @@ def _stills(job: Job, labels: Stills) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def _tracker(job: Job, side: str) -> Any:
     """A fresh tracker; the model is the same for all of its configuration."""
-    from toftrack.tracking.hands import HandsTracker
+    from toftrack.tracking.tracker import HandsTracker
 
     side = side if job.side == "told" else "auto"
     model, hands = _model(f"hand.side={side}", *job.overrides)

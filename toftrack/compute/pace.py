@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 FRAME_S = 1 / 25
 """What "a frame" means in settings."""
@@ -20,3 +21,29 @@ def elapsed_s(before_s: float | None, now_s: float) -> float:
         return FRAME_S
     passed = now_s - before_s
     return min(max(passed, _SHORTEST_S), _LONGEST_S) if math.isfinite(passed) else FRAME_S
+
+
+@dataclass(frozen=True)
+class Duration:
+    """How long something has gone on, in seconds.
+
+    The frame in which it begins counts as FRAME_S, so that a single frame means the same at any
+    rate. A duration of 0 has not begun.
+    """
+
+    seconds: float = 0.0
+
+    def extended(self, dt_s: float, most_s: float = math.inf) -> Duration:
+        """It goes on in a frame that comes dt_s after the last one, of which at most `most_s`
+        count.
+        """
+        return Duration(self.seconds + min(dt_s, most_s) if self.seconds else FRAME_S)
+
+    def reached(self, frames: float) -> bool:
+        """Whether it has gone on for so many frames of FRAME_S; half a frame is forgiven."""
+        return self.seconds > (frames - 0.5) * FRAME_S
+
+    @property
+    def begun(self) -> bool:
+        """Whether there was a frame of it."""
+        return self.seconds > 0

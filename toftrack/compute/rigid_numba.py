@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.backend import Motions
 from toftrack.compute.compiling import announced, compiled, entry_point
+from toftrack.compute.motions import Motions
 from toftrack.compute.rigid import PIVOT_M
 
 _cached = entry_point(__file__)

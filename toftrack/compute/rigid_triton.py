@@ -11,7 +11,7 @@ import triton.language as tl
 from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.backend import Motions
+from toftrack.compute.motions import Motions
 from toftrack.compute.redraw import redraw_with
 from toftrack.compute.rigid import PIVOT_M
 

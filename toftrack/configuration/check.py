@@ -43,11 +43,11 @@ _ABOVE_ZERO = frozenset(
     record_limit_gb
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
     detector.hypotheses detector.keypoint_m detector.keypoint_sigmas detector.places
-    detector.rival_frames detector.rival_m
+    hysteresis.place_frames hysteresis.place_m
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
-    start.memory_rad start.memory_s
+    posterior.orientation_rad posterior.orientation_s
     stream.waiting
     view.most_fps view.quality
     """.split()
@@ -60,7 +60,6 @@ _LOG_ODDS = ("lost.intercept", "lost.weights.", "lost.joints.odds", "detector.me
 """How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
 _OF_NETWORKS = {
-    "start._target_": ("toftrack.tracking.prior.Prior", "start=prior"),
     "lost._target_": ("toftrack.tracking.confidence.ConfidenceModel", "lost=calibrated"),
     "hand.shape": ("auto", "hand.shape=auto"),
     "hand.side": ("auto", "hand.side=auto"),
@@ -110,7 +109,7 @@ def check_tracker(config: DictConfig) -> None:
     if not given:
         return
     some = ", ".join(given)
-    if without and {"start=prior", "lost=calibrated"} <= set(given):
+    if without and {"lost=calibrated", "refine=gauss_newton"} <= set(given):
         raise ToftrackError(
             "detector=none belongs to experiment=paper, the tracker without networks; give"
             " experiment=paper, or leave detector=none out"

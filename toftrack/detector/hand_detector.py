@@ -30,21 +30,16 @@ _CLEAR_M = 0.010
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """How the networks' word is used; see conf/detector/network.yaml for what each does."""
+    """How the networks are used; see conf/detector/network.yaml for what each does."""
 
     places: int
     least: float
     merit: float
     hypotheses: int
-    rivals: int
+    candidates: int
     every: int
     search: int
     sure: float
-    prior: float
-    rival_m: float
-    rival_gain: float
-    rival_frames: int
-    keypoints: float
     keypoint_m: float
     keypoint_sigmas: float
     keypoint_weight: float
@@ -52,16 +47,14 @@ class DetectorSettings:
     def __post_init__(self) -> None:
         for name in ("places", "hypotheses"):
             check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
-        check_number("detector.rivals", self.rivals, 0, whole=True)
+        check_number("detector.candidates", self.candidates, 0, whole=True)
         for name in ("every", "search"):
             check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
         check_number("detector.sure", self.sure, 0.5, 0.999)
-        check_number("detector.rival_frames", self.rival_frames, 1, whole=True)
         check_number("detector.least", self.least, 0, 1)
         check_number("detector.merit", self.merit)
-        for name in ("prior", "rival_gain", "keypoints", "keypoint_weight"):
-            check_number(f"detector.{name}", getattr(self, name), 0)
-        for name in ("rival_m", "keypoint_m", "keypoint_sigmas"):
+        check_number("detector.keypoint_weight", self.keypoint_weight, 0)
+        for name in ("keypoint_m", "keypoint_sigmas"):
             check_number(f"detector.{name}", getattr(self, name), 0, above=True)
 
 
@@ -95,6 +88,11 @@ class Detection:
         return torch.from_numpy(states)
 
     @property
+    def empty(self) -> bool:
+        """Whether nothing was said; see NO_DETECTION."""
+        return not len(self.rotvec)
+
+    @property
     def length_m(self) -> float:
         """The hand's length, the mean of the hypotheses'."""
         weights = self.log_probability.softmax(0)
@@ -122,6 +120,21 @@ class Detection:
         )
 
 
+NO_DETECTION = Detection(
+    pivot_m=torch.zeros(0, 3),
+    rotvec=torch.zeros(0, 3),
+    angles=torch.zeros(0, 21),
+    joints_m=torch.zeros(0, 21, 3),
+    log_size=torch.zeros(0),
+    log_probability=torch.zeros(0),
+    error_m=torch.zeros(0),
+    keypoints=Keypoints(torch.zeros(21, 3), torch.full((21,), torch.inf)),
+    present=0.0,
+    right_side=0.5,
+)
+"""Of a frame in which the network was not asked, or found no hand."""
+
+
 @dataclass(frozen=True, eq=False)
 class HandDetector:
     """Both networks and how they are used; images are read, and answers given, on the CPU."""
@@ -146,7 +159,7 @@ class HandDetector:
         seen = run_pose_network(self.pose, depth_m, k, centres_m, side)
         return [_detection(seen, row) for row in range(len(seen.present))]
 
-    def start_detection(
+    def start(
         self, depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, side: str
     ) -> Callable[[], Detection]:
         """The same at one place (3,), begun beside whatever does not need it; see looking."""

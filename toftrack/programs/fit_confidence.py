@@ -28,8 +28,7 @@ from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.programs import command_line
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
 from toftrack.safe_files import whole_file, write_whole
-from toftrack.tracking.features import FEATURES
-from toftrack.tracking.joint_confidence import JOINT_FEATURES
+from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES
 from toftrack.tracking.model import TrackerModel
 from toftrack.views.pictures import write_picture
 
@@ -155,7 +154,7 @@ def _fitted_frames(
         "weights": fitted,
     }
     lines = [f"intercept: {summary['intercept']} # log odds where all signs are 0; fitted"]
-    lines += ["weights: # of the signs, see toftrack/tracking/features.py"]
+    lines += ["weights: # of the signs, see toftrack/tracking/confidence.py"]
     return log_odds, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
 
 
@@ -197,8 +196,8 @@ def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], li
         "held_out_joints_log_loss": round(-float(np.log(right.clip(1e-9)).mean()), 4),
     }
     lines = [
-        "joints: # how far off each joint may be; see toftrack/tracking/joint_confidence.py",
-        "  _target_: toftrack.tracking.joint_confidence.JointConfidence",
+        "joints: # how far off each joint may be; see toftrack/tracking/confidence.py",
+        "  _target_: toftrack.tracking.confidence.JointConfidence",
         # Not fitted on rendered sequences: what stands there may stay.
         "  scale: 1.0 # times all standard deviations; larger holds joints oftener",
         "  odds: 1.5 # added to all log odds; larger trusts joints more",

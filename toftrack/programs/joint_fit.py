@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from toftrack.hand.regions import REGION_90
-from toftrack.tracking.joint_confidence import JOINT_FEATURES, KIND_OF_JOINT, KINDS, JointConfidence
+from toftrack.tracking.confidence import JOINT_FEATURES, KIND_OF_JOINT, KINDS, JointConfidence
 
 _TAILS = 4.0
 """Degrees of freedom of the Student t that errors are taken for: wrong fingers are no outliers of a

@@ -22,8 +22,8 @@ from toftrack.api import build_hands_tracker, compute_device
 from toftrack.hand.openxr import openxr_rig
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.tracking.hands import HandsTracker
 from toftrack.tracking.model import FilterModel, TrackerModel
+from toftrack.tracking.tracker import HandsTracker
 
 _log = logging.getLogger(__name__)
 
@@ -45,11 +45,11 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
 
 def _compile_here(model: FilterModel) -> None:
     """The large kernels but for the one that the second process compiles."""
-    model.backend.make_scorer(model.shape)
+    model.backend.make_scorer(model.configured.shape)
     if isinstance(model, TrackerModel):
         nothing = np.zeros((72, 88), np.float32)
         k = np.array([[110.0, 0, 44], [0, 110.0, 36], [0, 0, 1]])
-        model.detector.detect(nothing, k, np.array([[0.0, 0.0, 0.5]]), model.shape.side)
+        model.detector.detect(nothing, k, np.array([[0.0, 0.0, 0.5]]), model.configured.shape.side)
 
 
 def _helper(config: DictConfig) -> subprocess.Popen | None:
@@ -79,9 +79,9 @@ def main() -> None:
     """What the second process does."""
     from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+    from toftrack.refinement.penalty_numba import joints_penalty
     from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
     from toftrack.render.numba.median import thinned
-    from toftrack.tracking.penalty_numba import joints_penalty
 
     shape = default_hand_shape()
     CompiledRefiner(shape)

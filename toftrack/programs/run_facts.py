@@ -18,7 +18,7 @@ from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.output.summary import shape_file
-from toftrack.tracking.hands import HandsTracker
+from toftrack.tracking.tracker import HandsTracker
 
 _APART_S = 1.0
 

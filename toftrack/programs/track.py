@@ -18,9 +18,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from toftrack.compute.quality import Pace
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, confidence_words, is_vacant
+from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.advice import Watch
@@ -33,9 +35,7 @@ from toftrack.programs import shutdown
 from toftrack.programs.precompile import ready_tracker
 from toftrack.programs.run_facts import ShapeFiles, configured_side, opening, run_metadata
 from toftrack.recordings.recorder import Recorder
-from toftrack.tracking.conventions import in_all_conventions
-from toftrack.tracking.hands import HandsTracker
-from toftrack.tracking.quality import Pace
+from toftrack.tracking.tracker import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 
 _log = logging.getLogger(__name__)

@@ -65,7 +65,8 @@ def train(config: DictConfig) -> float:
     last = pose_course[-1]
     print(
         f"trained in {minutes} minutes; on the last training images: joints"
-        f" {last['keypoints_mm']:.1f} mm by keypoints, {last['joints_mm']:.1f} mm by the likeliest hypothesis"
+        f" {last['keypoints_mm']:.1f} mm by keypoints, {last['joints_mm']:.1f} mm by the likeliest"
+        " hypothesis"
     )
     for name in (config.output, "images.png", "course.png", "summary.json"):
         print(f"  {folder / name}")

@@ -6,7 +6,7 @@ hand tracking", SGP 2015) with toftrack's ellipsoids:
 
   * seen points are drawn to the nearest ellipsoid (point to plane along its normal);
   * the bones' axes are drawn into the silhouette where they stick out over the background;
-  * the joints are drawn to landmarks, where there are any: joints that somebody else found;
+  * the joints are drawn to keypoints, where there are any: joints that somebody else found;
   * the joint angles are drawn to the filter's estimate, the pose space acting as a prior, and are
     kept within the joint limits.
 
@@ -64,7 +64,7 @@ ALONG_BONE = (0.25, 0.6, 0.9)
 NEAREST_M = 0.05
 """Depth below which points are projected as if they were this far."""
 SILHOUETTE_PX = 8.0
-LANDMARK_SIGMAS = 3.0
+KEYPOINT_SIGMAS = 3.0
 """Robust scales: from there on a residual counts less the larger it is (Geman and McClure)."""
 POINT_REACH = 0.4
 """Likewise for seen points, in parts of `Refinement.reach_m`."""
@@ -80,12 +80,6 @@ class Refinement:
     point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
         ones count more.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
-    swaps: other poses of single fingers that are tried; the log scores by which one is better must
-        sum up to `swap_gain` over frames, of each of which `drift` is taken off.
-    sure: probability of a hand from which on the networks' poses and single other fingers are tried
-        in turn, and not both in every frame.
-    overlap: of the log score, for fingers that are in one another (see finger_overlap).
-    keep_gain: by how much the log score of another pose must exceed the last frame's.
     steadying: how much of a change from frame to frame is believed.
     carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
     """
@@ -97,23 +91,15 @@ class Refinement:
     silhouette_px: float
     angle_rad: float
     damping: float
-    swaps: int
-    swap_gain: float
-    sure: float
-    drift: float
-    overlap: float
-    keep_gain: float
     steadying: Steadying
     carry: float
 
     def __post_init__(self) -> None:
-        for name, least in (("iterations", 0), ("points", 1), ("swaps", 0)):
+        for name, least in (("iterations", 0), ("points", 1)):
             check_number(f"refine.{name}", getattr(self, name), least, whole=True)
         for name in ("reach_m", "point_m", "silhouette_px", "angle_rad"):
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
-        for name in ("damping", "swap_gain", "drift", "keep_gain", "overlap"):
-            check_number(f"refine.{name}", getattr(self, name), 0)
-        check_number("refine.sure", self.sure, 0.5, 1)
+        check_number("refine.damping", self.damping, 0)
         check_number("refine.carry", self.carry, 0, 1)
 
 
@@ -145,7 +131,7 @@ class Refiner(Protocol):
         prior_angles: Tensor,
         seen: SeenPoints,
         settings: Refinement,
-        landmarks: Keypoints | None = None,
+        keypoints: Keypoints | None = None,
     ) -> Tensor:
         """See refine."""
 
@@ -167,10 +153,10 @@ class TorchRefiner:
         prior_angles: Tensor,
         seen: SeenPoints,
         settings: Refinement,
-        landmarks: Keypoints | None = None,
+        keypoints: Keypoints | None = None,
     ) -> Tensor:
         """See refine."""
-        return refine(states, prior_angles, seen, self.shape, self.surface, settings, landmarks)
+        return refine(states, prior_angles, seen, self.shape, self.surface, settings, keypoints)
 
     def joints(self, states: Tensor) -> Tensor:
         """See Refiner."""
@@ -215,21 +201,21 @@ def refine(
     shape: HandShape,
     surface: HandSurface,
     settings: Refinement,
-    landmarks: Keypoints | None = None,
+    keypoints: Keypoints | None = None,
 ) -> Tensor:
     """Bring N hands onto the seen points, each by itself.
 
     states: (N, 27).  prior_angles: (N, 21) the poses that the filter believes in.
-    landmarks: joints that are known besides.
-    Returns (N, 27); a hand within whose reach nothing is seen, and of which no landmark is known,
+    keypoints: joints that are known besides.
+    Returns (N, 27); a hand within whose reach nothing is seen, and of which no keypoint is known,
     stays as it is.
     """
     middle = forward_kinematics(states, shape).joints_m.mean(1)
     points, there = seen.around(middle, settings.points)
     informed = there.any(1)
-    if landmarks is not None:
-        landmarks = landmarks.of_each(len(states))
-        informed = informed | landmarks.sigma_m.isfinite().any(1)
+    if keypoints is not None:
+        keypoints = keypoints.of_each(len(states))
+        informed = informed | keypoints.sigma_m.isfinite().any(1)
     refined = states
     for _ in range(settings.iterations):
         pose = forward_kinematics(refined, shape)
@@ -237,8 +223,8 @@ def refine(
             point_residuals(pose, points, there, shape, surface, settings),
             silhouette_residuals(pose, seen, shape, settings),
         ]
-        if landmarks is not None:
-            parts.append(keypoint_residuals(pose, landmarks, shape))
+        if keypoints is not None:
+            parts.append(keypoint_residuals(pose, keypoints, shape))
         rows, values = (torch.cat(part, 1) for part in zip(*parts, strict=True))
         step = _step(rows, values, refined[:, 6:] - prior_angles, settings)
         refined = _moved(refined, step)
@@ -341,14 +327,14 @@ def silhouette_residuals(
     return Residuals(rows * weight[..., None], gap.mT.flatten(1) * weight)
 
 
-def keypoint_residuals(pose: HandPose, landmarks: Keypoints, shape: HandShape) -> Residuals:
-    """Of the joints: how far they are from their landmarks, along each of the camera's axes.
+def keypoint_residuals(pose: HandPose, keypoints: Keypoints, shape: HandShape) -> Residuals:
+    """Of the joints: how far they are from their keypoints, along each of the camera's axes.
 
-    landmarks: of each of the N hands, see Landmarks.of_each.
+    keypoints: of each of the N hands, see Landmarks.of_each.
     """
-    gap = pose.joints_m - landmarks.points_m
-    sigma = landmarks.sigma_m
-    away = (gap.norm(dim=-1) / (LANDMARK_SIGMAS * sigma)).square()
+    gap = pose.joints_m - keypoints.points_m
+    sigma = keypoints.sigma_m
+    away = (gap.norm(dim=-1) / (KEYPOINT_SIGMAS * sigma)).square()
     weight = (1 / ((1 + away) * sigma)).repeat_interleave(3, 1)
     x = pose.joints_m.repeat_interleave(3, 1)
     n = torch.eye(3, dtype=x.dtype, device=x.device).repeat(21, 1).expand_as(x)

@@ -87,15 +87,15 @@ def _move(state, prior, settings, sums):
 
 
 @compiled
-def _refine(state, prior, landmarks, seen, shape, surface, settings, work):
-    """All iterations on one hand, see refine_hands; landmarks: (21, 3) and (21,)."""
+def _refine(state, prior, keypoints, seen, shape, surface, settings, work):
+    """All iterations on one hand, see refine_hands; keypoints: (21, 3) and (21,)."""
     base_frames, base, lengths, mirror = shape
     index, centres, semi_axes = surface
     iterations, points, _, _, deviation, _, _ = settings
     hand, posed, matched, within, wrenches, twists, sums = work
     frames, joints, axes = hand
     xyz, distance, nearest = matched
-    known = landmarks[1]
+    known = keypoints[1]
     pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
     count = choose_points(seen[0], joints, points, within, xyz)
     informed = count > 0
@@ -111,7 +111,7 @@ def _refine(state, prior, landmarks, seen, shape, surface, settings, work):
         nearest_ellipsoids(xyz, count, posed, distance, nearest)
         add_points(matched, count, index, posed, hand, settings, wrenches)
         add_silhouette(seen, lengths, hand, deviation, wrenches)
-        add_landmarks(landmarks[0], landmarks[1], hand, wrenches)
+        add_landmarks(keypoints[0], keypoints[1], hand, wrenches)
         assemble(wrenches, hand, twists, sums)
         _move(state, prior, settings, sums)
 
@@ -135,11 +135,11 @@ def scratch(ellipsoids, points, seen):
 
 
 @_cached
-def refine_hands(states, priors, landmarks, seen, shape, surface, settings, counter):
+def refine_hands(states, priors, keypoints, seen, shape, surface, settings, counter):
     """Refine hands as long as `counter` has any; called from several threads.
 
     states: (N, 27) float64, overwritten.  priors: (N, 21).
-    landmarks: (N, 21, 3) and (N, 21), or one for all; inf = none.
+    keypoints: (N, 21, 3) and (N, 21), or one for all; inf = none.
     seen: points (P, 3) float32, nearest_px (h, w, 2) and its corner (top, left) in an image of
         size (height, width), k (3, 3).
     shape: base_frames, base, lengths, mirror, see pose_hand.
@@ -152,8 +152,8 @@ def refine_hands(states, priors, landmarks, seen, shape, surface, settings, coun
         i = take(counter)
         if i >= len(states):
             break
-        row = i % max(1, len(landmarks[0]))
-        known = landmarks[0][row], landmarks[1][row]
+        row = i % max(1, len(keypoints[0]))
+        known = keypoints[0][row], keypoints[1][row]
         _refine(states[i], priors[i], known, seen, shape, surface, settings, mine)
 
 
@@ -197,13 +197,13 @@ class CompiledRefiner:
         prior_angles: Tensor,
         seen: SeenPoints,
         settings: Refinement,
-        landmarks: Keypoints | None = None,
+        keypoints: Keypoints | None = None,
     ) -> Tensor:
         """See gauss_newton.refine."""
         names = ("reach_m", "point_m", "silhouette_px", "angle_rad", "damping")
         numbers = tuple(float(getattr(settings, name)) for name in names)
         counts = int(settings.iterations), int(settings.points)
-        return self._refined(states, prior_angles, seen, counts + numbers, landmarks)
+        return self._refined(states, prior_angles, seen, counts + numbers, keypoints)
 
     def _refined(
         self,
@@ -211,14 +211,14 @@ class CompiledRefiner:
         prior_angles: Tensor,
         seen: SeenPoints,
         numbers: tuple,
-        landmarks: Keypoints | None,
+        keypoints: Keypoints | None,
     ) -> Tensor:
         n = len(states)
-        if landmarks is None:
+        if keypoints is None:
             known = np.empty((1, 21, 3)), np.full((1, 21), np.inf)
         else:
-            points = _array(landmarks.points_m).reshape(-1, 21, 3)
-            sigma = np.broadcast_to(_array(landmarks.sigma_m), (len(points), 21))
+            points = _array(keypoints.points_m).reshape(-1, 21, 3)
+            sigma = np.broadcast_to(_array(keypoints.sigma_m), (len(points), 21))
             known = points, sigma.copy()  # which may be written to, as the kernel was compiled for
         refined = _array(states)
         task = functools.partial(

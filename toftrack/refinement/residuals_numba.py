@@ -22,7 +22,7 @@ from toftrack.refinement.gauss_newton import (
     ALONG_BONE,
     FACING_M,
     JOINT_FRAME,
-    LANDMARK_SIGMAS,
+    KEYPOINT_SIGMAS,
     NEAREST_M,
     POINT_REACH,
     SILHOUETTE_PX,
@@ -221,13 +221,13 @@ def add_silhouette(seen, lengths, hand, deviation, wrenches):
 
 @compiled
 def add_landmarks(points, sigmas, hand, wrenches):
-    """The landmarks' part of the normal equations, see gauss_newton.landmark_residuals."""
+    """The keypoints' part of the normal equations, see gauss_newton.landmark_residuals."""
     joints = hand[1]
     for j in range(21):
         sigma = sigmas[j]
         x = (joints[j, 0], joints[j, 1], joints[j, 2])
         gap = (x[0] - points[j, 0], x[1] - points[j, 1], x[2] - points[j, 2])
-        away = (gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2) / (LANDMARK_SIGMAS * sigma) ** 2
+        away = (gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2) / (KEYPOINT_SIGMAS * sigma) ** 2
         if not (sigma > 0 and sigma < np.inf and away < np.inf):
             continue  # what is no number is a joint that was not found
         weight = 1 / ((1 + away) * sigma)

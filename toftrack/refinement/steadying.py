@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.backend import Motions
+from toftrack.compute.motions import Motions
 from toftrack.compute.pace import FRAME_S
 from toftrack.refinement.proposals import FINGER_OF_ANGLE
 
@@ -43,7 +43,7 @@ class Steadying:
 def steadied(
     state: Tensor,
     before: Tensor,
-    trend: Tensor | None,
+    trend: Tensor,
     dt_s: float,
     settings: Steadying,
     motions: Motions,
@@ -59,7 +59,7 @@ def steadied(
     Everything is on the CPU.
 
     state, before: (1, 27) this frame's pose and the last one's.
-    trend: (27,) mean change a second as of the last frame; None at the start.
+    trend: (27,) mean change a second as of the last frame; NaN at the start.
     dt_s: from the last frame to this one.
     Returns the (1, 27) pose to believe and the trend.
     """
@@ -67,7 +67,8 @@ def steadied(
     change = motions.difference(state, before)[0].numpy()
     speed = change / np.float32(dt_s)
     keep = np.float32(settings.memory ** (dt_s / FRAME_S))
-    mean = speed if trend is None else speed + keep * (trend.numpy() - speed)
+    before_s = np.where(np.isfinite(trend.numpy()), trend.numpy(), speed)
+    mean = speed + keep * (before_s - speed)
     noise = np.array([settings.finger_rad] * 5 + [settings.translation_m, settings.rotation_rad])
     noise = np.square(np.maximum(noise, 1e-9))
     moving = (_size_squared(mean * FRAME_S) / noise).sum()

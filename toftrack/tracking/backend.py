@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import TypedDict
 
@@ -11,14 +12,37 @@ import torch
 from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.backend import Backend, Motions
+from toftrack.compute.motions import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.refinement.gauss_newton import Refiner, TorchRefiner
+from toftrack.refinement import penalty
+from toftrack.refinement.gauss_newton import Keypoints, Refiner, TorchRefiner
 from toftrack.render.scoring import Scorer
 from toftrack.render.torch_scorer import TorchScorer
-from toftrack.tracking import penalty
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to compute everything that depends on the machine.
+
+    name: "torch", "numba" or "triton", as `renderer=` says it.
+    device: where the particles are. A frame's estimate is on the CPU, where its few poses are
+        refined and compared, as is all that is said of it.
+    motions: of particles, there and on the CPU.
+    joints_penalty: what speaks against joints besides the image, see refinement/penalty.py; on the
+        CPU.
+    make_scorer: for a hand of some sizes, given on the CPU; it takes states on the device.
+    make_refiner: likewise, on the CPU.
+    """
+
+    name: str
+    device: torch.device
+    motions: Motions
+    joints_penalty: Callable[[Tensor, float, float, Keypoints | None, float], Tensor]
+    make_scorer: Callable[[HandShape], Scorer]
+    make_refiner: Callable[[HandShape], Refiner]
+
 
 log = logging.getLogger(__name__)
 
@@ -99,8 +123,8 @@ def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
 
 def _compiled() -> _Beside:
     from toftrack.compute import rigid_numba
+    from toftrack.refinement import penalty_numba
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
-    from toftrack.tracking import penalty_numba
 
     return _Beside(
         motions=rigid_numba.motions(),

@@ -1,28 +1,314 @@
-"""How likely an estimate is right: a calibrated probability from everything that bears on it.
+"""How likely an estimate, and each of its joints, is right: calibrated probabilities.
 
-A logistic model of a few signs, fitted by toftrack.programs.fit_confidence on rendered sequences of
-other hands, persons and sensors than any recording that the tracker is judged on.
+Logistic models of a few features of a frame, and a log-linear one of the joints' standard
+deviations, all fitted by toftrack.programs.fit_confidence on rendered sequences of other hands,
+persons and sensors than any recording that the tracker is judged on. hand/regions.py says along
+which axes the deviations are, and what they mean.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.pace import FRAME_S
+from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError
-from toftrack.tracking.features import FEATURES, ConfidenceFeatures
-from toftrack.tracking.joint_confidence import JointConfidence
-from toftrack.tracking.life_cycle import Status, bad_for, reached
-from toftrack.tracking.state import Track
+from toftrack.hand.regions import joint_axes
 
-_HIDDEN = 0.3
-"""Share of the joints behind something from which on a hand is hidden."""
-_WAITED = 10
-"""Times as long is waited for a hidden hand."""
+_LEAST = 1e-3
+_LIKELY = 0.03
+
+
+@dataclass(frozen=True)
+class ConfidenceFeatures:
+    """What speaks for and against an estimate in one frame; each is a number of order 1.
+
+    log_score: of the image, per factor e.
+    keypoints_off, farthest_keypoint_off: distance of the joints from the network's keypoints, mean
+        and largest, log of centimetres.
+    pose_off: mean distance from the hypothesis that is most like it, likewise.
+    likeliest_off: mean distance from the likeliest hypothesis.
+    expected_error, unsure: the network's own expected error of its likeliest hypothesis, and the
+        mean standard deviation of its keypoints, likewise.
+    absent, other_side: log odds that there is no hand, or that it is the other one.
+    unseen: share of the joints that lie outside of the image.
+    hidden: share of the joints that lie behind something.
+    young: 1 in the first frame of a track, falling.
+    """
+
+    log_score: float
+    keypoints_off: float
+    farthest_keypoint_off: float
+    pose_off: float
+    likeliest_off: float
+    expected_error: float
+    unsure: float
+    absent: float
+    other_side: float
+    unseen: float
+    hidden: float
+    young: float
+
+    def values(self) -> list[float]:
+        """In the order of FEATURES."""
+        return [getattr(self, name) for name in FEATURES]
+
+
+FEATURES = tuple(field.name for field in fields(ConfidenceFeatures))
+NO_FEATURES = ConfidenceFeatures(*[0.0] * len(FEATURES))
+"""Before any frame."""
+
+
+def confidence_features(
+    joints_m: Tensor,
+    score: float,
+    age_s: float,
+    detection: Detection,
+    last: ConfidenceFeatures,
+    depth_m: Tensor,
+    k: Tensor,
+) -> ConfidenceFeatures:
+    """The features of an estimate with joints (21, 3) in an image (H, W) with intrinsics k.
+
+    age_s: seconds since its track began.
+    last: of the frame before; in a frame without a detection, all but the score hold.
+    """
+    if detection.empty:
+        return replace(last, log_score=math.log(max(score, _LEAST)))
+    joints = joints_m.cpu()
+    at = joints.numpy()
+    keypoints = np.linalg.norm(at - detection.keypoints.points_m.numpy(), axis=1)
+    off = np.linalg.norm(at - detection.joints_m.numpy(), axis=-1).mean(1)
+    likely = off[detection.log_probability.numpy() > math.log(_LIKELY)]
+    unseen, hidden = out_of_sight(joints, depth_m, k)
+    return ConfidenceFeatures(
+        log_score=math.log(max(score, _LEAST)),
+        keypoints_off=_log_cm(float(keypoints.mean())),
+        farthest_keypoint_off=_log_cm(float(keypoints.max())),
+        pose_off=_log_cm(float(likely.min()) if len(likely) else float(off.min())),
+        likeliest_off=_log_cm(float(off[0])),
+        expected_error=_log_cm(float(detection.error_m[0])),
+        unsure=_log_cm(float(detection.keypoints.sigma_m.numpy().mean())),
+        absent=_log_odds(1 - detection.present),
+        other_side=_log_odds(1 - detection.right_side),
+        unseen=unseen,
+        hidden=hidden,
+        young=1 / (1 + age_s / FRAME_S),
+    )
+
+
+def log_odds(probability: float) -> float:
+    """Of a probability in 0 .. 1, both excluded."""
+    return math.log(probability / (1 - probability))
+
+
+def _log_cm(metres: float) -> float:
+    return math.log(max(100 * metres, 0.05))
+
+
+def _log_cm_of(*columns_m: np.ndarray) -> np.ndarray:
+    """Columns of metres to the logarithm of centimetres, (N, columns)."""
+    values: np.ndarray = np.log(np.maximum(100 * np.stack(columns_m, 1), 0.05))
+    return values
+
+
+def _log_odds(probability: float) -> float:
+    p = min(max(probability, _LEAST), 1 - _LEAST)
+    return math.log(p / (1 - p))
+
+
+def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
+    """Shares of the joints (21, 3) outside of the image (H, W), and of those behind something."""
+    depth, k_px, at = depth_m.cpu().numpy(), k.cpu().numpy(), joints.numpy()
+    z = np.maximum(at[:, 2], np.float32(0.05))
+    u = np.rint(k_px[0, 0] * at[:, 0] / z + k_px[0, 2])
+    v = np.rint(k_px[1, 1] * at[:, 1] / z + k_px[1, 2])
+    height, width = depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    column, row = np.where(inside, u, 0).astype(np.int64), np.where(inside, v, 0).astype(np.int64)
+    seen = depth[row, column]
+    behind = inside & (seen > 0) & (seen < z - np.float32(0.04))
+    count = len(at)
+    return 1 - np.count_nonzero(inside) / count, np.count_nonzero(behind) / count
+
+
+JOINT_FEATURES = (
+    "unsure",
+    "keypoint_off",
+    "finger_off",
+    "outside",
+    "unread",
+    "behind",
+    "before",
+    "misfit",
+    "pixel",
+    "doubt",
+)
+"""Features of a joint, each a number of order 1 that is larger where it speaks against it:
+
+unsure: the standard deviation of its keypoint, log of centimetres.
+keypoint_off: how far it is from that keypoint, log of centimetres.
+finger_off: the same of the farthest of its finger; at the wrist, the mean of all joints.
+outside, unread: parts of its surroundings that are out of the image, or without a reading.
+behind, before: how much farther or nearer it is than where it should be below the surface that is
+    seen there, in units of 20 mm, 50 mm at most.
+misfit: minus the log of the image's score.
+pixel: log of a pixel's width there, in millimetres.
+doubt: log(1 + exp(-x)) of the log odds x that the whole estimate is right.
+"""
+KINDS = (
+    *("wrist", "thumb_cmc", "thumb_mcp", "thumb_ip", "thumb_tip"),
+    *("mcp", "pip", "dip", "tip"),
+)
+"""Joints that are alike."""
+COLUMNS = ("ray", "finger", "across", "odds")
+"""What a row of weights is about: log standard deviations in centimetres along three axes, see
+hand/regions.py, and the log odds that the joint is within 40 mm."""
+KIND_OF_JOINT = np.array([0, 1, 2, 3, 4] + 4 * [5, 6, 7, 8])
+"""(21,) rows of KINDS."""
+_KEYPOINTS = slice(0, 3)
+"""The features that come from the network."""
+_BELOW_M = np.array([0.012, 0.010, 0.010, 0.008, 0.004] + 4 * [0.010, 0.008, 0.007, 0.004])
+"""How far joints are below the surface that a camera sees, roughly."""
+_AROUND_M = 0.006
+"""Distance of the readings about a joint."""
+_GRID_M = _AROUND_M * np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.float64)
+_LEAST_CM, _MOST_CM = 0.1, 30.0
+"""Standard deviations are never smaller or larger."""
+
+
+@dataclass(frozen=True)
+class JointConfidence:
+    """What makes a joint's standard deviations and probability; see conf/lost/calibrated.yaml.
+
+    scale: times all standard deviations.  odds: added to all log odds.
+    kinds: what each kind of joint begins with, in the order of COLUMNS.
+    weights: of the features, likewise.
+    """
+
+    scale: float
+    odds: float
+    kinds: Mapping[str, Sequence[float]]
+    weights: Mapping[str, Sequence[float]]
+
+    def __post_init__(self) -> None:
+        check_number("lost.joints.scale", self.scale, 0, above=True)
+        check_number("lost.joints.odds", self.odds)
+        for name, known in (("kinds", KINDS), ("weights", JOINT_FEATURES)):
+            rows = getattr(self, name)
+            if set(rows) != set(known):
+                raise ToftrackError(
+                    f"lost.joints.{name} must have a row for each of {', '.join(known)}"
+                )
+            for key, row in rows.items():
+                if isinstance(row, str) or len(row) != len(COLUMNS):
+                    raise ToftrackError(
+                        f"lost.joints.{name}.{key} must be {len(COLUMNS)} numbers:"
+                        f" {', '.join(COLUMNS)}"
+                    )
+                for value in row:
+                    check_number(f"lost.joints.{name}.{key}", value)
+
+    @cached_property
+    def _kinds(self) -> np.ndarray:
+        return np.array([list(self.kinds[name]) for name in KINDS])[KIND_OF_JOINT]
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        return np.array([list(self.weights[name]) for name in JOINT_FEATURES])
+
+    def judge(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviations (21, 3), m, and probabilities (21,) from features (21, J)."""
+        predicted = features @ self._weights + self._kinds
+        sigma = (self.scale * np.exp(predicted[:, :3])).clip(_LEAST_CM, _MOST_CM) / 100
+        odds = (predicted[:, 3] + self.odds).clip(-30.0, 30.0)
+        return sigma.astype(np.float32), (1 / (1 + np.exp(-odds))).astype(np.float32)
+
+
+def joint_features(
+    joints_m: np.ndarray,
+    detection: Detection,
+    last: np.ndarray,
+    score: float,
+    log_odds: float,
+    depth_m: np.ndarray,
+    k: np.ndarray,
+) -> np.ndarray:
+    """(21, J) in the order of JOINT_FEATURES.
+
+    joints_m: (21, 3).
+    last: (21, J) of the frame before; in a frame without a detection, those of its keypoints hold.
+    score: of the image, 0..1.  log_odds: that the estimate is right.
+    depth_m: (H, W), 0 = no reading.  k: (3, 3).
+    """
+    joints = joints_m.astype(np.float64)
+    features = np.empty((len(joints), len(JOINT_FEATURES)))
+    if detection.empty:
+        features[:, _KEYPOINTS] = last[:, _KEYPOINTS]
+    else:
+        keypoints = detection.keypoints
+        off = np.linalg.norm(joints - keypoints.points_m.numpy(), axis=1)
+        worst = np.concatenate(([off.mean()], off[1:].reshape(5, 4).max(1).repeat(4)))
+        features[:, _KEYPOINTS] = _log_cm_of(keypoints.sigma_m.numpy(), off, worst)
+    depth = np.maximum(joints[:, 2], 0.05)
+    outside, unread, surface = _seen_around(joints[:, :2], depth, depth_m, k)
+    deeper = np.where(np.isnan(surface), 0.0, joints[:, 2] - surface - _BELOW_M)
+    features[:, 3], features[:, 4] = outside, unread
+    features[:, 5], features[:, 6] = deeper.clip(0, 0.05) / 0.02, (-deeper).clip(0, 0.05) / 0.02
+    features[:, 7] = -math.log(max(score, 1e-3))
+    features[:, 8] = np.log(1e3 * depth / k[0, 0])
+    features[:, 9] = np.logaddexp(0.0, -log_odds)
+    return features
+
+
+def propagated_sigma(
+    joints_m: np.ndarray, covariance: Tensor, joints_of: Callable[[Tensor], Tensor]
+) -> np.ndarray:
+    """(21, 3) m along joint_axes: what the particles' covariance means for the joints (21, 3).
+
+    covariance: (6 + d, 6 + d) in the tangent space.
+    joints_of: joints (N, 21, 3) of the estimate moved by tangents (N, 6 + d).
+    """
+    size = len(covariance)
+    # One step along each main axis and back; a covariance may be singular, so no Cholesky.
+    values, vectors = torch.linalg.eigh(covariance.double())
+    steps = (vectors * values.clamp(min=0).sqrt()).mT.to(covariance.dtype)
+    moved = joints_of(torch.cat((steps, -steps))).cpu().double().numpy()
+    half = 0.5 * (moved[:size] - moved[size:])
+    along = np.einsum("jab,njb->nja", joint_axes(joints_m), half)
+    sigma: np.ndarray = np.sqrt(np.square(along).sum(0)).astype(np.float32)
+    return sigma
+
+
+def _seen_around(
+    xy_m: np.ndarray, z_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What is seen about points: parts outside, parts without reading, median depth or NaN; (N,).
+
+    xy_m: (N, 2).  z_m: (N,), above 0.
+    """
+    height, width = depth_m.shape
+    focal, middle = k[[0, 1], [0, 1]], k[[0, 1], [2, 2]]
+    pixels = (xy_m[:, None] + _GRID_M) * (focal / z_m[:, None, None]) + middle
+    column, row = np.rint(pixels.clip(-1e6, 1e6)).astype(np.int64).transpose(2, 0, 1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen = depth_m[row.clip(0, height - 1), column.clip(0, width - 1)]
+    read = inside & (seen > 0)
+    # The lower middle of what was read; nanmedian takes ten times as long.
+    ordered = np.sort(np.where(read, seen, np.inf), 1)
+    count = read.sum(1)
+    median = ordered[np.arange(len(count)), np.maximum(count - 1, 0) // 2]
+    inside_count = inside.sum(1)
+    unread = (inside_count - count) / len(_GRID_M)
+    return 1 - inside_count / len(_GRID_M), unread, np.where(count > 0, median, np.nan)
 
 
 @dataclass(frozen=True)
@@ -35,8 +321,8 @@ class ConfidenceModel:
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
     probation: frames after a start during which the hand is not remembered as seen.
-    intercept, weights: of the signs, by name.
-    joints: what is thought of each joint.
+    intercept, weights: of the features, by name.
+    joints: of each joint.
     """
 
     confidence: float
@@ -60,7 +346,7 @@ class ConfidenceModel:
         for name, value in self.weights.items():
             if name not in FEATURES:
                 raise ToftrackError(
-                    f"lost.weights.{name} is unknown; the signs are {', '.join(FEATURES)}"
+                    f"lost.weights.{name} is unknown; the features are {', '.join(FEATURES)}"
                 )
             check_number(f"lost.weights.{name}", value)
 
@@ -72,40 +358,3 @@ class ConfidenceModel:
     def _weights(self) -> list[tuple[str, float]]:
         # A mapping out of a configuration takes microseconds for each of its items.
         return [(name, float(weight)) for name, weight in self.weights.items()]
-
-    def judge(
-        self,
-        track: Track,
-        features: ConfidenceFeatures,
-        dt_s: float,
-        side: float = 1.0,
-        second: bool = False,
-    ) -> Status:
-        """What is thought of an estimate, dt_s after the last, and whether its track goes on.
-
-        side: probability that it is of the right side; of the other one every finger is wrong.
-        second: another hand is believed already.
-        """
-        now = self.log_odds(features)
-        before = track.log_odds
-        kept = self.memory ** (dt_s / FRAME_S)
-        smooth = now if before is None else kept * before + (1 - kept) * now
-        confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
-        bad = bad_for(track.bad_s, dt_s) if confidence < self.give_up else 0.0
-        # What is hidden is waited for.
-        patience = self.patience * (_WAITED if features.hidden > _HIDDEN else 1)
-        ends = patience > 0 and bad > 0 and reached(bad, patience)
-        # Whether it is a hand at all does not depend on whose it is.
-        new = 0.0 if track.believed else self.second if second else self.believe
-        lost = confidence < new or side * confidence < self.confidence
-        confidence *= side
-        return Status(not ends, _state_name(features, lost), lost, bad, confidence, smooth)
-
-
-def _state_name(features: ConfidenceFeatures, lost: bool) -> str:
-    """Why an estimate is not to be used."""
-    if not lost:
-        return "tracking"
-    if features.unseen > 0.4:
-        return "out of view"
-    return "hidden" if features.hidden > _HIDDEN else "searching"

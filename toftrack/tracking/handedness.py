@@ -1,76 +1,119 @@
-"""Whose hand it is: evidence for a right and for a left hand, summed up over looks.
+"""Handedness: evidence for a right and for a left hand, summed up over comparisons.
 
-The same look at the image is explained twice, by the networks' poses of a right hand and by those
-of a left one, each brought onto the seen points; what is known of the better explanation (image,
-forearm, fingers, votes) is compared. The networks' own word for a side is left out: on renders it
-is better than this, on other persons' hands worse, for it has learned which poses are drawn.
+The same image is explained twice, by the detector's poses of a right hand and by those of a left
+one, each brought onto the seen points; their posteriors are compared (lifecycle.py). The network's
+own probability of a side is left out: on renders it is better than this, on other persons' hands
+worse, for it has learned which poses are drawn.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from toftrack.detector.hand_detector import Detection
+from toftrack.checks import check_number
 from toftrack.frames import DepthImage
-from toftrack.tracking import shape_fit
-from toftrack.tracking.detect import best_start, expected_of
-from toftrack.tracking.handedness_estimate import OTHER_SIDE, comparison_due, probability
-from toftrack.tracking.model import TrackerModel, observed
-from toftrack.tracking.other_hand import OtherHand
-from toftrack.tracking.shape_fit import first_shape
-from toftrack.tracking.state import Track, TrackerState
 
+_BODY_COMPARISONS = 20
+"""Comparisons over which the body's place is averaged."""
 _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
 """Its least area that is seen, and rows of the image that it is looked for in."""
-_GONE_S = 1.0
-"""A hand that was believed so long ago may have made way for another one."""
-_SWITCHED = 0.4
-"""The side is changed when it has become less probable than this, so that it does not flicker."""
-_LEAST_PRESENT = 0.5
-"""Where a hand is less probable than this, nothing is said of its side."""
+OTHER_SIDE = {"right": "left", "left": "right"}
 
 
-def sided(
-    state: TrackerState,
-    track: Track | None,
-    detection: Detection | None,
-    dt_s: float,
-    image: DepthImage,
-    model: TrackerModel,
-    other_hand: OtherHand | None = None,
-) -> tuple[TrackerState, Track | None, Detection | None]:
-    """The state, the track and the look at the hand to go on with, after its side was judged.
+@dataclass(frozen=True)
+class HandednessSettings:
+    """How the side is detected; see conf/hand for what each does."""
 
-    When the other side has become the likelier one, a track of it begins in this frame.
+    weight: float
+    largest: float
+    most: float
+    kept: float
+    shoulder: float
+    shoulder_most: float
+    partner: float
+    sure: float
+    interval_unsure_s: float
+    interval_sure_s: float
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            least, most = (0.5, 0.999) if entry.name == "sure" else (0, math.inf)
+            check_number(f"hand.sides.{entry.name}", getattr(self, entry.name), least, most)
+
+
+@dataclass(frozen=True)
+class HandednessEstimate:
+    """Which hand it is; all but the body's place are log odds of a right hand.
+
+    given: the user gave the side, which is certain.
+    fits: by how much better a right hand explains the image than a left one, summed up.
+    shoulder: by where the body is.  partner: by which hand the other one is that is tracked.
+    body_m: how far the body is to the image's right of the hand, on average.
+    comparisons: how many there were.  age_s: how long ago the last one was.
     """
-    fit, belief = model.sides, state.sides
-    if fit is None or belief is None:
-        return state, track, detection
-    due = comparison_due(belief, fit, track is not None, dt_s)
-    if track is None and (state.seen is None or state.seen.age_s > _GONE_S):
-        belief = belief.left(fit)  # what comes may be the other hand
-    belief = replace(belief, undetected_time_s=belief.undetected_time_s + dt_s)
-    if detection is None or not due or detection.present < _LEAST_PRESENT:
-        return replace(state, sides=belief), track, detection
-    side, other = state.side, OTHER_SIDE[state.side]
-    centre = detection.centre_m.numpy()
-    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other)[0]
-    gain = _best_log_posterior(detection, side, state, track, image, model, other_hand)
-    gain -= _best_log_posterior(mirrored, other, state, track, image, model, other_hand)
-    gain = gain if side == "right" else -gain
-    belief = belief.compared(gain, _body_m(image, centre), fit)
-    if probability(belief, side) >= _SWITCHED:
-        return replace(state, sides=belief), track, detection
-    state = replace(state, side=other, sides=belief, size=first_shape(), gesture=None)
-    return state, None, mirrored
+
+    given: bool = False
+    fits: float = 0.0
+    shoulder: float = 0.0
+    partner: float = 0.0
+    body_m: float = 0.0
+    comparisons: int = 0
+    age_s: float = 0.0
+
+    @property
+    def log_odds(self) -> float:
+        """That it is a right hand, by all this."""
+        return self.fits + self.shoulder + self.partner
+
+    def probability(self, side: str) -> float:
+        """That the hand is of a side; 1 where it was given."""
+        if self.given:
+            return 1.0
+        log_odds = self.log_odds if side == "right" else -self.log_odds
+        return 1 / (1 + math.exp(-log_odds))
+
+    def comparison_due(self, settings: HandednessSettings, tracked: bool, dt_s: float) -> bool:
+        """Whether both sides are to be compared in a frame, dt_s after the last."""
+        if self.given or not tracked:
+            return not self.given
+        sure = max(self.probability(side) for side in OTHER_SIDE) > settings.sure
+        interval = settings.interval_sure_s if sure else settings.interval_unsure_s
+        return self.age_s + dt_s >= interval
+
+    def waited(self, dt_s: float) -> HandednessEstimate:
+        """After a frame without a comparison."""
+        return replace(self, age_s=self.age_s + dt_s)
+
+    def compared(
+        self, gain: float, body_m: float, settings: HandednessSettings
+    ) -> HandednessEstimate:
+        """After one more comparison: how much better a right hand is, and where the body."""
+        comparisons = self.comparisons + 1
+        fits = self.fits + settings.weight * min(max(gain, -settings.largest), settings.largest)
+        fits = min(max(fits, -settings.most), settings.most)
+        body_m = self.body_m + (body_m - self.body_m) / min(comparisons, _BODY_COMPARISONS)
+        most = settings.shoulder_most
+        shoulder = min(max(settings.shoulder * body_m, -most), most)
+        return HandednessEstimate(False, fits, shoulder, self.partner, body_m, comparisons)
+
+    def left(self, settings: HandednessSettings) -> HandednessEstimate:
+        """After the hand has left: the next one is likely, but not surely, the same."""
+        before = self.fits + self.shoulder
+        kept = min(max(before, -settings.kept), settings.kept)
+        return HandednessEstimate(fits=kept, partner=self.partner, age_s=self.age_s)
+
+    def beside(self, other: HandednessEstimate, settings: HandednessSettings) -> HandednessEstimate:
+        """The same where another hand is tracked: a person's two hands are not of one side."""
+        surely = math.tanh(0.5 * (other.fits + other.shoulder))
+        return self if self.given else replace(self, partner=-settings.partner * surely)
 
 
-def _body_m(image: DepthImage, centre_m: np.ndarray) -> float:
+def body_offset_m(image: DepthImage, centre_m: np.ndarray) -> float:
     """How far a body behind a hand is to the image's right of it; 0 where none is seen.
 
     Who faces the camera has the right hand to the image's left of the body, as a rule.
@@ -83,24 +126,3 @@ def _body_m(image: DepthImage, centre_m: np.ndarray) -> float:
     if np.square(z * step / focal).sum() < _BODY_M2:
         return 0.0
     return float(np.median((columns - image.k[0, 2]) / focal * z)) - float(centre_m[0])
-
-
-def _best_log_posterior(
-    detection: Detection,
-    side: str,
-    state: TrackerState,
-    track: Track | None,
-    image: DepthImage,
-    model: TrackerModel,
-    other: OtherHand | None,
-) -> float:
-    """The best of what is known of a side's poses, log scale; as low as it counts for none."""
-    theirs = None if other is None else other.pixels
-    observation = model.segmentation(image.depth_m, image.k, expected_of(detection), theirs)
-    if observation.empty:
-        return -math.inf
-    size = state.size
-    if track is None:
-        size = shape_fit.with_network_length(size, detection.length_m, model.adapt, model.shape)
-    hand = model.hand(side, size)
-    return best_start(observed(observation, hand, model, detection, other=other))[1]

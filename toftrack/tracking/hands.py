@@ -1,243 +1,231 @@
-"""One or two hands: a state each, in slots that keep to their hand."""
+"""Two hands: what each has to know of the other one, and which slot a hand belongs to."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
-from toftrack.checks import check_number
-from toftrack.compute.pace import elapsed_s
-from toftrack.compute.threads import at_most, small_operations
-from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, no_estimate
-from toftrack.frames import DepthImage, checked_image
-from toftrack.hand.shape import HandShape, default_hand_shape
-from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import hand_surface
-from toftrack.pose_space.base import PoseSpace
-from toftrack.render.closed_form import render_range_images
-from toftrack.render.scoring import Scorer
+from toftrack.compute.rigid import pivot_offset
+from toftrack.frames import DepthImage
+from toftrack.render.model_image import model_range_image
 from toftrack.render.segmentation import reduce_image
-from toftrack.tracking.handedness_estimate import OTHER_SIDE
-from toftrack.tracking.model import FilterModel, TrackerModel
-from toftrack.tracking.quality import Pace, Timekeeper
-from toftrack.tracking.slots import (
-    believed,
-    exchanged,
-    in_wrong_slot,
-    known_side,
-    of_one_hand,
-    partnered,
-    placed,
-    seen_beside,
-    sureness,
-)
-from toftrack.tracking.state import StepInfo, TrackerState
-from toftrack.tracking.step import step
-from toftrack.tracking.tracker import restarted, stepped
+from toftrack.tracking.filter import predicted_motion
+from toftrack.tracking.model import FittedHand, TrackerModel
+from toftrack.tracking.posterior import touching
+from toftrack.tracking.state import HandState, Track
 
-_SOUGHT_S = 0.12
-"""How often a further hand is looked for."""
-_TRIED_S, _AGAIN_S = 0.5, 0.5
-"""A second track is given up when it was not believed for so long, and looked for so much later."""
-_ONE_S = 0.15
-"""Two tracks that were believed may be on one hand for so long."""
-_RENDERED_PX = 72, 88
-"""Size of an image that nobody sees."""
+_TOLERANCE_M = 0.02
+"""A pixel that is so near to a hand's surface may be the hand's."""
+_EDGE_M = 0.06
+"""Pixels on the outline of a hand mix it with what is behind, up to this."""
+_FAR_M = 5.0
+"""So far away is nothing for the detector."""
+_IN_FRONT_M = 0.03
+"""What is so much nearer than a hand's wrist may hide the hand."""
+_BELIEVED = 20.0
+"""A hand that was believed once comes before one that never was, log odds."""
+_KNOWN = 0.5
+"""Log odds from which on a slot's side is known."""
+_ONE_M, _ONE = 0.045, 0.3
+"""Two tracks are of one hand where their palms are so near, and so much of one is in the other."""
 
 
 @dataclass(frozen=True, eq=False)
-class HandsState:
-    """All that is carried between frames.
+class OtherHand:
+    """What one hand has to know of another one in a frame.
 
-    slots: of each hand.  unsought_s: how long ago a further hand was looked for.
-    one_s: how long two tracks have seemed to be of one hand.
+    joints_m: (21, 3).  centre_m: (3,) middle of its palm.
+    believed: it is a hand, and not just a place that may be one.
+    certain: its last estimate was not flagged, so that pixels are its own.
+    pixels: (H, W) bool of the reduced image, those that it explains better.
+    beside: (H, W) bool, those of them that cannot hide this hand.
     """
 
-    slots: tuple[TrackerState, ...]
-    second_search_age_s: float = math.inf
-    one_s: float = 0.0
+    joints_m: Tensor
+    centre_m: np.ndarray
+    believed: bool
+    certain: bool
+    pixels: np.ndarray
+    beside: np.ndarray
 
 
-def first_states(model: FilterModel, seed: int, hands: int) -> HandsState:
-    """Before any frame. The second slot looks for the other side of the first one."""
-    first, *others = (model.first_state(seed + slot) for slot in range(hands))
-    return HandsState((first, *(replace(state, side=OTHER_SIDE[first.side]) for state in others)))
+@dataclass(frozen=True, eq=False)
+class PlacedHand:
+    """Where a hand is, or is predicted.
 
-
-@small_operations()
-def step_hands(
-    state: HandsState, image: DepthImage, model: TrackerModel
-) -> tuple[HandsState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
-    """One frame of two hands: the surer one first, and each knows of the other one.
-
-    A pure function, as `step`. A vacant slot looks for a hand now and then.
+    pose: (1, 27).  k: (3, 3) and size: (H, W) of the reduced image.
     """
-    slots, before = list(state.slots), state.slots
-    dt_s = elapsed_s(slots[0].timestamp_s, image.timestamp_s)
+
+    pose: Tensor
+    fitted: FittedHand
+    k: np.ndarray
+    size: tuple[int, int]
+
+    @cached_property
+    def surface_m(self) -> np.ndarray:
+        """(H, W) Z of its surface, 0 = none."""
+        pose = self.pose[0].cpu().numpy()
+        return model_range_image(pose, self.fitted.shape, self.k, *self.size)
+
+    @cached_property
+    def joints_m(self) -> Tensor:
+        """(21, 3) on the CPU."""
+        return self.fitted.refiner.joints(self.pose)[0].cpu()
+
+    @property
+    def centre_m(self) -> np.ndarray:
+        """(3,) middle of the palm."""
+        hand = self.pose.numpy()
+        centre: np.ndarray = hand[0, :3] + pivot_offset(hand[:, 3:6])[0]
+        return centre
+
+
+def placed(
+    hand: HandState,
+    track: Track,
+    model: TrackerModel,
+    k: np.ndarray,
+    size: tuple[int, int],
+    dt_s: float,
+) -> PlacedHand:
+    """A slot's hand as it is predicted dt_s after its last pose."""
+    moved = predicted_motion(track, dt_s, model.filter)[None]
+    shift = model.backend.motions.compose(track.mean, moved)[:, :3] - track.mean[:, :3]
+    pose = torch.cat((track.pose[:, :3] + shift, track.pose[:, 3:]), 1)
+    return PlacedHand(pose, model.hand(hand.side, hand.shape), k, size)
+
+
+def others_of(
+    hands: Sequence[HandState], image: DepthImage, model: TrackerModel, dt_s: float
+) -> list[tuple[OtherHand, ...]]:
+    """For each slot, the other hands as they are predicted in a frame."""
+    if len(hands) == 1:
+        return [()]
     depth_m, k = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
     size = (depth_m.shape[0], depth_m.shape[1])
-    hands = [placed(slot, model, k, size, dt_s) for slot in slots]
-    infos: list[StepInfo | None] = [None, None]
-    reported: list[Estimate | None] = [None, None]
-    second_search_age_s = state.second_search_age_s + dt_s
-    vacant = [slot.track is None for slot in slots]
-    sought = all(vacant) or second_search_age_s >= _SOUGHT_S
-    for mine in sorted((0, 1), key=lambda slot: -sureness(slots[slot])):
-        theirs = 1 - mine
-        if vacant[mine] and not sought:
-            slots[mine] = slots[mine].at(image)
-            continue
-        other = seen_beside(slots[theirs], hands[theirs], hands[mine], depth_m)
-        partner = partnered(slots[mine], slots[theirs], model)
-        slots[mine], infos[mine], reported[mine] = step(partner, image, model, other)
-        hands[mine] = placed(slots[mine], model, k, size)
-    second_search_age_s = 0.0 if sought else second_search_age_s
-    one_s = state.one_s + dt_s if of_one_hand(hands) else 0.0
-    if one_s and (one_s > _ONE_S or not all(believed(slot) for slot in slots)):
-        worse = min((0, 1), key=lambda slot: sureness(slots[slot]))
-        slots[worse], one_s = replace(slots[worse], track=None), 0.0
-    for slot in (0, 1):
-        if _in_vain(slots[slot], slots[1 - slot]):
-            second_search_age_s = 0.0 if known_side(slots[slot]) else -_AGAIN_S
-            slots[slot] = replace(slots[slot], track=None)
-    if in_wrong_slot(before, slots):
-        slots = exchanged(before, slots)
-        infos.reverse()
-        reported.reverse()
-    dims = model.space.dims
-    nothing = no_estimate(image.index, image.timestamp_s, "lost", dims, math.nan)
-    estimates = tuple(
-        nothing if estimate is None or slot.track is None else estimate
-        for slot, estimate in zip(slots, reported, strict=True)
-    )
-    return HandsState(tuple(slots), second_search_age_s, one_s), tuple(infos), estimates
-
-
-def _in_vain(slot: TrackerState, other: TrackerState) -> bool:
-    """Whether a second track was not believed for too long."""
-    track = slot.track
-    return track is not None and not track.believed and believed(other) and track.age_s > _TRIED_S
-
-
-class HandsTracker:
-    """Follows `hands` hands, each in a slot of its own: slot 0 is the first one that was found.
-
-    state: all that is carried between frames; one that was kept may be put back.
-    infos: what the last step saw and believed of each; None where it did not look.
-    time: what frames take, and what may be spent on them.
-    """
-
-    def __init__(
-        self,
-        model: FilterModel,
-        seed: int = 0,
-        hands: int = 1,
-        pace: Pace | None = None,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        """pace, clock: see Tracker.
-
-        Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without networks.
-        """
-        check_number("hands", hands, 1, 2, whole=True)
-        if hands > 1 and not isinstance(model, TrackerModel):
-            raise ToftrackError(
-                "hands=2 tells two hands apart by the networks, but experiment=paper has none;"
-                " give hands=1, or leave experiment=paper out"
-            )
-        self.model, self.time = model, Timekeeper(pace, clock)
-        self.state = first_states(model, seed, hands)
-        self.infos: tuple[StepInfo | None, ...] = (None,) * hands
-
-    @property
-    def states(self) -> tuple[TrackerState, ...]:
-        """Of the slots."""
-        return self.state.slots
-
-    def step(
-        self,
-        depth_m: np.ndarray,
-        k: np.ndarray,
-        index: int | None = None,
-        timestamp_s: float | None = None,
-        began_s: float | None = None,
-    ) -> tuple[Estimate, ...]:
-        """One frame, see Tracker.step; an estimate a slot. One without a hand is lost and NaN."""
-        quality = self.time.begin(began_s)
-        depth_m, k = checked_image(depth_m, k)
-        index = self.states[0].next_index if index is None else index
-        timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
-        image = DepthImage(depth_m, k, index, timestamp_s)
-        model = self.model.at_quality(quality)
-        with at_most(quality.threads):
-            if len(self.states) == 2 and isinstance(model, TrackerModel):
-                self.state, self.infos, estimates = step_hands(self.state, image, model)
-            else:
-                state, info, estimate = stepped(self.states[0], image, model)
-                estimates = (estimate,)
-                self.state, self.infos = HandsState((state,)), (info,)
-        took_s = self.time.took_s()
-        return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
-
-    @small_operations()
-    def prepare(self) -> None:
-        """Load and compile now what the first frame would have to wait for; changes nothing."""
-        stepped(self.states[0], _rendered_hand(), self.model)
-
-    def restart(self, side: str | None = None) -> None:
-        """Forget the hands, see Tracker.restart; a side is the first one's."""
-        first, *others = self.states
-        first = restarted(first, self.model, side)
-        other = OTHER_SIDE[first.side]
-        others = [restarted(state, self.model, side and other) for state in others]
-        self.state = HandsState((first, *(replace(state, side=other) for state in others)))
-        self.infos = (None,) * len(self.states)
-
-    @property
-    def shapes(self) -> tuple[HandShape, ...]:
-        """The hand of each slot that the next frame is compared with."""
-        return tuple(self.model.hand(state.side, state.size).shape for state in self.states)
-
-    @property
-    def fitted(self) -> tuple[HandShape, ...]:
-        """The same hands, with how sure the fit is of them."""
-        return tuple(self.model.fitted(state.side, state.size) for state in self.states)
-
-    @property
-    def scorer(self) -> Scorer:
-        """The back end's, for the first hand."""
-        return self.model.hand(self.states[0].side, self.states[0].size).scorer
-
-    @property
-    def space(self) -> PoseSpace:
-        """The pose space."""
-        return self.model.space
-
-    @property
-    def device(self) -> torch.device:
-        """Where everything is computed."""
-        return self.model.device
-
-    @property
-    def insights(self) -> tuple[StepInfo | None, ...]:
-        """What the last step saw and believed of each; None where nothing could be a hand."""
-        return tuple(
-            None if info is None or info.observation.empty else info for info in self.infos
+    there = [
+        placed(hand, hand.track, model, k, size, dt_s) if hand.track is not None else None
+        for hand in hands
+    ]
+    return [
+        tuple(
+            _other_hand(hands[slot].track, theirs, mine, depth_m)
+            for slot, theirs in enumerate(there)
+            if theirs is not None and slot != own
         )
+        for own, mine in enumerate(there)
+    ]
 
 
-def _rendered_hand() -> DepthImage:
-    """A small image of an open hand before a wall."""
-    shape, (height, width) = default_hand_shape(), _RENDERED_PX
-    state = torch.zeros(1, 27)
-    state[0, 1:3] = torch.tensor([0.08, 0.5])
-    k = torch.tensor([[110.0, 0, width / 2], [0, 110.0, height / 2], [0, 0, 1]])
-    hand = hand_surface(shape).pose(forward_kinematics(state, shape))
-    depth = render_range_images(hand, k, height, width)[0]
-    return DepthImage(torch.where(depth > 0, depth, 1.5).numpy(), k.double().numpy(), 0, 0.0)
+def _other_hand(
+    track: Track | None, theirs: PlacedHand, mine: PlacedHand | None, depth_m: np.ndarray
+) -> OtherHand:
+    """Another hand as this one, which may have no place yet, has to know it."""
+    assert track is not None
+    none = np.zeros(depth_m.shape, bool)
+    if track.doubted or not track.believed:
+        return OtherHand(theirs.joints_m, theirs.centre_m, track.believed, False, none, none)
+    if mine is None:
+        pixels = explained(depth_m, theirs.surface_m, np.zeros_like(depth_m))
+        return OtherHand(theirs.joints_m, theirs.centre_m, True, True, pixels, none)
+    pixels = explained(depth_m, theirs.surface_m, mine.surface_m)
+    beside = pixels & (depth_m > float(mine.pose[0, 2]) - _IN_FRONT_M)
+    return OtherHand(theirs.joints_m, theirs.centre_m, True, True, pixels, beside)
+
+
+def explained(depth_m: np.ndarray, theirs_m: np.ndarray, mine_m: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels of an image that the other hand's surface explains, and better than mine.
+
+    depth_m, theirs_m, mine_m: (H, W) Z, 0 = none.
+    """
+    there = (depth_m > 0) & (theirs_m > 0)
+    off = np.where(there, np.abs(depth_m - theirs_m), np.inf)
+    my_off = np.where(mine_m > 0, np.abs(depth_m - mine_m), np.inf)
+    sure = there & (off < my_off) & (off < _TOLERANCE_M)
+    # About them lie the mixed pixels of its outline, which are neither hand's.
+    near = cv2.dilate(sure.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    around = cv2.dilate(np.where(sure, theirs_m, np.float32(0)), np.ones((3, 3), np.float32))
+    mixed = near & ~sure & (depth_m > around) & (depth_m < around + _EDGE_M)
+    return sure | (mixed & (my_off >= _TOLERANCE_M))
+
+
+def pixels_of(others: Sequence[OtherHand]) -> np.ndarray | None:
+    """(H, W) bool of the reduced image: pixels of other hands; None where none are known."""
+    masks = [other.pixels for other in others if other.certain]
+    return np.logical_or.reduce(masks) if masks else None
+
+
+def without(image: DepthImage, others: Sequence[OtherHand]) -> DepthImage:
+    """The image as the detector is to see it: with nothing where other hands are, or its keypoints
+    lie on their fingers as well. What may hide a hand stays, for it knows things that hide hands.
+    """
+    for other in others:
+        if other.beside.any():
+            height, width = image.depth_m.shape
+            beside = other.beside.view(np.uint8)
+            gone = cv2.resize(beside, (width, height), interpolation=cv2.INTER_NEAREST)
+            image = replace(image, depth_m=np.where(gone, np.float32(_FAR_M), image.depth_m))
+    return image
+
+
+def partnered(hands: Sequence[HandState], model: TrackerModel) -> list[HandState]:
+    """The hands, with what the other hand's side says of each one's."""
+    settings = model.configured.handedness
+    return [
+        replace(hand, handedness=hand.handedness.beside(other.handedness, settings))
+        if other.believed
+        else replace(hand, handedness=replace(hand.handedness, partner=0.0))
+        for hand, other in zip(hands, reversed(hands), strict=True)
+    ]
+
+
+def sureness(hand: HandState) -> float:
+    """How surely a slot's last estimate was right."""
+    if hand.track is None:
+        return -math.inf
+    return hand.track.log_odds + (_BELIEVED if hand.track.believed else 0.0)
+
+
+def on_one_hand(first: PlacedHand, second: PlacedHand) -> bool:
+    """Whether two tracks have come onto one hand."""
+    if float(np.linalg.norm(first.centre_m - second.centre_m)) > _ONE_M:
+        return False
+    return float(touching(first.joints_m[None], second.joints_m)) > _ONE
+
+
+def known_side(hand: HandState) -> str:
+    """Of the hand that a slot had; "" where it had none, or nothing was said of its side."""
+    known = hand.handedness.given or abs(hand.handedness.log_odds) > _KNOWN
+    return hand.side if known and not hand.last.lost else ""
+
+
+def in_wrong_slot(before: Sequence[HandState], hands: Sequence[HandState]) -> bool:
+    """Whether a hand that began where both slots were vacant belongs into the other one.
+
+    A slot keeps to a hand, also when both were away: whose it is tells which one came back. One
+    that nobody knows comes into the first slot.
+    """
+    began = [hand.track is not None for hand in hands]
+    if any(hand.track is not None for hand in before) or sum(began) != 1:
+        return False
+    new = began.index(True)
+    known = [known_side(hand) for hand in before]
+    side = hands[new].side
+    first = 0 if known[0] == side or known[1] != side else 1
+    return new != first
+
+
+def exchanged(before: Sequence[HandState], hands: Sequence[HandState]) -> list[HandState]:
+    """The new hand in the other slot; the one that it began in is as it was."""
+    new = [hand.track is not None for hand in hands].index(True)
+    now = hands[1 - new]
+    # What was learned of a hand's shape and gestures stays with the slot that the hand is in.
+    moved = replace(hands[new], shape=now.shape, gesture=now.gesture, last=now.last)
+    return [before[new], moved] if new == 0 else [moved, before[new]]

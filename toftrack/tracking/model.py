@@ -10,66 +10,63 @@ from functools import cached_property, lru_cache, partial
 import torch
 from torch import Tensor
 
-from toftrack.compute.backend import Backend
-from toftrack.compute.transfer import on_device, on_host
-from toftrack.detector.hand_detector import Detection, HandDetector
+from toftrack.compute.particle_filter import FilterSettings, Spread, bound
+from toftrack.compute.quality import Quality
+from toftrack.detector.hand_detector import HandDetector
+from toftrack.estimate import no_estimate
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import HandShape
 from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.data.natural_poses import natural_poses
-from toftrack.pose_space.density import LatentDensity, latent_density
 from toftrack.refinement.gauss_newton import Refinement, Refiner
+from toftrack.refinement.shape_fit import ShapeEstimate, ShapeFit, first_shape
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.scoring import Counts, Evidence, Scorer
-from toftrack.render.segmentation import NearestSurface, Observation
+from toftrack.render.scoring import Scorer
+from toftrack.render.segmentation import NearestSurface
+from toftrack.tracking.backend import Backend
 from toftrack.tracking.confidence import ConfidenceModel
-from toftrack.tracking.handedness_estimate import HandednessEstimate, HandednessSettings
-from toftrack.tracking.other_hand import OtherHand
-from toftrack.tracking.particle_filter import FilterSettings, Spread, bound
-from toftrack.tracking.prior import LastSeen, Prior
-from toftrack.tracking.quality import Quality
-from toftrack.tracking.shape_fit import ShapeEstimate, ShapeFit, first_shape
-from toftrack.tracking.state import TrackerState
+from toftrack.tracking.handedness import OTHER_SIDE, HandednessEstimate, HandednessSettings
+from toftrack.tracking.posterior import PosteriorWeights
+from toftrack.tracking.select import Hysteresis
+from toftrack.tracking.state import HandState, LastSeen, TrackerState
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
-_HIDDEN = 0.03
-"""Share of the hand's pixels that must be hidden for it to matter."""
 _HANDS = 32
-"""Hands that are kept made."""
+"""Hands of some side and shape that are kept made."""
 
 
 @dataclass(frozen=True)
 class Hand:
     """The hand of a configuration: a shape, and how it is fitted to the user.
 
-    sides: how its side is found out; None where it is told.
+    handedness: how its side is detected.  side_given: it is not, because the user gave it.
     """
 
     shape: HandShape
-    adapt: ShapeFit
-    sides: HandednessSettings | None
+    fit: ShapeFit
+    handedness: HandednessSettings
+    side_given: bool
 
 
 def make_hand(
     shape: str, side: str, length_m: float, adapt: ShapeFit, sides: HandednessSettings
 ) -> Hand:
-    """See toftrack.hand.make_hand_shape; only shape="auto" is fitted, and only side="auto" found
-    out: it begins as a right hand.
+    """See toftrack.hand.make_hand_shape; only shape="auto" is fitted, and only side="auto"
+    detected: it begins as a right hand.
     """
     made = make_hand_shape(shape, "right" if side == "auto" else side, length_m)
-    adapt = replace(adapt, fixed=shape != "auto")
-    return Hand(made, adapt, sides if side == "auto" else None)
+    return Hand(made, replace(adapt, fixed=shape != "auto"), sides, side != "auto")
 
 
 @dataclass(frozen=True, eq=False)
-class SizedHand:
+class FittedHand:
     """A hand of one side and shape, and what was made for it.
 
-    first: the hand whose components `worn` is away from; see hand/shape_space.py.
+    first: the hand whose components `applied` is away from; see hand/shape_space.py.
     """
 
     shape: HandShape
@@ -90,11 +87,11 @@ class FilterModel:
 
     All is on the CPU but for those parts that the back end makes.
 
-    shape: the hand as configured, before it was fitted.
-    gestures: None tells none.
+    configured: the hand as the user configured it.
+    gestures: None recognises none.
     """
 
-    shape: HandShape
+    configured: Hand
     space: PoseSpace
     segmentation: NearestSurface
     likelihood: FMeasure
@@ -102,10 +99,19 @@ class FilterModel:
     gestures: Gestures | None
     backend: Backend
 
-    def first_state(self, seed: int) -> TrackerState:
-        """Before any frame."""
+    def first_hand(self, side: str, side_given: bool) -> HandState:
+        """A slot before any frame."""
+        handedness = HandednessEstimate(given=side_given)
+        seen = LastSeen(torch.zeros(1, 6 + self.space.dims), math.inf)
+        nothing = no_estimate(-1, math.nan, "lost", self.space.dims, math.nan)
+        return HandState(side, handedness, first_shape(), seen, nothing)
+
+    def first_state(self, seed: int, hands: int = 1) -> TrackerState:
+        """Before any frame. A second slot looks for the other side of the first one."""
         generator = torch.Generator().manual_seed(seed)
-        return TrackerState(generator.get_state(), self.shape.side, first_shape())
+        side, given = self.configured.shape.side, self.configured.side_given
+        slots = (self.first_hand(side, given), self.first_hand(OTHER_SIDE[side], given))
+        return TrackerState(generator.get_state(), slots[:hands])
 
     def at_quality(self, quality: Quality) -> FilterModel:
         """The same tracker with less effort; itself where nothing is left out."""
@@ -116,9 +122,9 @@ class FilterModel:
         """Whether the hand's shape is fitted to the user."""
         return False
 
-    def fitted(self, side: str, belief: ShapeEstimate) -> HandShape:
-        """The hand of a side, with how sure the fit is of it if there is one."""
-        return self.hand(side, belief).shape
+    def fitted(self, hand: HandState) -> HandShape:
+        """A slot's hand, with how sure the fit is of it if there is one."""
+        return self.hand(hand.side, hand.shape).shape
 
     @property
     def device(self) -> torch.device:
@@ -143,24 +149,13 @@ class FilterModel:
         """(6 + d,) of what the particles do not know."""
         return _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
 
-    def log_prior(self, particles: Tensor) -> Tensor | None:
-        """(N, 6 + d) to (N,) what speaks for a pose before the image does; None where nothing."""
-        if self._density is None:
-            return None
-        return self.filter.density * self._density.log_density(particles[:, 6:])
+    def hand(self, side: str, shape: ShapeEstimate) -> FittedHand:
+        """The hand of a side in the shape that is applied."""
+        return self._hands(side, shape.applied)
 
     @cached_property
-    def _density(self) -> LatentDensity | None:
-        space = self.space if self.device.type == "cpu" else self._space_there
-        return latent_density(space) if self.filter.density else None
-
-    def hand(self, side: str, belief: ShapeEstimate) -> SizedHand:
-        """The hand of a side in the shape that is believed in."""
-        return self._hands(side, belief.applied)
-
-    @cached_property
-    def _hands(self) -> Callable[[str, tuple[float, ...]], SizedHand]:
-        return lru_cache(_HANDS)(partial(_sized_hand, self.shape, self.backend))
+    def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
+        return lru_cache(_HANDS)(partial(_fitted_hand, self.configured.shape, self.backend))
 
     def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
         """(N, 6 + d) particles to (N, 27) hand states, all displaced by `offset` (21,) rad."""
@@ -184,22 +179,15 @@ class FilterModel:
 class TrackerModel(FilterModel):
     """The parts of the tracker with networks.
 
-    prior: what speaks for a hand besides the image and the networks.
-    adapt: how the shape is fitted, by what the networks say.
-    sides: how the side is found out, by the networks; None where it was told.
+    weights: of the terms of the posterior.  hysteresis: when another pose takes over.
+    lost: when an estimate is not to be used, and its track is given up.
     """
 
     detector: HandDetector
     refinement: Refinement
-    prior: Prior
+    weights: PosteriorWeights
+    hysteresis: Hysteresis
     lost: ConfidenceModel
-    adapt: ShapeFit
-    sides: HandednessSettings | None = None
-
-    def first_state(self, seed: int) -> TrackerState:
-        """See FilterModel."""
-        sides = None if self.sides is None else HandednessEstimate()
-        return replace(super().first_state(seed), sides=sides)
 
     def at_quality(self, quality: Quality) -> TrackerModel:
         """See FilterModel."""
@@ -210,16 +198,21 @@ class TrackerModel(FilterModel):
         return lru_cache(partial(_at_quality, self))
 
     @property
+    def fit(self) -> ShapeFit:
+        """How the hand's shape is fitted."""
+        return self.configured.fit
+
+    @property
     def fits(self) -> bool:
         """See FilterModel."""
-        return not self.adapt.fixed
+        return not self.fit.fixed
 
-    def fitted(self, side: str, belief: ShapeEstimate) -> HandShape:
-        """See FilterModel; None is said of the fit before anything was fitted."""
-        shape = super().fitted(side, belief)
-        if not (self.fits and belief.poses):
+    def fitted(self, hand: HandState) -> HandShape:
+        """See FilterModel; nothing is said of the fit before anything was fitted."""
+        shape = super().fitted(hand)
+        if not (self.fits and hand.shape.poses):
             return shape
-        return replace(shape, fitted=belief.summary(self.adapt))
+        return replace(shape, fitted=hand.shape.summary(self.fit))
 
     @cached_property
     def poses(self) -> Tensor:
@@ -230,97 +223,31 @@ class TrackerModel(FilterModel):
 def _at_quality(model: TrackerModel, quality: Quality) -> TrackerModel:
     if quality == Quality(quality.threads):
         return model
-    reported, refinement = model.detector.settings, model.refinement
-    reported = replace(
-        reported,
-        every=max(reported.every, quality.every),
-        search=max(reported.search, quality.search),
-        rivals=_least(reported.rivals, quality.rivals),
-        places=_least(reported.places, quality.places),
+    settings, hysteresis = model.detector.settings, model.hysteresis
+    settings = replace(
+        settings,
+        every=max(settings.every, quality.every),
+        search=max(settings.search, quality.search),
+        candidates=_at_most(settings.candidates, quality.candidates),
+        places=_at_most(settings.places, quality.places),
     )
+    exchanged = math.ceil(quality.exchanged * hysteresis.exchanged)
     made = replace(
         model,
-        refinement=replace(refinement, swaps=math.ceil(quality.swaps * refinement.swaps)),
-        detector=replace(model.detector, settings=reported),
+        hysteresis=replace(hysteresis, exchanged=exchanged),
+        detector=replace(model.detector, settings=settings),
     )
-    vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the effort
+    vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the quality
     return made
 
 
-def _least(count: int, most: int | None) -> int:
+def _at_most(count: int, most: int | None) -> int:
     return count if most is None else min(count, most)
 
 
-def _sized_hand(
+def _fitted_hand(
     shape: HandShape, backend: Backend, side: str, applied: tuple[float, ...]
-) -> SizedHand:
+) -> FittedHand:
     first = shape.of_side(side)
-    sized = shaped(first, torch.tensor(applied))
-    return SizedHand(sized, backend.make_scorer(sized), backend.make_refiner(sized), first, applied)
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedFrame:
-    """A frame that may show a hand, and the hand looked for: the judge of hypotheses.
-
-    evidence: on the model's device.
-    """
-
-    observation: Observation
-    evidence: Evidence
-    hand: SizedHand
-    model: FilterModel
-
-    def counts(self, states: Tensor) -> Counts:
-        """(N, 27) hands, on the CPU or the model's device, counted there and told here."""
-        if states.device.type != "cpu":
-            return self.hand.scorer(states, self.evidence)
-        there = on_device(states, self.model.device)
-        return Counts(*on_host(*self.hand.scorer(there, self.evidence)))
-
-    def log_scores(self, states: Tensor, coverage: float | None = None) -> Tensor:
-        """(N, 27) hands to (N,) what they are weighed by, see FMeasure.log_score."""
-        return self.model.likelihood.log_score(self.counts(states), coverage)
-
-    def score(self, state: Tensor) -> float:
-        """(1, 27) to the likelihood head's score, 0..1."""
-        return float(self.model.likelihood.score(self.counts(state)))
-
-
-@dataclass(frozen=True, eq=False)
-class DetectedFrame(ObservedFrame):
-    """The same, with what else is known of the hand.
-
-    glance: what the networks say of it; None in a frame in which they do not look.
-    seen: the hand as it was last believed.
-    other: another hand that is tracked as well.
-    """
-
-    model: TrackerModel
-    detection: Detection | None
-    seen: LastSeen | None
-    other: OtherHand | None
-
-    @property
-    def hidden(self) -> bool:
-        """Whether something hides part of the hand."""
-        hand, occluder = self.observation.hand, self.observation.occluder
-        return int(occluder.sum()) > _HIDDEN * int(hand.sum())
-
-
-def evidence_of(observation: Observation, model: FilterModel) -> Evidence:
-    """Of an observation that is not empty, on the model's device."""
-    return model.likelihood.evidence(observation).to(model.device)
-
-
-def observed(
-    observation: Observation,
-    hand: SizedHand,
-    model: TrackerModel,
-    detection: Detection | None = None,
-    seen: LastSeen | None = None,
-    other: OtherHand | None = None,
-) -> DetectedFrame:
-    """A segmented frame, which is not empty."""
-    evidence = evidence_of(observation, model)
-    return DetectedFrame(observation, evidence, hand, model, detection, seen, other)
+    made = shaped(first, torch.tensor(applied))
+    return FittedHand(made, backend.make_scorer(made), backend.make_refiner(made), first, applied)

@@ -15,21 +15,22 @@ import numpy as np
 import torch
 
 from toftrack.checks import check_number
-from toftrack.compute.pace import elapsed_s
+from toftrack.compute.particle_filter import Spread, covariance
 from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.spans import Spans
 from toftrack.compute.threads import small_operations
-from toftrack.compute.transfer import on_device
+from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.estimates import emitted, estimate_of, no_hand, particles_sigma
-from toftrack.tracking.following import Found, advanced, expected_depths, filtered
-from toftrack.tracking.life_cycle import Status
-from toftrack.tracking.model import FilterModel, ObservedFrame, evidence_of
-from toftrack.tracking.particle_filter import Spread
-from toftrack.tracking.spans import Spans
-from toftrack.tracking.state import StepInfo, Track, TrackerState, resumed
+from toftrack.tracking.candidates import image_term
+from toftrack.tracking.confidence import propagated_sigma
+from toftrack.tracking.filter import Found, predicted_depths, run_filter, velocity_after
+from toftrack.tracking.lifecycle import Absence, Status
+from toftrack.tracking.model import FilterModel, FittedHand
+from toftrack.tracking.state import StepInfo, Track, TrackerState
+from toftrack.tracking.step import emitted, estimate_of, no_hand
 
 _WIDEST_PALM_M = 0.06
 """Half the breadth of the broadest hand's palm with the ball of the thumb."""
@@ -137,8 +138,8 @@ class ScoreThreshold:
     def judge(self, track: Track, score: float) -> Status:
         """What is thought of an estimate with a score."""
         if score < self.score:
-            return Status(True, "recovering", True)
-        return Status(True, "tracking" if track.age_s > 0 else "initialising", False)
+            return Status("recovering", True)
+        return Status("tracking" if track.age.begun else "initialising", False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,36 +153,64 @@ class PaperModel(FilterModel):
 @small_operations()
 def paper_step(
     state: TrackerState, image: DepthImage, model: PaperModel
-) -> tuple[TrackerState, StepInfo, Estimate]:
+) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
     """One frame: segment, start if there is no hand yet, filter, take the mean.
 
     A pure function: the state given stays as it is, and gives the same again. In an image without
     anything in it, the particles wait as they were.
     """
-    spans, generator = Spans(), resumed(state.generator)
-    dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
+    spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     state = state.at(image)
-    track, hand = state.track, model.hand(state.side, state.size)
+    hand, track = state.hands[0], state.hands[0].track
+    fitted = model.hand(hand.side, hand.shape)
     with spans("segmentation and evidence"):
-        expected = expected_depths(track, dt_s, hand, model)
+        expected = None if track is None else predicted_depths(track, dt_s, fitted, model)
         observation = model.segmentation(image.depth_m, image.k, expected)
         if observation.empty:
-            return no_hand(state, image, observation, model, spans)
-        frame = ObservedFrame(observation, evidence_of(observation, model), hand, model)
+            _, hand, info, estimate = no_hand(Absence(0, hand, observation), image, model)
+            info = replace(info, seconds=spans.seconds())
+            return replace(state, hands=(hand,)), (info,), (estimate,)
+        likelihood = image_term(observation, fitted, model)
     with spans("start"):
         track = model.start(observation, model, generator) if track is None else track
     with spans("filter: rest"):
-        particles, weights = filtered(track, dt_s, frame, generator, spans)
-        mean = model.backend.motions.mean(particles, weights)
-        pose = model.decode(mean)
-    score = frame.score(pose)
-    belief = model.lost.judge(track, score)
-    found = Found(particles, weights, mean, pose, None, *model.nearest(pose), track.offset)
-    estimate = estimate_of(image, found, score, belief, frame)
-    sigma_m = particles_sigma(estimate.joints_m, found, frame)
+        filtered = run_filter(track, dt_s, likelihood, model, generator, spans)
+        pose = model.decode(filtered.mean)
+    score = likelihood.score(pose)
+    status = model.lost.judge(track, score)
+    found = Found(filtered, pose, track.trend, *model.nearest(pose))
+    estimate = estimate_of(image, found, score, status, fitted, model)
+    sigma_m = _particles_sigma(estimate.joints_m, found, track, fitted, model)
+    hidden = expected is not None and bool(observation.occluder.any())
+    track = replace(
+        track,
+        particles=filtered.particles,
+        weights=filtered.weights,
+        mean=filtered.mean,
+        velocity=velocity_after(track, filtered.mean, dt_s, model),
+        pose=pose,
+        age=track.age.extended(dt_s),
+        doubted=status.lost,
+        believed=track.believed or not status.lost,
+        nearest_m=expected.nearest_m if expected is not None and hidden else 0.0,
+    )
     estimate = replace(estimate, joint_sigma_m=sigma_m)
-    hidden = bool(observation.occluder.any())
-    track = advanced(track, found, belief, expected if hidden else None, dt_s, model)
-    state, estimate = emitted(state, image, estimate, hand.shape, dt_s, model, spans)
-    state = replace(state, generator=generator.get_state(), track=track)
-    return state, StepInfo(observation, particles, weights, spans.seconds()), estimate
+    hand, estimate = emitted(replace(hand, track=track), image, estimate, fitted.shape, dt_s, model)
+    info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
+    state = replace(state, generator=generator.get_state(), hands=(hand,))
+    return state, (info,), (estimate,)
+
+
+def _particles_sigma(
+    joints_m: np.ndarray, found: Found, track: Track, fitted: FittedHand, model: FilterModel
+) -> np.ndarray:
+    """(21, 3) standard deviations of joints by the particles alone, as joint_sigma_m has them."""
+    motions, filtered = model.backend.motions, found.filtered
+
+    def joints_of(tangents: torch.Tensor) -> torch.Tensor:
+        moved = motions.compose(found.particle.repeat(len(tangents), 1), tangents)
+        return fitted.refiner.joints(model.decode(moved, track.offset))
+
+    around = motions.difference(filtered.particles, on_device(filtered.mean, model.device))
+    (spread,) = on_host(covariance(around, filtered.weights))
+    return propagated_sigma(joints_m, spread + torch.diag(model.model_variance), joints_of)

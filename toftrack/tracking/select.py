@@ -1,155 +1,237 @@
-"""Which of several poses is the hand's: as it was, as the networks see it, or with other fingers.
+"""Which of a frame's hypotheses is the hand, with all hysteresis that there is.
 
-A pose whose fingers are others must prove itself. One image often says as much for a pose as for
-the same with the neighbouring finger, and what is a little better changes from frame to frame; so
-the lead of such a contender is summed up over frames, as in a sequential test (Page, "Continuous
-inspection schemes", Biometrika 41, 1954), and it takes over when the lead is large enough.
+What is a little better changes from frame to frame, and one image often says as much for a pose as
+for the same with the neighbouring finger. So a pose with other fingers must prove itself: its lead
+is summed up over frames, as in a sequential test (Page, "Continuous inspection schemes", Biometrika
+41, 1954), and it takes over when the lead is large enough. A hypothesis of the detector at another
+place, or the other way round, must be better in several frames without a break.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from torch import Tensor
 
-from toftrack.compute.pace import FRAME_S
-from toftrack.refinement.gauss_newton import Refinement
-from toftrack.refinement.proposals import exchange_fingers, swap_fingers
-from toftrack.tracking.detect import joints_log_prior, log_posterior
-from toftrack.tracking.model import DetectedFrame
-from toftrack.tracking.state import Contender, Track
+from toftrack.checks import check_number
+from toftrack.compute.pace import FRAME_S, Duration
 
-_CLOSE = 16
-"""Of many poses, so many of the best by the image are compared by all that is known."""
-_SWAPPED = 2
-"""So many poses with another finger are refined."""
 _OTHER_M = 0.025
 """Poses with a joint that is farther off are other ones."""
 _PAUSE_S = 0.06
 """A time between two frames that is not the usual one."""
 _LEAST_CREDIT = 0.2
-"""Of what a contender needs against a track that is believed, it needs so much against any."""
+"""Of the lead that is needed against a pose that is surely right, so much is needed against any."""
+
+
+class Source(IntEnum):
+    """Where a hypothesis comes from."""
+
+    HELD = 0
+    """The last frame's pose as it was, while the hand is hidden."""
+    PREVIOUS = 1
+    """The last frame's fingers where the filter has the hand."""
+    DYNAMICS = 2
+    """The filter's estimate."""
+    CONTENDER = 3
+    """The pose that has been better for a while."""
+    DETECTOR = 4
+    """The detector's hypotheses, as they are and bent to its keypoints."""
+    EXCHANGED = 5
+    """The best pose with a single finger of another one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Alternatives:
-    """Poses (N, 27) and what they are compared by, (N,)."""
+class Hypotheses:
+    """A table of poses, a row each; of one hand or of two.
 
-    poses: Tensor
-    scores: Tensor
+    pose: (N, 27).  hand: (N,) which hand is meant, a row of the frame's hands.
+    source: (N,) see Source.  log_posterior: (N,), NaN before they are scored.
+    """
 
-    def rows(self, rows: Tensor) -> Alternatives:
-        """Some of them."""
-        return Alternatives(self.poses[rows], self.scores[rows])
+    pose: Tensor
+    hand: Tensor
+    source: Tensor
+    log_posterior: Tensor
 
-    def and_(self, other: Alternatives) -> Alternatives:
-        """These and others."""
-        return Alternatives(
-            torch.cat((self.poses, other.poses)), torch.cat((self.scores, other.scores))
+    @classmethod
+    def of(cls, pose: Tensor, hand: int, source: Source) -> Hypotheses:
+        """Poses (N, 27) of one hand and source, not scored."""
+        n = len(pose)
+        return cls(
+            pose, torch.full((n,), hand), torch.full((n,), int(source)), torch.full((n,), math.nan)
         )
 
+    @classmethod
+    def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
+        """One below the other."""
+        return cls(
+            torch.cat([table.pose for table in tables]),
+            torch.cat([table.hand for table in tables]),
+            torch.cat([table.source for table in tables]),
+            torch.cat([table.log_posterior for table in tables]),
+        )
 
-def scored(states: Tensor, frame: DetectedFrame) -> Alternatives:
-    """Hands (N, 27) with what they are compared by: the image, the votes, room for the fingers."""
-    scores = frame.log_scores(states)
-    # What speaks against a pose never raises its score: it matters for the first few only.
-    rows = torch.arange(len(states), device=states.device)
-    if len(states) > _CLOSE:
-        rows = torch.cat((rows[:1], scores[1:].topk(_CLOSE - 1).indices + 1))
-    word = torch.full_like(scores, -torch.inf)
-    word[rows] = joints_log_prior(frame.hand.refiner.joints(states[rows]), frame)
-    return Alternatives(states, scores + word)
+    def rows(self, rows: Tensor) -> Hypotheses:
+        """Some rows, by number or as a mask."""
+        return Hypotheses(
+            self.pose[rows], self.hand[rows], self.source[rows], self.log_posterior[rows]
+        )
+
+    def of_hand(self, hand: int) -> Hypotheses:
+        """The rows of one hand."""
+        return self.rows(self.hand == hand)
+
+    def of_source(self, *sources: Source) -> Hypotheses:
+        """The rows of some sources."""
+        return self.rows(torch.isin(self.source, torch.tensor([int(s) for s in sources])))
+
+    @property
+    def best(self) -> Hypotheses:
+        """The row with the highest posterior, the first of equals."""
+        return self.rows(self.log_posterior.argmax()[None])
+
+    def __len__(self) -> int:
+        return len(self.pose)
 
 
-def with_other_fingers(
-    found: Alternatives,
-    poses: Tensor,
-    frame: DetectedFrame,
-    cfg: Refinement,
-    generator: torch.Generator,
-) -> Tensor:
-    """(N, 27) the best of the found pose (1, 27) with single fingers of other poses, N few.
+@dataclass(frozen=True)
+class Hysteresis:
+    """When another pose takes over; see conf/hysteresis for what each does."""
 
-    poses: (M, 21) likely ones, every finger of which is tried; of natural poses a few are.
+    exchanged: int
+    lead: float
+    drift: float
+    alternate: float
+    place_m: float
+    place_lead: float
+    place_frames: int
+
+    def __post_init__(self) -> None:
+        for name in ("exchanged", "place_frames"):
+            least = 1 if name == "place_frames" else 0
+            check_number(f"hysteresis.{name}", getattr(self, name), least, whole=True)
+        for name in ("lead", "drift", "place_lead"):
+            check_number(f"hysteresis.{name}", getattr(self, name), 0)
+        check_number("hysteresis.place_m", self.place_m, 0, above=True)
+        check_number("hysteresis.alternate", self.alternate, 0.5, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Incumbent:
+    """What a track brings to the choice of its frame's pose.
+
+    contender_m: (C, 21, 3) joints of its contender, C = 0 or 1.  lead: of the contender.
+    challenged: how long a pose of another place has been better.
+    log_odds: that the last estimate was right.  new: this is the track's first frame.
     """
-    tried = (
-        swap_fingers(found.poses, frame.model.poses, cfg.swaps, generator)[1:],
-        exchange_fingers(found.poses, poses),
-    )
-    swapped = scored(torch.cat(tried), frame)
-    best = swapped.scores.topk(min(_SWAPPED, len(swapped.scores)))
-    return swapped.poses[best.indices[best.values > found.scores]]
+
+    contender_m: Tensor
+    lead: float
+    challenged: Duration
+    log_odds: float
+    new: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The pose of a frame, and what the choice of the next one begins with.
+
+    pose: (1, 27).  moved: it is of another place, where a new track begins.
+    contender: (C, 27), C = 0 or 1.  lead, challenged: see Track.
+    """
+
+    pose: Tensor
+    moved: bool
+    contender: Tensor
+    lead: float
+    challenged: Duration
 
 
 def select(
-    found: Alternatives, others: Alternatives, track: Track, dt_s: float, frame: DetectedFrame
-) -> tuple[Tensor, Contender | None]:
-    """The pose (1, 27) of a frame and its contender, from the found pose and others beside it.
+    table: Hypotheses,
+    joints_m: Tensor,
+    incumbent: Incumbent,
+    dt_s: float,
+    detected: bool,
+    hidden: bool,
+    settings: Hysteresis,
+) -> Choice:
+    """The pose of one hand in a frame.
 
-    Much the same poses are better or worse; other ones must prove themselves.
+    1. The last frame's fingers stand unless the filter's are better.
+    2. A hypothesis of the detector at another place takes over when it was better by `place_lead`
+       in `place_frames` frames; never while something hides the hand.
+    3. Of all others, one that is much the same takes over when it is better;
+    4. one with other fingers takes over when its lead, summed up over frames, is large enough.
+
+    table: the hand's hypotheses, scored.  joints_m: (N, 21, 3) of them.
+    dt_s: since the last frame.  detected: the detector was asked in this frame.
     """
-    if not len(others.scores):
-        return found.poses, None
-    refiner, old = frame.hand.refiner, track.contender
-    joints = refiner.joints(torch.cat((found.poses, others.poses)))
-    other = _apart(joints[1:], joints[:1])
-    same = others.scores.masked_fill(other, -torch.inf)
-    if same.max() > found.scores:
-        found = others.rows(same.argmax()[None])
-    if not bool(other.any()):
-        return found.poses, None
-    lead = (others.scores - found.scores) * _weight(dt_s) - frame.model.refinement.drift
-    if track.age_s == 0:
+    rows = torch.arange(len(table))
+    stands = table.source <= Source.DYNAMICS
+    base = int(rows[stands][table.log_posterior[stands].argmax()])
+    score = table.log_posterior - table.log_posterior[base]
+    elsewhere = (joints_m - joints_m[base]).norm(dim=-1).mean(1) >= settings.place_m
+    elsewhere &= table.source == Source.DETECTOR
+    best, challenged = _best_of(score, elsewhere), incumbent.challenged
+    if detected:
+        leads = best >= 0 and float(score[best]) > settings.place_lead and not hidden
+        challenged = challenged.extended(dt_s) if leads else Duration()
+        if leads and (incumbent.new or challenged.reached(settings.place_frames)):
+            return Choice(table.pose[best][None], True, table.pose[:0], 0.0, Duration())
+    others = ~elsewhere & ~stands
+    far = others & _apart(joints_m, joints_m[base])
+    same = _best_of(score, others & ~far)
+    if same >= 0 and float(score[same]) > 0:
+        base, score = same, score - score[same]
+    contender, lead = _contender(score, far, joints_m, incumbent, dt_s, settings)
+    if contender >= 0 and float(score[contender]) > 0 and lead > _needed(incumbent, settings):
+        return Choice(table.pose[contender][None], False, table.pose[:0], 0.0, challenged)
+    kept = table.pose[contender][None] if contender >= 0 and lead > 0 else table.pose[:0]
+    return Choice(table.pose[base][None], False, kept, max(lead, 0.0), challenged)
+
+
+def _contender(
+    score: Tensor,
+    far: Tensor,
+    joints_m: Tensor,
+    incumbent: Incumbent,
+    dt_s: float,
+    settings: Hysteresis,
+) -> tuple[int, float]:
+    """The row of the other pose with the largest lead, and the lead; -1 where there is none.
+
+    score: (N,) in units of the standing pose's.  far: (N,) bool, the other poses.
+    """
+    if not bool(far.any()):
+        return -1, 0.0
+    # After a pause a frame speaks for those that were dropped, too.
+    weight = dt_s / FRAME_S if dt_s < FRAME_S or dt_s > _PAUSE_S else 1.0
+    lead = score * weight - settings.drift
+    if incumbent.new:
         lead = lead + torch.inf
-    elif old is not None:
-        lead = lead + old.lead * ~_apart(joints[1:], refiner.joints(old.pose))
-    lead = lead.masked_fill(~other, -torch.inf)
-    best = int(lead.argmax())
-    if others.scores[best] > found.scores and lead[best] > _needed(track, frame):
-        return others.poses[best][None], None
-    lead_so_far = float(lead[best])
-    return found.poses, Contender(
-        others.poses[best][None], lead_so_far
-    ) if lead_so_far > 0 else None
+    elif len(incumbent.contender_m):
+        lead = lead + incumbent.lead * ~_apart(joints_m, incumbent.contender_m[0])
+    row = _best_of(lead, far)
+    return row, float(lead[row])
 
 
-def _weight(dt_s: float) -> float:
-    """Of a frame's word: after a pause it speaks for the frames that were dropped, too."""
-    return dt_s / FRAME_S if dt_s < FRAME_S or dt_s > _PAUSE_S else 1.0
+def _best_of(values: Tensor, mask: Tensor) -> int:
+    """The row of the largest value under a mask; -1 where the mask has none."""
+    return int(values.masked_fill(~mask, -torch.inf).argmax()) if bool(mask.any()) else -1
 
 
 def _apart(joints_m: Tensor, from_m: Tensor) -> Tensor:
-    """(N,) whether hands (N, 21, 3) have a joint that is far from another hand's (1, 21, 3)."""
+    """(N,) whether hands (N, 21, 3) have a joint that is far from another hand's (21, 3)."""
     return (joints_m - from_m).norm(dim=-1).amax(1) > _OTHER_M
 
 
-def _needed(track: Track, frame: DetectedFrame) -> float:
-    """The lead with which a contender takes over: little where the track is not believed."""
-    gain = frame.model.refinement.swap_gain
-    if track.log_odds is None:
-        return gain
-    believed = 1 / (1 + math.exp(-min(max(track.log_odds, -30.0), 30.0)))
-    return gain * min(1.0, max(_LEAST_CREDIT, 2 * believed))
-
-
-def rivals_of(
-    found: Alternatives, others: Alternatives, frame: DetectedFrame
-) -> tuple[Alternatives, Tensor | None]:
-    """Those of the networks' poses that are about the found one, and the best that is not.
-
-    The latter, (1, 27), is another hand or another way round; None where none is better.
-    """
-    detector = frame.model.detector
-    states = torch.cat((found.poses, others.poses))
-    joints = frame.hand.refiner.joints(states)
-    near = (joints[1:] - joints[:1]).norm(dim=-1).mean(1) < detector.settings.rival_m
-    rival = None
-    if bool((~near).any()):
-        scores = log_posterior(states, joints, frame)
-        scores[1:][near] = -torch.inf
-        best = int(scores[1:].argmax())
-        if scores[1 + best] > scores[0] + detector.settings.rival_gain:
-            rival = others.poses[best][None]
-    return others.rows(near.nonzero()[:, 0]), rival
+def _needed(incumbent: Incumbent, settings: Hysteresis) -> float:
+    """The lead with which a contender takes over: little where the estimate is doubtful."""
+    probability = 1 / (1 + math.exp(-min(max(incumbent.log_odds, -30.0), 30.0)))
+    return settings.lead * min(1.0, max(_LEAST_CREDIT, 2 * probability))

@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.pace import Duration, elapsed_s
 from toftrack.detector.hand_detector import Detection
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import GestureState
-from toftrack.render.segmentation import Expected, Observation
-from toftrack.tracking.features import ConfidenceFeatures
-from toftrack.tracking.handedness_estimate import HandednessEstimate
-from toftrack.tracking.prior import LastSeen
-from toftrack.tracking.shape_fit import ShapeEstimate
-
-
-@dataclass(frozen=True, eq=False)
-class Contender:
-    """A pose with other fingers that has been better than the track's.
-
-    pose: (1, 27).  lead: by how much, log scores summed up over frames.
-    """
-
-    pose: Tensor
-    lead: float
+from toftrack.refinement.shape_fit import ShapeEstimate
+from toftrack.render.segmentation import Observation
+from toftrack.tracking.confidence import JOINT_FEATURES, NO_FEATURES, ConfidenceFeatures
+from toftrack.tracking.handedness import HandednessEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,17 +31,18 @@ class Track:
     offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
         displaced by it.
     pose: (1, 27) the last estimate; at the start, what the track begins with.
-    trend: (27,) its mean change a second, see steadying.
-    contender: another pose that may take its place, None where there is none.
-    age_s: how long it has been followed, 0 before the first frame.
-    bad_s: how long it has been doubted much. The first frame counts FRAME_S, so that one alone says
-        the same at any rate.
-    challenged_s: how long a pose of the networks has been better.
-    log_odds: that the estimate is right, smoothed over time; None where nobody says.
+    trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
+    contender: (C, 27) another pose that may take its place, C = 0 or 1; lead: by how much it has
+        been better, log posteriors summed up over frames.
+    age: how long it has been followed.
+    doubtful: how long its confidence has been below what a track is kept for.
+    challenged: how long a pose of another place has been better.
+    log_odds: that the estimate is right, smoothed over time.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
-    unlooked_s: how long ago the networks looked at it.  signs: of the last estimate.
-    joint_signs: (21, S) likewise, see JOINT_FEATURES; None where there are none.
-    expected: depths where the hand was looked for in the last frame, if something hid part of it.
+    unseen_s: how long ago the pose network looked at it.
+    features, joint_features: of the last estimate, (21, J); see confidence.py.
+    nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
+        at; 0 while nothing does.
     """
 
     particles: Tensor
@@ -61,18 +51,68 @@ class Track:
     velocity: Tensor
     offset: Tensor
     pose: Tensor
-    trend: Tensor | None = None
-    contender: Contender | None = None
-    age_s: float = 0.0
-    bad_s: float = 0.0
-    challenged_s: float = 0.0
-    log_odds: float | None = None
+    trend: Tensor = field(default_factory=lambda: torch.full((27,), math.nan))
+    contender: Tensor = field(default_factory=lambda: torch.zeros(0, 27))
+    lead: float = 0.0
+    age: Duration = Duration()
+    doubtful: Duration = Duration()
+    challenged: Duration = Duration()
+    log_odds: float = 0.0
     doubted: bool = False
     believed: bool = False
-    undetected_time_s: float = 0.0
-    features: ConfidenceFeatures | None = None
-    joint_features: np.ndarray | None = None
-    expected: Expected | None = None
+    unseen_s: float = 0.0
+    features: ConfidenceFeatures = NO_FEATURES
+    joint_features: np.ndarray = field(default_factory=lambda: np.zeros((21, len(JOINT_FEATURES))))
+    nearest_m: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class LastSeen:
+    """A hand as it was last believed.
+
+    particle: (1, 6 + d).  age_s: how long ago; inf = it never was.
+    """
+
+    particle: Tensor
+    age_s: float
+
+    @property
+    def ever(self) -> bool:
+        """Whether there was one."""
+        return self.age_s < math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class HandState:
+    """One hand, in its slot: the track, and what outlives it.
+
+    side: "right" or "left".  handedness: how sure the side is.
+    shape: the estimate of the hand's shape.
+    track: None while there is no hand to follow.
+    seen: the last hand that was believed.
+    gesture: smoothed probabilities of the gestures, None where there are none.
+    last: the last estimate that there was; lost and NaN before any.
+    searched_s: how long ago the whole image was searched for this hand.
+    """
+
+    side: str
+    handedness: HandednessEstimate
+    shape: ShapeEstimate
+    seen: LastSeen
+    last: Estimate
+    track: Track | None = None
+    gesture: GestureState | None = None
+    searched_s: float = math.inf
+
+    @property
+    def believed(self) -> bool:
+        """Whether it is a hand that is followed, and not just a place that may be one."""
+        return self.track is not None and self.track.believed
+
+    def after(self, dt_s: float) -> HandState:
+        """The hand as time goes on."""
+        seen = replace(self.seen, age_s=self.seen.age_s + dt_s)
+        return replace(self, seen=seen, searched_s=self.searched_s + dt_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,52 +120,52 @@ class TrackerState:
     """All that is carried between frames: from the same state and images, the same estimates.
 
     generator: the state of the random generator, as torch.Generator.get_state() gives it.
-    side: "right" or "left", whose hand is followed.
-    size: what is believed of the hand's shape.
-    sides: how sure the side is; None where it was told.
-    track: None while there is no hand to follow.
-    seen: the last hand that was believed.
-    gesture: smoothed probabilities of the gestures.
-    last: the last estimate that there was.
-    unsearched_s: how long ago the whole image was searched for a hand.
+    hands: one or two, each in its slot.
+    second_s: how long ago a second hand was searched for; below 0 while none is.
+    merged: how long two tracks have seemed to be on one hand.
     next_index: number of the next frame that comes without one.
-    timestamp_s: of the last frame.
+    timestamp_s: of the last frame, None before any.
     """
 
     generator: Tensor
-    side: str
-    size: ShapeEstimate
-    sides: HandednessEstimate | None = None
-    track: Track | None = None
-    seen: LastSeen | None = None
-    gesture: GestureState | None = None
-    last: Estimate | None = None
-    search_age_s: float = math.inf
+    hands: tuple[HandState, ...]
+    second_s: float = math.inf
+    merged: Duration = Duration()
     next_index: int = 0
     timestamp_s: float | None = None
 
+    def elapsed_s(self, image: DepthImage) -> float:
+        """Seconds from the last frame to an image, as motions are reckoned with."""
+        return elapsed_s(self.timestamp_s, image.timestamp_s)
+
     def at(self, image: DepthImage) -> TrackerState:
         """The state as time goes on to an image."""
-        before, seen = self.timestamp_s, self.seen
-        passed = 0.0 if before is None else max(0.0, image.timestamp_s - before)
+        before = image.timestamp_s if self.timestamp_s is None else self.timestamp_s
+        passed = max(0.0, image.timestamp_s - before)
         return replace(
             self,
-            seen=None if seen is None else replace(seen, age_s=seen.age_s + passed),
-            search_age_s=self.search_age_s + passed,
+            hands=tuple(hand.after(passed) for hand in self.hands),
+            second_s=self.second_s + self.elapsed_s(image),
             next_index=image.index + 1,
             timestamp_s=image.timestamp_s,
         )
 
+    def resumed(self) -> torch.Generator:
+        """The random generator, on the CPU."""
+        made = torch.Generator()
+        made.set_state(self.generator)
+        return made
+
 
 @dataclass(frozen=True, eq=False)
 class StepInfo:
-    """What a step saw and believed; for those who watch it.
+    """What a step saw and believed of one hand; for those who watch it.
 
     particles: (N, 6 + d) before the estimate was refined; none where nothing can be a hand.
     weights: (N,) normalised. Both are on the model's device.
     seconds: wall seconds of each stage.
-    signs, joint_signs: what the beliefs were formed from; None where there are no networks.
-    glance: what the networks saw; None where they did not look.
+    features, joint_features: what the confidence was computed from; None where there is no network.
+    detection: what the network said; None in a frame in which it was not asked.
     """
 
     observation: Observation
@@ -135,13 +175,6 @@ class StepInfo:
     features: ConfidenceFeatures | None = None
     joint_features: np.ndarray | None = None
     detection: Detection | None = None
-
-
-def resumed(generator: Tensor) -> torch.Generator:
-    """The random generator of a state, on the CPU."""
-    made = torch.Generator()
-    made.set_state(generator)
-    return made
 
 
 def generator_on(device: torch.device, generator: torch.Generator) -> torch.Generator:

@@ -1,211 +1,303 @@
-"""The tracker's step: a state and an image in, the next state and an estimate out."""
+"""The tracker's step: a state and an image in, the next state and an estimate of each hand out."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from toftrack.compute.pace import FRAME_S, elapsed_s
+from toftrack.compute import particle_filter
+from toftrack.compute.pace import FRAME_S
+from toftrack.compute.spans import Spans
 from toftrack.compute.threads import small_operations
-from toftrack.detector.hand_detector import Detection
-from toftrack.estimate import Estimate
+from toftrack.compute.transfer import on_device, on_host
+from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
-from toftrack.tracking import shape_fit
-from toftrack.tracking.detect import (
-    begun,
-    detect,
-    expected_of,
-    keypoints_of,
-    search_due,
-    start_detection,
+from toftrack.gestures.recognition import tell_gesture
+from toftrack.hand.conventions import in_all_conventions
+from toftrack.hand.shape import HandShape
+from toftrack.refinement import shape_fit
+from toftrack.refinement.steadying import steadied
+from toftrack.tracking.candidates import FilteredFrame, HandFrame, keypoints_of, propose
+from toftrack.tracking.confidence import confidence_features, joint_features
+from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
+from toftrack.tracking.hands import PlacedHand, others_of, partnered
+from toftrack.tracking.lifecycle import (
+    Absence,
+    Status,
+    close,
+    observed_shape,
+    open_hand,
+    reconcile,
+    taking_part,
 )
-from toftrack.tracking.estimates import emitted, estimate_of, no_hand
-from toftrack.tracking.features import ConfidenceFeatures, confidence_features, scored
-from toftrack.tracking.following import (
-    Found,
-    advanced,
-    drawn_to,
-    expected_depths,
-    filtered,
-    remembered,
-)
-from toftrack.tracking.handedness import sided
-from toftrack.tracking.handedness_estimate import probability
-from toftrack.tracking.joint_confidence import joint_features
-from toftrack.tracking.life_cycle import Status
-from toftrack.tracking.model import DetectedFrame, TrackerModel, observed
-from toftrack.tracking.other_hand import OtherHand, without
-from toftrack.tracking.refining import challenged, refined
-from toftrack.tracking.shape_fit import ShapeEstimate
-from toftrack.tracking.spans import Spans
-from toftrack.tracking.state import StepInfo, Track, TrackerState, resumed
+from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
+from toftrack.tracking.state import HandState, StepInfo, TrackerState
 
 
 @small_operations()
 def step(
-    state: TrackerState, image: DepthImage, model: TrackerModel, other: OtherHand | None = None
-) -> tuple[TrackerState, StepInfo, Estimate]:
-    """One frame: segment, start if there is no hand yet, filter, refine, judge, fit the shape.
+    state: TrackerState, image: DepthImage, model: TrackerModel
+) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
+    """One frame of one hand or two; a pure function: the state given stays as it is.
 
-    A pure function: the state given stays as it is, and gives the same again.
+    A particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and
+    local optimisation of few hypotheses (Gall et al., IJCV 87, 2010). For H hands:
 
-    other: another hand that is tracked as well; it is not taken for this one.
+    1. Predict the hands, and *open*: detect (a network that votes for joints, as A2J: Xiong et al.,
+       ICCV 2019), compare the sides, segment, begin tracks. -> H frames
+    2. Filter: N particles (N, 6 + d) in the pose space, resampled, diffused and weighed by the
+       F-measure of the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
+    3. Wait for detections that ran beside it.
+    4. *Propose*: one table of hypotheses (M, 27) of all hands, refined by Levenberg-Marquardt
+       steps, scored by the posterior; in a second round the best ones with exchanged fingers.
+    5. *Select* a pose for each hand, with hysteresis (Page's test, Biometrika 41, 1954).
+    6. *Close*: steady the pose, judge it, carry the track on or end it, learn the hand's shape.
+    7. Reconcile the slots of two hands.
+
+    Returns the next state, and for each slot what was seen, None where nobody looked, and the
+    estimate.
     """
-    spans, generator = Spans(), resumed(state.generator)
-    dt_s = elapsed_s(state.timestamp_s, image.timestamp_s)
-    state = state.at(image)
+    spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
+    before = state.at(image)
+    hands = list(before.hands)
+    infos: list[StepInfo | None] = [None] * len(hands)
+    estimates = [vacant(image, model) for _ in hands]
     with spans("detector"):
-        alone = without(image, other)
-        coming = start_detection(state, dt_s, alone, model)
-        if coming is None:
-            track, detection = detect(state, dt_s, alone, model, other)
-            state = replace(state, search_age_s=0.0) if search_due(state, model) else state
-            state, track, detection = _updated_hand(
-                state, track, detection, dt_s, alone, model, other
-            )
-        else:
-            track, detection = state.track, None
-    hand = model.hand(state.side, state.size)
-    with spans("segmentation and evidence"):
-        expected = expected_depths(track, dt_s, hand, model)
-        if expected is None and detection is not None:
-            expected = expected_of(detection)
-        theirs = None if other is None else other.pixels
-        observation = model.segmentation(image.depth_m, image.k, expected, theirs)
-        if observation.empty or (detection is None and track is None):
-            if coming is not None:
-                state = _updated_hand(state, track, coming(), dt_s, alone, model, other)[0]
-            return no_hand(replace(state, track=None), image, observation, model, spans)
-        frame = observed(observation, hand, model, detection, state.seen, other)
-    with spans("start"):
-        track = begun(frame) if track is None else track
+        others = others_of(hands, image, model, dt_s)
+        known = partnered(hands, model)
+        opened = [
+            open_hand(slot, known[slot], others[slot], image, model, dt_s)
+            for slot in taking_part(before)
+        ]
+    frames = [one for one in opened if isinstance(one, HandFrame)]
     with spans("filter: rest"):
-        # A hand that was nearly lost is looked for farther away, but not ever farther.
-        width = 1.0 + (track.bad_s / FRAME_S if model.lost.patience else 0.0)
-        particles, weights = filtered(track, dt_s, frame, generator, spans, width)
-        mean = model.backend.motions.mean(particles, weights)
-    if coming is not None:
-        with spans("detector"):
-            state, _, detection = _updated_hand(state, track, coming(), dt_s, alone, model, other)
-            frame = replace(frame, detection=detection)
+        filtered = [filtered_frame(frame, dt_s, generator, spans) for frame in frames]
+    with spans("detector"):
+        frames = [waited_for(frame) for frame in frames]
     with spans("refinement"):
-        outcome = refined(track, mean, dt_s, frame, generator)
-        track, pose, trend = challenged(track, outcome, dt_s, frame)
-    score = frame.score(pose)
-    found = Found(particles, weights, mean, pose, trend, *model.nearest(pose), track.offset)
-    belief, features = _believed(track, found, score, state, dt_s, frame)
-    undetected_time_s = track.undetected_time_s + dt_s if frame.detection is None else 0.0
-    estimate = estimate_of(image, found, score, belief, frame)
-    estimate, joint_row = _joints_judged(image, estimate, track, belief, frame)
+        pairs = zip(frames, filtered, strict=True)
+        candidates = [FilteredFrame.of(frame, found.mean) for frame, found in pairs]
+        table = propose(candidates, generator)
+        choices = [choose(row, one, table, dt_s) for row, one in enumerate(candidates)]
+    told = [conclude(*one, image, dt_s) for one in zip(frames, filtered, choices, strict=True)]
+    told += [no_hand(one, image, model) for one in opened if isinstance(one, Absence)]
+    for slot, hand, info, estimate in told:
+        hands[slot], estimates[slot] = hand, estimate
+        infos[slot] = replace(info, seconds=spans.seconds())
+    after = replace(before, generator=generator.get_state(), hands=tuple(hands))
+    return reconciled(after, before, infos, estimates, image, model, dt_s)
+
+
+def filtered_frame(
+    frame: HandFrame, dt_s: float, generator: torch.Generator, spans: Spans
+) -> Filtered:
+    """The particles of a hand in a frame."""
+    model, track = frame.model, frame.track
+    # A hand that was nearly lost is looked for farther away, but not ever farther.
+    width = 1.0 + (track.doubtful.seconds / FRAME_S if model.lost.patience else 0.0)
+    return run_filter(track, dt_s, frame.image, model, generator, spans, width)
+
+
+def waited_for(frame: HandFrame) -> HandFrame:
+    """The frame with its detection, if that ran beside the filter."""
+    detection = frame.pending()
+    if detection.empty:
+        return frame
+    hand = observed_shape(frame.hand, detection, frame.model)
+    return replace(frame, hand=hand, detection=detection)
+
+
+def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
+    """The pose of one of the table's hands."""
+    frame, track = filtered.frame, filtered.frame.track
+    mine, joints = table.of_hand(row), frame.fitted.refiner.joints
+    incumbent = Incumbent(
+        joints(track.contender) if len(track.contender) else torch.zeros(0, 21, 3),
+        track.lead,
+        track.challenged,
+        track.log_odds,
+        not track.age.begun,
+    )
+    asked, settings = not frame.detection.empty, frame.model.hysteresis
+    return select(mine, joints(mine.pose), incumbent, dt_s, asked, frame.hidden, settings)
+
+
+def conclude(
+    frame: HandFrame, filtered: Filtered, choice: Choice, image: DepthImage, dt_s: float
+) -> tuple[int, HandState, StepInfo, Estimate]:
+    """A slot's hand after a frame, from the pose that was chosen."""
+    model, track, seen = frame.model, frame.track, frame.observation
+    pose, trend = choice.pose, track.trend
+    if choice.moved:
+        begun = new_track(pose, model, model.refinement.carry)
+        track, trend = replace(begun, believed=track.believed), begun.trend
+    elif model.refinement.iterations:
+        steadying, motions = model.refinement.steadying, model.backend.motions
+        pose, trend = steadied(pose, track.pose, trend, dt_s, steadying, motions)
     track = replace(
-        track, features=features, joint_features=joint_row, undetected_time_s=undetected_time_s
+        track, contender=choice.contender, lead=choice.lead, challenged=choice.challenged
     )
-    if model.refinement.iterations:
-        found = drawn_to(found, model.refinement.carry, model)
-    track = advanced(track, found, belief, expected if frame.hidden else None, dt_s, model)
-    size = state.size if belief.lost else _shape_learned(state.size, found, frame)
-    state, estimate = emitted(state, image, estimate, hand.shape, dt_s, model, spans)
-    after = replace(
-        state,
-        generator=generator.get_state(),
-        track=track if belief.kept else None,
-        seen=remembered(state.seen, track, belief, model.lost.probation),
-        size=size,
+    found = Found(filtered, pose, trend, *model.nearest(pose))
+    score, joints = frame.image.score(pose), frame.fitted.refiner.joints(pose)[0]
+    age_s, last = track.age.seconds, track.features
+    features = confidence_features(
+        joints, score, age_s, frame.detection, last, seen.depth_m, seen.k
     )
-    info = StepInfo(
-        frame.observation, particles, weights, spans.seconds(), features, joint_row, frame.detection
-    )
-    return after, info, estimate
-
-
-def _updated_hand(
-    state: TrackerState,
-    track: Track | None,
-    detection: Detection | None,
-    dt_s: float,
-    image: DepthImage,
-    model: TrackerModel,
-    other: OtherHand | None,
-) -> tuple[TrackerState, Track | None, Detection | None]:
-    """What a look at the hand says of its side and its size."""
-    state, track, detection = sided(state, track, detection, dt_s, image, model, other)
-    return replace(state, size=_hand_reported(state, track, detection, model)), track, detection
-
-
-def _believed(
-    track: Track,
-    found: Found,
-    score: float,
-    state: TrackerState,
-    dt_s: float,
-    frame: DetectedFrame,
-) -> tuple[Status, ConfidenceFeatures]:
-    """What is thought of a frame's estimate, and by which signs."""
-    if frame.detection is None:
-        # The networks did not look: what they said last still holds. They look at each start.
-        assert track.features is not None
-        features = scored(track.features, score)
-    else:
-        joints = frame.hand.refiner.joints(found.pose)[0]
-        seen = frame.observation
-        features = confidence_features(
-            joints, score, track.age_s, frame.detection, seen.depth_m, seen.k
-        )
-    second = frame.other is not None and frame.other.believed
-    side = probability(state.sides, state.side)
-    return frame.model.lost.judge(track, features, dt_s, side, second), features
-
-
-def _hand_reported(
-    state: TrackerState, track: Track | None, detection: Detection | None, model: TrackerModel
-) -> ShapeEstimate:
-    """What the networks say of the hand: its length to begin a track with, until estimates say
-    better; and whether it still is the hand that was fitted.
-    """
-    belief = state.size
-    if detection is None:
-        return belief
-    if track is None:
-        belief = shape_fit.with_network_length(belief, detection.length_m, model.adapt, model.shape)
-    return shape_fit.contradicted(belief, detection, model.adapt, model.shape)
-
-
-def _shape_learned(belief: ShapeEstimate, found: Found, frame: DetectedFrame) -> ShapeEstimate:
-    """What is believed of the hand's shape after a believed estimate."""
-    model, hand, detection = frame.model, frame.hand, frame.detection
-    if detection is None or frame.hidden or belief.applied != hand.applied:
-        return belief  # of a hand that was given up in this very frame nothing is learned
-    keypoints = keypoints_of(detection, model)
-    return shape_fit.learned(
-        belief,
-        found.pose,
-        hand.shape,
-        hand.derivatives,
-        detection,
-        keypoints,
-        model.adapt,
-        hand.first,
-    )
-
-
-def _joints_judged(
-    image: DepthImage,
-    estimate: Estimate,
-    track: Track,
-    belief: Status,
-    frame: DetectedFrame,
-) -> tuple[Estimate, np.ndarray]:
-    """The estimate with what is thought of each joint, and by which signs."""
-    detection = frame.detection
-    features = joint_features(
+    status, track, last_seen = close(replace(frame, track=track), found, features, dt_s)
+    estimate = estimate_of(image, found, score, status, frame.fitted, model)
+    rows = joint_features(
         estimate.joints_m,
-        None if detection is None else detection.keypoints,
+        frame.detection,
         track.joint_features,
-        estimate.score,
-        belief.log_odds,
+        score,
+        status.log_odds,
         image.depth_m,  # as the camera took it, and not reduced
         image.k,
     )
-    sigma, confidence = frame.model.lost.joints.judge(features)
-    return replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence), features
+    sigma, confidence = model.lost.joints.judge(rows)
+    estimate = replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence)
+    hand = replace(
+        frame.hand,
+        shape=frame.hand.shape if status.lost else learned_shape(frame, found),
+        track=None if status.ends else replace(track, joint_features=rows),
+        seen=last_seen,
+    )
+    hand, estimate = emitted(hand, image, estimate, frame.fitted.shape, dt_s, model)
+    detection = None if frame.detection.empty else frame.detection
+    particles, weights = filtered.particles, filtered.weights
+    info = StepInfo(seen, particles, weights, {}, features, rows, detection)
+    return frame.slot, hand, info, estimate
+
+
+def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
+    """The estimate of the hand's shape after a believed estimate of its pose."""
+    shape, fitted, model = frame.hand.shape, frame.fitted, frame.model
+    if frame.detection.empty or frame.hidden or shape.applied != fitted.applied:
+        return shape  # of a hand that was given up in this very frame nothing is learned
+    return shape_fit.learned(
+        shape,
+        found.pose,
+        fitted.shape,
+        fitted.derivatives,
+        frame.detection,
+        keypoints_of(frame.detection, model),
+        model.fit,
+        fitted.first,
+    )
+
+
+def reconciled(
+    after: TrackerState,
+    before: TrackerState,
+    infos: list[StepInfo | None],
+    estimates: list[Estimate],
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
+) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
+    """What a step returns, with two hands each in its slot; one that is not followed is vacant."""
+    if len(after.hands) == 1:
+        return after, tuple(infos), tuple(estimates)
+    none, size = np.eye(3), (1, 1)
+
+    def pose_of(slot: int) -> PlacedHand:
+        hand = after.hands[slot]
+        assert hand.track is not None
+        return PlacedHand(hand.track.pose, model.hand(hand.side, hand.shape), none, size)
+
+    after, exchanged = reconcile(before, after, pose_of, dt_s)
+    if exchanged:
+        infos, estimates = infos[::-1], estimates[::-1]
+    told = [
+        vacant(image, model) if hand.track is None else estimate
+        for hand, estimate in zip(after.hands, estimates, strict=True)
+    ]
+    return after, tuple(infos), tuple(told)
+
+
+def estimate_of(
+    image: DepthImage,
+    found: Found,
+    score: float,
+    status: Status,
+    fitted: FittedHand,
+    model: FilterModel,
+) -> Estimate:
+    """The estimate of a frame, but for its joints' deviations and what `emitted` adds."""
+    particles, motions = found.filtered.particles, model.backend.motions
+    mean = on_device(found.filtered.mean, model.device)
+    tangents = motions.difference(particles, mean)
+    tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
+    covariance, effective = on_host(
+        particle_filter.covariance(tangents, found.filtered.weights),
+        particle_filter.effective_sample_size(found.filtered.weights),
+    )
+    return Estimate(
+        index=image.index,
+        timestamp_s=image.timestamp_s,
+        state_name=status.state_name,
+        lost=status.lost,
+        confidence=status.confidence,
+        outside_rad=found.off_rad,
+        joints_m=_host(fitted.refiner.joints(found.pose)[0]),
+        state=_host(found.pose[0]),
+        latent=_host(model.space.encode(found.pose[:, 6:])[0]),
+        score=score,
+        covariance=_host(covariance + torch.diag(model.model_variance)),
+        effective_sample_size=float(effective),
+        compute_s=math.nan,
+    )
+
+
+def emitted(
+    hand: HandState,
+    image: DepthImage,
+    estimate: Estimate,
+    shape: HandShape,
+    dt_s: float,
+    model: FilterModel,
+) -> tuple[HandState, Estimate]:
+    """The estimate with its gesture, its side and other programs' conventions; and the hand with
+    what is kept of them.
+
+    shape: the hand of the estimate.
+    """
+    gesture, estimate = tell_gesture(
+        model.gestures, hand.gesture, estimate, model.space, dt_s / FRAME_S
+    )
+    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
+    estimate = in_all_conventions(_sided(estimate, hand), shape, image.k, size_px)
+    # While there is no hand, the last estimate that was believed is told, if one was.
+    kept = hand.last if estimate.lost and not hand.last.lost else estimate
+    return replace(hand, gesture=gesture, last=kept), estimate
+
+
+def no_hand(
+    absence: Absence, image: DepthImage, model: FilterModel
+) -> tuple[int, HandState, StepInfo, Estimate]:
+    """Nothing in the frame can be a hand: the last estimate stands, and is lost."""
+    hand = absence.hand
+    estimate = lost_estimate(hand.last, image.index, image.timestamp_s, math.nan)
+    gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
+    none = torch.zeros(0, 6 + model.space.dims, device=model.device)
+    info = StepInfo(absence.observation, none, none[:, 0], {})
+    return absence.slot, replace(hand, gesture=gesture), info, _sided(estimate, hand)
+
+
+def vacant(image: DepthImage, model: FilterModel) -> Estimate:
+    """The estimate of a slot without a hand."""
+    return no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
+
+
+def _sided(estimate: Estimate, hand: HandState) -> Estimate:
+    probability = hand.handedness.probability(hand.side)
+    return replace(estimate, side=hand.side, side_probability=probability)
+
+
+def _host(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().numpy().astype(np.float32)

@@ -1,4 +1,4 @@
-"""The tracker: a frame in, an estimate out, a state held in between (paper, fig. 1)."""
+"""The tracker: a frame in, an estimate of each hand out, a state held in between."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from toftrack.compute.threads import at_most
+from toftrack.checks import check_number
+from toftrack.compute.quality import Pace, Timekeeper
+from toftrack.compute.threads import at_most, small_operations
+from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage, checked_image
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import PoseSpace
+from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Scorer
+from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
-from toftrack.tracking.quality import Pace, Timekeeper
-from toftrack.tracking.state import StepInfo, Track, TrackerState
+from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.step import step
 
-
-def stepped(
-    state: TrackerState, image: DepthImage, model: FilterModel
-) -> tuple[TrackerState, StepInfo, Estimate]:
-    """One frame of one hand, by the tracker that a model is of: see step and paper_step."""
-    if isinstance(model, PaperModel):
-        return paper_step(state, image, model)
-    assert isinstance(model, TrackerModel)
-    return step(state, image, model)
+_RENDERED_PX = 72, 88
+"""Size of an image that nobody sees."""
+Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 
 
-class Tracker:
-    """Follows one hand through rectified depth images: holds the state of `step`.
+class HandsTracker:
+    """Follows `hands` hands, each in a slot of its own: slot 0 is the first one that was found.
 
     state: all that is carried between frames; one that was kept may be put back.
-    info: what the last step saw and believed; None before the first one.
+    infos: what the last step saw and believed of each; None where it did not look.
     time: what frames take, and what may be spent on them.
     """
 
@@ -44,13 +44,23 @@ class Tracker:
         self,
         model: FilterModel,
         seed: int = 0,
+        hands: int = 1,
         pace: Pace | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`."""
+        """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`.
+
+        Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without a detector.
+        """
+        check_number("hands", hands, 1, 2, whole=True)
+        if hands > 1 and isinstance(model, PaperModel):
+            raise ToftrackError(
+                "hands=2 tells two hands apart by the networks, but experiment=paper has none;"
+                " give hands=1, or leave experiment=paper out"
+            )
         self.model, self.time = model, Timekeeper(pace, clock)
-        self.state: TrackerState = model.first_state(seed)
-        self.info: StepInfo | None = None
+        self.state = model.first_state(seed, hands)
+        self.infos: tuple[StepInfo | None, ...] = (None,) * hands
 
     def step(
         self,
@@ -59,8 +69,8 @@ class Tracker:
         index: int | None = None,
         timestamp_s: float | None = None,
         began_s: float | None = None,
-    ) -> Estimate:
-        """One frame.
+    ) -> tuple[Estimate, ...]:
+        """One frame; an estimate a slot. One without a hand is lost and NaN.
 
         depth_m: (H, W) rectified Z in metres, 0 = no reading; H and W may change.
         k: (3, 3) intrinsics in pixels.
@@ -78,31 +88,42 @@ class Tracker:
         image = DepthImage(depth_m, k, index, timestamp_s)
         with at_most(quality.threads):
             model = self.model.at_quality(quality)
-            self.state, self.info, estimate = stepped(self.state, image, model)
-        return replace(estimate, compute_s=self.time.took_s())
+            self.state, self.infos, estimates = _stepped(self.state, image, model)
+        took_s = self.time.took_s()
+        return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
+
+    @small_operations()
+    def prepare(self) -> None:
+        """Load and compile now what the first frame would have to wait for; changes nothing."""
+        _stepped(self.state, _rendered_hand(), self.model)
 
     def restart(self, side: str | None = None) -> None:
-        """Forget the hand, also its size, and look for one anew; of another side if one is given.
+        """Forget the hands, also their size, and look for them anew; a side is the first hand's.
 
         Only random numbers and frame numbers go on. Raises ToftrackError for an unknown side.
         """
         self.state = restarted(self.state, self.model, side)
-        self.info = None
+        self.infos = (None,) * len(self.infos)
 
     @property
-    def shape(self) -> HandShape:
-        """The hand that the next frame is compared with."""
-        return self.model.hand(self.state.side, self.state.size).shape
+    def states(self) -> tuple[HandState, ...]:
+        """Of the slots."""
+        return self.state.hands
 
     @property
-    def fitted(self) -> HandShape:
-        """The same hand, with how sure the fit is of it."""
-        return self.model.fitted(self.state.side, self.state.size)
+    def shapes(self) -> tuple[HandShape, ...]:
+        """The hand of each slot that the next frame is compared with."""
+        return tuple(self.model.hand(hand.side, hand.shape).shape for hand in self.state.hands)
+
+    @property
+    def fitted(self) -> tuple[HandShape, ...]:
+        """The same hands, with how sure the fit is of them."""
+        return tuple(self.model.fitted(hand) for hand in self.state.hands)
 
     @property
     def scorer(self) -> Scorer:
-        """The back end's, for that hand."""
-        return self.model.hand(self.state.side, self.state.size).scorer
+        """The back end's, for the first hand."""
+        return self.model.hand(self.state.hands[0].side, self.state.hands[0].shape).scorer
 
     @property
     def space(self) -> PoseSpace:
@@ -115,25 +136,133 @@ class Tracker:
         return self.model.device
 
     @property
-    def track(self) -> Track | None:
-        """The hand that is followed; None while there is none."""
-        return self.state.track
+    def insights(self) -> tuple[StepInfo | None, ...]:
+        """What the last step saw and believed of each; None where nothing could be a hand."""
+        return tuple(
+            None if info is None or info.observation.empty else info for info in self.infos
+        )
+
+
+class Tracker:
+    """Follows one hand: the only slot of a HandsTracker.
+
+    hands: that tracker.
+    """
+
+    def __init__(
+        self,
+        model: FilterModel,
+        seed: int = 0,
+        pace: Pace | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """See HandsTracker."""
+        self.hands = HandsTracker(model, seed, 1, pace, clock)
+
+    def step(
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        index: int | None = None,
+        timestamp_s: float | None = None,
+        began_s: float | None = None,
+    ) -> Estimate:
+        """One frame, see HandsTracker.step."""
+        return self.hands.step(depth_m, k, index, timestamp_s, began_s)[0]
+
+    def restart(self, side: str | None = None) -> None:
+        """Forget the hand, see HandsTracker.restart."""
+        self.hands.restart(side)
+
+    @property
+    def state(self) -> TrackerState:
+        """All that is carried between frames; one that was kept may be put back."""
+        return self.hands.state
+
+    @state.setter
+    def state(self, state: TrackerState) -> None:
+        self.hands.state = state
+
+    @property
+    def model(self) -> FilterModel:
+        """The parts of the tracker."""
+        return self.hands.model
+
+    @property
+    def time(self) -> Timekeeper:
+        """What frames take, and what may be spent on them."""
+        return self.hands.time
+
+    @property
+    def info(self) -> StepInfo | None:
+        """What the last step saw and believed; None before the first one."""
+        return self.hands.infos[0]
 
     @property
     def insight(self) -> StepInfo | None:
-        """What the last step saw and believed; None where nothing could be a hand."""
-        return None if self.info is None or self.info.observation.empty else self.info
+        """The same; None also where nothing could be a hand."""
+        return self.hands.insights[0]
+
+    @property
+    def track(self) -> Track | None:
+        """The hand that is followed; None while there is none."""
+        return self.state.hands[0].track
+
+    @property
+    def shape(self) -> HandShape:
+        """The hand that the next frame is compared with."""
+        return self.hands.shapes[0]
+
+    @property
+    def fitted(self) -> HandShape:
+        """The same hand, with how sure the fit is of it."""
+        return self.hands.fitted[0]
+
+    @property
+    def scorer(self) -> Scorer:
+        """The back end's, for that hand."""
+        return self.hands.scorer
+
+    @property
+    def space(self) -> PoseSpace:
+        """The pose space."""
+        return self.hands.space
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is computed."""
+        return self.hands.device
+
+
+def _stepped(state: TrackerState, image: DepthImage, model: FilterModel) -> Stepped:
+    """One frame, by the tracker that a model is of: see step and paper_step."""
+    if isinstance(model, PaperModel):
+        return paper_step(state, image, model)
+    assert isinstance(model, TrackerModel)
+    return step(state, image, model)
 
 
 def restarted(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
     """A state that has seen nothing, but for its random and frame numbers; of a side if one is
-    given, which is told from then on.
+    given, which is certain from then on.
 
     Raises ToftrackError for an unknown side.
     """
-    first = model.first_state(0)
-    if side is not None:
-        first = replace(first, side=model.shape.of_side(side).side, sides=None)
-    elif state.sides is None:
-        first = replace(first, side=state.side, sides=None)
-    return replace(first, generator=state.generator, next_index=state.next_index)
+    fresh = model.first_state(0, len(state.hands))
+    given = side is not None or state.hands[0].handedness.given
+    first = state.hands[0].side if given else fresh.hands[0].side
+    first = model.configured.shape.of_side(side).side if side is not None else first
+    sides = (first, OTHER_SIDE[first])
+    hands = tuple(model.first_hand(sides[slot], given) for slot in range(len(state.hands)))
+    return replace(fresh, hands=hands, generator=state.generator, next_index=state.next_index)
+
+
+def _rendered_hand() -> DepthImage:
+    """A small image of an open hand before a wall."""
+    shape, (height, width) = default_hand_shape(), _RENDERED_PX
+    state = torch.zeros(1, 27)
+    state[0, 1:3] = torch.tensor([0.08, 0.5])
+    k = torch.tensor([[110.0, 0, width / 2], [0, 110.0, height / 2], [0, 0, 1]])
+    hand = hand_surface(shape).pose(forward_kinematics(state, shape))
+    depth = render_range_images(hand, k, height, width)[0]
+    return DepthImage(torch.where(depth > 0, depth, 1.5).numpy(), k.double().numpy(), 0, 0.0)

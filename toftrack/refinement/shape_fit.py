@@ -1,13 +1,13 @@
 """Fitting the user's hand: its components (hand/shape_space.py) from what the networks say of it.
 
 A Gaussian posterior over the components: the population is the prior; every believed frame tells
-the hand's length, as the pose network has it, and where the joints are by its votes, which is a
+the hand's length, as the pose network has it, and where the joints are by its keypoints, which is a
 Gauss-Newton system of the pose and the components with the pose marginalised (as Tkach et al.,
 "Online generative model personalization for hand tracking", SIGGRAPH Asia 2017, do with points).
 
-How much a frame counts falls with the fourth power of the votes' standard deviation. On rendered
-sequences of other hands the error of the length does so: 3 % in frames of 3.8 mm, 5 % and more from
-4.5 mm on. Frames of one pose and view err alike, so they count once, as a *key pose*; key poses of
+How much a frame counts falls with the fourth power of the keypoints' standard deviation. On
+rendered sequences of other hands the error of the length does so: 3 % in frames of 3.8 mm, 5 % and
+more from 4.5 mm on. Frames of one pose and view err alike, so they count once, as a *key pose*; key poses of
 one hand err alike too, by `alike`, so that no number of them makes the fit arbitrarily sure.
 
 Thickness is no part of what joints tell: it keeps the population's mean and spread, but for what
@@ -22,13 +22,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.rotations import rotvec_to_rotmat
-from toftrack.detector.hand_detector import Detection
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
 from toftrack.hand.skeleton import forward_kinematics
@@ -36,7 +36,7 @@ from toftrack.refinement.gauss_newton import Keypoints, keypoint_residuals
 
 _COUNT = len(COMPONENTS)
 _ANGLE_RAD = 0.25
-"""Standard deviation of a refined joint angle where the votes are to say it."""
+"""Standard deviation of a refined joint angle where the keypoints are to say it."""
 _KEY_RAD, _KEY_TURN_RAD = 0.25, 0.35
 """Poses are another key pose when their angles, rms, or their rotations differ by so much."""
 _KEYS = 24
@@ -47,13 +47,29 @@ _ENOUGH, _ENOUGH_FRAMES, _SURER = 1.5, 3, 1.2
 """Weight of the frames of a key pose from which on no more are looked at; or their number, from
 which on only frames that count so many times as much are: a look costs a millisecond."""
 _KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
-"""By how much the votes put the components wrong: means of uncertain places shorten the fingers. Of
-rendered sequences of other hands, like what is said above."""
+"""By how much the keypoints put the components wrong: means of uncertain places shorten fingers.
+Of rendered sequences of other hands, like what is said above."""
 _LEAST = 0.02
 """Weight below which a frame says nothing."""
 _STEP, _STEP_SIGMAS = 0.01, 0.5
 """Change of a component for which another hand is made, which costs some milliseconds: at least so
 much, and so many of its standard deviations."""
+
+
+class SeenHand(Protocol):
+    """What the pose network says of a hand; see detector/hand_detector.py."""
+
+    @property
+    def keypoints(self) -> Keypoints:
+        """The joints."""
+
+    @property
+    def length_m(self) -> float:
+        """The hand's length."""
+
+    @property
+    def present(self) -> float:
+        """Probability that there is a hand."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +157,9 @@ class ShapeEstimate:
 
     mean, covariance: (6,) and (6, 6) of the components.  poses: how many sure, different poses it
     rests on.  keys: what they said.
-    worn: the components of the hand in use, which follows the mean in steps.
-    off, heard: by how much the network's log length has differed from the mean lately, summed by
-    weight, and the sum of these weights.
+    applied: the components of the hand in use, which follows the mean in steps.
+    off, considered: by how much the network's log length has differed from the mean lately, summed
+    by weight, and the sum of these weights.
     frames: how many were seen, looked at or not.
     """
 
@@ -174,23 +190,23 @@ def first_shape() -> ShapeEstimate:
 
 
 def with_network_length(
-    belief: ShapeEstimate, length_m: float, fit: ShapeFit, first: HandShape
+    estimate: ShapeEstimate, length_m: float, fit: ShapeFit, first: HandShape
 ) -> ShapeEstimate:
-    """Before any estimate, when somebody else says how long the hand is: it is worn so long.
+    """Before any estimate, when somebody else says how long the hand is: that length is applied.
 
     first: the hand whose components are 0.
     """
-    if belief.poses or fit.fixed:
-        return belief
+    if estimate.poses or fit.fixed:
+        return estimate
     sigma = POPULATION_SIGMA[0]
     log_length = math.log(length_m / first.hand_length_m)
     applied = min(max(log_length, -3 * sigma), 3 * sigma)
-    mean = belief.mean.clone()
+    mean = estimate.mean.clone()
     mean[0] = applied
-    return replace(belief, mean=mean, applied=(applied, *belief.applied[1:]))
+    return replace(estimate, mean=mean, applied=(applied, *estimate.applied[1:]))
 
 
-def weight_of(detection: Detection, fit: ShapeFit) -> float:
+def weight_of(detection: SeenHand, fit: ShapeFit) -> float:
     """How much a look at the hand counts, at most 1."""
     sigma = float(detection.keypoints.sigma_m.square().mean().sqrt())
     weight = min(1.0, (fit.sure_m / max(sigma, 1e-6)) ** 4)
@@ -198,69 +214,70 @@ def weight_of(detection: Detection, fit: ShapeFit) -> float:
 
 
 def contradicted(
-    belief: ShapeEstimate, detection: Detection, fit: ShapeFit, first: HandShape
+    estimate: ShapeEstimate, detection: SeenHand, fit: ShapeFit, first: HandShape
 ) -> ShapeEstimate:
-    """The belief after one more frame, believed or not; begun anew where looks contradict it."""
-    belief = replace(belief, frames=belief.frames + 1)
-    if not belief.poses or belief.frames % _EVERY:
-        return belief
+    """The estimate after one more frame, believed or not; begun anew where detections disagree."""
+    estimate = replace(estimate, frames=estimate.frames + 1)
+    if not estimate.poses or estimate.frames % _EVERY:
+        return estimate
     weight = weight_of(detection, fit) * detection.present
     keep = 1 - 1 / fit.memory
     log_length = math.log(detection.length_m / first.hand_length_m)
-    off = keep * belief.off + weight * (log_length - float(belief.mean[0]))
-    considered = keep * belief.considered + weight
-    # What a frame of weight 1 errs, of which `alike` stays however many are heard.
+    off = keep * estimate.off + weight * (log_length - float(estimate.mean[0]))
+    considered = keep * estimate.considered + weight
+    # What a frame of weight 1 errs, of which `alike` stays however many there are.
     error = fit.length_sigma**2 * (fit.alike + (1 - fit.alike) / max(considered, 1e-9))
-    expected = math.sqrt(error + float(belief.covariance[0, 0]))
+    expected = math.sqrt(error + float(estimate.covariance[0, 0]))
     if considered > 1 and abs(off / considered) > fit.contradiction * expected:
         return with_network_length(first_shape(), detection.length_m, fit, first)
-    return replace(belief, off=off, considered=considered)
+    return replace(estimate, off=off, considered=considered)
 
 
 def learned(
-    belief: ShapeEstimate,
+    estimate: ShapeEstimate,
     state: Tensor,
     shape: HandShape,
     derivatives: tuple[Tensor, Tensor],
-    detection: Detection,
+    detection: SeenHand,
     keypoints: Keypoints,
     fit: ShapeFit,
     first: HandShape,
 ) -> ShapeEstimate:
-    """The belief after a believed estimate; everything on the CPU.
+    """The estimate after a believed estimate; everything on the CPU.
 
-    state: (1, 27).  shape: the hand worn.  derivatives: see shape_derivatives.
-    keypoints: the glance's, as the refinement takes them.  first: the hand whose components are 0.
+    state: (1, 27).  shape: the hand applied.  derivatives: see shape_derivatives.
+    keypoints: the detection's, as the refinement takes them.
+    first: the hand whose components are 0.
     """
-    if belief.frozen(fit) or (belief.poses and belief.frames % _EVERY):
-        return belief
+    if estimate.frozen(fit) or (estimate.poses and estimate.frames % _EVERY):
+        return estimate
     weight = weight_of(detection, fit)
     if weight < _LEAST:
-        return belief
-    row, far = belief.keys.nearest(state)
+        return estimate
+    row, far = estimate.keys.nearest(state)
     known = far <= 1
-    if known and belief.keys.considered(row, weight):
-        return belief
-    if not known and len(belief.keys.weight) == _KEYS:
-        row = int((belief.keys.square / belief.keys.weight).argmin())
-        if float(belief.keys.square[row] / belief.keys.weight[row]) >= weight:
-            return belief
+    if known and estimate.keys.considered(row, weight):
+        return estimate
+    if not known and len(estimate.keys.weight) == _KEYS:
+        row = int((estimate.keys.square / estimate.keys.weight).argmin())
+        if float(estimate.keys.square[row] / estimate.keys.weight[row]) >= weight:
+            return estimate
     information, vector = keypoints_system(state, shape, derivatives, keypoints)
-    reported_here = torch.tensor(belief.applied) - torch.tensor(_KEYPOINTS_OFF)
-    # The network's length and its votes rest on the same image: each counts half.
+    reported_here = torch.tensor(estimate.applied) - torch.tensor(_KEYPOINTS_OFF)
+    # The network's length and its keypoints rest on the same image: each counts half.
     vector = 0.5 * fit.keypoints * (information @ reported_here + vector)
     information = 0.5 * fit.keypoints * information
     precision = 0.5 / fit.length_sigma**2
     information[0, 0] += precision
     vector[0] += precision * math.log(detection.length_m / first.hand_length_m)
-    keys = _kept(belief.keys, row, known, state, weight, information, vector)
-    return _posterior(replace(belief, keys=keys), fit)
+    keys = _kept(estimate.keys, row, known, state, weight, information, vector)
+    return _posterior(replace(estimate, keys=keys), fit)
 
 
 def keypoints_system(
     state: Tensor, shape: HandShape, derivatives: tuple[Tensor, Tensor], keypoints: Keypoints
 ) -> tuple[Tensor, Tensor]:
-    """What votes for the joints say of the components, the pose (1, 27) marginalised.
+    """What keypoints say of the components, the pose (1, 27) marginalised.
 
     Returns the precision (6, 6) and the precision times the change of the components (6,).
     """
@@ -329,14 +346,14 @@ def _kept(
     return KeyPoses(*fields)
 
 
-def _posterior(belief: ShapeEstimate, fit: ShapeFit) -> ShapeEstimate:
+def _posterior(estimate: ShapeEstimate, fit: ShapeFit) -> ShapeEstimate:
     """Mean, covariance and the hand in use by the key poses that there are."""
-    poses, information, vector = belief.keys.summed()
+    poses, information, vector = estimate.keys.summed()
     shared = 1 / (1 + fit.alike * max(poses - 1, 0.0))
     precision = torch.tensor(POPULATION_SIGMA).square().reciprocal().diag() + shared * information
     covariance = torch.linalg.inv(precision)
     mean = covariance @ (shared * vector)
-    off = (mean - torch.tensor(belief.applied)).abs()
+    off = (mean - torch.tensor(estimate.applied)).abs()
     least = (_STEP_SIGMAS * covariance.diagonal().sqrt()).clamp(min=_STEP)
-    applied = tuple(mean.tolist()) if bool((off > least).any()) else belief.applied
-    return replace(belief, mean=mean, covariance=covariance, poses=poses, applied=applied)
+    applied = tuple(mean.tolist()) if bool((off > least).any()) else estimate.applied
+    return replace(estimate, mean=mean, covariance=covariance, poses=poses, applied=applied)

@@ -9,9 +9,9 @@ from torch import Tensor
 from toftrack.compute.compiling import called, entry_point
 from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
+from toftrack.refinement import penalty
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.tracking import penalty
-from toftrack.tracking.penalty import FAR_SIGMAS
+from toftrack.refinement.penalty import FAR_SIGMAS
 
 _cached = entry_point(__file__, *(m.__file__ for m in (overlap, overlap_numba, penalty)))
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.backend import Motions
+from toftrack.compute.motions import Motions
 from toftrack.compute.redraw import BOUNDS, Redraw, bound
 from toftrack.errors import ToftrackError
 
@@ -61,7 +61,6 @@ class FilterSettings:
     velocity_smoothing: float
     resampling: str
     bounds: str
-    density: float
 
     def __post_init__(self) -> None:
         if self.resampling not in RESAMPLERS:
@@ -77,7 +76,7 @@ class FilterSettings:
             check_number(f"filter.{name}", getattr(self, name), 1, whole=True)
         for name in ("exponent", "exponent_growth", "shrink"):
             check_number(f"filter.{name}", getattr(self, name), 0, above=True)
-        for name in ("rest", "speed_gain", "velocity", "density"):
+        for name in ("rest", "speed_gain", "velocity"):
             check_number(f"filter.{name}", getattr(self, name), 0)
         check_number("filter.velocity_smoothing", self.velocity_smoothing, 0, 1)
 
@@ -178,7 +177,6 @@ def annealed(
     weights: Tensor,
     sigmas: Tensor,
     log_scores: Callable[[Tensor], Tensor],
-    log_prior: Callable[[Tensor], Tensor | None],
     lower: Tensor,
     upper: Tensor,
     settings: FilterSettings,
@@ -190,7 +188,6 @@ def annealed(
     particles, weights: (M, 6 + d) predicted and (M,) normalised.
     sigmas: (6 + d,) of the first pass's diffusion.
     log_scores: of the image, (N, 6 + d) to (N,); their exponent grows.
-    log_prior: what else speaks for particles, (N,), in every pass alike; may say None.
     Returns (N, 6 + d) and (N,).
     """
     n, device = settings.particles, particles.device
@@ -202,8 +199,7 @@ def annealed(
         bounds = lower, upper, settings.bounds
         particles = redraw(particles, weights, positions, tangents, *bounds)
         log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
-        prior = log_prior(particles)
-        weights = normalise(log_weights if prior is None else log_weights + prior)
+        weights = normalise(log_weights)
     return particles, weights
 
 

@@ -36,15 +36,15 @@ class Quality:
         they help.
     every: frames from one look of the networks to the next at a hand that is believed.
     search: likewise from one search of the whole image to the next, while none is.
-    swaps: part of the poses with another finger that are tried.
-    rivals, places: at most.
+    exchanged: part of the poses with another finger that are tried.
+    candidates, places: at most.
     """
 
     threads: int | None = None
     every: int = 1
     search: int = 1
-    swaps: float = 1.0
-    rivals: int | None = None
+    exchanged: float = 1.0
+    candidates: int | None = None
     places: int | None = None
 
 
@@ -52,8 +52,8 @@ LEVELS = (
     Quality(),
     Quality(threads=1),
     Quality(1, every=2, search=2),
-    Quality(1, every=3, search=3, swaps=0.5, rivals=2, places=2),
-    Quality(1, every=4, search=4, swaps=0.25, rivals=1, places=2),
+    Quality(1, every=3, search=3, exchanged=0.5, candidates=2, places=2),
+    Quality(1, every=4, search=4, exchanged=0.25, candidates=1, places=2),
 )
 """All effort first; each leaves out more than the one before. Fewer particles or passes save little
 and cost much of the accuracy: rather frames are dropped."""

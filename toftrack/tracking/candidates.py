@@ -1,0 +1,343 @@
+"""The hypotheses of a frame: proposed, brought onto the seen points, scored.
+
+Two rounds, as in ICONDENSATION (Isard and Blake, ECCV 1998) with local optimisation (Gall et al.,
+"Optimization and filtering for human motion capture", IJCV 87, 2010): what the filter and the
+detector propose; then the best of these with single fingers of other poses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from toftrack.compute.pace import FRAME_S
+from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
+from toftrack.refinement.gauss_newton import Keypoints
+from toftrack.refinement.proposals import exchange_fingers, swap_fingers
+from toftrack.refinement.seen_points import SeenPoints, seen_points
+from toftrack.render.forearm import arm_sight
+from toftrack.render.segmentation import Observation
+from toftrack.tracking.confidence import log_odds, out_of_sight
+from toftrack.tracking.hands import OtherHand
+from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.posterior import (
+    ForearmTerm,
+    HypothesisTerm,
+    ImageTerm,
+    JointsTerm,
+    OrientationTerm,
+    OtherHandTerm,
+    Posterior,
+    Term,
+)
+from toftrack.tracking.select import Hypotheses, Source
+from toftrack.tracking.state import HandState, LastSeen, Track
+
+_HIDDEN = 0.03
+"""Share of the hand's pixels that must be hidden for it to matter."""
+_COVERED = 0.6
+"""Share of the joints behind something from which on a hand is held where it was."""
+_UNSEEN = 0.3
+"""Share of the joints out of sight from which on the detector is not considered."""
+_UNLIKELY = 0.03
+"""Hypotheses that are less probable are no candidates."""
+_BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
+"""How many hypotheses are bent to the keypoints, in how many steps; how sure the keypoints are at
+best, and how far an angle may go."""
+_NO_WEIGHT = 1e-6
+"""Instead of 0, so that deviations stay numbers: kilometres."""
+_DONORS = 4
+"""Single fingers are taken from so many of the detector's poses."""
+_SCREENED, _EXCHANGED = 16, 2
+"""Of the poses with another finger, so many of the best by the image are scored by all terms, and
+so many of those are refined."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandFrame:
+    """One hand in one frame: what is compared with what.
+
+    slot: of the hand.  hand: its state as of this frame.  track: the track that goes on or begins.
+    fitted: the hand as it is applied.  observation: not empty.
+    expected_m: the depth at which its nearest joint was expected; 0 where the track begins.
+    detection: what the detector says of it, and `pending` waits for it where it is still computed.
+    others: hands that are tracked as well.  image: the likelihood of the image.
+    """
+
+    slot: int
+    hand: HandState
+    track: Track
+    fitted: FittedHand
+    observation: Observation
+    expected_m: float
+    detection: Detection
+    pending: Callable[[], Detection]
+    others: tuple[OtherHand, ...]
+    image: ImageTerm
+    model: TrackerModel
+
+    @property
+    def hidden(self) -> bool:
+        """Whether something hides part of the hand."""
+        hand, occluder = self.observation.hand, self.observation.occluder
+        return int(occluder.sum()) > _HIDDEN * int(hand.sum())
+
+    def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
+        """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""
+        joints = self.fitted.refiner.joints(pose)[0].cpu()
+        return out_of_sight(joints, self.observation.depth_m, self.observation.k)
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredFrame:
+    """A hand's frame after the filter, with what its candidates are compared by.
+
+    pose: (1, 27) the filter's estimate.
+    detection: as far as it is considered: not of a hand that is mostly out of sight, where the
+        detector sees another one in the rest.
+    """
+
+    frame: HandFrame
+    pose: Tensor
+    detection: Detection
+    posterior: Posterior
+    seen: SeenPoints
+
+    @classmethod
+    def of(cls, frame: HandFrame, mean: Tensor) -> FilteredFrame:
+        """mean: (1, 6 + d) of the particles."""
+        pose = frame.model.decode(mean, frame.track.offset)
+        unseen = sum(frame.out_of_sight(pose)) > _UNSEEN
+        detection = NO_DETECTION if unseen else frame.detection
+        posterior = posterior_of(
+            frame.observation,
+            frame.fitted,
+            detection,
+            frame.hand.seen,
+            frame.others,
+            frame.model,
+            image=frame.image,
+        )
+        return cls(frame, pose, detection, posterior, seen_points(frame.observation))
+
+    @property
+    def covered(self) -> bool:
+        """Whether so much of the hand is hidden that it is held where it was."""
+        return self.frame.out_of_sight(self.frame.track.pose)[1] > _COVERED
+
+    def refined(self, poses: Tensor) -> Tensor:
+        """Hands (N, 27) brought onto the seen points and the keypoints."""
+        cfg, model = self.frame.model.refinement, self.frame.model
+        keypoints = keypoints_of(self.detection, model)
+        return self.frame.fitted.refiner(poses, poses[:, 6:], self.seen, cfg, keypoints)
+
+
+def image_term(
+    observation: Observation,
+    fitted: FittedHand,
+    model: FilterModel,
+    coverage: float | None = None,
+) -> ImageTerm:
+    """The likelihood of a segmented image, which is not empty."""
+    evidence = model.likelihood.evidence(observation).to(model.device)
+    return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
+
+
+def posterior_of(
+    observation: Observation,
+    fitted: FittedHand,
+    detection: Detection,
+    seen: LastSeen,
+    others: Sequence[OtherHand],
+    model: TrackerModel,
+    image: ImageTerm,
+) -> Posterior:
+    """The posterior of one hand in one frame; terms of weight 0 are left out."""
+    weights, terms = model.weights, dict[str, Term]()
+    keypoints = 0.0 if detection.empty else weights.keypoints
+    if keypoints or weights.overlap:
+        terms["joints"] = JointsTerm(
+            model.backend.joints_penalty,
+            fitted.shape.hand_length_m,
+            keypoints_of(detection, model),
+            keypoints,
+            weights.overlap,
+        )
+    if weights.other_hand:
+        touched = [other.joints_m for other in others if other.certain]
+        terms |= {
+            f"other hand {n}": OtherHandTerm(joints, weights.other_hand)
+            for n, joints in enumerate(touched)
+        }
+    if weights.forearm:
+        terms["forearm"] = ForearmTerm(arm_sight(observation), weights.forearm)
+    memory = weights.orientation * math.exp(-seen.age_s / weights.orientation_s)
+    if memory:
+        rotvec = seen.particle[:, 3:6]
+        terms["orientation"] = OrientationTerm(rotvec, memory, weights.orientation_rad)
+    if weights.hypothesis and not detection.empty:
+        terms["hypothesis"] = HypothesisTerm(detection, weights.hypothesis)
+    return Posterior(image, fitted.refiner.joints, terms)
+
+
+def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
+    """The detector's keypoints as the refinement takes them."""
+    cfg, found = model.detector.settings, detection.keypoints
+    sigma = (cfg.keypoint_sigmas * found.sigma_m).clamp(min=cfg.keypoint_m)
+    return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, _NO_WEIGHT))
+
+
+def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
+    """(H, 27) the likeliest hypotheses as states of a hand; at least one, where there is any."""
+    ratio = fitted.shape.hand_length_m / DEFAULT_HAND_LENGTH_M
+    likely = int((detection.log_probability > math.log(_UNLIKELY)).sum())
+    return detection.first(max(1, min(count, likely))).states(ratio)
+
+
+def detected_poses(
+    detection: Detection,
+    observation: Observation,
+    fitted: FittedHand,
+    model: TrackerModel,
+    count: int,
+) -> Tensor:
+    """(H, 27) the detector's poses: the likeliest bent to the keypoints, and as they are.
+
+    The keypoints are more exact than the hypotheses where a finger is seen, but no pose by
+    themselves. None where nothing was detected.
+    """
+    if detection.empty:
+        return torch.zeros(0, 27)
+    states = hypotheses_of(detection, fitted, count)
+    if not model.refinement.iterations:
+        return states
+    bent = states[:_BENT]
+    nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), observation.k, (0, 0))
+    weight = max(model.detector.settings.keypoint_weight, _NO_WEIGHT)
+    sigma = detection.keypoints.sigma_m.clamp(min=_BENT_M) / weight
+    freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
+    keypoints = Keypoints(detection.keypoints.points_m, sigma)
+    return torch.cat((fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
+
+
+def best_start(
+    detection: Detection,
+    observation: Observation,
+    fitted: FittedHand,
+    posterior: Posterior,
+    model: TrackerModel,
+) -> tuple[Tensor, float]:
+    """The best (1, 27) of the detector's poses, as they are and refined, and its log posterior."""
+    cfg, count = model.refinement, model.detector.settings.hypotheses
+    poses = detected_poses(detection, observation, fitted, model, count)
+    if cfg.iterations:
+        seen, keypoints = seen_points(observation), keypoints_of(detection, model)
+        better = fitted.refiner(poses, poses[:, 6:], seen, cfg, keypoints)
+        poses = torch.cat((poses, better))
+    values = posterior(poses)
+    best = int(values.argmax())
+    return poses[best][None], float(values[best])
+
+
+def propose(frames: Sequence[FilteredFrame], generator: torch.Generator) -> Hypotheses:
+    """The scored hypotheses of a frame's hands, in two rounds."""
+    proposed = [_first_round(number, frame) for number, frame in enumerate(frames)]
+    first = _refined(Hypotheses.joined([table for table, _ in proposed]), frames)
+    second = [
+        _second_round(number, frame, first.of_hand(number), donors, generator)
+        for number, (frame, (_, donors)) in enumerate(zip(frames, proposed, strict=True))
+    ]
+    return Hypotheses.joined((first, *second))
+
+
+def _first_round(number: int, filtered: FilteredFrame) -> tuple[Hypotheses, Tensor]:
+    """What the filter and the detector propose, not refined; and the poses (M, 21) to take single
+    fingers from.
+
+    The pose of the last frame stands until another one is clearly better: what the image does not
+    decide, such as a hidden finger, must not flicker. A contender moves along with it.
+    """
+    frame, track, state = filtered.frame, filtered.frame.track, filtered.pose
+    model, settings = frame.model, frame.model.detector.settings
+    if not model.refinement.iterations:
+        return Hypotheses.of(state, number, Source.DYNAMICS), state[:0, 6:]
+    if filtered.covered:
+        return Hypotheses.of(track.pose, number, Source.HELD), state[:0, 6:]
+    detected = detected_poses(
+        filtered.detection, frame.observation, frame.fitted, model, settings.candidates
+    )
+    tables = [
+        Hypotheses.of(_with_fingers(state, track.pose), number, Source.PREVIOUS),
+        Hypotheses.of(state, number, Source.DYNAMICS),
+        Hypotheses.of(_with_fingers(state, track.contender), number, Source.CONTENDER),
+    ]
+    if schedule(track, frame.hidden, model.hysteresis.alternate)[0]:
+        tables.append(Hypotheses.of(detected, number, Source.DETECTOR))
+    return Hypotheses.joined(tables), detected[:_DONORS, 6:]
+
+
+def _second_round(
+    number: int,
+    filtered: FilteredFrame,
+    table: Hypotheses,
+    donors: Tensor,
+    generator: torch.Generator,
+) -> Hypotheses:
+    """The best pose with single fingers of other poses, as they are and refined, scored."""
+    frame, none = filtered.frame, table.rows(table.hand < 0)
+    standing = table.of_source(Source.PREVIOUS, Source.DYNAMICS)
+    due = schedule(frame.track, frame.hidden, frame.model.hysteresis.alternate)[1]
+    if not (frame.model.refinement.iterations and len(standing) and due):
+        return none
+    best, exchanged = standing.best, frame.model.hysteresis.exchanged
+    poses = torch.cat(
+        (
+            swap_fingers(best.pose, frame.model.poses, exchanged, generator)[1:],
+            exchange_fingers(best.pose, donors),
+        )
+    )
+    if not len(poses):
+        return none
+    values = filtered.posterior.screened(poses, _SCREENED)
+    top = values.topk(min(_EXCHANGED, len(values)))
+    rows = top.indices[top.values > best.log_posterior]
+    if not len(rows):
+        return none
+    tried = torch.cat((poses[rows], filtered.refined(poses[rows])))
+    found = Hypotheses.of(tried, number, Source.EXCHANGED)
+    return replace(found, log_posterior=filtered.posterior(tried))
+
+
+def _refined(table: Hypotheses, frames: Sequence[FilteredFrame]) -> Hypotheses:
+    """The same table, each hand's rows refined, but for a pose that is held, and scored."""
+    tables = []
+    for number, filtered in enumerate(frames):
+        mine = table.of_hand(number)
+        if filtered.frame.model.refinement.iterations and mine.source[0] != Source.HELD:
+            mine = replace(mine, pose=filtered.refined(mine.pose))
+        tables.append(replace(mine, log_posterior=filtered.posterior(mine.pose)))
+    return Hypotheses.joined(tables)
+
+
+def schedule(track: Track, hidden: bool, alternate: float) -> tuple[bool, bool]:
+    """Whether the detector's poses are candidates in a frame, and whether fingers are exchanged.
+
+    Both; but in turn where the last estimate was surely right and nothing challenges it.
+
+    alternate: probability from which on it was; 1 = never.
+    """
+    sure = alternate < 1 and track.log_odds >= log_odds(alternate)
+    if hidden or track.challenged.begun or not sure:
+        return True, True
+    even = round(track.age.seconds / FRAME_S) % 2 == 0
+    return even, not even
+
+
+def _with_fingers(state: Tensor, poses: Tensor) -> Tensor:
+    """Poses (N, 27) with the wrist of a hand (1, 27)."""
+    return torch.cat((state[:, :6].expand(len(poses), 6), poses[:, 6:]), 1)

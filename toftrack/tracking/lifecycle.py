@@ -1,0 +1,392 @@
+"""Where tracks begin and end: `open_hand` before a frame is compared, `close` after, and
+`reconcile` where there are two hands. Nobody else begins or ends a track.
+
+| in a frame | the track |
+| --- | --- |
+| no track, and a hand is detected | begins |
+| no track, and none is | stays away |
+| nothing in the image can be a hand | ends |
+| doubted, and a hand is detected elsewhere | ends, and one begins there in this frame |
+| the other side has become the likelier one | ends, and one of that side begins in this frame |
+| a pose at another place was better for a while | ends, and one begins with it (select.py) |
+| doubtful for longer than `lost.patience` | ends |
+| two tracks on one hand for a while | the less sure one ends |
+| a second hand that was never believed | ends after a while |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.frames import DepthImage
+from toftrack.refinement import shape_fit
+from toftrack.refinement.shape_fit import first_shape
+from toftrack.render.segmentation import Observation
+from toftrack.tracking.candidates import (
+    HandFrame,
+    best_start,
+    image_term,
+    posterior_of,
+)
+from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
+from toftrack.tracking.detect import (
+    detect,
+    detection_due,
+    expected_of,
+    is_elsewhere,
+    search,
+    search_due,
+    start_detection,
+)
+from toftrack.tracking.filter import (
+    Found,
+    drawn_to,
+    new_track,
+    predicted_depths,
+    velocity_after,
+)
+from toftrack.tracking.handedness import OTHER_SIDE, body_offset_m
+from toftrack.tracking.hands import (
+    OtherHand,
+    PlacedHand,
+    exchanged,
+    in_wrong_slot,
+    known_side,
+    on_one_hand,
+    pixels_of,
+    sureness,
+    without,
+)
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
+
+_HIDDEN = 0.3
+"""Share of the joints behind something from which on a hand is hidden."""
+_OUT_OF_VIEW = 0.4
+"""Share of the joints outside of the image from which on a hand is out of view."""
+_PATIENT = 10
+"""Times as long is waited for a hidden hand."""
+_GONE_S = 1.0
+"""A hand that was believed so long ago may have made way for another one."""
+_SWITCHED = 0.4
+"""The side is changed when it has become less probable than this, so that it does not flicker."""
+_LEAST_PRESENT = 0.5
+"""Where a hand is less probable than this, its sides are not compared."""
+_SECOND_S = 0.12
+"""How often a second hand is searched for."""
+_TRIED_S, _AGAIN_S = 0.5, 0.5
+"""A second track ends when it was not believed for so long, and is searched for so much later."""
+_ONE_FRAMES = 4
+"""Two tracks that were believed may be on one hand for so many frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class Absence:
+    """A slot without a hand in a frame.  observation: what was segmented."""
+
+    slot: int
+    hand: HandState
+    observation: Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Status:
+    """What is thought of a frame's estimate.
+
+    state_name, lost: as Estimate has them.  ends: the track does not go on.
+    confidence: probability that every joint is within 40 mm; NaN where nothing says.
+    log_odds: the same, smoothed over time.  doubtful: as Track has it, with this frame.
+    """
+
+    state_name: str
+    lost: bool
+    ends: bool = False
+    confidence: float = math.nan
+    log_odds: float = 0.0
+    doubtful: Duration = Duration()
+
+
+def open_hand(
+    slot: int,
+    hand: HandState,
+    others: tuple[OtherHand, ...],
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
+) -> HandFrame | Absence:
+    """A slot's hand as it goes into a frame: detected, its side compared, segmented, begun.
+
+    Where a track is believed, and its side need not be compared, the detector runs beside the
+    filter; else it is waited for, as everything depends on it.
+    """
+    alone, settings, track = without(image, others), model.configured.handedness, hand.track
+    compared = hand.handedness.comparison_due(settings, track is not None, dt_s)
+    if track is not None and not track.doubted and not compared:
+        asked = detection_due(track, model.detector.settings, dt_s)
+        pending = start_detection(hand, track, alone, model, dt_s) if asked else _nothing
+        hand = replace(hand, handedness=hand.handedness.waited(dt_s))
+        detection = NO_DETECTION
+    else:
+        hand, detection = _detected(hand, others, alone, model, dt_s)
+        hand, detection = _compared(hand, detection, others, alone, model, dt_s)
+        hand = observed_shape(hand, detection, model)
+        pending, track = _nothing, hand.track
+    fitted = model.hand(hand.side, hand.shape)
+    expected = None if detection.empty else expected_of(detection)
+    if track is not None:
+        expected = predicted_depths(track, dt_s, fitted, model)
+    observation = model.segmentation(image.depth_m, image.k, expected, pixels_of(others))
+    if observation.empty or expected is None:
+        hand = observed_shape(hand, pending(), model)
+        return Absence(slot, replace(hand, track=None), observation)
+    if track is None:
+        track = _begun(hand, detection, observation, others, model)
+    return HandFrame(
+        slot,
+        hand,
+        track,
+        fitted,
+        observation,
+        expected.nearest_m,
+        detection,
+        pending,
+        others,
+        image_term(observation, fitted, model),
+        model,
+    )
+
+
+def _nothing() -> Detection:
+    return NO_DETECTION
+
+
+def _detected(
+    hand: HandState,
+    others: Sequence[OtherHand],
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
+) -> tuple[HandState, Detection]:
+    """The hand with the track that it goes on with, and what the detector says of it.
+
+    A track that is doubted gives way to a hand that is detected elsewhere.
+    """
+    track, best = hand.track, NO_DETECTION
+    if search_due(hand, model):
+        best = search(hand, image, others, model)
+        hand = replace(hand, searched_s=0.0)
+    if track is None:
+        return hand, best
+    if not detection_due(track, model.detector.settings, dt_s):
+        return hand, NO_DETECTION
+    if is_elsewhere(best, track, model, dt_s):
+        return replace(hand, track=None), best
+    return hand, detect(hand, track, image, model, dt_s)
+
+
+def _compared(
+    hand: HandState,
+    detection: Detection,
+    others: tuple[OtherHand, ...],
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
+) -> tuple[HandState, Detection]:
+    """The hand after its side was compared, where that is due.
+
+    When the other side has become the likelier one, a track of it begins in this frame.
+    """
+    settings, before = model.configured.handedness, hand.handedness
+    if before.given:
+        return hand, detection
+    due = before.comparison_due(settings, hand.track is not None, dt_s)
+    if hand.track is None and hand.seen.age_s > _GONE_S:
+        before = before.left(settings)  # what comes may be the other hand
+    handedness = before.waited(dt_s)
+    if detection.present < _LEAST_PRESENT or not due:
+        return replace(hand, handedness=handedness), detection
+    other, centre = OTHER_SIDE[hand.side], detection.centre_m.numpy()
+    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other)[0]
+    gain = _best_log_posterior(hand, detection, hand.side, others, image, model)
+    gain -= _best_log_posterior(hand, mirrored, other, others, image, model)
+    gain = gain if hand.side == "right" else -gain
+    handedness = handedness.compared(gain, body_offset_m(image, centre), settings)
+    hand = replace(hand, handedness=handedness)
+    if handedness.probability(hand.side) >= _SWITCHED:
+        return hand, detection
+    return replace(hand, side=other, shape=first_shape(), gesture=None, track=None), mirrored
+
+
+def _best_log_posterior(
+    hand: HandState,
+    detection: Detection,
+    side: str,
+    others: tuple[OtherHand, ...],
+    image: DepthImage,
+    model: TrackerModel,
+) -> float:
+    """Of the best pose that the detector has for a side; -inf where nothing can be a hand."""
+    observation = model.segmentation(
+        image.depth_m, image.k, expected_of(detection), pixels_of(others)
+    )
+    if observation.empty:
+        return -math.inf
+    shape = hand.shape
+    if hand.track is None:
+        first = model.configured.shape
+        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
+    hand = replace(hand, side=side, shape=shape, seen=replace(hand.seen, age_s=math.inf))
+    return _best_start(hand, detection, observation, others, model)[1]
+
+
+def _begun(
+    hand: HandState,
+    detection: Detection,
+    observation: Observation,
+    others: tuple[OtherHand, ...],
+    model: TrackerModel,
+) -> Track:
+    """A track that begins with the best of the detector's poses."""
+    pose, _ = _best_start(hand, detection, observation, others, model)
+    return new_track(pose, model, model.refinement.carry)
+
+
+def _best_start(
+    hand: HandState,
+    detection: Detection,
+    observation: Observation,
+    others: tuple[OtherHand, ...],
+    model: TrackerModel,
+) -> tuple[Tensor, float]:
+    """The best of the detector's poses of a hand, and its log posterior."""
+    fitted = model.hand(hand.side, hand.shape)
+    # Very different poses are compared: what explains more of the image counts in full.
+    image = image_term(observation, fitted, model, coverage=1.0)
+    posterior = posterior_of(observation, fitted, detection, hand.seen, others, model, image)
+    return best_start(detection, observation, fitted, posterior, model)
+
+
+def observed_shape(hand: HandState, detection: Detection, model: TrackerModel) -> HandState:
+    """The hand with what a detection says of its shape: the length to begin a track with, and
+    whether it still is the hand that was fitted.
+    """
+    if detection.empty:
+        return hand
+    shape, first = hand.shape, model.configured.shape
+    if hand.track is None:
+        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
+    return replace(hand, shape=shape_fit.contradicted(shape, detection, model.fit, first))
+
+
+def close(
+    frame: HandFrame, found: Found, features: ConfidenceFeatures, dt_s: float
+) -> tuple[Status, Track, LastSeen]:
+    """What is thought of a frame's estimate, the track as of the frame, and the hand last seen."""
+    model, track = frame.model, frame.track
+    side = frame.hand.handedness.probability(frame.hand.side)
+    second = any(other.believed for other in frame.others)
+    status = judge(track, features, dt_s, side, second, model.lost)
+    # Without refinement the particles stay where they are.
+    followed = drawn_to(found, model) if model.refinement.iterations else found.filtered
+    carried = model.refinement.carry * found.offset if model.refinement.iterations else track.offset
+    track = replace(
+        track,
+        particles=followed.particles,
+        weights=followed.weights,
+        mean=followed.mean,
+        velocity=velocity_after(track, followed.mean, dt_s, model),
+        offset=carried,
+        pose=found.pose,
+        trend=found.trend,
+        age=track.age.extended(dt_s),
+        doubtful=status.doubtful,
+        log_odds=status.log_odds,
+        doubted=status.lost,
+        believed=track.believed or not status.lost,
+        unseen_s=track.unseen_s + dt_s if frame.detection.empty else 0.0,
+        features=features,
+        nearest_m=frame.expected_m if frame.hidden else 0.0,
+    )
+    remembered = not status.lost and track.age.reached(model.lost.probation + 1)
+    seen = LastSeen(track.mean, 0.0) if remembered else frame.hand.seen
+    return status, track, seen
+
+
+def judge(
+    track: Track,
+    features: ConfidenceFeatures,
+    dt_s: float,
+    side: float,
+    second: bool,
+    model: ConfidenceModel,
+) -> Status:
+    """What is thought of an estimate, dt_s after the last, and whether its track goes on.
+
+    side: probability that it is of the right side; of the other one every finger is wrong.
+    second: another hand is believed already.
+    """
+    now, kept = model.log_odds(features), model.memory ** (dt_s / FRAME_S)
+    smooth = kept * track.log_odds + (1 - kept) * now if track.age.begun else now
+    confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
+    # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
+    doubtful = track.doubtful.extended(dt_s, 2 * FRAME_S)
+    doubtful = doubtful if confidence < model.give_up else Duration()
+    patience = model.patience * (_PATIENT if features.hidden > _HIDDEN else 1)
+    ends = patience > 0 and doubtful.begun and doubtful.reached(patience)
+    # Whether it is a hand at all does not depend on whose it is.
+    new = 0.0 if track.believed else model.second if second else model.believe
+    lost = confidence < new or side * confidence < model.confidence
+    name = _state_name(features) if lost else "tracking"
+    return Status(name, lost, ends, side * confidence, smooth, doubtful)
+
+
+def _state_name(features: ConfidenceFeatures) -> str:
+    """Why an estimate is not to be used."""
+    if features.unseen > _OUT_OF_VIEW:
+        return "out of view"
+    return "hidden" if features.hidden > _HIDDEN else "searching"
+
+
+def taking_part(state: TrackerState) -> list[int]:
+    """The slots that a frame is about, the surest first; one without a hand now and then."""
+    vacant = [hand.track is None for hand in state.hands]
+    sought = all(vacant) or state.second_s >= _SECOND_S
+    slots = [slot for slot in range(len(vacant)) if sought or not vacant[slot]]
+    return sorted(slots, key=lambda slot: -sureness(state.hands[slot]))
+
+
+def reconcile(
+    before: TrackerState, after: TrackerState, poses: Callable[[int], PlacedHand], dt_s: float
+) -> tuple[TrackerState, bool]:
+    """Two hands after a frame: none is followed twice, and each is in its slot.
+
+    before: as of the frame's beginning.  poses: where a slot's hand was found.
+    Returns the state, and whether the slots were exchanged.
+    """
+    hands = list(after.hands)
+    sought = len(taking_part(before)) == 2 and any(hand.track is None for hand in before.hands)
+    second_s = 0.0 if sought else before.second_s
+    both = all(hand.track is not None for hand in hands)
+    merged = (
+        before.merged.extended(dt_s) if both and on_one_hand(poses(0), poses(1)) else Duration()
+    )
+    sure = all(hand.believed for hand in hands)
+    if merged.begun and (merged.reached(_ONE_FRAMES) or not sure):
+        worse = min((0, 1), key=lambda slot: sureness(hands[slot]))
+        hands[worse], merged = replace(hands[worse], track=None), Duration()
+    for slot, hand in enumerate(hands):
+        track = hand.track
+        if track is None or track.believed or not hands[1 - slot].believed:
+            continue
+        if track.age.seconds > _TRIED_S:
+            second_s = 0.0 if known_side(hand) else -_AGAIN_S
+            hands[slot] = replace(hand, track=None)
+    wrong = in_wrong_slot(before.hands, hands)
+    hands = exchanged(before.hands, hands) if wrong else hands
+    return replace(after, hands=tuple(hands), second_s=second_s, merged=merged), wrong
