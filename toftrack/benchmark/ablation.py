@@ -50,12 +50,12 @@ VARIANTS: dict[str, Variant] = {
     ),
     "no-refinement": Variant("no refinement", ("refine=none",)),
     "no-keypoints": Variant(
-        "no keypoints: neither refinement nor choice hears the networks' votes",
-        ("detector.keypoints=0", "detector.keypoint_weight=0"),
+        "no keypoints, neither in the refinement nor in the posterior",
+        ("posterior.keypoints=0", "detector.keypoint_weight=0"),
     ),
-    "no-rivals": Variant("no rivals", ("detector.rivals=0",)),
-    "no-exchange": Variant("no exchanged fingers", ("refine.swaps=0",)),
-    "no-overlap": Variant("fingers may be in one another", ("refine.overlap=0",)),
+    "no-candidates": Variant("no candidates of the detector", ("detector.candidates=0",)),
+    "no-exchange": Variant("no exchanged fingers", ("hysteresis.exchanged=0",)),
+    "no-overlap": Variant("fingers may be in one another", ("posterior.overlap=0",)),
     "side-found": Variant("the side found out", (), "auto"),
     "two-hands": Variant("two hands", ("hands=2",)),
 }
@@ -174,7 +174,7 @@ def _markdown(about: Mapping[str, Any], done: Mapping[str, list[Row]]) -> str:
         "[accuracy.md](../accuracy.md).",
         markdown(ablation_table(done)).replace(")*", ")\\*"),
         "| variant | overrides |\n| --- | --- |\n" + "\n".join(how),
-        "Without keypoints the confidence still knows of the votes: its weights were fitted with "
+        "Without keypoints the confidence still knows of them: its weights were fitted with "
         "them. Milliseconds are measured one variant after another, beside whatever else the "
         "machine did.",
     ]

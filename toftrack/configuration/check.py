@@ -47,7 +47,6 @@ _ABOVE_ZERO = frozenset(
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
-    posterior.orientation_rad posterior.orientation_s
     stream.waiting
     view.most_fps view.quality
     """.split()

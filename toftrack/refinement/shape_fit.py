@@ -7,8 +7,9 @@ Gauss-Newton system of the pose and the components with the pose marginalised (a
 
 How much a frame counts falls with the fourth power of the keypoints' standard deviation. On
 rendered sequences of other hands the error of the length does so: 3 % in frames of 3.8 mm, 5 % and
-more from 4.5 mm on. Frames of one pose and view err alike, so they count once, as a *key pose*; key poses of
-one hand err alike too, by `alike`, so that no number of them makes the fit arbitrarily sure.
+more from 4.5 mm on. Frames of one pose and view err alike, so they count once, as a *key pose*; key
+poses of one hand err alike too, by `alike`, so that no number of them makes the fit arbitrarily
+sure.
 
 Thickness is no part of what joints tell: it keeps the population's mean and spread, but for what
 goes with the breadth. It was tried with other evidence (the F-measure, the seen points): one

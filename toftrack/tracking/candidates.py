@@ -27,16 +27,14 @@ from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
 from toftrack.tracking.posterior import (
     ForearmTerm,
-    HypothesisTerm,
     ImageTerm,
     JointsTerm,
-    OrientationTerm,
     OtherHandTerm,
     Posterior,
     Term,
 )
 from toftrack.tracking.select import Hypotheses, Source
-from toftrack.tracking.state import HandState, LastSeen, Track
+from toftrack.tracking.state import HandState, Track
 
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
@@ -118,7 +116,6 @@ class FilteredFrame:
             frame.observation,
             frame.fitted,
             detection,
-            frame.hand.seen,
             frame.others,
             frame.model,
             image=frame.image,
@@ -152,7 +149,6 @@ def posterior_of(
     observation: Observation,
     fitted: FittedHand,
     detection: Detection,
-    seen: LastSeen,
     others: Sequence[OtherHand],
     model: TrackerModel,
     image: ImageTerm,
@@ -176,12 +172,6 @@ def posterior_of(
         }
     if weights.forearm:
         terms["forearm"] = ForearmTerm(arm_sight(observation), weights.forearm)
-    memory = weights.orientation * math.exp(-seen.age_s / weights.orientation_s)
-    if memory:
-        rotvec = seen.particle[:, 3:6]
-        terms["orientation"] = OrientationTerm(rotvec, memory, weights.orientation_rad)
-    if weights.hypothesis and not detection.empty:
-        terms["hypothesis"] = HypothesisTerm(detection, weights.hypothesis)
     return Posterior(image, fitted.refiner.joints, terms)
 
 

@@ -241,7 +241,7 @@ def _best_log_posterior(
     if hand.track is None:
         first = model.configured.shape
         shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
-    hand = replace(hand, side=side, shape=shape, seen=replace(hand.seen, age_s=math.inf))
+    hand = replace(hand, side=side, shape=shape)
     return _best_start(hand, detection, observation, others, model)[1]
 
 
@@ -268,7 +268,7 @@ def _best_start(
     fitted = model.hand(hand.side, hand.shape)
     # Very different poses are compared: what explains more of the image counts in full.
     image = image_term(observation, fitted, model, coverage=1.0)
-    posterior = posterior_of(observation, fitted, detection, hand.seen, others, model, image)
+    posterior = posterior_of(observation, fitted, detection, others, model, image)
     return best_start(detection, observation, fitted, posterior, model)
 
 

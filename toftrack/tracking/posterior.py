@@ -1,7 +1,6 @@
 """The posterior of a hand's pose: one definition for all who compare poses.
 
-    log p(pose | frame) = image + keypoints + overlap + other hand + forearm + orientation
-                          + hypothesis  (up to a constant)
+    log p(pose | frame) = image + keypoints + overlap + other hand + forearm  (up to a constant)
 
 A start, the candidates of a frame, exchanged fingers and the two sides of a hand are compared by
 it; the particle filter weighs its particles by the image alone, sharpened. Each term is a small
@@ -10,25 +9,19 @@ object, and a term of weight 0 is left out.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.rotations import rotvec_geodesic_distance
 from toftrack.compute.transfer import on_device, on_host
-from toftrack.detector.hand_detector import Detection
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.render.forearm import ArmSight, forearm_conflict
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer
 
-_LEAST_LOG_PROBABILITY = math.log(0.001)
-"""The least that a hypothesis' probability counts."""
 _TOUCH_M = 0.018
 """Joints of two hands come no nearer to each other, as a rule: fingers are so thick."""
 Term = Callable[[Tensor, Tensor], Tensor]
@@ -40,18 +33,13 @@ class PosteriorWeights:
     """The weights of the posterior's terms; see conf/posterior for what each does."""
 
     keypoints: float
-    hypothesis: float
     overlap: float
     other_hand: float
     forearm: float
-    orientation: float
-    orientation_rad: float
-    orientation_s: float
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            scale = entry.name in ("orientation_rad", "orientation_s")
-            check_number(f"posterior.{entry.name}", getattr(self, entry.name), 0, above=scale)
+            check_number(f"posterior.{entry.name}", getattr(self, entry.name), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,38 +118,6 @@ class ForearmTerm:
         wrists = poses.numpy()
         conflict = forearm_conflict(wrists[:, :3], wrists[:, 3:6], self.sight)
         return torch.from_numpy(-self.weight * conflict)
-
-
-@dataclass(frozen=True, eq=False)
-class OrientationTerm:
-    """A hand turned as when it was last believed gains `weight`, the less the longer ago it was.
-
-    rotvec: (1, 3) of that hand.  spread_rad: standard deviation of how far it has turned since.
-    """
-
-    rotvec: Tensor
-    weight: float
-    spread_rad: float
-
-    def __call__(self, poses: Tensor, joints_m: Tensor) -> Tensor:
-        """See Term."""
-        turned = rotvec_geodesic_distance(poses[:, 3:6], self.rotvec.expand(len(poses), -1))
-        return self.weight * torch.exp(-0.5 * (turned / self.spread_rad).square())
-
-
-@dataclass(frozen=True, eq=False)
-class HypothesisTerm:
-    """The log probability of the detector's hypothesis that is most like the pose."""
-
-    detection: Detection
-    weight: float
-
-    def __call__(self, poses: Tensor, joints_m: Tensor) -> Tensor:
-        """See Term."""
-        away = joints_m.numpy()[:, None] - self.detection.joints_m.numpy()
-        nearest = np.sqrt(np.square(away).sum(-1)).mean(-1).argmin(1)
-        log_probability = self.detection.log_probability.numpy()[nearest]
-        return torch.from_numpy(self.weight * np.maximum(log_probability, _LEAST_LOG_PROBABILITY))
 
 
 @dataclass(frozen=True, eq=False)

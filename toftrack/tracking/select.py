@@ -68,7 +68,8 @@ class Hypotheses:
 
     @classmethod
     def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
-        """One below the other."""
+        """One below the other; of no tables, one without rows."""
+        tables = [cls.of(torch.zeros(0, 27), 0, Source.HELD), *tables]
         return cls(
             torch.cat([table.pose for table in tables]),
             torch.cat([table.hand for table in tables]),
