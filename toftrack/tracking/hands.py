@@ -177,6 +177,8 @@ def without(image: DepthImage, others: Sequence[OtherHand]) -> DepthImage:
 
 def partnered(hands: Sequence[HandState], model: TrackerModel) -> list[HandState]:
     """The hands, with what the other hand's side says of each one's."""
+    if len(hands) == 1:
+        return list(hands)
     settings = model.configured.handedness
     return [
         replace(hand, handedness=hand.handedness.beside(other.handedness, settings))

@@ -93,6 +93,7 @@ class Absence:
     slot: int
     hand: HandState
     observation: Observation
+    track: None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,12 +68,7 @@ def step(
     infos: list[StepInfo | None] = [None] * len(hands)
     estimates = [vacant(image, model) for _ in hands]
     with spans("detector"):
-        others = others_of(hands, image, model, dt_s)
-        known = partnered(hands, model)
-        opened = [
-            open_hand(slot, known[slot], others[slot], image, model, dt_s)
-            for slot in taking_part(before)
-        ]
+        opened = open_hands(before, image, model, dt_s)
     frames = [one for one in opened if isinstance(one, HandFrame)]
     with spans("filter: rest"):
         filtered = [filtered_frame(frame, dt_s, generator, spans) for frame in frames]
@@ -91,6 +86,21 @@ def step(
         infos[slot] = replace(info, seconds=spans.seconds())
     after = replace(before, generator=generator.get_state(), hands=tuple(hands))
     return reconciled(after, before, infos, estimates, image, model, dt_s)
+
+
+def open_hands(
+    state: TrackerState, image: DepthImage, model: TrackerModel, dt_s: float
+) -> list[HandFrame | Absence]:
+    """The hands that a frame is about, the surest first; each knows where the others are."""
+    hands, opened = partnered(state.hands, model), list[HandFrame | Absence]()
+    others = others_of(hands, image, model, dt_s)
+    for slot in taking_part(state):
+        opened.append(open_hand(slot, hands[slot], others[slot], image, model, dt_s))
+        track = opened[-1].track
+        if track is not hands[slot].track:  # it began or ended: the next one must know
+            hands[slot] = replace(opened[-1].hand, track=track)
+            others = others_of(hands, image, model, dt_s)
+    return opened
 
 
 def filtered_frame(
