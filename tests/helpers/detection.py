@@ -134,10 +134,11 @@ class FixedDetector:
         return self.found
 
     def detect(self, depth_m, k, centres_m, side) -> list[Detection]:
-        """An open palm at each place."""
+        """An open palm whose middle is at each place."""
         self.centres_m.append(np.array(centres_m))
         states = torch.zeros(len(centres_m), 27)
         states[:, :3] = torch.from_numpy(np.asarray(centres_m)).float()
+        states[:, :3] -= rotated_pivot(states[:, 3:6])
         return [detection_of(state[None], side=side) for state in states]
 
     def start(self, depth_m, k, centre_m, side) -> Callable[[], Detection]:

@@ -1,4 +1,4 @@
-"""Which hypothesis becomes a frame's pose: against a plain reference, and as sequences of frames."""
+"""Which hypothesis becomes the pose: against a plain reference, and as sequences of frames."""
 
 from __future__ import annotations
 
