@@ -133,7 +133,7 @@ def edited(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
         (lambda content: content[:60], "'a'"),
     ],
 )
-def test_a_damaged_header_is_told(tmp_path: Path, edit: Callable, words: str) -> None:
+def test_a_damaged_header_is_reported(tmp_path: Path, edit: Callable, words: str) -> None:
     content = edit(npy(np.ones((4, 5))))
     assert words in reported(save(tmp_path / "a.npz", {"a": content}, zipfile.ZIP_STORED))
 
@@ -162,7 +162,7 @@ def test_an_array_beyond_the_cap_is_refused(
 
 
 @pytest.mark.parametrize(("method", "words"), [(97, "unknown way"), (14, "lzma properties")])
-def test_an_unknown_compression_is_told(tmp_path: Path, method: int, words: str) -> None:
+def test_an_unknown_compression_is_reported(tmp_path: Path, method: int, words: str) -> None:
     path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_STORED)
     forged = bytearray(path.read_bytes())
     for start, at in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
@@ -194,7 +194,7 @@ def test_random_damage_never_ends_otherwise_than_with_a_value_error(
 
 
 @pytest.mark.parametrize("kind", ["<U2", ">U2"])
-def test_characters_that_are_none_are_told(kind: str, tmp_path: Path) -> None:
+def test_characters_that_are_none_are_reported(kind: str, tmp_path: Path) -> None:
     whole = np.array(["a", "\U0010ffff"], kind)
     path = save(tmp_path / "a.npz", {"a": npy(whole)}, zipfile.ZIP_STORED)
     assert read_archive(path)["a"].tolist() == whole.tolist()

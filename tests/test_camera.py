@@ -189,7 +189,7 @@ def test_correction_below_zero_is_no_reading() -> None:
     assert (camera.rectify(np.full((H, W), 0.4, np.float32), True) == 0).all()
 
 
-def test_image_of_another_size_is_told() -> None:
+def test_image_of_another_size_is_reported() -> None:
     with pytest.raises(ToftrackError, match="144 rows"):
         Camera(K, W, H).rectify(np.ones((W, H), np.float32), False)
 
@@ -229,7 +229,7 @@ def test_save_and_load_are_the_same_camera(tmp_path: Path) -> None:
         ({"depth_polynomial": ["a"]}, "depth polynomial"),
     ],
 )
-def test_bad_camera_file_is_told(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+def test_bad_camera_file_is_reported(tmp_path: Path, change: dict[str, Any], words: str) -> None:
     path = tmp_path / "camera.json"
     Camera(K, W, H).save(path)
     content = json.loads(path.read_text()) | change
@@ -240,14 +240,14 @@ def test_bad_camera_file_is_told(tmp_path: Path, change: dict[str, Any], words: 
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe\x00"])
-def test_file_that_is_no_camera_is_told(tmp_path: Path, content: bytes) -> None:
+def test_file_that_is_no_camera_is_reported(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "camera.json"
     path.write_bytes(content)
     with pytest.raises(ToftrackError, match="not a camera file"):
         Camera.load(path)
 
 
-def test_missing_and_unwritable_camera_files_are_told(tmp_path: Path) -> None:
+def test_missing_and_unwritable_camera_files_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="cannot be read"):
         Camera.load(tmp_path / "nope.json")
     with pytest.raises(ToftrackError, match="cannot be written"):
@@ -284,7 +284,7 @@ def test_unusual_cameras_are_plausible(K: list, size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("width", [float("inf"), float("nan"), "wide", None, []])
-def test_a_width_that_is_no_whole_number_is_told(width: object, tmp_path: Path) -> None:
+def test_a_width_that_is_no_whole_number_is_reported(width: object, tmp_path: Path) -> None:
     content = Camera(np.array([[40.0, 0, 15.5], [0, 40, 11.5], [0, 0, 1]]), 32, 24).to_dict()
     (tmp_path / "camera.json").write_text(json.dumps(content | {"width": width}))
     with pytest.raises(ToftrackError, match="width or height that is not a whole number"):

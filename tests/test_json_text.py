@@ -45,7 +45,7 @@ def test_a_file_that_is_too_large_is_not_parsed(
 
 @pytest.mark.parametrize("text", [text for text, _ in HOSTILE.values()], ids=HOSTILE)
 @pytest.mark.parametrize("load", [Camera.load, HandShape.load])
-def test_files_of_it_are_told_in_one_sentence(load, text: str, tmp_path: Path) -> None:
+def test_files_of_it_are_reported_in_one_sentence(load, text: str, tmp_path: Path) -> None:
     path = tmp_path / "hostile.json"
     path.write_text(text)
     with pytest.raises(ToftrackError, match="hostile.json"):

@@ -59,7 +59,7 @@ def test_every_recording_is_measured_with_every_seed(measurement) -> None:
     assert picture is not None and picture.shape[1] > 900
 
 
-def test_differences_to_an_earlier_measurement_are_told(measurement, folder, capsys) -> None:
+def test_differences_to_an_earlier_measurement_are_reported(measurement, folder, capsys) -> None:
     _, out = measurement
     arguments = [str(folder), "--seeds", "1,2", "--compare", str(out / "a.json"), *QUICK]
     accuracy.main([*arguments, "--json", str(out / "b.json")])
@@ -127,7 +127,7 @@ def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> No
         assert reported in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_side_that_nobody_knows_cannot_be_told(folder, tmp_path) -> None:
+def test_a_side_that_nobody_knows_cannot_be_given(folder, tmp_path) -> None:
     with np.load(folder / "a.npz") as arrays:
         np.savez(tmp_path / "x.npz", **{k: v for k, v in arrays.items() if k != "metadata"})
     with pytest.raises(ToftrackError, match="give --side auto"):

@@ -118,7 +118,7 @@ def test_the_lift_finds_a_flat_hand_below_its_skin() -> None:
     assert np.isnan(nothing).all()
 
 
-def test_the_told_side_goes_before_the_surer_hand() -> None:
+def test_the_given_side_goes_before_the_surer_hand() -> None:
     def hand(label: str, score: float) -> SimpleNamespace:
         return SimpleNamespace(classification=[SimpleNamespace(label=label, score=score)])
 

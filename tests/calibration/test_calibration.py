@@ -85,7 +85,7 @@ def test_takes_the_depth_error_away(calibrated: tuple[Camera, Path]) -> None:
     assert np.sqrt((wiggle(true) ** 2).mean()) > 0.008
 
 
-def test_no_board_is_told_long_before_the_end(
+def test_no_board_is_reported_long_before_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(calibrate, "_HOPE_S", 0.0)
@@ -230,13 +230,13 @@ def test_errors_are_one_sentence(
     assert words in last
 
 
-def test_a_recording_without_amplitude_is_told(tmp_path: Path) -> None:
+def test_a_recording_without_amplitude_is_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", depth_m=np.ones((2, 6, 8), np.float32), K=np.diag((9.0, 9, 1)))
     with pytest.raises(ToftrackError, match="no amplitude"):
         calibrate.main([str(tmp_path / "a.npz"), "--board", "7x5", "--square", "0.03"])
 
 
-def test_boards_at_one_distance_are_told() -> None:
+def test_boards_at_one_distance_are_reported() -> None:
     view = np.repeat(np.arange(9), 50)
     pairs = DepthPairs(np.full(450, 0.8), np.full(450, 0.81), np.ones(450), view)
     with pytest.raises(ToftrackError, match="near and far"):

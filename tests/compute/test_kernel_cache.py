@@ -93,7 +93,7 @@ def _folder_instead(file: Path) -> None:
     ],
     ids=["empty", "garbage", "cut", "bit", "other numba"],
 )
-def test_a_damaged_kernel_is_compiled_anew_and_told_once(
+def test_a_damaged_kernel_is_compiled_anew_and_reported_once(
     damage: Callable[[Path], object], folder: Path, caplog
 ) -> None:
     assert not _is_loaded()
@@ -105,7 +105,7 @@ def test_a_damaged_kernel_is_compiled_anew_and_told_once(
     assert _is_loaded(), "it was mended"
 
 
-def test_what_stands_in_the_way_of_a_kernel_is_told(folder: Path, caplog) -> None:
+def test_what_stands_in_the_way_of_a_kernel_is_reported(folder: Path, caplog) -> None:
     assert not _is_loaded()
     (file,) = folder.iterdir()
     _folder_instead(file)
@@ -142,7 +142,7 @@ def test_where_it_cannot_be_written_every_run_compiles_and_says_why(
     assert not list(folder.iterdir()), "nothing half-written stays"
 
 
-def test_a_file_in_place_of_the_folder_is_told(folder: Path, caplog) -> None:
+def test_a_file_in_place_of_the_folder_is_reported(folder: Path, caplog) -> None:
     folder.write_bytes(b"mine")
     assert not _is_loaded()
     (reported,) = caplog.messages

@@ -60,7 +60,7 @@ def test_a_crop_shows_depths_about_its_centre() -> None:
     assert (inner[1] == 1).all() and (inner[2] == 0).all()
 
 
-def test_what_is_not_in_the_cube_is_told_from_what_is_not_read() -> None:
+def test_what_is_not_in_the_cube_differs_from_what_is_not_read() -> None:
     depth = np.full((144, 176), 2.0, np.float32)
     depth[:, :88] = 0.0
     image, _ = crop(depth, K, PRECOMPILED[0])

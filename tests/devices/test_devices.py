@@ -79,12 +79,12 @@ def test_range_keeps_the_recordings_indices_and_its_truth(recording: Path) -> No
     ("start", "stop"),
     [(T, None), (-1, None), (0, T + 1), (5, 5), (5, 4), (0, 0), ("a", None), (0, 2.5), (True, 3)],
 )
-def test_range_outside_the_recording_is_told(recording: Path, start: Any, stop: Any) -> None:
+def test_range_outside_the_recording_is_reported(recording: Path, start: Any, stop: Any) -> None:
     with pytest.raises(ToftrackError, match=f"start|stop.*{T}"):
         Replay(recording, start=start, stop=stop)
 
 
-def test_no_path_is_told() -> None:
+def test_no_path_is_reported() -> None:
     with pytest.raises(ToftrackError, match="device.path"):
         Replay(None)
 
@@ -144,7 +144,7 @@ def test_camera_file_replaces_the_intrinsics(recording: Path, tmp_path: Path) ->
     assert camera.depth_polynomial == (0.01,)
 
 
-def test_camera_file_of_another_size_is_told(recording: Path, tmp_path: Path) -> None:
+def test_camera_file_of_another_size_is_reported(recording: Path, tmp_path: Path) -> None:
     Camera(K, W + 1, H).save(tmp_path / "camera.json")
     with pytest.raises(ToftrackError, match="9x6.*8x6"):
         Replay(recording, camera_file=tmp_path / "camera.json")

@@ -58,19 +58,19 @@ def test_a_recording_gives_what_the_sdk_recorded(recording: Path, images: np.nda
         assert frame.timestamp_s == pytest.approx(1 + number / 30, abs=1e-5)
 
 
-def test_a_start_behind_the_end_is_told(recording: Path) -> None:
+def test_a_start_behind_the_end_is_reported(recording: Path) -> None:
     with pytest.raises(ToftrackError, match="no frame from start=50 on"):
         list(orbbec(bag=recording, keep="every", start=50))
 
 
-def test_what_is_no_recording_is_told(tmp_path: Path, recording: Path) -> None:
+def test_what_is_no_recording_is_reported(tmp_path: Path, recording: Path) -> None:
     for content in (b"", b"nonsense" * 50, recording.read_bytes()[:9000]):
         (tmp_path / "a.bag").write_bytes(content)
         with pytest.raises(ToftrackError, match="a.bag' is not a recording of an Orbbec camera"):
             orbbec(bag=tmp_path / "a.bag")
 
 
-def test_as_a_bag_of_ros_it_is_told_whose_it_is(recording: Path) -> None:
+def test_as_a_bag_of_ros_it_is_refused_with_whose_it_is(recording: Path) -> None:
     with pytest.raises(ToftrackError, match="device=orbbec device.bag="):
         Replay(recording)
 

@@ -94,7 +94,7 @@ def test_the_newest_frame_wins(plug: Callable[..., Sdk]) -> None:
     assert len(indices) <= 2 and round(float(indices[-1])) == 99
 
 
-def test_an_unplugged_camera_is_told_after_its_last_frame(plug: Callable[..., Sdk]) -> None:
+def test_an_unplugged_camera_is_reported_after_its_last_frame(plug: Callable[..., Sdk]) -> None:
     camera = a_camera(numbers=(1, 2))
     plug(camera)
     indices = []
@@ -105,7 +105,7 @@ def test_an_unplugged_camera_is_told_after_its_last_frame(plug: Callable[..., Sd
     assert indices == [0, 1]
 
 
-def test_a_silent_camera_is_told(plug: Callable[..., Sdk]) -> None:
+def test_a_silent_camera_is_reported(plug: Callable[..., Sdk]) -> None:
     camera = a_camera(numbers=(1,))
     plug(camera)
     with pytest.raises(ToftrackError, match="no frame has come.*0.05 s"):
@@ -113,7 +113,7 @@ def test_a_silent_camera_is_told(plug: Callable[..., Sdk]) -> None:
     assert not camera.started
 
 
-def test_a_camera_that_cannot_be_started_is_told(plug: Callable[..., Sdk]) -> None:
+def test_a_camera_that_cannot_be_started_is_reported(plug: Callable[..., Sdk]) -> None:
     plug(a_camera(), start_error="busy\nor so")
     with pytest.raises(ToftrackError, match=r"cannot be started \(busy or so\); close other"):
         list(orbbec())
@@ -133,7 +133,7 @@ def test_leaving_stops_the_camera_and_iterating_again_starts_it_again(
     device.close()
 
 
-def test_frames_with_too_few_bytes_are_told(plug: Callable[..., Sdk]) -> None:
+def test_frames_with_too_few_bytes_are_reported(plug: Callable[..., Sdk]) -> None:
     camera = a_camera()
     camera.sets = [Images(Image(1, "depth", few=True))]
     plug(camera)
@@ -151,13 +151,15 @@ def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Callable[..., Sdk]
         orbbec(serial=5)
 
 
-def test_no_camera_is_told_with_what_else_there_is(plug: Callable[..., Sdk]) -> None:
+def test_no_camera_is_reported_with_what_else_there_is(plug: Callable[..., Sdk]) -> None:
     plug()
     with pytest.raises(ToftrackError, match="no Orbbec camera.*udev.*device.bag"):
         orbbec()
 
 
-def test_a_size_that_the_camera_lacks_is_told_with_those_it_has(plug: Callable[..., Sdk]) -> None:
+def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(
+    plug: Callable[..., Sdk],
+) -> None:
     plug(a_camera())
     with pytest.raises(ToftrackError, match="width=641.*8x6 at 15, 8x6 at 30, 16x12 at 30"):
         orbbec(width=641)
@@ -165,7 +167,7 @@ def test_a_size_that_the_camera_lacks_is_told_with_those_it_has(plug: Callable[.
     assert orbbec(width=16, height=12).camera.width == 16
 
 
-def test_a_camera_without_depth_is_told(plug: Callable[..., Sdk]) -> None:
+def test_a_camera_without_depth_is_reported(plug: Callable[..., Sdk]) -> None:
     plug(FakeCamera("1", {IR: [Profile("y8")]}))
     with pytest.raises(ToftrackError, match="the camera has no depth images"):
         orbbec()
@@ -178,7 +180,7 @@ def test_the_cameras_lens_becomes_opencvs(plug: Callable[..., Sdk], model: str |
     np.testing.assert_array_equal(orbbec().camera.distortion, (k1, k2, p1, p2, k3, k4, k5, k6))
 
 
-def test_other_lenses_are_a_fisheye_none_or_told(plug: Callable[..., Sdk]) -> None:
+def test_other_lenses_are_a_fisheye_none_or_reported(plug: Callable[..., Sdk]) -> None:
     plug(FakeCamera("1", {DEPTH: [Profile("y16", lens=LENS, model="kannala_brandt4")]}))
     camera = orbbec().camera
     assert camera.lens == "fisheye"
@@ -202,7 +204,7 @@ def test_other_lenses_are_a_fisheye_none_or_told(plug: Callable[..., Sdk]) -> No
         ({"bag": "none.bag"}, "no file 'none.bag'"),
     ],
 )
-def test_settings_that_make_no_sense_are_told(changes: dict[str, Any], reported: str) -> None:
+def test_settings_that_make_no_sense_are_reported(changes: dict[str, Any], reported: str) -> None:
     with pytest.raises(ToftrackError, match=reported):
         orbbec(**changes)
 
@@ -212,7 +214,9 @@ def test_the_sdk_is_not_imported_until_it_is_used() -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
-def test_a_missing_or_strange_sdk_is_told_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_or_strange_sdk_is_reported_with_the_extra(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for module in (None, ModuleType("pyorbbecsdk")):
         monkeypatch.setitem(sys.modules, "pyorbbecsdk", module)
         with pytest.raises(ToftrackError, match=r"pyorbbecsdk2.*-e '.\[orbbec\]'.*--no-deps"):

@@ -71,7 +71,7 @@ def test_the_readmes_camera_is_tracked(workplace: Path, track: Callable) -> None
     assert np.abs(found[..., 2] - sample.truth.joints_m[..., 2]).mean() < 0.01
 
 
-def test_its_own_error_is_told_in_one_sentence(
+def test_its_own_error_is_reported_in_one_sentence(
     workplace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(workplace)
@@ -83,7 +83,7 @@ def test_its_own_error_is_told_in_one_sentence(
     assert sentence(caught.value) == "'nowhere.raw' cannot be opened: No such file or directory"
 
 
-def test_a_missing_argument_is_told(track: Callable) -> None:
+def test_a_missing_argument_is_reported(track: Callable) -> None:
     status, _, err = track()
     assert status == 1
     assert "device.path=" in err
@@ -99,7 +99,7 @@ def test_a_missing_argument_is_told(track: Callable) -> None:
         ("class Other: ...", "my_device.RawImages"),
     ],
 )
-def test_code_that_cannot_be_imported_is_told(
+def test_code_that_cannot_be_imported_is_reported(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: str | None, reason: str
 ) -> None:
     if code is not None:
@@ -114,7 +114,7 @@ def test_code_that_cannot_be_imported_is_told(
     assert "PYTHONPATH" in reported
 
 
-def test_a_device_without_frames_is_told() -> None:
+def test_a_device_without_frames_is_reported() -> None:
     class Empty(BaseDevice): ...
 
     with Empty(Camera(np.eye(3), 4, 3)) as device:

@@ -170,12 +170,12 @@ def test_a_recording_at_its_own_pace_drops_what_comes_too_late(recording: Path) 
     assert device.dropped > 30
 
 
-def test_a_start_behind_the_end_is_told(recording: Path) -> None:
+def test_a_start_behind_the_end_is_reported(recording: Path) -> None:
     with pytest.raises(ToftrackError, match="no frame from start=100 on, but 100 before"):
         list(realsense(bag=recording, start=100))
 
 
-def test_a_recording_without_depth_is_told(rs: ModuleType, tmp_path: Path) -> None:
+def test_a_recording_without_depth_is_reported(rs: ModuleType, tmp_path: Path) -> None:
     class InfraredOnly(EmulatedCamera):
         def _stream(self, uid: int, kind: Any, index: int, pixel_format: Any) -> Any:
             if kind == rs.stream.depth:
@@ -191,7 +191,7 @@ def test_a_recording_without_depth_is_told(rs: ModuleType, tmp_path: Path) -> No
         realsense(bag=path)
 
 
-def test_a_recording_without_a_frame_is_told(rs: ModuleType, tmp_path: Path) -> None:
+def test_a_recording_without_a_frame_is_reported(rs: ModuleType, tmp_path: Path) -> None:
     class Silent(EmulatedCamera):
         def _send(self, number: int) -> None: ...
 
@@ -201,7 +201,7 @@ def test_a_recording_without_a_frame_is_told(rs: ModuleType, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["text.bag", "text.db3", "empty.bag", "empty.db3", "cut"])
-def test_what_is_no_recording_is_told(
+def test_what_is_no_recording_is_reported(
     rs: ModuleType, tmp_path: Path, recording: Path, name: str
 ) -> None:
     path = tmp_path / (f"cut{recording.suffix}" if name == "cut" else name)
@@ -231,7 +231,7 @@ def test_a_camera_without_distortion_has_none(rs: ModuleType) -> None:
         assert not camera_of(rs, some_intrinsics(rs, model, coefficients)).distortion.any()
 
 
-def test_a_lens_unlike_opencvs_is_told(rs: ModuleType) -> None:
+def test_a_lens_unlike_opencvs_is_reported(rs: ModuleType) -> None:
     with pytest.raises(ToftrackError, match="kannala.*pixels.*camera.file"):
         camera_of(rs, some_intrinsics(rs, "kannala_brandt4", [0.9, -3.0, 9.0, -20.0, 0.0]))
 
@@ -244,13 +244,13 @@ def some_intrinsics(rs: ModuleType, model: str, coefficients: list[float]) -> An
     return intrinsics
 
 
-def test_a_camera_file_of_another_size_is_told(rs: ModuleType, tmp_path: Path) -> None:
+def test_a_camera_file_of_another_size_is_reported(rs: ModuleType, tmp_path: Path) -> None:
     Camera(np.diag([200.0, 200, 1]), 320, 240).save(tmp_path / "camera.json")
     with pytest.raises(ToftrackError, match="320x240.*176x144"):
         emulated(camera_file=tmp_path / "camera.json")
 
 
-def test_without_a_camera_the_user_is_told_at_once(rs: ModuleType, tmp_path: Path) -> None:
+def test_without_a_camera_the_user_is_reported_at_once(rs: ModuleType, tmp_path: Path) -> None:
     if len(rs.context().devices):
         pytest.skip("a camera is plugged in")
     done = subprocess.run(

@@ -43,19 +43,19 @@ def test_the_sdk_is_not_imported_until_it_is_used() -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
-def test_a_missing_sdk_is_told_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_sdk_is_reported_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(ToftrackError, match=r"pyrealsense2.*pip install -e '.\[realsense\]'"):
         live()
 
 
-def test_an_old_sdk_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_old_sdk_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", ModuleType("pyrealsense2"))
     with pytest.raises(ToftrackError, match="older than 2.56"):
         live()
 
 
-def test_no_camera_is_told_with_what_else_there_is(plug: Callable[..., Sdk]) -> None:
+def test_no_camera_is_reported_with_what_else_there_is(plug: Callable[..., Sdk]) -> None:
     plug()
     with pytest.raises(ToftrackError, match="no RealSense camera.*device.bag.*emulated"):
         live()
@@ -71,14 +71,16 @@ def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Callable[..., Sdk]
         live(serial=5)
 
 
-def test_a_size_that_the_camera_lacks_is_told_with_those_it_has(plug: Callable[..., Sdk]) -> None:
+def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(
+    plug: Callable[..., Sdk],
+) -> None:
     plug(a_camera())
     with pytest.raises(ToftrackError, match="641x6 pixels at 30.*8x6 at 15, 8x6 at 30"):
         live(width=641)
     assert live(fps=15).fps == 15
 
 
-def test_a_camera_without_depth_is_told(plug: Callable[..., Sdk]) -> None:
+def test_a_camera_without_depth_is_reported(plug: Callable[..., Sdk]) -> None:
     plug(FakeCamera("1", [Profile("color", "rgb8")], []))
     with pytest.raises(ToftrackError, match="the camera has no depth images"):
         live()
@@ -106,7 +108,7 @@ def test_live_frames_are_counted_from_the_first_and_dropped_ones_leave_a_gap(
     assert frames[0].amplitude is None
 
 
-def test_an_unplugged_camera_is_told_after_its_last_frame(plug: Callable[..., Sdk]) -> None:
+def test_an_unplugged_camera_is_reported_after_its_last_frame(plug: Callable[..., Sdk]) -> None:
     camera = a_camera(frames=(1, 2))
     plug(camera)
     indices = []
@@ -117,14 +119,14 @@ def test_an_unplugged_camera_is_told_after_its_last_frame(plug: Callable[..., Sd
     assert indices == [0, 1]
 
 
-def test_a_silent_camera_is_told(plug: Callable[..., Sdk]) -> None:
+def test_a_silent_camera_is_reported(plug: Callable[..., Sdk]) -> None:
     sdk = plug(a_camera(frames=(1,)))
     with pytest.raises(ToftrackError, match="no frame has come.*0.05 s"):
         list(live(timeout_s=0.05))
     assert sdk.started is None, "the camera was not let go"
 
 
-def test_a_camera_in_use_is_told(plug: Callable[..., Sdk]) -> None:
+def test_a_camera_in_use_is_reported(plug: Callable[..., Sdk]) -> None:
     plug(a_camera(), start_error="Device or resource\n busy")
     with pytest.raises(ToftrackError, match=r"be started \(Device or resource busy\); close"):
         live().open()
@@ -146,13 +148,13 @@ def test_a_camera_in_use_is_told(plug: Callable[..., Sdk]) -> None:
         ({"bag": "a.bag", "transport": "emulated"}, "device.emulated.source"),
     ],
 )
-def test_senseless_settings_are_told_without_the_sdk(
+def test_senseless_settings_are_reported_without_the_sdk(
     changes: dict[str, Any], reported: str
 ) -> None:
     with pytest.raises(ToftrackError, match=reported):
         live(**changes)
 
 
-def test_senseless_settings_of_the_virtual_camera_are_told() -> None:
+def test_senseless_settings_of_the_virtual_camera_are_reported() -> None:
     with pytest.raises(ToftrackError, match="fps and unit_m above 0"):
         realsense_emulator(unit_m=0)

@@ -128,13 +128,13 @@ def test_nonsense_of_the_right_length_is_a_frame(kind: str, distance: float | No
 
 
 @pytest.mark.parametrize("kind", ["timeout", "refuse", "stall", "short", "empty", "long", "cut"])
-def test_a_camera_that_never_answers_is_told(kind: str) -> None:
+def test_a_camera_that_never_answers_is_reported(kind: str) -> None:
     with pytest.raises(ToftrackError, match="libmesasr.*emulated"):
         read(camera(kind))
 
 
 @pytest.mark.parametrize("kind", ["timeout", "stall", "short"])
-def test_a_camera_that_falls_silent_is_told_after_its_last_frame(kind: str) -> None:
+def test_a_camera_that_falls_silent_is_reported_after_its_last_frame(kind: str) -> None:
     device, seen = camera(f"{kind}@4+"), []
     with pytest.raises(ToftrackError, match="cable and power"), device:
         for frame in device:
@@ -166,7 +166,7 @@ def test_unplugged_between_frames_by_hand() -> None:
     assert device.counts.unplugged == 1
 
 
-def test_never_gives_up_when_told_so() -> None:
+def test_never_gives_up_when_asked_not_to() -> None:
     device = camera("timeout@2x30", persistence={"give_up_s": None, "first_frame_s": 0.1}, stop=4)
     assert [frame.index for frame in read(device)] == [0, 1, 2, 3]
 
@@ -175,18 +175,18 @@ def no_library(**_: Any) -> None:
     raise usb.core.NoBackendError("No backend available")
 
 
-def test_no_library_is_told_with_the_ids(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_library_is_reported_with_the_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sr3000_usb.usb.core, "find", no_library)
     with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*libusb.*libmesasr.*emulated"):
         sr3000()
 
 
-def test_no_camera_is_told_with_the_ids() -> None:
+def test_no_camera_is_reported_with_the_ids() -> None:
     with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*plug.*libmesasr.*emulated"):
         camera("missing")
 
 
-def test_usb_that_cannot_be_listed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_usb_that_cannot_be_listed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(**_: Any) -> None:
         raise usb.core.USBError("no access", None, 13)
 
@@ -196,7 +196,7 @@ def test_usb_that_cannot_be_listed_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize(("kind", "words"), [("permission", "udev"), ("busy", "another program")])
-def test_a_camera_that_cannot_be_opened_is_told(kind: str, words: str) -> None:
+def test_a_camera_that_cannot_be_opened_is_reported(kind: str, words: str) -> None:
     device = camera(kind)
     with pytest.raises(ToftrackError, match=words):
         device.open()

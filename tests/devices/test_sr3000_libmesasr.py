@@ -140,7 +140,7 @@ def test_reads_frames_and_sets_the_camera_up(
         ("image", "sent no frame.*SR_GetImage"),
     ],
 )
-def test_what_goes_wrong_is_told(
+def test_what_goes_wrong_is_reported(
     libraries: dict[str, Path], fault: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STAND_IN_FAULT", fault)
@@ -163,16 +163,16 @@ def test_recovers(
 
 
 @needs_compiler
-def test_a_library_that_lacks_a_function_is_told(libraries: dict[str, Path]) -> None:
+def test_a_library_that_lacks_a_function_is_reported(libraries: dict[str, Path]) -> None:
     with pytest.raises(ToftrackError, match="no function SR_SetModulationFrequency"):
         camera(libraries["incomplete"])
 
 
-def test_no_library_is_told() -> None:
+def test_no_library_is_reported() -> None:
     with pytest.raises(ToftrackError, match="libnowhere.so.*vendor's package.*transport=usb"):
         camera("libnowhere.so")
 
 
-def test_a_serial_that_is_no_number_is_told() -> None:
+def test_a_serial_that_is_no_number_is_reported() -> None:
     with pytest.raises(ToftrackError, match="SN-12 is not a number"):
         camera("libnowhere.so", serial="SN-12")

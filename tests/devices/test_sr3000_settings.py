@@ -66,7 +66,7 @@ def test_amplitude_threshold_takes_the_distance_of_dim_pixels() -> None:
     assert (frame.depth[~dim] > 0).mean() > 0.9
 
 
-def test_a_camera_with_other_endpoints_is_told() -> None:
+def test_a_camera_with_other_endpoints_is_reported() -> None:
     source, settings = open_source("sample"), sr3000_emulator()
     backend = EmulatedBackend(source, settings, 7.5, usb_settings(endpoint_in=0x81))
     transport = UsbTransport(usb_settings(), Exposure(20, None, 0), None, backend)
@@ -75,7 +75,7 @@ def test_a_camera_with_other_endpoints_is_told() -> None:
     assert backend.open_handles == set()
 
 
-def test_a_register_that_the_camera_refuses_is_told() -> None:
+def test_a_register_that_the_camera_refuses_is_reported() -> None:
     source, settings = open_source("sample"), sr3000_emulator()
     backend = EmulatedBackend(source, settings, 7.5, usb_settings(endpoint_out=0x02))
     backend.bulk_write = lambda *_: (_ for _ in ()).throw(usb.core.USBError("Pipe error", -9, 32))
@@ -113,7 +113,7 @@ def test_camera_file_replaces_the_optics(tmp_path: Any) -> None:
         ({"stop": 0}, "at least 1"),
     ],
 )
-def test_bad_settings_are_told(settings: dict[str, Any], words: str) -> None:
+def test_bad_settings_are_reported(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         sr3000(**({"transport": "emulated"} | settings))
 
@@ -133,6 +133,6 @@ def test_bad_settings_are_told(settings: dict[str, Any], words: str) -> None:
         (lambda: persistence_settings(backoff_s="soon"), "backoff_s"),
     ],
 )
-def test_bad_settings_of_the_parts_are_told(make: Any, words: str) -> None:
+def test_bad_settings_of_the_parts_are_reported(make: Any, words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         make()

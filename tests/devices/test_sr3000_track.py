@@ -24,7 +24,7 @@ def track(folder: Path, *overrides: str) -> tuple[int, str, str]:
     return programs.call(*overrides, "hydra.run.dir=out", folder=folder)
 
 
-def test_without_a_camera_the_user_is_told_at_once(tmp_path: Path) -> None:
+def test_without_a_camera_the_user_is_reported_at_once(tmp_path: Path) -> None:
     status, _, err = track(tmp_path, "device=sr3000", "device.usb.ids=[dead:0001,dead:0002]")
     assert status == 1
     assert err.startswith("error: no SR3000")

@@ -14,9 +14,8 @@ from helpers.tracking import configuration, sample
 from toftrack.api import build_model
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, is_vacant
-from toftrack.tracking.hands import HandsTracker
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.tracker import Tracker
+from toftrack.tracking.tracker import HandsTracker, Tracker
 
 hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is not installed")
 

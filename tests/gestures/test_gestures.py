@@ -121,7 +121,7 @@ SHOWN = [
 
 
 @pytest.mark.parametrize(("label", "angles", "thumbs"), SHOWN)
-def test_a_gesture_is_told_by_its_fingers_and_thumb(
+def test_a_gesture_is_reported_by_its_fingers_and_thumb(
     label: str, angles: np.ndarray, thumbs: tuple[str, ...]
 ) -> None:
     if label.startswith("pointing"):
@@ -242,7 +242,7 @@ def test_labels_do_not_flicker_at_a_border() -> None:
     assert changes(followed) < changes(alone) / 4
 
 
-def test_a_new_gesture_is_told_within_three_frames_and_one_odd_frame_changes_nothing() -> None:
+def test_a_new_gesture_is_reported_within_three_frames_and_one_odd_frame_changes_nothing() -> None:
     labels = [label for label, _ in follow([pose("palm")] * 5 + [pose("gun", "tucked")] * 4)]
     assert labels[:5] == ["palm"] * 5 and labels[7:] == ["pointing"] * 2
     labels = [
@@ -443,7 +443,7 @@ def test_a_gesture_that_was_seen_to_vary_forgives_more() -> None:
         ([{"name": "v", "angles": ROCK, "spread": [-1] * 21}], "degrees", "a spread below 0"),
     ],
 )
-def test_bad_json_is_told_in_one_sentence(
+def test_bad_json_is_reported_in_one_sentence(
     tmp_path: Path, poses: object, units: str | None, words: str
 ) -> None:
     path = write_json(tmp_path, poses, units)
@@ -464,12 +464,12 @@ def test_bad_json_is_told_in_one_sentence(
         ("# units: degrees\nname,spread\nv,3\n", "unknown angle 'spread'"),
     ],
 )
-def test_bad_csv_is_told_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:
+def test_bad_csv_is_reported_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         gestures(str(write_csv(tmp_path, text)))
 
 
-def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_none_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="no file of gestures"):
         gestures(str(tmp_path / "none.json"))
     with pytest.raises(ToftrackError, match="neither .json nor .csv"):
@@ -490,7 +490,7 @@ def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
         {"known": "most"},
     ],
 )
-def test_settings_out_of_range_are_told(bad: dict[str, float]) -> None:
+def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures"):
         gestures(**bad)
 

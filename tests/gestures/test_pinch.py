@@ -76,6 +76,6 @@ def test_one_odd_frame_is_no_pinch_and_ends_none() -> None:
 @pytest.mark.parametrize(
     "bad", [{"touching": 0.5}, {"begin": 1.2}, {"end": 0.9}, {"frames": -1.0}], ids=str
 )
-def test_settings_out_of_range_are_told(bad: dict[str, float]) -> None:
+def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures.pinch"):
         dataclasses.replace(SETTINGS, **bad)

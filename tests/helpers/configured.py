@@ -16,14 +16,14 @@ from toftrack.refinement.steadying import Steadying
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import NearestSurface
 from toftrack.tracking.confidence import ConfidenceModel
-from toftrack.tracking.handedness_estimate import HandednessSettings
+from toftrack.tracking.handedness import HandednessSettings
 from toftrack.tracking.paper import RoughStart
-from toftrack.tracking.prior import Prior
+from toftrack.tracking.posterior import PosteriorWeights
+from toftrack.tracking.select import Hysteresis
 
 
 @cache
-def _part(group: str, option: str | None = None) -> Any:
-    overrides = [] if option is None else [f"{group}={option}"]
+def _part(group: str, *overrides: str) -> Any:
     return hydra.utils.instantiate(configuration(*overrides)[group])
 
 
@@ -47,19 +47,24 @@ def steadying(**changes: Any) -> Steadying:
     return replace(_part("refine").steadying, **changes)
 
 
-def prior(**changes: Any) -> Prior:
-    """conf/start/prior.yaml"""
-    return replace(_part("start", "prior"), **changes)
+def posterior_weights(**changes: Any) -> PosteriorWeights:
+    """conf/posterior/default.yaml"""
+    return replace(_part("posterior"), **changes)
+
+
+def hysteresis(**changes: Any) -> Hysteresis:
+    """conf/hysteresis/default.yaml"""
+    return replace(_part("hysteresis"), **changes)
 
 
 def rough_start(**changes: Any) -> RoughStart:
-    """conf/start/rough.yaml"""
-    return replace(_part("start", "rough"), **changes)
+    """conf/start/rough.yaml, of experiment=paper alone"""
+    return replace(_part("start", "experiment=paper"), **changes)
 
 
-def calibrated_belief(**changes: Any) -> ConfidenceModel:
+def confidence_model(**changes: Any) -> ConfidenceModel:
     """conf/lost/calibrated.yaml"""
-    return replace(_part("lost", "calibrated"), **changes)
+    return replace(_part("lost"), **changes)
 
 
 def detector_settings(**changes: Any) -> DetectorSettings:
@@ -70,6 +75,6 @@ def detector_settings(**changes: Any) -> DetectorSettings:
     return replace(DetectorSettings(**config), **changes)
 
 
-def side_fit(**changes: Any) -> HandednessSettings:
+def handedness_settings(**changes: Any) -> HandednessSettings:
     """hand.sides."""
-    return replace(_part("hand").sides, **changes)
+    return replace(_part("hand").handedness, **changes)

@@ -114,20 +114,33 @@ def detection_of(states: torch.Tensor, log_size: float = 0.0, side: str = "right
 
 
 class FixedDetector:
-    """In the networks' place: says what it is told to, and remembers what it was asked."""
+    """In the networks' place: finds what it is given, and records where it was asked to look.
+
+    found: what a search of the whole image finds, whichever side is searched for.
+    searched: the sides of all searches.  likely: of the last one, None before any.
+    centres_m: (C, 3) of all calls of `detect` and `start`.
+    """
 
     def __init__(self, found: Sequence[Detection] = (), **settings: float) -> None:
         self.settings = detector_settings(**settings)
         self.found = list(found)
-        self.compared: list[np.ndarray] = []
+        self.searched: list[str] = []
+        self.centres_m: list[np.ndarray] = []
         self.likely: Callable[[np.ndarray], float] | None = None
 
     def search(self, depth_m, k, side, likely) -> list[Detection]:
+        self.searched.append(side)
         self.likely = likely
         return self.found
 
     def detect(self, depth_m, k, centres_m, side) -> list[Detection]:
-        self.compared.append(np.array(centres_m))
+        """An open palm whose middle is at each place."""
+        self.centres_m.append(np.array(centres_m))
         states = torch.zeros(len(centres_m), 27)
         states[:, :3] = torch.from_numpy(np.asarray(centres_m)).float()
+        states[:, :3] -= rotated_pivot(states[:, 3:6])
         return [detection_of(state[None], side=side) for state in states]
+
+    def start(self, depth_m, k, centre_m, side) -> Callable[[], Detection]:
+        found = self.detect(depth_m, k, np.asarray(centre_m)[None], side)[0]
+        return lambda: found

@@ -59,7 +59,7 @@ def test_each_cause_has_its_remedy(changes: dict, remedy: str) -> None:
     assert seen.startswith("60 of 100 frames")
 
 
-def test_a_hand_of_the_other_side_that_is_followed_is_told() -> None:
+def test_a_hand_of_the_other_side_that_is_followed_is_reported() -> None:
     followed = RunFacts()
     for i in range(10):
         followed = followed.tracked(other_side=i < 6)

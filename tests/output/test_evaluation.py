@@ -236,7 +236,7 @@ def test_lost_tolerance_forgives_only_near_a_change() -> None:
 
 
 @pytest.mark.parametrize("shape", [(9, 21, 3), (10, 20, 3), (10, 63)])
-def test_other_shapes_than_the_truth_are_told(shape: tuple[int, ...]) -> None:
+def test_other_shapes_than_the_truth_are_reported(shape: tuple[int, ...]) -> None:
     with pytest.raises(ToftrackError, match="shape"):
         evaluate(np.zeros(shape), None, still_hand(10))
 

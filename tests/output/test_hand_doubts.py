@@ -33,7 +33,7 @@ def hand(length_m: float, sigma: float = 0.024) -> HandShape:
         (0.230, "230 mm long, as hardly anybody's is.*too small.*fx = 363.2 instead of 300"),
     ],
 )
-def test_a_fitted_hand_that_is_hardly_anybody_s_is_told(length_m: float, words: str) -> None:
+def test_a_fitted_hand_that_is_hardly_anybody_s_is_reported(length_m: float, words: str) -> None:
     assert re.search(words, length_doubt(hand(length_m), K))
 
 
@@ -81,7 +81,7 @@ def tracked(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tu
     return summary, captured.err + captured.out
 
 
-def test_a_focal_length_that_makes_the_hand_small_is_told_at_the_end(
+def test_a_focal_length_that_makes_the_hand_small_is_reported_at_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with packaged_sample() as path:

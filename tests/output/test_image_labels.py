@@ -90,6 +90,6 @@ def test_a_still_may_have_several_names_and_other_is_no_wrong_one(tmp_path) -> N
         {"image_size": [1, 2], "side": "left", "images": [3], "called": {}, "shown_frames": 1},
     ],
 )
-def test_labels_of_neither_kind_are_told_in_one_sentence(tmp_path, content) -> None:
+def test_labels_of_neither_kind_are_reported_in_one_sentence(tmp_path, content) -> None:
     with pytest.raises(ToftrackError, match="labels '.*' are of neither kind"):
         labels(tmp_path, content)

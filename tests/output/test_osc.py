@@ -68,7 +68,7 @@ def sent(receiver: socket.socket, estimate: Estimate, **changes: Any) -> dict[st
         return read(receiver.recv(65535))
 
 
-def test_a_tracked_hand_is_told_with_all_its_joints(receiver: socket.socket) -> None:
+def test_a_tracked_hand_is_reported_with_all_its_joints(receiver: socket.socket) -> None:
     estimate = hand_estimate(7, "left", pinch=0.75, pinching=True)
     found = sent(receiver, estimate)
     assert found["/toftrack/frame"] == [7, 7 / 25]
@@ -81,13 +81,13 @@ def test_a_tracked_hand_is_told_with_all_its_joints(receiver: socket.socket) -> 
     assert not any("pointing" in address or "openxr" in address for address in found)
 
 
-def test_the_pointing_ray_is_told_while_there_is_one(receiver: socket.socket) -> None:
+def test_the_pointing_ray_is_sent_while_there_is_one(receiver: socket.socket) -> None:
     ray = np.arange(6, dtype=np.float32)
     estimate = replace(hand_estimate(0), pointing_origin_m=ray[:3], pointing_direction=ray[3:])
     assert sent(receiver, estimate)["/toftrack/right/pointing"] == ray.tolist()
 
 
-def test_of_a_lost_hand_nothing_is_told_but_that(receiver: socket.socket) -> None:
+def test_of_a_lost_hand_nothing_is_sent_but_that(receiver: socket.socket) -> None:
     assert sent(receiver, lost_hand(2)) == {
         "/toftrack/frame": [2, 2 / 25],
         "/toftrack/hand/tracked": [0],
@@ -96,7 +96,7 @@ def test_of_a_lost_hand_nothing_is_told_but_that(receiver: socket.socket) -> Non
     assert set(sent(receiver, gone)) == {"/toftrack/frame", "/toftrack/right/tracked"}
 
 
-def test_landmarks_and_the_joints_of_openxr_are_told_on_demand(receiver: socket.socket) -> None:
+def test_landmarks_and_the_joints_of_openxr_are_reported_on_demand(receiver: socket.socket) -> None:
     estimate = hand_estimate(0)
     found = sent(receiver, estimate, parts=["landmarks", "openxr"])
     tip = found["/toftrack/right/landmark/index_tip"]
@@ -133,7 +133,7 @@ def test_a_bad_setting_is_one_clear_error() -> None:
         osc_stream(port=0)
 
 
-def test_a_missing_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pythonosc", None)
     with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[osc\]'"):
         osc_stream()

@@ -16,7 +16,7 @@ def kept_up(tracked: int, dropped: int, reduced: int = 0) -> RealTime:
     return facts
 
 
-def test_dropped_frames_are_told_with_what_to_do() -> None:
+def test_dropped_frames_are_reported_with_what_to_do() -> None:
     words = kept_up(20, 80, reduced=18).words()
     assert words.startswith(
         "80 of 100 frames were dropped: the machine was too slow for 30 frames/s, a frame took 55 "

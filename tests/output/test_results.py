@@ -403,7 +403,7 @@ def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_a_run_json_that_is_damaged_is_told(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[str, Any]) -> None:
     write(tmp_path, [estimate(i) for i in range(3)])
     path = tmp_path / "run.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
@@ -514,13 +514,13 @@ def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
     }
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ToftrackError, match="file.*cannot be written.*hydra.run.dir"):
         ResultWriter(tmp_path / "file" / "out", {}, NAMES, None)
 
 
-def test_a_result_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     writer = ResultWriter(tmp_path, {}, NAMES, None)
     writer.append((estimate(0),))
     (tmp_path / "track.npz").mkdir()
@@ -530,7 +530,7 @@ def test_a_result_that_cannot_be_written_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"text", b"PK\x03\x04broken"])
-def test_a_file_that_is_no_result_is_told(tmp_path: Path, content: bytes | None) -> None:
+def test_a_file_that_is_no_result_is_reported(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "track.npz"
     if content is not None:
         path.write_bytes(content)
@@ -538,7 +538,7 @@ def test_a_file_that_is_no_result_is_told(tmp_path: Path, content: bytes | None)
         read_results(path)
 
 
-def test_a_result_without_a_key_is_told(tmp_path: Path) -> None:
+def test_a_result_without_a_key_is_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "track.npz", lost=np.zeros(3, bool))
     with pytest.raises(ToftrackError, match="joints_m"):
         read_results(tmp_path / "track.npz")

@@ -31,13 +31,13 @@ def test_a_run_that_does_not_say_where_it_ran_is_read(folder: Path) -> None:
     assert read_run(folder).found("recording.npz") == Path("recording.npz")
 
 
-def test_a_summary_that_is_no_object_is_told(folder: Path) -> None:
+def test_a_summary_that_is_no_object_is_reported(folder: Path) -> None:
     (folder / "summary.json").write_text("[]")
     with pytest.raises(ToftrackError, match="summary.json' cannot be read"):
         read_run(folder)
 
 
-def test_a_configuration_that_is_no_object_is_told(folder: Path) -> None:
+def test_a_configuration_that_is_no_object_is_reported(folder: Path) -> None:
     with np.load(folder / "track.npz") as content:
         arrays = dict(content)
     np.savez(folder / "track.npz", **(arrays | {"metadata": np.array('{"config": [1]}')}))

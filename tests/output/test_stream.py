@@ -146,7 +146,7 @@ def test_a_reader_that_never_reads_stops_nothing(
     assert sent + dropped == 300 and dropped > 100
 
 
-def test_a_reader_that_goes_away_is_told_at_once() -> None:
+def test_a_reader_that_goes_away_is_reported_at_once() -> None:
     reading, writing = os.pipe()
     kept = os.dup(1)
     os.dup2(writing, 1)

@@ -176,7 +176,7 @@ def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path)
     assert "the other hand" in table and table.count("usable") == 2
 
 
-def test_a_second_hand_that_nobody_has_is_told(tmp_path: Path) -> None:
+def test_a_second_hand_that_nobody_has_is_reported(tmp_path: Path) -> None:
     summary = write(tmp_path, frames(), replace(truth(), other=None))
     assert summary["metrics"]["slot"] == 1 and "second" not in summary["metrics"]
     assert summary["metrics"]["ghost_pct"] == 100

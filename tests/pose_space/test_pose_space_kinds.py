@@ -1,4 +1,4 @@
-"""Every kind of pose space: what they have in common, their density and their speed."""
+"""Every kind of pose space: what they have in common, and their speed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.pose_space import isomap, kernel_pca, lle
 from toftrack.pose_space.base import PoseSpace, clamped_share
 from toftrack.pose_space.data.pose_data import synthetic_data
-from toftrack.pose_space.density import latent_density
 from toftrack.pose_space.files import (
     fit_pose_space,
     load_pose_space,
@@ -200,42 +199,6 @@ def test_barycentric_weights_make_up_a_point_between_its_neighbours() -> None:
     assert weights.sum().item() == pytest.approx(1.0)
     made = torch.einsum("nk,nkd->nd", weights, corners[nearest])
     torch.testing.assert_close(made, torch.tensor([[0.25, 0.25]]), atol=5e-3, rtol=0)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_density_is_high_on_the_training_path_and_low_in_empty_corners(kind: str) -> None:
-    space = fitted(kind)
-    density = latent_density(space)
-    on_path = density.log_density(space.training_latents)
-    assert on_path.shape == (79,)
-    assert float(on_path.max()) == pytest.approx(0.0, abs=2e-3)
-    away = space.upper + 2 * (space.upper - space.lower)
-    assert float(density.log_density(away[None])) == pytest.approx(math.log(1e-3), abs=1e-3)
-    unit = torch.rand(1000, 4, generator=torch.Generator().manual_seed(0))
-    anywhere = density.log_density(space.lower + unit * (space.upper - space.lower))
-    assert float(anywhere.median()) < float(on_path.median()) - 1.0
-
-
-def test_the_density_agrees_with_the_sum_it_stands_for() -> None:
-    space = fitted("pca", 2)
-    density = latent_density(space, bandwidth=0.7, floor=1e-9)
-    points = space.training_latents[::9] + 0.1
-    deviation = space.training_latents.std(0, correction=0)
-    width = 0.7 * deviation * 79 ** (-1 / 6)
-
-    def kernel_sum(at: torch.Tensor) -> torch.Tensor:
-        apart = (at[:, None] - space.training_latents) / width
-        return (-0.5 * apart.square().sum(-1)).exp().sum(1)
-
-    peak = kernel_sum(space.training_latents).max()
-    expected = (kernel_sum(points) / peak + 1e-9).log()
-    torch.testing.assert_close(density.log_density(points), expected, atol=1e-3, rtol=1e-3)
-
-
-@pytest.mark.parametrize(("bandwidth", "floor"), [(0.0, 0.1), (1.0, 0.0), (1.0, 1.0)])
-def test_a_density_out_of_range_is_refused(bandwidth: float, floor: float) -> None:
-    with pytest.raises(ToftrackError, match="density"):
-        latent_density(fitted("pca"), bandwidth, floor)
 
 
 def test_decoding_is_timed_for_every_space() -> None:

@@ -253,7 +253,7 @@ def test_exit_requests_keep_to_the_promised_statuses(code: object, status: int) 
     assert run(main) == status
 
 
-def test_a_cause_deep_inside_is_what_is_told() -> None:
+def test_a_cause_deep_inside_is_what_is_reported() -> None:
     try:
         try:
             try:
@@ -266,7 +266,7 @@ def test_a_cause_deep_inside_is_what_is_told() -> None:
         assert sentence(error) == "the cause"
 
 
-def test_a_full_disk_is_told_without_a_path() -> None:
+def test_a_full_disk_is_reported_without_a_path() -> None:
     text = sentence(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     assert "No space left" in text
     assert "hydra.run.dir" in text

@@ -115,7 +115,7 @@ def test_convert_errors(srs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.mkv", "a.npy", "pictures"])
-def test_bare_images_are_converted_when_their_lens_is_told(tmp_path: Path, name: str) -> None:
+def test_bare_images_are_converted_when_their_lens_is_given(tmp_path: Path, name: str) -> None:
     words = np.random.default_rng(0).integers(1, 5000, (3, 24, 32)).astype(np.uint16)
     path = tmp_path / name
     if name.endswith(".mkv"):
@@ -268,12 +268,12 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
         ({"camera": {"K": [[1]]}}, "3x3"),
     ],
 )
-def test_broken_folders_are_told(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+def test_broken_folders_are_reported(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         read_png_folder(images(tmp_path / "f", **changes))
 
 
-def test_more_broken_folders_are_told(tmp_path: Path) -> None:
+def test_more_broken_folders_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="no folder"):
         read_png_folder(tmp_path / "nope")
     with pytest.raises(ToftrackError, match="no depth image"):

@@ -82,7 +82,9 @@ def test_errors_are_one_sentence(
     assert last.startswith("error: ") and reason in last
 
 
-def test_labels_without_image_are_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_labels_without_image_are_reported(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (folder / "P0" / "1" / "000005_depth.bin").unlink()
     main(["MSRA15", str(folder), "--sequences", "P0/1", "--frames", "1", FEW])
     assert "note: P0/1: 1 labels have no image" in capsys.readouterr().err

@@ -109,12 +109,12 @@ def test_of_two_hands_of_one_side_the_joints_have_names_of_their_own(tmp_path: P
 
 
 @pytest.mark.parametrize("kind", ["bvh", "csv"])
-def test_the_file_is_in_the_folder_and_told(run: Path, kind: str, capsys) -> None:
+def test_the_file_is_in_the_folder_and_reported(run: Path, kind: str, capsys) -> None:
     export.main([str(run), "--to", kind])
     assert capsys.readouterr().out.split() == [str(run / f"hand.{kind}")]
 
 
-def test_what_is_no_run_or_has_no_hand_is_told(run: Path, tmp_path: Path) -> None:
+def test_what_is_no_run_or_has_no_hand_is_reported(run: Path, tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="is not the output folder of a run"):
         export.main([str(tmp_path), "--to", "csv"])
     with ResultWriter(run, {}, JOINT_NAMES) as results:

@@ -276,7 +276,7 @@ def test_without_truth_the_score_stands_alone(run: Path, tmp_path: Path) -> None
     assert share(picture, chart.GREEN) > 0 and share(picture, chart.BLUE) == 0
 
 
-def test_a_space_that_has_changed_is_told_and_used_anew(
+def test_a_space_that_has_changed_is_reported_and_used_anew(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[np.ndarray, str]] = []

@@ -101,7 +101,7 @@ def test_what_cannot_be_told_apart_or_was_not_followed_is_refused(shows, here: P
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_a_command_that_cannot_be_done_is_told(words: tuple[str, ...], reported: str) -> None:
+def test_a_command_that_cannot_be_done_is_reported(words: tuple[str, ...], reported: str) -> None:
     save_poses("gestures.json", [NamedPose("mine", rock())])
     with pytest.raises(ToftrackError, match=reported):
         main(words)

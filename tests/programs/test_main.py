@@ -54,7 +54,7 @@ def test_every_command_is_a_function_that_there_is() -> None:
         (["xyz"], "give one of track, train"),
     ],
 )
-def test_a_command_that_there_is_not_is_told(words, reported, capsys) -> None:
+def test_a_command_that_there_is_not_is_reported(words, reported, capsys) -> None:
     assert front.main(words) == 1
     err = capsys.readouterr().err
     assert err.startswith("error: there is no command") and reported in err and err.count("\n") == 1
@@ -121,7 +121,7 @@ def test_a_name_that_begins_with_a_tilde_is_not_somebody_s_home(tmp_path, monkey
     assert with_recording(["~x"], *KNOWN)[1] == "device.path='./~x'"
 
 
-def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missing() -> None:
+def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missing() -> None:
     for name in ("gone.npz", "gone [2]=x.npz"):
         assert with_recording([name], *KNOWN)[1] == f"device.path={quoted(name)}"
 
@@ -134,7 +134,7 @@ def test_what_is_neither_is_taken_for_a_file_so_that_it_is_told_that_it_is_missi
         (["a.npz", "device=sr3000"], "device=sr3000 and the recording 'a.npz'"),
     ],
 )
-def test_what_cannot_be_one_recording_is_told(words: list[str], reported: str) -> None:
+def test_what_cannot_be_one_recording_is_reported(words: list[str], reported: str) -> None:
     with pytest.raises(ToftrackError, match=reported):
         with_recording(words, *KNOWN)
 

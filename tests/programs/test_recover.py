@@ -111,7 +111,7 @@ def test_what_the_lines_do_not_tell_stays_in_the_summary(run: Path) -> None:
 
 
 @pytest.mark.parametrize("hands", [1, 2])
-def test_dropped_frames_are_told_alike_by_lines_results_and_exports(
+def test_dropped_frames_are_reported_alike_by_lines_results_and_exports(
     hands: int, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"

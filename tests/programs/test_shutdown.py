@@ -59,7 +59,7 @@ def test_whoever_finishes_is_left_alone_until_the_fourth_request(listening) -> N
         ask()
 
 
-def test_an_error_is_told_rather_than_the_request(listening) -> None:
+def test_an_error_is_reported_rather_than_the_request(listening) -> None:
     with pytest.raises(ZeroDivisionError), shutdown.not_now():
         ask()
         1 / 0  # noqa: B018

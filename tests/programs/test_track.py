@@ -249,7 +249,7 @@ def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
     assert not np.array_equal(one["joints_m"], two["joints_m"])
 
 
-def test_a_missing_recording_is_told_in_one_line_by_the_program_itself(tmp_path: Path) -> None:
+def test_a_missing_recording_is_reported_in_one_line_by_the_program_itself(tmp_path: Path) -> None:
     process = start("device=replay", "device.path=gone.npz", cwd=tmp_path)
     out, err = process.communicate(timeout=300)
     assert (process.returncode, out) == (1, "")

@@ -298,12 +298,12 @@ def test_no_image_at_all_is_an_error(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", list(DATA_SETS))
-def test_another_folder_is_told_what_it_lacks(name: str, tmp_path: Path) -> None:
+def test_of_another_folder_the_error_says_what_it_lacks(name: str, tmp_path: Path) -> None:
     assert "does not hold" in refusal(name, tmp_path)
     assert "there is no folder" in refusal(name, tmp_path / "nowhere")
 
 
-def test_an_unknown_data_set_is_told_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_data_set_is_reported_the_known_ones(tmp_path: Path) -> None:
     assert "MSRA14, MSRA15, ICVL, NYU" in refusal("MSRA", tmp_path)
 
 

@@ -35,11 +35,11 @@ FOLDERS = ("crowd", "grasps", "mesh-hand", "real")
         (1e-3, "look like thousands of seconds: their median step is 3.3e-05; multiply them by"),
     ],
 )
-def test_times_in_another_unit_are_told_with_the_factor(factor: float, words: str) -> None:
+def test_times_in_another_unit_are_reported_with_the_factor(factor: float, words: str) -> None:
     assert words in times_doubt(TIMES * factor + 17)
 
 
-def test_times_that_stand_still_are_told() -> None:
+def test_times_that_stand_still_are_reported() -> None:
     assert "all time stamps are 3" in times_doubt(np.full(5, 3.0))
     whole_seconds = np.floor(np.arange(60) / 25)
     assert "57 of 60 time stamps repeat the one before" in times_doubt(whole_seconds)
@@ -61,7 +61,7 @@ def test_times_of_cameras_are_not_doubted(times: np.ndarray) -> None:
         ([0.1, -0.3, 0.8, 0, 0], "if they were given as k1 k2 k3 p1 p2, would leave"),
     ],
 )
-def test_a_lens_that_leaves_little_of_the_image_is_told(distortion: list, words: str) -> None:
+def test_a_lens_that_leaves_little_of_the_image_is_reported(distortion: list, words: str) -> None:
     doubt = lens_doubt(Camera(K, 176, 144, distortion))
     assert doubt.startswith("of the image only ") and words in doubt
 
@@ -94,7 +94,7 @@ def test_centimetres_are_not_called_millimetres(kind: type, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("step_mm", "right"), [(10, "0.01 m a step"), (0.1, "0.0001 m a step")])
-def test_a_folder_in_another_unit_is_told(step_mm: float, right: str, tmp_path: Path) -> None:
+def test_a_folder_in_another_unit_is_reported(step_mm: float, right: str, tmp_path: Path) -> None:
     with make_device("device=sample", "device.stop=1") as sample:
         depth_mm = 1000 * next(iter(sample)).depth
     cv2.imwrite(str(tmp_path / "0.png"), (depth_mm / step_mm).astype(np.uint16))

@@ -21,7 +21,7 @@ from toftrack.recordings.store import open_recording
     ],
     ids=("negative", "not closed", "long", "huge"),
 )
-def test_a_damaged_header_is_told(header: str, tmp_path: Path) -> None:
+def test_a_damaged_header_is_reported(header: str, tmp_path: Path) -> None:
     text = header.encode() + b"\n"
     path = tmp_path / "stack.npy"
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(4608))

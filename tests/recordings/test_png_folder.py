@@ -57,7 +57,7 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     np.testing.assert_array_equal(footage.camera.K, K)
 
 
-def test_the_lens_of_any_recording_can_be_told(tmp_path: Path) -> None:
+def test_the_lens_of_any_recording_can_be_given(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     depth = np.random.default_rng(0).uniform(0.4, 2, (2, 144, 176)).astype(np.float32)
     np.savez(path, depth_m=depth, K=np.array(K) * 2 - np.diag([0, 0, 1]), distortion=[0.1, 0, 0, 0])
@@ -81,14 +81,14 @@ def test_the_lens_of_any_recording_can_be_told(tmp_path: Path) -> None:
         ("[1,1,88,72]", "cannot be that of images of 176x144 pixels"),
     ],
 )
-def test_lenses_that_are_none_are_told(given: str, words: str, folder: Path) -> None:
+def test_lenses_that_are_none_are_reported(given: str, words: str, folder: Path) -> None:
     for device in ("folder", "replay"):
         with pytest.raises(ToftrackError, match=words) as caught:
             make_device(f"device={device}", f"device.path={folder}", f"device.intrinsics={given}")
         assert "\n" not in str(caught.value)
 
 
-def test_a_lens_is_told_once(folder: Path) -> None:
+def test_a_lens_is_reported_once(folder: Path) -> None:
     read_png_folder(folder, intrinsics=[201, 202, 87, 71]).camera.save(folder / "mine.json")
     words = ["device=folder", f"device.path={folder}", f"camera.file={folder / 'mine.json'}"]
     with make_device(*words) as device:

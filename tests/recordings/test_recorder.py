@@ -156,7 +156,7 @@ def test_a_damaged_frame_ends_what_is_recovered(
 
 
 @pytest.mark.parametrize("content", [b"", b"something else", None])
-def test_what_is_no_unfinished_recording_is_told(
+def test_what_is_no_unfinished_recording_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes | None
 ) -> None:
     part = unfinished(tmp_path, monkeypatch)
@@ -282,7 +282,7 @@ def test_times_never_go_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_recording(tmp_path / "hand.npz").timestamp_s, expected)
 
 
-def test_another_unit_is_told_at_the_beginning(tmp_path: Path) -> None:
+def test_another_unit_is_reported_at_the_beginning(tmp_path: Path) -> None:
     for name, depth in (("a", words(0)), ("b", words(0).astype(np.float32))):
         frames = [one_frame(depth=depth)] * module._STRANGE
         recorder = recorded(tmp_path / f"{name}.npz", *frames)

@@ -138,7 +138,7 @@ def test_the_other_hands_truth_is_kept_and_cut_with_the_first_ones(tmp_path: Pat
     assert read_recording(save(tmp_path)).truth.other is None
 
 
-def test_writing_into_no_folder_is_told(tmp_path: Path) -> None:
+def test_writing_into_no_folder_is_reported(tmp_path: Path) -> None:
     recording = read_recording(save(tmp_path))
     with pytest.raises(ToftrackError, match="cannot be written"):
         write_recording(tmp_path / "nowhere" / "copy.npz", recording)
@@ -230,7 +230,7 @@ def test_pickled_objects_are_refused(tmp_path: Path, key: str) -> None:
 
 
 @pytest.mark.parametrize("reported", ["", "timestamp_s"])
-def test_frames_that_are_counted_last_are_told(tmp_path: Path, reported: str) -> None:
+def test_frames_that_are_counted_last_are_reported(tmp_path: Path, reported: str) -> None:
     depth = np.full((48, 64, 20), 0.6, np.float32)
     camera = np.array([[70.0, 0, 32], [0, 70.0, 24], [0, 0, 1]])
     times = {"timestamp_s": np.arange(20.0)} if reported else {}
@@ -313,7 +313,7 @@ def test_whole_numbers_look_like_millimetres(tmp_path: Path, kind: type) -> None
 
 
 @pytest.mark.parametrize("key", ["depth_m", "radial_m"])
-def test_millimetres_are_told_with_the_conversion(tmp_path: Path, key: str) -> None:
+def test_millimetres_are_reported_with_the_conversion(tmp_path: Path, key: str) -> None:
     depth = np.full((T, H, W), 480.0, np.float32)
     depth[:, : H - 1] = 0  # mostly without a reading, which must not hide it
     text = complaint(save(tmp_path, **({"depth_m": None} | {key: depth})))

@@ -188,7 +188,9 @@ def test_depth_that_was_recorded_twice_is_one_topic(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bags_without_depth_are_told(tmp_path: Path, messages: list[Message], words: str) -> None:
+def test_bags_without_depth_are_reported(
+    tmp_path: Path, messages: list[Message], words: str
+) -> None:
     for message in messages:
         if not message.fields:
             message.fields = image(some_depth()[0], "mono16")
@@ -197,14 +199,14 @@ def test_bags_without_depth_are_told(tmp_path: Path, messages: list[Message], wo
         read_rosbag(path)
 
 
-def test_colour_images_that_are_asked_for_as_depth_are_told(tmp_path: Path) -> None:
+def test_colour_images_that_are_asked_for_as_depth_are_reported(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", [colour(), *recording(some_depth(), CAMERA)])
     CAMERA.save(tmp_path / "camera.json")
     with pytest.raises(ToftrackError, match=f"image 0 of the topic {COLOUR}.*'rgb8', not 16UC1"):
         Bag(path, topic=COLOUR, camera_file=tmp_path / "camera.json")
 
 
-def test_images_of_another_unit_and_another_size_are_told(tmp_path: Path) -> None:
+def test_images_of_another_unit_and_another_size_are_reported(tmp_path: Path) -> None:
     depth = some_depth()
     path = write_bag(tmp_path, "bag", recording(1000 * depth, CAMERA, "32FC1"))
     with pytest.raises(ToftrackError, match="plainly another unit"):
@@ -216,7 +218,7 @@ def test_images_of_another_unit_and_another_size_are_told(tmp_path: Path) -> Non
         list(Bag(write_bag(tmp_path / "b", "bag", messages)))
 
 
-def test_a_unit_can_be_told(tmp_path: Path) -> None:
+def test_a_unit_can_be_given(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "bag", recording(some_depth(), CAMERA))
     depth = next(iter(Bag(path, unit_m=0.0001))).depth
     np.testing.assert_allclose(depth, some_depth()[0] / 10, atol=1e-6)
@@ -230,7 +232,7 @@ def cut(path: Path, share: float) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.3, 0.9, 0.999])
 @pytest.mark.parametrize("kind", KINDS)
-def test_bags_that_were_cut_off_are_told_or_used_so_far(
+def test_bags_that_were_cut_off_are_reported_or_used_so_far(
     tmp_path: Path, kind: str, share: float
 ) -> None:
     path = write_bag(tmp_path, kind, recording(some_depth(40), CAMERA))
@@ -248,7 +250,7 @@ def test_bags_that_were_cut_off_are_told_or_used_so_far(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whatever_bytes_are_damaged_it_is_read_or_told(tmp_path: Path, kind: str) -> None:
+def test_whatever_bytes_are_damaged_it_is_read_or_reported(tmp_path: Path, kind: str) -> None:
     path = write_bag(tmp_path, kind, recording(some_depth(), CAMERA))
     path = path if path.is_file() else next(path.glob(f"*.{kind}"))
     content = path.read_bytes()
@@ -260,7 +262,7 @@ def test_whatever_bytes_are_damaged_it_is_read_or_told(tmp_path: Path, kind: str
                 store.image(number)
 
 
-def test_what_is_no_bag_is_told(tmp_path: Path) -> None:
+def test_what_is_no_bag_is_reported(tmp_path: Path) -> None:
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     for name in ("a.bag", "a.mcap", "a.db3"):
         (tmp_path / name).write_bytes(b"nonsense" * 40)
@@ -270,7 +272,7 @@ def test_what_is_no_bag_is_told(tmp_path: Path) -> None:
         Bag(tmp_path / "none.bag")
 
 
-def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag1", None)
     (tmp_path / "a.bag").write_bytes(b"")
     with pytest.raises(ToftrackError, match=r"rosbags.*pip install -e '.\[ros\]'"):
@@ -343,7 +345,7 @@ def test_a_plain_png_of_16_bits_is_depth_too() -> None:
         ),
     ],
 )
-def test_compressed_images_of_another_kind_are_told(
+def test_compressed_images_of_another_kind_are_reported(
     change: Callable[[dict], dict], words: str
 ) -> None:
     message = as_message(change(compressed(some_depth(1)[0])))
@@ -351,7 +353,7 @@ def test_compressed_images_of_another_kind_are_told(
         ros_images.depth_image(message, COMPRESSED, 0.001)
 
 
-def test_an_image_with_too_few_bytes_is_told() -> None:
+def test_an_image_with_too_few_bytes_is_reported() -> None:
     fields = image(some_depth(1)[0])
     for change in ({"data": fields["data"][:-70]}, {"step": 3}, {"height": 0}, {"width": 2**31}):
         with pytest.raises(ToftrackError, match="too few"):
@@ -402,12 +404,12 @@ def test_a_part_of_the_sensor_and_binning_move_the_lens() -> None:
         ({"K": np.array([np.nan] * 9)}, "not calibrated"),
     ],
 )
-def test_a_camera_info_that_tells_no_lens_is_told(changes: dict[str, Any], words: str) -> None:
+def test_a_camera_info_that_tells_no_lens_is_reported(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         camera_of(as_message(camera_info(CAMERA, **changes)), rectified=False)
 
 
-def test_a_camera_info_that_is_announced_and_missing_is_told(tmp_path: Path) -> None:
+def test_a_camera_info_that_is_announced_and_missing_is_reported(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "db3", recording(some_depth(), CAMERA))
     with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as store, store:
         store.execute(

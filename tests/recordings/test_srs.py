@@ -195,7 +195,7 @@ def test_cut_off_anywhere_keeps_the_whole_frames_before(path: Path) -> None:
         (vendors(INIT, CONFIGURE) + struct.pack("<II", 3, 0), "no whole frame.*no sense"),
     ],
 )
-def test_broken_files_are_told(path: Path, content: bytes, words: str) -> None:
+def test_broken_files_are_reported(path: Path, content: bytes, words: str) -> None:
     path.write_bytes(content)
     with pytest.raises(ToftrackError, match=words) as caught:
         read_srs(path)
@@ -210,7 +210,7 @@ def test_a_size_of_4_gb_ends_the_recording_there(path: Path) -> None:
     assert "cut off" in recording.damage
 
 
-def test_missing_file_and_directory_are_told(tmp_path: Path) -> None:
+def test_missing_file_and_directory_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="no file"):
         read_srs(tmp_path / "nope.srs")
     with pytest.raises(ToftrackError, match="directory"):
@@ -218,7 +218,7 @@ def test_missing_file_and_directory_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["srs", "npz"])
-def test_random_corruption_is_told_or_harmless(tmp_path: Path, kind: str) -> None:
+def test_random_corruption_is_reported_or_harmless(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"recording.{kind}"
     if kind == "srs":
         record(path, 2)
@@ -259,7 +259,7 @@ def test_existing_files_are_not_overwritten_unless_asked(path: Path) -> None:
         SrsWriter(path.parent / "nowhere" / "a.srs")
 
 
-def test_a_full_disk_is_told_and_the_whole_frames_are_kept(path: Path) -> None:
+def test_a_full_disk_is_reported_and_the_whole_frames_are_kept(path: Path) -> None:
     # In a process of its own, whose files may not become larger than two frames and a half.
     program = f"""
 import resource, sys

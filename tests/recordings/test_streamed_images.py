@@ -56,7 +56,7 @@ def test_a_short_one_is_loaded(tmp_path: Path) -> None:
     assert isinstance(read_recording(path).depth, np.ndarray)
 
 
-def test_damage_on_the_way_is_told_when_it_is_met(long: Path) -> None:
+def test_damage_on_the_way_is_reported_when_it_is_met(long: Path) -> None:
     np.savez(long, depth_m=DEPTH, K=K)
     content = bytearray(long.read_bytes())
     with zipfile.ZipFile(long) as archive:
@@ -72,7 +72,7 @@ def test_damage_on_the_way_is_told_when_it_is_met(long: Path) -> None:
 @pytest.mark.parametrize(
     "changes", [{"depth_m": np.asfortranarray(DEPTH)}, {"amplitude": AMPLITUDE.astype(np.int32)}]
 )
-def test_what_cannot_be_read_in_turn_is_told(long: Path, changes: dict) -> None:
+def test_what_cannot_be_read_in_turn_is_reported(long: Path, changes: dict) -> None:
     np.savez(long, **{"depth_m": DEPTH, "amplitude": AMPLITUDE, "K": K} | changes)
     with pytest.raises(ToftrackError, match="long.npz"):
         read_recording(long)

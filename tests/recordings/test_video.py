@@ -126,7 +126,7 @@ def test_missing_infrared_is_black(tmp_path: Path, images: tuple[np.ndarray, np.
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.8, 0.95])
-def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_told(
+def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_reported(
     tmp_path: Path, images: tuple[np.ndarray, np.ndarray], share: float
 ) -> None:
     depth = np.concatenate([images[0]] * 3)
@@ -144,7 +144,7 @@ def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_told(
 
 
 @pytest.mark.parametrize("name", ["kinect.mkv", "grey.mkv", "grey.avi", "stack.npy"])
-def test_whatever_bytes_are_damaged_it_is_read_or_told(
+def test_whatever_bytes_are_damaged_it_is_read_or_reported(
     tmp_path: Path, images: tuple[np.ndarray, np.ndarray], name: str
 ) -> None:
     path = tmp_path / name
@@ -190,7 +190,7 @@ def broken(change: Callable[[dict], Any]) -> dict:
         ),
     ],
 )
-def test_a_calibration_that_tells_no_lens_is_told(
+def test_a_calibration_that_tells_no_lens_is_reported(
     tmp_path: Path, about: Any, complaint: str
 ) -> None:
     path = write_kinect(tmp_path / "a.mkv", np.ones((1, 288, 320), np.uint16), about=about)
@@ -200,7 +200,7 @@ def test_a_calibration_that_tells_no_lens_is_told(
     assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 252
 
 
-def test_a_kinects_recording_without_depth_and_of_no_mode_are_told(tmp_path: Path) -> None:
+def test_a_kinects_recording_without_depth_and_of_no_mode_are_reported(tmp_path: Path) -> None:
     ones = np.ones((1, 288, 320), np.uint16)
     path = write_kinect(tmp_path / "a.mkv", ones, about=ABOUT, titles=("COLOR", "IR"))
     with pytest.raises(ToftrackError, match="Azure Kinect without depth"):
@@ -236,7 +236,7 @@ def test_lossless_grey_videos_are_depth_in_millimetres(
     np.testing.assert_array_equal(store.camera.K, [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]])
 
 
-def test_unit_and_rate_of_a_video_can_be_told(tmp_path: Path) -> None:
+def test_unit_and_rate_of_a_video_can_be_given(tmp_path: Path) -> None:
     pixels = words()
     bare = BareFacts((30.0, 31.0, 15.5, 11.5), unit_m=0.0002, fps=10.0)
     store = open_recording(write_grey(tmp_path / "a.mkv", pixels), bare=bare)
@@ -258,7 +258,7 @@ def test_without_a_camera_a_video_asks_for_one(tmp_path: Path) -> None:
         Replay(path)
 
 
-def test_colour_video_and_what_is_no_video_are_told(tmp_path: Path) -> None:
+def test_colour_video_and_what_is_no_video_are_reported(tmp_path: Path) -> None:
     for name in ("a.mkv", "a.avi", "a.mp4"):
         with pytest.raises(ToftrackError, match="colour or 8-bit images.*mpeg4 yuv420p.*16 bits"):
             Replay(write_colour(tmp_path / name))
@@ -298,13 +298,15 @@ def test_stacks_are_depth(tmp_path: Path, stack: np.ndarray, factor: float) -> N
         (np.array([[None] * 4] * 3), "no .npy of numbers"),
     ],
 )
-def test_stacks_of_another_kind_are_told(tmp_path: Path, stack: np.ndarray, complaint: str) -> None:
+def test_stacks_of_another_kind_are_reported(
+    tmp_path: Path, stack: np.ndarray, complaint: str
+) -> None:
     np.save(tmp_path / "a.npy", stack, allow_pickle=True)
     with pytest.raises(ToftrackError, match=complaint):
         open_recording(tmp_path / "a.npy", bare=REPORTED)
 
 
-def test_damaged_stacks_are_told(tmp_path: Path) -> None:
+def test_damaged_stacks_are_reported(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", words())
     content = (tmp_path / "a.npy").read_bytes()
     for part in (b"", content[:7], content[:50], content[:-9], b"nonsense" * 30):
@@ -314,11 +316,11 @@ def test_damaged_stacks_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.oni", "a.ply", "a.png", "a.xef", "a.h5"])
-def test_of_other_kinds_it_is_told_how_to_convert_them(tmp_path: Path, name: str) -> None:
+def test_of_other_kinds_the_error_says_how_to_convert_them(tmp_path: Path, name: str) -> None:
     with pytest.raises(ToftrackError, match=rf"{name}' is not read: .*(PNG|npy|folder|points)"):
         open_recording(tmp_path / name)
 
 
-def test_a_topic_of_what_is_no_bag_is_told(tmp_path: Path) -> None:
+def test_a_topic_of_what_is_no_bag_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="no ROS bag, and has no topic /depth"):
         open_recording(tmp_path / "a.npz", topic="/depth")

@@ -19,7 +19,7 @@ class Break:
     """One fault.
 
     overrides: of the configuration.  patched: entered before the tracker is made, for what no
-    setting can do.  k_scale: times the camera's matrix.  other_side: the side is told wrongly.
+    setting can do.  k_scale: times the camera's matrix.  other_side: the side is given wrongly.
     """
 
     about: str
@@ -45,8 +45,8 @@ def _turned_index(degrees: float) -> Iterator[None]:
 
 BREAKS = {
     "keypoints off": Break(
-        "the networks' votes for joints neither judge nor pull a pose",
-        ("detector.keypoints=0", "detector.keypoint_weight=0"),
+        "the networks' keypoints neither judge nor pull a pose",
+        ("posterior.keypoints=0", "detector.keypoint_weight=0"),
     ),
     "finger's axis": Break(
         "the index finger bends about an axis turned by 5 degrees",
@@ -57,9 +57,9 @@ BREAKS = {
     ),
     "hysteresis off": Break(
         "another pose or finger need not lead for a while before it takes over",
-        ("detector.rival_gain=0", "detector.rival_frames=1", "refine.swap_gain=0"),
+        ("hysteresis.place_lead=0", "hysteresis.place_frames=1", "hysteresis.lead=0"),
     ),
-    "other side": Break("the other hand's side is told", other_side=True),
+    "other side": Break("the other hand's side is given", other_side=True),
     "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),
 }
 

@@ -1,4 +1,4 @@
-"""Belief from the networks, the score and the image: by signs, over time."""
+"""How surely an estimate is right: by features of a frame, smoothed over time."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.configured import calibrated_belief
+from helpers.configured import confidence_model
 from helpers.detection import detection_of
 
-from toftrack.compute.pace import FRAME_S
+from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.detector.hand_detector import NO_DETECTION
 from toftrack.errors import ToftrackError
-from toftrack.tracking.confidence import ConfidenceModel
-from toftrack.tracking.features import FEATURES, ConfidenceFeatures, confidence_features
+from toftrack.tracking.confidence import (
+    FEATURES,
+    NO_FEATURES,
+    ConfidenceFeatures,
+    ConfidenceModel,
+    confidence_features,
+)
+from toftrack.tracking.lifecycle import Status, judge
 from toftrack.tracking.state import Track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -35,29 +42,39 @@ GOOD = ConfidenceFeatures(
 K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 
 
-def belief_of(**changes: object) -> ConfidenceModel:
+def model_of(**changes: object) -> ConfidenceModel:
     """Of the score alone: log odds 4 at a good score, 0 at 2 below, and so on; no memory."""
     usual = {"memory": 0.0, "intercept": 4.0, "weights": {"log_score": 2.0}}
     numbers = {"confidence": 0.5, "give_up": 0.1, "patience": 5}
-    return calibrated_belief(**(usual | numbers | changes))
+    return confidence_model(**(usual | numbers | changes))
 
 
 def with_odds(log_odds: float, **changes: float) -> ConfidenceFeatures:
-    """Signs that such a belief takes for these log odds."""
+    """Features that such a model takes for these log odds."""
     return replace(GOOD, log_score=(log_odds - 4.0) / 2.0, **changes)
 
 
 def followed(**changes: object) -> Track:
     nothing = torch.zeros(1, 10)
-    track = Track(
-        nothing, torch.ones(1), nothing, nothing[0], torch.zeros(21), torch.zeros(1, 27), age_s=1.0
-    )
-    return replace(track, **changes)
+    track = Track(nothing, torch.ones(1), nothing, nothing[0], torch.zeros(21), torch.zeros(1, 27))
+    return replace(track, age=Duration(1.0), **changes)
 
 
-def test_a_weight_of_an_unknown_sign_is_one_sentence() -> None:
-    with pytest.raises(ToftrackError, match="lost.weights.luck is unknown; the signs are log_"):
-        belief_of(weights={"luck": 1.0})
+def judged(
+    model: ConfidenceModel,
+    track: Track,
+    features: ConfidenceFeatures,
+    dt_s: float = FRAME_S,
+    side: float = 1.0,
+    second: bool = False,
+) -> Status:
+    """As a rule the side is given, and there is no other hand."""
+    return judge(track, features, dt_s, side, second, model)
+
+
+def test_a_weight_of_an_unknown_feature_is_refused() -> None:
+    with pytest.raises(ToftrackError, match="lost.weights.luck is unknown; the features are log_"):
+        model_of(weights={"luck": 1.0})
 
 
 @pytest.mark.parametrize(
@@ -75,90 +92,92 @@ def test_a_weight_of_an_unknown_sign_is_one_sentence() -> None:
 )
 def test_settings_that_cannot_be_are_refused(name: str, value: object) -> None:
     with pytest.raises(ToftrackError, match=f"lost.{name}"):
-        belief_of(**{name: value})
+        model_of(**{name: value})
 
 
 @pytest.mark.parametrize("name", FEATURES)
-def test_log_odds_rise_and_fall_with_a_sign_as_its_weight_says(name: str) -> None:
+def test_log_odds_rise_and_fall_with_a_feature_as_its_weight_says(name: str) -> None:
     more = replace(GOOD, **{name: getattr(GOOD, name) + 1.0})
     for weight in (-0.7, 0.4):
-        belief = belief_of(weights={name: weight})
-        assert belief.log_odds(more) - belief.log_odds(GOOD) == pytest.approx(weight)
-    assert belief_of(weights={}).log_odds(more) == 4.0
+        model = model_of(weights={name: weight})
+        assert model.log_odds(more) - model.log_odds(GOOD) == pytest.approx(weight)
+    assert model_of(weights={}).log_odds(more) == 4.0
 
 
 @pytest.mark.parametrize("log_odds", [-1e9, -40.0, -2.0, 0.1, 3.0, 1e9])
 def test_the_confidence_is_the_probability_of_the_log_odds(log_odds: float) -> None:
-    found = belief_of().judge(followed(), with_odds(log_odds), FRAME_S)
+    found = judged(model_of(), followed(), with_odds(log_odds))
     assert found.confidence == pytest.approx(1 / (1 + math.exp(-max(min(log_odds, 50), -50))))
     assert 0 <= found.confidence <= 1
     assert found.lost == (found.confidence < 0.5)
 
 
-def test_the_package_s_belief_prefers_good_scores_and_agreement() -> None:
-    belief = calibrated_belief()
+def test_the_package_s_confidence_prefers_good_scores_and_agreement() -> None:
+    model = confidence_model()
     worse = replace(
         GOOD, log_score=-2.0, keypoints_off=2.5, farthest_keypoint_off=3.0, pose_off=2.5
     )
-    assert belief.log_odds(GOOD) > belief.log_odds(worse)
+    assert model.log_odds(GOOD) > model.log_odds(worse)
 
 
 @pytest.mark.parametrize("fps", [12.5, 25.0, 50.0, 100.0])
 def test_belief_is_smoothed_over_time_whatever_the_frame_rate(fps: float) -> None:
-    belief = belief_of(memory=0.6)
+    model = model_of(memory=0.6)
     track = followed(log_odds=5.0)
     for _ in range(round(0.24 * fps)):
-        found = belief.judge(track, with_odds(-3.0), 1 / fps)
+        found = judged(model, track, with_odds(-3.0), 1 / fps)
         track = replace(track, log_odds=found.log_odds)
     assert found.log_odds == pytest.approx(-3.0 + 8.0 * 0.6**6, abs=1e-6)
 
 
 def test_the_first_frame_of_a_track_is_believed_as_it_is() -> None:
-    found = belief_of(memory=0.9).judge(followed(log_odds=None), with_odds(-3.0), FRAME_S)
+    found = judged(
+        model_of(memory=0.9), replace(followed(log_odds=5.0), age=Duration()), with_odds(-3.0)
+    )
     assert found.log_odds == pytest.approx(-3.0)
 
 
 @pytest.mark.parametrize("fps", [60.0, 25.0, 15.0])
 def test_a_bad_track_is_given_up_after_a_time(fps: float) -> None:
-    belief, track, passed_s = belief_of(patience=5), followed(), 0.0
+    model, track, passed_s = model_of(patience=5), followed(), 0.0
     while True:
-        found = belief.judge(track, with_odds(-5.0), 1 / fps)
+        found = judged(model, track, with_odds(-5.0), 1 / fps)
         assert found.lost
-        if not found.kept:
+        if found.ends:
             break
         passed_s += 1 / fps
-        track = replace(track, bad_s=found.bad_s)
+        track = replace(track, doubtful=found.doubtful)
         assert passed_s < 1
     # Five frames of 1/25 s, the first of which has passed when it is seen; half a one is forgiven.
     assert 3.5 * FRAME_S < passed_s <= 3.5 * FRAME_S + 1 / fps
 
 
 def test_a_good_frame_between_begins_the_time_anew() -> None:
-    belief, track = belief_of(patience=2), followed()
+    model, track = model_of(patience=2), followed()
     for log_odds in (-5.0, 5.0) * 4:
-        found = belief.judge(track, with_odds(log_odds), FRAME_S)
-        assert found.kept and (found.bad_s > 0) == (log_odds < 0)
-        track = replace(track, bad_s=found.bad_s)
+        found = judged(model, track, with_odds(log_odds))
+        assert not found.ends and found.doubtful.begun == (log_odds < 0)
+        track = replace(track, doubtful=found.doubtful)
 
 
 def test_a_doubtful_track_is_flagged_and_kept() -> None:
-    belief, track = belief_of(patience=2, confidence=0.6, believe=0.6, give_up=0.3), followed()
+    model, track = model_of(patience=2, confidence=0.6, believe=0.6, give_up=0.3), followed()
     for _ in range(20):
-        found = belief.judge(track, with_odds(0.0), FRAME_S)
-        assert found.lost and found.kept
-        track = replace(track, bad_s=found.bad_s)
+        found = judged(model, track, with_odds(0.0))
+        assert found.lost and not found.ends
+        track = replace(track, doubtful=found.doubtful)
 
 
 def test_without_patience_no_track_is_given_up() -> None:
-    belief, track = belief_of(patience=0), followed(bad_s=100.0)
-    assert belief.judge(track, with_odds(-20.0), FRAME_S).kept
+    model, track = model_of(patience=0), followed(doubtful=Duration(100.0))
+    assert not judged(model, track, with_odds(-20.0)).ends
 
 
 def test_the_state_s_name_says_why() -> None:
     def name(**changes: float) -> str:
-        return belief_of().judge(followed(), with_odds(-5.0, **changes), FRAME_S).state_name
+        return judged(model_of(), followed(), with_odds(-5.0, **changes)).state_name
 
-    assert belief_of().judge(followed(), GOOD, FRAME_S).state_name == "tracking"
+    assert judged(model_of(), followed(), GOOD).state_name == "tracking"
     assert name() == "searching"
     assert name(unseen=0.8) == "out of view"
     assert name(hidden=0.8) == "hidden"
@@ -174,10 +193,10 @@ def palm_at(z: float = 0.5) -> torch.Tensor:
 def features_of(
     joints: torch.Tensor, depth: torch.Tensor, score: float = 0.9
 ) -> ConfidenceFeatures:
-    return confidence_features(joints, score, 1.0, detection_of(palm_at()), depth, K)
+    return confidence_features(joints, score, 1.0, detection_of(palm_at()), NO_FEATURES, depth, K)
 
 
-def test_signs_are_of_order_one_and_finite() -> None:
+def test_features_are_of_order_one_and_finite() -> None:
     joints = detection_of(palm_at()).joints_m[0]
     empty, wall = torch.zeros(144, 176), torch.full((144, 176), 0.9)
     for found in (joints, joints + 100.0, joints * 1e-6, joints * -1.0):
@@ -187,7 +206,7 @@ def test_signs_are_of_order_one_and_finite() -> None:
                 assert all(math.isfinite(value) and abs(value) < 15 for value in values)
 
 
-def test_an_estimate_as_the_networks_see_it_has_good_signs() -> None:
+def test_an_estimate_as_the_networks_see_it_has_good_features() -> None:
     joints, wall = detection_of(palm_at()).joints_m[0], torch.full((144, 176), 0.9)
     right, wrong = features_of(joints, wall), features_of(joints + 0.1, wall)
     for name in ("keypoints_off", "farthest_keypoint_off", "pose_off", "likeliest_off"):
@@ -196,6 +215,13 @@ def test_an_estimate_as_the_networks_see_it_has_good_signs() -> None:
     one = joints.clone()
     one[8] += 0.1
     assert features_of(one, wall).farthest_keypoint_off > right.farthest_keypoint_off + 1
+
+
+def test_in_a_frame_without_a_detection_all_but_the_score_holds() -> None:
+    joints, wall = detection_of(palm_at()).joints_m[0], torch.full((144, 176), 0.9)
+    last = features_of(joints, wall)
+    found = confidence_features(joints + 1.0, 0.5, 1.0, NO_DETECTION, last, wall, K)
+    assert found == replace(last, log_score=math.log(0.5))
 
 
 def test_joints_out_of_sight_are_counted() -> None:
@@ -210,7 +236,23 @@ def test_joints_out_of_sight_are_counted() -> None:
 
 
 def test_a_new_hand_must_convince_more_than_one_that_was_believed() -> None:
-    belief, new = belief_of(confidence=0.2, believe=0.6), followed()
+    model, new = model_of(confidence=0.2, believe=0.6), followed()
     old = replace(new, believed=True)
-    assert belief.judge(new, with_odds(0.0), FRAME_S).lost
-    assert not belief.judge(old, with_odds(0.0), FRAME_S).lost
+    assert judged(model, new, with_odds(0.0)).lost
+    assert not judged(model, old, with_odds(0.0)).lost
+
+
+def test_a_new_hand_beside_a_believed_one_must_convince_still_more() -> None:
+    model, new = model_of(confidence=0.2, believe=0.4, second=0.6), followed()
+    assert not judged(model, new, with_odds(0.0)).lost
+    assert judged(model, new, with_odds(0.0), second=True).lost
+    assert not judged(model, replace(new, believed=True), with_odds(0.0), second=True).lost
+
+
+def test_an_estimate_is_as_sure_as_its_side() -> None:
+    model, track = model_of(confidence=0.5), followed(believed=True)
+    sure = judged(model, track, with_odds(2.0))
+    unsure = judged(model, track, with_odds(2.0), side=0.5)
+    assert unsure.confidence == pytest.approx(0.5 * sure.confidence)
+    assert unsure.lost and not sure.lost
+    assert not unsure.doubtful.begun, "whether it is a hand does not depend on whose it is"

@@ -1,4 +1,4 @@
-"""Whose hand it is: found out, told, and changed."""
+"""Which hand it is: detected, given, and changed."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.configured import side_fit
+from helpers.configured import handedness_settings
 from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 
 from toftrack.frames import DepthImage
-from toftrack.tracking.handedness import _body_m
-from toftrack.tracking.handedness_estimate import HandednessEstimate, probability
+from toftrack.tracking.handedness import HandednessEstimate, body_offset_m
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 FRAMES = 12
-SMALL = ("filter.particles=80", "refine.swaps=16")
+SMALL = ("filter.particles=80", "hysteresis.exchanged=16")
 
 
 def first(count: int = FRAMES) -> Scene:
@@ -32,7 +31,7 @@ def test_the_side_of_a_hand_and_of_its_mirror_image_is_found_out(side: str) -> N
     assert errors_mm(estimates, scene)[-1] < 15.0
 
 
-def test_a_told_side_is_told_as_certain_and_never_overruled() -> None:
+def test_a_given_side_is_certain_and_never_overruled() -> None:
     estimates = follow(first(), "hand.side=left", *SMALL)
     assert {estimate.side for estimate in estimates} == {"left"}
     assert {estimate.side_probability for estimate in estimates} == {1.0}
@@ -45,7 +44,8 @@ def test_a_wrong_side_is_changed_in_one_frame_and_the_fingers_with_it() -> None:
         # Told beforehand that it is a left hand, and nearly sure of it.
         if i == 0:
             wrong = HandednessEstimate(fits=-1.0)
-            tracker.state = replace(tracker.state, side="left", sides=wrong)
+            hand = replace(tracker.state.hands[0], side="left", handedness=wrong)
+            tracker.state = replace(tracker.state, hands=(hand,))
         estimates.append(tracker.step(scene.depth_m[i], scene.k, i, i / 25))
     for i in range(4, FRAMES):
         estimates.append(tracker.step(scene.depth_m[i], scene.k, i, i / 25))
@@ -55,7 +55,7 @@ def test_a_wrong_side_is_changed_in_one_frame_and_the_fingers_with_it() -> None:
     assert errors_mm(estimates, scene)[changed] < 20.0, "the fingers are renamed in that frame"
 
 
-def test_a_side_that_is_told_at_a_restart_stays_told() -> None:
+def test_a_side_that_is_reported_at_a_restart_stays_reported() -> None:
     scene, tracker = first(4), make_tracker(*SMALL)
     tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
     tracker.restart("left")
@@ -65,32 +65,35 @@ def test_a_side_that_is_told_at_a_restart_stays_told() -> None:
         tracker.restart()
 
 
-def test_the_evidence_of_looks_is_summed_up_and_bounded() -> None:
-    fit, belief = side_fit(weight=1.0, largest=2.0, most=3.0, shoulder=0.0), HandednessEstimate()
+def test_the_evidence_of_comparisons_is_summed_up_and_bounded() -> None:
+    fit, belief = (
+        handedness_settings(weight=1.0, largest=2.0, most=3.0, shoulder=0.0),
+        HandednessEstimate(),
+    )
     belief = belief.compared(0.5, 0.0, fit)
     assert belief.log_odds == pytest.approx(0.5)
     for _ in range(5):
         belief = belief.compared(100.0, 0.0, fit)
     assert belief.log_odds == pytest.approx(3.0)
-    assert probability(belief, "right") + probability(belief, "left") == pytest.approx(1.0)
-    assert probability(None, "left") == 1.0, "told"
+    assert belief.probability("right") + belief.probability("left") == pytest.approx(1.0)
+    assert HandednessEstimate(given=True).probability("left") == 1.0
 
 
-def test_looks_at_a_mirror_image_say_the_opposite() -> None:
-    fit, one, other = side_fit(), HandednessEstimate(), HandednessEstimate()
+def test_comparisons_of_a_mirror_image_say_the_opposite() -> None:
+    fit, one, other = handedness_settings(), HandednessEstimate(), HandednessEstimate()
     for gain, body_m in ((0.3, 0.1), (-0.1, 0.05), (0.4, -0.02)):
         one, other = one.compared(gain, body_m, fit), other.compared(-gain, -body_m, fit)
         assert one.log_odds == pytest.approx(-other.log_odds)
 
 
 def test_when_the_hand_has_left_the_next_one_is_likely_but_not_surely_of_its_side() -> None:
-    fit = side_fit(kept=1.0)
+    fit = handedness_settings(kept=1.0)
     gone = HandednessEstimate(fits=5.0, shoulder=0.5, comparisons=9).left(fit)
     assert gone.log_odds == pytest.approx(1.0)
 
 
 def test_two_hands_are_of_different_sides_the_more_surely_the_surer_one_of_them_is() -> None:
-    fit, new = side_fit(partner=2.0), HandednessEstimate()
+    fit, new = handedness_settings(partner=2.0), HandednessEstimate()
     beside = [
         new.beside(HandednessEstimate(fits=fits), fit).log_odds for fits in (-4.0, 0.0, 1.0, 4.0)
     ]
@@ -106,7 +109,7 @@ def test_a_body_is_seen_beside_the_hand_only_where_it_is_large_and_near_enough()
     def place(body_m: float, columns: slice) -> float:
         depth = np.zeros((144, 176), np.float32)
         depth[40:, columns] = body_m
-        return _body_m(DepthImage(depth, k, 0, 0.0), centre)
+        return body_offset_m(DepthImage(depth, k, 0, 0.0), centre)
 
     assert place(0.8, slice(60, 150)) > 0.1, "to the right of the hand"
     assert place(0.8, slice(0, 20)) < 0.0, "to the left of it"

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.configured import calibrated_belief
+from helpers.configured import confidence_model
 from helpers.tracking import configuration, follow, sample
 from helpers.two_hands import TwoHands, beside_its_mirror
 
 from toftrack.api import build_hands_tracker
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
-from toftrack.tracking.hands import HandsTracker
+from toftrack.tracking.tracker import HandsTracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SMALL = ("filter.particles=80", "refine.swaps=16")
+SMALL = ("filter.particles=80", "hysteresis.exchanged=16")
 ROWS = range(14, 34)
 """Frames of the sample with the hand to the left of the image's middle."""
 
@@ -83,7 +83,7 @@ def test_one_hand_is_not_seen_twice() -> None:
     assert sum(not estimates[1].lost for estimates in reported) == 0
 
 
-def test_a_told_side_is_that_of_the_first_slot_and_the_other_one_is_of_the_other(
+def test_a_given_side_is_that_of_the_first_slot_and_the_other_one_is_of_the_other(
     apart: TwoHands,
 ) -> None:
     tracker = tracker_of("hands=2", "hand.side=left")
@@ -118,9 +118,9 @@ def test_a_restart_forgets_both_hands(apart: TwoHands) -> None:
     for i in range(3):
         tracker.step(apart.depth_m[i], apart.k, i, i / 25)
     tracker.restart("left")
-    assert [state.track for state in tracker.states] == [None, None]
-    assert [state.side for state in tracker.states] == ["left", "right"]
-    assert tracker.states[0].next_index == 3
+    assert [hand.track for hand in tracker.states] == [None, None]
+    assert [hand.side for hand in tracker.states] == ["left", "right"]
+    assert tracker.state.next_index == 3
 
 
 @pytest.mark.parametrize("hands", [0, 3, 1.5])
@@ -136,5 +136,5 @@ def test_two_hands_without_networks_are_refused() -> None:
 
 
 def test_the_second_hand_has_to_convince_more_than_the_first() -> None:
-    lost = calibrated_belief()
+    lost = confidence_model()
     assert lost.second > lost.believe

@@ -1,4 +1,4 @@
-"""What is thought of each joint: from signs of its own, and from particles where there are none."""
+"""What is thought of each joint: from its features, and from particles where there are none."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.configured import calibrated_belief
+from helpers.configured import confidence_model
+from helpers.detection import detection_of
 from helpers.tracking import configuration, make_tracker, sample
 
+from toftrack.detector.hand_detector import NO_DETECTION
 from toftrack.errors import ToftrackError
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.tracking.joint_confidence import (
+from toftrack.tracking.confidence import (
     COLUMNS,
     JOINT_FEATURES,
     KINDS,
@@ -27,10 +29,11 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 K = np.array([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 WALL = np.full((144, 176), 0.9, np.float32)
+NOTHING = np.zeros((21, len(JOINT_FEATURES)))
 
 
-def belief() -> JointConfidence:
-    return calibrated_belief().joints
+def model() -> JointConfidence:
+    return confidence_model().joints
 
 
 def joints_at(z: float = 0.5) -> np.ndarray:
@@ -43,10 +46,11 @@ def joints_at(z: float = 0.5) -> np.ndarray:
 def features_of(
     joints: np.ndarray, depth: np.ndarray = WALL, **changes: Any
 ) -> dict[str, np.ndarray]:
-    """Signs by name; as a rule the networks see the joints where they are."""
+    """Features by name; as a rule the networks see the joints where they are."""
     keypoints = Keypoints(torch.from_numpy(joints_at()), torch.full((21,), 0.005))
-    reported = {"keypoints": keypoints, "last": None, "score": 0.9, "log_odds": 2.0} | changes
-    found = joint_features(joints, depth_m=depth, k=K, **reported)
+    detection = replace(detection_of(torch.zeros(1, 27)), keypoints=keypoints)
+    given = {"detection": detection, "last": NOTHING, "score": 0.9, "log_odds": 2.0} | changes
+    found = joint_features(joints, depth_m=depth, k=K, **given)
     return dict(zip(JOINT_FEATURES, found.T, strict=True))
 
 
@@ -63,7 +67,7 @@ def features_of(
 )
 def test_settings_that_cannot_be_are_refused(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
-        replace(belief(), **changes)
+        replace(model(), **changes)
 
 
 def test_a_scale_is_taken_from_the_command_line() -> None:
@@ -71,11 +75,11 @@ def test_a_scale_is_taken_from_the_command_line() -> None:
 
 
 @pytest.mark.parametrize("name", JOINT_FEATURES)
-def test_the_package_s_belief_is_never_surer_for_a_sign_against_a_joint(name: str) -> None:
+def test_the_package_s_confidence_is_never_surer_for_a_feature_against_a_joint(name: str) -> None:
     features = np.zeros((21, len(JOINT_FEATURES)))
     worse = features.copy()
     worse[:, JOINT_FEATURES.index(name)] += 1
-    (sigma, confidence), (wider, less) = belief().judge(features), belief().judge(worse)
+    (sigma, confidence), (wider, less) = model().judge(features), model().judge(worse)
     assert (wider >= sigma).all() and (less <= confidence).all()
     assert (wider > sigma).any() or (less < confidence).any()
 
@@ -95,19 +99,19 @@ def test_a_row_of_weights_is_of_its_column_and_kind() -> None:
     assert odds[[0, 3, 8]] == pytest.approx([0, -2, 1.5], abs=1e-5)
 
 
-def test_signs_and_what_follows_are_finite_whatever_is_seen() -> None:
+def test_features_and_what_follows_are_finite_whatever_is_seen() -> None:
     for joints in (joints_at(), joints_at() + 100, joints_at() * 1e-6, -joints_at()):
         for depth in (WALL, 0 * WALL):
             for score, log_odds in ((0.0, -1e3), (1.0, 1e3)):
                 found = features_of(
                     joints.astype(np.float32), depth, score=score, log_odds=log_odds
                 )
-                sigma, confidence = belief().judge(np.stack(list(found.values()), 1))
+                sigma, confidence = model().judge(np.stack(list(found.values()), 1))
                 assert np.isfinite(sigma).all() and (sigma > 0).all()
                 assert ((confidence >= 0) & (confidence <= 1)).all()
 
 
-def test_a_joint_away_from_its_vote_speaks_against_its_finger() -> None:
+def test_a_joint_away_from_its_keypoint_speaks_against_its_finger() -> None:
     moved = joints_at()
     moved[6] += (0, 0, 0.05)
     before, after = features_of(joints_at()), features_of(moved)
@@ -129,7 +133,7 @@ def test_a_hidden_joint_says_so() -> None:
     assert (after["behind"][behind] > 2).all() and (after["behind"][~behind] == 0).all()
     assert (features_of(joints_at())["before"] > 2).all()
     (sigma, sure), (wider, less) = (
-        belief().judge(np.stack(list(reported.values()), 1)) for reported in (before, after)
+        model().judge(np.stack(list(reported.values()), 1)) for reported in (before, after)
     )
     assert (wider[behind] > sigma[behind]).all() and (wider[~behind] == sigma[~behind]).all()
     assert (less[behind] < sure[behind]).all() and (less[~behind] == sure[~behind]).all()
@@ -143,9 +147,9 @@ def test_what_is_out_of_the_image_or_not_read_is_told_apart() -> None:
     assert (blank["behind"] == 0).all() and (blank["before"] == 0).all()
 
 
-def test_without_a_look_the_last_votes_hold_and_the_image_is_read_anew() -> None:
+def test_without_a_detection_the_last_keypoints_hold_and_the_image_is_read_anew() -> None:
     last = np.stack(list(features_of(joints_at(0.6)).values()), 1)
-    found = features_of(joints_at(), 0 * WALL, keypoints=None, last=last)
+    found = features_of(joints_at(), 0 * WALL, detection=NO_DETECTION, last=last)
     for column, name in enumerate(JOINT_FEATURES[:3]):
         np.testing.assert_array_equal(found[name], last[:, column])
     assert (found["unread"] == 1).all()

@@ -105,7 +105,7 @@ def _passes(monkeypatch: pytest.MonkeyPatch, *overrides: str) -> Counts:
     [
         (),
         ("pose_space=kernel_pca", "filter.bounds=truncate", "filter.resampling=stratified"),
-        ("pose_space=lle", "filter.density=0.2"),
+        ("pose_space=lle",),
     ],
 )
 def test_the_filter_s_passes_wait_for_nothing(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,10 +13,12 @@ from toftrack.frames import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.model_image import model_range_image
 from toftrack.render.reference import ReferenceScorer
-from toftrack.tracking.other_hand import OtherHand, explained, touching, without
+from toftrack.tracking.hands import OtherHand, explained, pixels_of, without
+from toftrack.tracking.posterior import touching
 
 K = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
 SIZE = (144, 176)
+NOTHING = np.zeros(SIZE, np.float32)
 
 
 def hand_at(x: float, z: float) -> torch.Tensor:
@@ -38,14 +42,14 @@ def test_a_pixel_belongs_to_the_hand_that_explains_it_better() -> None:
 
 def test_a_hand_that_is_not_there_explains_nothing() -> None:
     depth = surface(-0.06, 0.5)
-    assert not explained(depth, surface(-0.06, 0.7), None).any()
-    assert not explained(np.zeros(SIZE, np.float32), surface(0, 0.5), None).any()
+    assert not explained(depth, surface(-0.06, 0.7), NOTHING).any()
+    assert not explained(NOTHING, surface(0, 0.5), NOTHING).any()
 
 
 def test_the_other_hand_hides_what_is_behind_it_and_not_what_is_in_front() -> None:
     theirs = surface(0.0, 0.5)
     segmentation, likelihood = nearest_surface(), f_measure()
-    pixels = explained(theirs, theirs, None)
+    pixels = explained(theirs, theirs, NOTHING)
     observation = segmentation(theirs, K, None, pixels)
     assert not observation.hand.any(), "nothing is left for a second hand"
     evidence = likelihood.evidence(observation)
@@ -57,9 +61,8 @@ def test_the_other_hand_hides_what_is_behind_it_and_not_what_is_in_front() -> No
 
 def test_hands_touch_where_their_joints_are_in_one_another() -> None:
     joints = torch.rand(21, 3, generator=torch.Generator().manual_seed(0))
-    other = OtherHand(joints, np.zeros(3), True)
-    assert float(touching(joints[None], other)) == pytest.approx(1.0)
-    assert float(touching(joints[None] + 1.0, other)) == 0.0
+    assert float(touching(joints[None], joints)) == pytest.approx(1.0)
+    assert float(touching(joints[None] + 1.0, joints)) == 0.0
 
 
 def test_the_networks_see_nothing_near_where_the_other_hand_is_beside() -> None:
@@ -67,8 +70,17 @@ def test_the_networks_see_nothing_near_where_the_other_hand_is_beside() -> None:
     beside = np.zeros(SIZE, bool)
     beside[:, :88] = True
     image = DepthImage(depth, K, 0, 0.0)
-    other = OtherHand(torch.zeros(21, 3), np.zeros(3), True, beside, beside)
-    seen = without(image, other).depth_m
+    other = OtherHand(torch.zeros(21, 3), np.zeros(3), True, True, beside, beside)
+    seen = without(image, [other]).depth_m
     assert (seen[:, :176] > 2.0).all() and (seen[:, 176:] == 0.5).all()
-    assert without(image, None) is image
+    assert without(image, []) is image
     np.testing.assert_array_equal(depth, 0.5, "the image itself is left alone")
+
+
+def test_only_the_pixels_of_certain_hands_are_taken() -> None:
+    left, right = (np.zeros(SIZE, bool) for _ in range(2))
+    left[:, :40], right[:, 100:] = True, True
+    hands = [OtherHand(torch.zeros(21, 3), np.zeros(3), True, True, at, at) for at in (left, right)]
+    np.testing.assert_array_equal(pixels_of(hands), left | right)
+    np.testing.assert_array_equal(pixels_of([hands[0], replace(hands[1], certain=False)]), left)
+    assert pixels_of([]) is None

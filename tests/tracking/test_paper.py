@@ -73,7 +73,7 @@ def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     middle = (track.particles[:, :3] + rotated_pivot(track.particles[:, 3:6])).mean(0).numpy()
     assert np.linalg.norm(middle - scene.joints_m[0, PALM].mean(0)) < 0.06
     mean = MOTIONS.mean(track.particles, torch.full((300,), 1 / 300))
-    hand = model.hand("right", model.first_state(0).size)
+    hand = model.hand("right", model.first_state(0).hands[0].shape)
     joints = hand.refiner.joints(model.decode(mean))[0]
     tips = joints[[8, 12, 16, 20]]
     assert (tips[:, 1] < joints[0, 1] - 0.1).all(), "the fingers point up"

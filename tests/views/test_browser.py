@@ -115,7 +115,7 @@ def test_two_hands_are_told_apart_from_the_frame(view) -> None:
     assert facts["lost"] and [one["there"] for one in facts["hands"]] == [False, True]
 
 
-def test_before_the_first_frame_and_after_the_last_the_page_is_told_so(monkeypatch) -> None:
+def test_before_the_first_frame_and_after_the_last_the_page_says_so(monkeypatch) -> None:
     moments()
     view = made(linger_s=PATIENCE_S)
     lingering, end = threading.Event(), threading.Event()
@@ -139,7 +139,7 @@ def test_before_the_first_frame_and_after_the_last_the_page_is_told_so(monkeypat
         thread.join()
 
 
-def test_who_waits_is_told_of_the_end_at_once(view) -> None:
+def test_who_waits_is_reported_of_the_end_at_once(view) -> None:
     view.show(moments()[0])
     facts, _ = next_picture(view, {})
     reported: list[dict] = []

@@ -116,7 +116,7 @@ def test_a_doubted_one_of_two_hands_is_hollow_and_neither_is_framed() -> None:
     assert colour_share(doubted[0], (40, 40, 220)) == 0
 
 
-def test_a_side_is_said_with_how_sure_it_is_unless_it_was_told() -> None:
+def test_a_side_is_said_with_how_sure_it_is_unless_it_was_given() -> None:
     assert [side_words(one) for one in (present(), other_hand(), lost_hand())] == [
         *("right", "left 83 %", ""),
     ]
@@ -336,7 +336,7 @@ def test_nothing_is_written_without_a_panel(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_video_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_video_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="overlay.mp4.*view=none"):
         VideoView(tmp_path / "nowhere", 25, 10).add(panel_of(1))
 

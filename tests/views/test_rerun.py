@@ -219,12 +219,12 @@ def test_the_configured_likelihood_is_the_one_that_classifies() -> None:
     assert OmegaConf.select(config, "view.connect") is None
 
 
-def test_a_folder_that_cannot_be_written_is_told(rerun_view, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(rerun_view, tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
         rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=f_measure())
 
 
-def test_addresses_without_a_viewer_are_told(rerun_view, tmp_path: Path) -> None:
+def test_addresses_without_a_viewer_are_reported(rerun_view, tmp_path: Path) -> None:
     def connect(address: str) -> None:
         rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure(), connect=address)
 

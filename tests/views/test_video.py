@@ -93,14 +93,14 @@ def test_a_browser_plays_what_is_finished_and_what_was_killed(
         assert chromium.execute_async_script(PLAY, path.as_uri()) == ["ended", frames]
 
 
-def test_a_missing_encoder_is_told_before_the_first_frame(tmp_path, monkeypatch) -> None:
+def test_a_missing_encoder_is_reported_before_the_first_frame(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ToftrackError, match="needs the package av.*view=none"):
         VideoView(tmp_path, 25.0)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-def test_a_full_disk_is_told() -> None:
+def test_a_full_disk_is_reported() -> None:
     with pytest.raises(ToftrackError, match="/dev/full.*free space.*view=none"):
         video = VideoFile(Path("/dev/full"), 10.0, (160, 96))
         for _ in range(12):

@@ -377,7 +377,7 @@ def reconcile(
     merged = (
         before.merged.extended(dt_s) if both and on_one_hand(poses(0), poses(1)) else Duration()
     )
-    sure = all(hand.believed for hand in hands)
+    sure = all(hand.believed for hand in before.hands)
     if merged.begun and (merged.reached(_ONE_FRAMES) or not sure):
         worse = min((0, 1), key=lambda slot: sureness(hands[slot]))
         hands[worse], merged = replace(hands[worse], track=None), Duration()

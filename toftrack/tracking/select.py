@@ -214,9 +214,7 @@ def _contender(
     # After a pause a frame speaks for those that were dropped, too.
     weight = dt_s / FRAME_S if dt_s < FRAME_S or dt_s > _PAUSE_S else 1.0
     lead = score * weight - settings.drift
-    if incumbent.new:
-        lead = lead + torch.inf
-    elif len(incumbent.contender_m):
+    if len(incumbent.contender_m):
         lead = lead + incumbent.lead * ~_apart(joints_m, incumbent.contender_m[0])
     row = _best_of(lead, far)
     return row, float(lead[row])
@@ -233,6 +231,10 @@ def _apart(joints_m: Tensor, from_m: Tensor) -> Tensor:
 
 
 def _needed(incumbent: Incumbent, settings: Hysteresis) -> float:
-    """The lead with which a contender takes over: little where the estimate is doubtful."""
+    """The lead with which a contender takes over: little where the estimate is doubtful, and any in
+    a track's first frame.
+    """
+    if incumbent.new:
+        return -math.inf
     probability = 1 / (1 + math.exp(-min(max(incumbent.log_odds, -30.0), 30.0)))
     return settings.lead * min(1.0, max(_LEAST_CREDIT, 2 * probability))

@@ -142,7 +142,7 @@ def test_until_its_side_is_found_out_a_hand_is_turned_as_it_was_then() -> None:
             assert np.allclose(world[f"{name.title()}_R"][:3, :3], turned, atol=1e-5), (frame, name)
 
 
-def test_a_run_without_a_hand_is_told() -> None:
+def test_a_run_without_a_hand_is_reported() -> None:
     with pytest.raises(ToftrackError, match="nothing to export"):
         motions_of(results_of([lost_hand(0), lost_hand(1)]), (shape_of("right"),))
 
@@ -186,7 +186,7 @@ def test_a_csv_has_a_row_a_frame_and_a_column_a_number() -> None:
         assert row["pointing_origin_x_m"] == ""
 
 
-def test_a_missing_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pygltflib", None)
     with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[export\]'"):
         glb_of([])

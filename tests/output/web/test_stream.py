@@ -89,7 +89,7 @@ def test_a_client_that_leaves_disturbs_nobody(stream: WebSocketStream) -> None:
         assert json.loads(stays.recv(PATIENCE_S))["index"] == 1
 
 
-def test_what_a_client_sends_is_not_looked_at(stream: WebSocketStream) -> None:
+def test_what_a_client_sends_is_ignored(stream: WebSocketStream) -> None:
     with listening(stream) as one:
         one.send("restart")
         stream.send((hand_estimate(1),))
@@ -157,7 +157,7 @@ def test_connections_that_ask_nothing_do_not_hold_up_the_end() -> None:
         eventually(lambda: all(map(ended, opened)))
 
 
-def test_trouble_of_the_server_is_told_once_in_a_while(
+def test_trouble_of_the_server_is_reported_once_in_a_while(
     stream: WebSocketStream, caplog: pytest.LogCaptureFixture
 ) -> None:
     for _ in range(500):
@@ -257,7 +257,7 @@ def test_the_last_lines_arrive_and_then_everything_ends() -> None:
     assert not any(t.name == "websocket-server" for t in threading.enumerate())
 
 
-def test_a_port_that_is_taken_is_told(stream: WebSocketStream) -> None:
+def test_a_port_that_is_taken_is_reported(stream: WebSocketStream) -> None:
     port = urlsplit(stream.url).port
     with pytest.raises(ToftrackError, match=f"port {port} of 127.0.0.1 is taken.*stream.port=PORT"):
         websocket_stream(port=port).__enter__()
@@ -276,7 +276,7 @@ def test_a_bad_setting_is_one_clear_error(changes: dict, words: str) -> None:
         websocket_stream(**changes)
 
 
-def test_a_missing_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "websockets.asyncio.server", None)
     with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[web\]'"):
         websocket_stream()

@@ -1,4 +1,4 @@
-"""Effort follows the time that frames take under a budget, and never without one."""
+"""Quality follows the time that frames take under a budget, and never changes without one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Slow:
         return self.now_s
 
 
-def test_effort_falls_while_frames_are_late_and_rises_when_they_are_not() -> None:
+def test_quality_falls_while_frames_are_late_and_rises_when_they_are_not() -> None:
     found = levels(Pace(BUDGET_S), [0.05] * 40)
     assert found[0] == 0 and found[-1] == EVERYTHING
     assert found == sorted(found)
@@ -66,7 +66,7 @@ def test_one_late_frame_changes_nothing() -> None:
 
 
 def test_what_was_too_much_is_tried_ever_later() -> None:
-    """On a machine on which only the least effort fits."""
+    """On a machine on which only the least quality fits."""
     pace, tried = Pace(BUDGET_S, EVERYTHING), []
     for number in range(1500):
         level = pace.level
@@ -77,7 +77,7 @@ def test_what_was_too_much_is_tried_ever_later() -> None:
     assert len(pauses) > 2 and (pauses[1:] > 1.5 * pauses[:-1]).all()
 
 
-def test_without_a_budget_effort_never_changes() -> None:
+def test_without_a_budget_quality_never_changes() -> None:
     assert set(levels(Pace(), [0.001, 5.0, 60.0] * 20)) == {0}
 
 
@@ -117,21 +117,21 @@ def test_each_level_leaves_out_more() -> None:
         assert less is model.at_quality(quality), "made once"
         assert less.detector.settings.every > before.detector.settings.every
         assert less.detector.settings.search > before.detector.settings.search
-        assert less.refinement.swaps <= before.refinement.swaps
-        assert less.detector.settings.rivals <= before.detector.settings.rivals
+        assert less.hysteresis.exchanged <= before.hysteresis.exchanged
+        assert less.detector.settings.candidates <= before.detector.settings.candidates
         assert less.filter == model.filter and less.poses is model.poses
-        shape = model.first_state(0).size
+        shape = model.first_state(0).hands[0].shape
         assert less.hand("right", shape) is model.hand("right", shape)
         before = less
 
 
 def test_settings_that_leave_out_more_stay() -> None:
-    model = make_tracker("detector.every=6", "detector.rivals=0", "refine=none").model
+    model = make_tracker("detector.every=6", "detector.candidates=0", "refine=none").model
     less = model.at_quality(LEVELS[-1])
-    assert less.detector.settings.every == 6 and less.detector.settings.rivals == 0
+    assert less.detector.settings.every == 6 and less.detector.settings.candidates == 0
 
 
-def test_less_effort_may_be_one_thread() -> None:
+def test_less_quality_may_be_one_thread() -> None:
     many = threads()
     with at_most(1):
         assert threads() == 1
@@ -152,7 +152,7 @@ def test_a_recording_is_tracked_alike_however_slow_the_machine_is() -> None:
 
 
 @pytest.mark.parametrize("hands", [1, 2])
-def test_a_slow_machine_still_tracks_with_less_effort(hands: int) -> None:
+def test_a_slow_machine_still_tracks_with_less_quality(hands: int) -> None:
     usual = build_hands_tracker(configuration(f"hands={hands}", "tracker.budget_ms=33"))
     usual.time = Timekeeper(usual.time.pace, Slow(0.06))
     scene = sample()

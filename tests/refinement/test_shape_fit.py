@@ -30,7 +30,7 @@ FIT = ShapeFit(
     contradiction=3.5,
     memory=20,
 )
-VOTES_OFF = torch.tensor(shape_fit._KEYPOINTS_OFF)
+KEYPOINTS_OFF = torch.tensor(shape_fit._KEYPOINTS_OFF)
 BETWEEN_FINGERS = torch.tensor([0.05, 0.06, 0.0, 0.0, -0.05, 0.04])
 
 
@@ -46,7 +46,7 @@ def poses(count: int, seed: int = 0) -> torch.Tensor:
 
 def detection(shape: HandShape, state: torch.Tensor, sigma_m: float = 0.004) -> Detection:
     """What networks would say that see every joint of a hand (1, 27), and err as they do."""
-    joints = forward_kinematics(state, shaped(shape, VOTES_OFF)).joints_m[0]
+    joints = forward_kinematics(state, shaped(shape, KEYPOINTS_OFF)).joints_m[0]
     log_size = math.log(shape.hand_length_m / DEFAULT_HAND_LENGTH_M)
     keypoints = Keypoints(joints, torch.full((21,), sigma_m))
     return replace(detection_of(state, log_size, shape.side), keypoints=keypoints)
@@ -82,7 +82,7 @@ def fitted(
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_votes_say_by_how_much_a_hand_is_another(side: str) -> None:
+def test_keypoints_say_by_how_much_a_hand_is_another(side: str) -> None:
     first, state = default_hand_shape(side=side), poses(1)
     none = torch.zeros(6)
     joints = forward_kinematics(state, shaped(first, 0.2 * BETWEEN_FINGERS)).joints_m[0]
@@ -152,7 +152,7 @@ def test_a_single_odd_look_reopens_nothing() -> None:
     assert once.poses >= belief.poses
 
 
-def test_the_network_s_length_is_worn_until_estimates_say_better() -> None:
+def test_the_network_s_length_is_applied_until_estimates_say_better() -> None:
     first = default_hand_shape()
     said = shape_fit.with_network_length(first_shape(), 0.16, FIT, first)
     assert shaped(first, torch.tensor(said.applied)).hand_length_m == pytest.approx(0.16, rel=1e-4)

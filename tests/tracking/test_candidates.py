@@ -1,0 +1,252 @@
+"""A frame's hypotheses: what is proposed for each hand, refined, and scored."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.configured import posterior_weights, refinement
+from helpers.detection import FixedDetector, detection_of
+from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
+
+from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.refinement.proposals import FINGER_OF_ANGLE
+from toftrack.tracking.candidates import (
+    FilteredFrame,
+    best_start,
+    hypotheses_of,
+    keypoints_of,
+    posterior_of,
+    propose,
+    schedule,
+)
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.select import Hypotheses, Source
+from toftrack.tracking.state import Track
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def model_with(exchanged: int = 0, detector: FixedDetector | None = None) -> TrackerModel:
+    """The tracker of a right hand; of natural poses, no finger is taken if nothing is said."""
+    model = right_hand_model()
+    hysteresis = replace(model.hysteresis, exchanged=exchanged)
+    return replace(model, hysteresis=hysteresis, detector=detector or FixedDetector())
+
+
+def filtered(
+    x: float,
+    seed: int = 0,
+    exchanged: int = 0,
+    covered: bool = False,
+    detection: Detection | None = None,
+    **changes: object,
+) -> FilteredFrame:
+    """A hand that the track has with other fingers than the image and the detector."""
+    truth = bent(hand_at(x), seed, 0.4)
+    usual = {"log_odds": 0.0, "contender": bent(hand_at(x), seed + 10, 0.3)}
+    track = track_of(hand_at(x), **(usual | changes))
+    detection = detection_of(truth) if detection is None else detection
+    frame = frame_of(image_of(truth), track, detection, model=model_with(exchanged))
+    if covered:
+        depth = torch.full_like(frame.observation.depth_m, 0.3)
+        frame = replace(frame, observation=replace(frame.observation, depth_m=depth))
+    return FilteredFrame.of(frame, track.mean)
+
+
+def table_of(*frames: FilteredFrame) -> Hypotheses:
+    return propose(frames, torch.Generator().manual_seed(0))
+
+
+def same(one: Hypotheses, two: Hypotheses) -> bool:
+    fields = ("pose", "source", "log_posterior")
+    return all(torch.equal(getattr(one, name), getattr(two, name)) for name in fields)
+
+
+def test_the_hypotheses_of_two_hands_stay_with_their_hand() -> None:
+    """Both together are each one's own, whichever comes first."""
+    left, right = filtered(-0.1, 1), filtered(0.1, 2)
+    alone = [table_of(one) for one in (left, right)]
+    for order in ((0, 1), (1, 0)):
+        both = table_of(*((left, right)[number] for number in order))
+        assert sorted(set(both.hand.tolist())) == [0, 1]
+        for row, number in enumerate(order):
+            assert same(both.of_hand(row), alone[number])
+    wrists = table_of(left, right)
+    assert bool((wrists.of_hand(0).pose[:, 0] < 0).all())
+    assert bool((wrists.of_hand(1).pose[:, 0] > 0).all())
+
+
+def test_every_hypothesis_is_scored_by_the_posterior_of_its_hand() -> None:
+    hands = filtered(-0.1, 1, exchanged=16), filtered(0.1, 2, exchanged=16)
+    table = table_of(*hands)
+    for row, hand in enumerate(hands):
+        mine = table.of_hand(row)
+        torch.testing.assert_close(mine.log_posterior, hand.posterior(mine.pose))
+
+
+def test_each_source_proposes_its_poses() -> None:
+    table = table_of(filtered(0.0, contender=torch.zeros(0, 27)))
+    counts = {source: len(table.of_source(source)) for source in Source}
+    assert counts[Source.HELD] == counts[Source.CONTENDER] == 0
+    assert counts[Source.PREVIOUS] == counts[Source.DYNAMICS] == 1
+    assert counts[Source.DETECTOR] >= 2, "as it is, and bent to the keypoints"
+    assert len(table_of(filtered(0.0)).of_source(Source.CONTENDER)) == 1
+
+
+def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> None:
+    hand = filtered(0.0)
+    table = table_of(hand)
+    before = float(hand.posterior(hand.frame.track.pose))
+    assert float(table.of_source(Source.PREVIOUS).log_posterior) > before
+    assert float(table.best.log_posterior) > before + 0.1
+
+
+def test_a_covered_hand_is_held_where_it_was() -> None:
+    covered, other = filtered(0.0, exchanged=16, covered=True), filtered(0.1, 2, exchanged=16)
+    table = table_of(covered, other)
+    mine = table.of_hand(0)
+    assert mine.source.tolist() == [Source.HELD]
+    assert torch.equal(mine.pose, covered.frame.track.pose)
+    assert len(table.of_hand(1)) > 3, "the other one is not held up by it"
+
+
+def test_a_hand_mostly_out_of_sight_is_not_compared_with_the_detector() -> None:
+    assert filtered(0.0, covered=True).detection.empty
+    assert not filtered(0.0).detection.empty
+    far = filtered(0.35)  # most of it is beside the image
+    assert far.detection.empty and not far.covered
+    assert len(table_of(far).of_source(Source.DETECTOR)) == 0
+
+
+def test_fingers_are_exchanged_from_the_second_round_on_only() -> None:
+    hands = filtered(-0.1, 1, exchanged=64), filtered(0.1, 2, exchanged=64)
+    table = table_of(*hands)
+    exchanged = table.source == Source.EXCHANGED
+    assert exchanged.any(), "the track has other fingers than the image"
+    assert exchanged.int().diff().min() >= 0, "all others come before"
+    for row, hand in enumerate(hands):
+        mine = table.of_hand(row)
+        best = mine.of_source(Source.PREVIOUS, Source.DYNAMICS).best
+        tried = mine.of_source(Source.EXCHANGED)
+        as_they_are = tried.rows(torch.arange(len(tried) // 2))
+        for pose, value in zip(as_they_are.pose, as_they_are.log_posterior, strict=True):
+            changed = (pose[6:] != best.pose[0, 6:]).nonzero()[:, 0].tolist()
+            assert len({FINGER_OF_ANGLE[angle] for angle in changed}) == 1
+            assert torch.equal(pose[:6], best.pose[0, :6]) and value > best.log_posterior
+        again = hand.refined(as_they_are.pose)
+        torch.testing.assert_close(tried.pose[len(tried) // 2 :], again)
+
+
+def test_nothing_is_exchanged_where_there_is_nothing_to_take_fingers_from() -> None:
+    alone = table_of(filtered(0.0, detection=NO_DETECTION))
+    assert len(alone.of_source(Source.EXCHANGED)) == 0
+    natural = table_of(filtered(0.0, exchanged=128, detection=NO_DETECTION))
+    assert len(natural.of_source(Source.EXCHANGED)) > 0
+
+
+def test_without_refinement_the_filter_alone_proposes() -> None:
+    hand = filtered(0.0, exchanged=16)
+    model = replace(hand.frame.model, refinement=refinement(iterations=0))
+    plain = replace(hand, frame=replace(hand.frame, model=model))
+    table = table_of(plain)
+    assert table.source.tolist() == [Source.DYNAMICS] and torch.equal(table.pose, hand.pose)
+
+
+def sure_track(frames: int, **changes: object) -> Track:
+    usual = {"age": Duration(frames * FRAME_S), "log_odds": 5.0}
+    return track_of(hand_at(), **(usual | changes))
+
+
+def test_the_detector_and_other_fingers_take_turns_on_a_sure_hand() -> None:
+    found = [schedule(sure_track(frames), False, 0.9) for frames in range(1, 7)]
+    assert found == [(False, True), (True, False)] * 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "hidden", "alternate"),
+    [
+        ({"log_odds": 0.0}, False, 0.9),
+        ({"challenged": Duration(FRAME_S)}, False, 0.9),
+        ({}, True, 0.9),
+        ({}, False, 1.0),
+    ],
+    ids=["doubtful", "challenged", "hidden", "never in turn"],
+)
+def test_else_both_are_tried_in_every_frame(
+    changes: dict[str, object], hidden: bool, alternate: float
+) -> None:
+    tracks = [sure_track(frames, **changes) for frames in range(1, 5)]
+    assert all(schedule(track, hidden, alternate) == (True, True) for track in tracks)
+
+
+@pytest.mark.parametrize("frames", [24, 25])
+def test_the_table_keeps_to_the_schedule(frames: int) -> None:
+    age = Duration(frames * FRAME_S)
+    table = table_of(filtered(0.0, exchanged=64, log_odds=5.0, age=age))
+    kinds = set(table.source.tolist()) & {Source.DETECTOR, Source.EXCHANGED}
+    assert kinds == ({Source.DETECTOR} if frames % 2 == 0 else {Source.EXCHANGED})
+
+
+def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
+    truth = bent(hand_at(), 1, 0.4)
+    detection = detection_of(torch.cat((bent(hand_at(), 2, 0.8), truth, hand_at())))
+    detection = replace(detection, keypoints=detection_of(truth).keypoints)
+    frame = frame_of(image_of(truth), track_of(hand_at()), detection)
+    model = replace(frame.model, weights=posterior_weights(forearm=0.0))
+    posterior = posterior_of(frame.observation, frame.fitted, detection, (), model, frame.image)
+    pose, value = best_start(detection, frame.observation, frame.fitted, posterior, model)
+    assert value == pytest.approx(float(posterior(pose)), abs=1e-5)
+    as_they_are = hypotheses_of(detection, frame.fitted, model.detector.settings.hypotheses)
+    assert value >= float(posterior(as_they_are).max()) - 1e-5
+    off = (frame.fitted.refiner.joints(pose) - frame.fitted.refiner.joints(truth)).norm(dim=-1)
+    assert float(off.mean()) < 0.005
+
+
+def with_settings(**settings: float) -> TrackerModel:
+    return model_with(detector=FixedDetector(**settings))
+
+
+def test_keypoints_are_trusted_no_more_than_is_set() -> None:
+    model = with_settings(keypoint_m=0.02, keypoint_sigmas=2.0)
+    detection = detection_of(hand_at())
+    assert (keypoints_of(detection, model).sigma_m == 0.02).all()
+    unsure = replace(detection.keypoints, sigma_m=torch.full((21,), 0.03))
+    assert keypoints_of(replace(detection, keypoints=unsure), model).sigma_m == pytest.approx(0.06)
+
+
+def test_a_keypoint_weight_divides_the_deviations_and_0_leaves_them_without_effect() -> None:
+    detection = detection_of(hand_at())
+    plain, half, none = (
+        keypoints_of(detection, with_settings(keypoint_weight=weight)).sigma_m
+        for weight in (1.0, 0.5, 0.0)
+    )
+    torch.testing.assert_close(half, 2 * plain)
+    assert bool(none.isfinite().all()) and float(none.min()) > 1000
+
+
+@pytest.mark.parametrize("count", [0, 1, 4, 8])
+def test_only_likely_hypotheses_are_candidates_and_at_least_one(count: int) -> None:
+    hand = right_hand_model().hand("right", right_hand_model().first_state(0).hands[0].shape)
+    detection = detection_of(torch.cat([hand_at(0.01 * i) for i in range(6)]))
+    likely = int((detection.log_probability > math.log(0.03)).sum())
+    states = hypotheses_of(detection, hand, count)
+    assert len(states) == max(1, min(count, likely)) < 6
+    np.testing.assert_allclose(states[0, :3], hand_at(0.0)[0, :3], atol=1e-4)
+
+
+def test_a_hand_of_another_size_is_proposed_with_the_same_palm() -> None:
+    model = right_hand_model()
+    hand = model.hand("right", model.first_state(0).hands[0].shape)
+    small = detection_of(hand_at(), log_size=math.log(0.8))
+    joints: Sequence[torch.Tensor] = (
+        small.joints_m[0],
+        hand.refiner.joints(hypotheses_of(small, hand, 1))[0],
+    )
+    palms = [points[[0, 5, 9, 13, 17]].mean(0) for points in joints]
+    assert float((palms[0] - palms[1]).norm()) < 0.01

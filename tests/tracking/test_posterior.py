@@ -1,0 +1,231 @@
+"""The terms of the posterior, each against plain arithmetic, and what they add up to."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.configured import posterior_weights
+from helpers.detection import detection_of
+from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
+
+from toftrack.errors import ToftrackError
+from toftrack.hand.overlap import RADII_MM
+from toftrack.render.forearm import arm_sight, forearm_conflict
+from toftrack.tracking.candidates import HandFrame, keypoints_of, posterior_of
+from toftrack.tracking.hands import OtherHand
+from toftrack.tracking.posterior import Posterior, touching
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+TRUTH = hand_at()
+NONE = {"keypoints": 0.0, "overlap": 0.0, "other_hand": 0.0, "forearm": 0.0}
+
+
+def poses(count: int = 24) -> torch.Tensor:
+    """(N, 27) hands about the one in the image, some far off, turned or with fingers crossed."""
+    draw = torch.Generator().manual_seed(3)
+    states = TRUTH.repeat(count, 1) + 0.01 * torch.randn(count, 27, generator=draw)
+    states[:, 3:6] += torch.linspace(0, 3.0, count)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    states[:, 6:] += 0.4 * torch.randn(count, 21, generator=draw)
+    return states
+
+
+def other_hand(x: float = 0.03, certain: bool = True) -> OtherHand:
+    """Another hand that is partly in this one."""
+    fitted = right_hand_model().hand("right", right_hand_model().first_state(0).hands[0].shape)
+    joints, none = fitted.refiner.joints(hand_at(x))[0], np.zeros((144, 176), bool)
+    return OtherHand(joints, joints.mean(0).numpy(), True, certain, none, none)
+
+
+def frame(*others: OtherHand) -> HandFrame:
+    return frame_of(image_of(TRUTH), track_of(TRUTH), detection_of(bent(TRUTH, 1)), others)
+
+
+def posterior(seen: HandFrame, coverage: float | None = None, **weights: float) -> Posterior:
+    """Only with the terms that are weighted here."""
+    model = replace(seen.model, weights=posterior_weights(**(NONE | weights)))
+    image = replace(seen.image, coverage=coverage)
+    return posterior_of(seen.observation, seen.fitted, seen.detection, seen.others, model, image)
+
+
+def added(seen: HandFrame, **weights: float) -> np.ndarray:
+    """(N,) what the terms add to the image's."""
+    alone, all_terms = posterior(seen), posterior(seen, **weights)
+    return (all_terms(poses()) - alone(poses())).numpy()
+
+
+def joints_of(seen: HandFrame) -> np.ndarray:
+    return seen.fitted.refiner.joints(poses()).double().numpy()
+
+
+@pytest.mark.parametrize("coverage", [0.0, 0.7, None])
+def test_the_image_says_the_log_of_the_f_measure_and_of_what_is_explained(
+    coverage: float | None,
+) -> None:
+    seen, settings = frame(), right_hand_model().likelihood
+    counts = seen.fitted.scorer(poses(), seen.image.evidence)
+    correct, false, missed, residual = (count.double().numpy() for count in counts)
+    c, f = (
+        correct - settings.residual_weight * residual,
+        false + settings.residual_weight * residual,
+    )
+    first, second = (missed, f) if settings.naming == "printed" else (f, missed)
+    precision, recall = c / (c + first), c / (c + second)
+    b2 = settings.beta**2
+    f_measure = (1 + b2) * precision * recall / (b2 * precision + recall)
+    share = settings.coverage if coverage is None else coverage
+    expected = np.log(f_measure) + share * np.log(correct)
+    found = posterior(seen, coverage)(poses()).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+    one = poses()[:1]
+    assert seen.image.score(one) == pytest.approx(f_measure[0], rel=1e-4)
+    assert np.ptp(expected) > 1, "the poses differ"
+
+
+def test_a_pose_that_explains_nothing_is_impossible() -> None:
+    away = TRUTH.clone()
+    away[0, 0] = 5.0
+    assert float(posterior(frame(), 1.0)(away)) == -math.inf
+    assert float(posterior(frame(), 0.0)(away)) == -math.inf
+
+
+def test_keypoints_cost_their_robust_squared_deviation() -> None:
+    """Geman-McClure: x^2 / (1 + x^2 / 9), x in standard deviations."""
+    seen = frame()
+    keypoints = keypoints_of(seen.detection, seen.model)
+    points, sigma = keypoints.points_m.double().numpy(), keypoints.sigma_m.double().numpy()
+    squared = (np.linalg.norm(joints_of(seen) - points, axis=-1) / sigma) ** 2
+    expected = -0.4 * (squared / (1 + squared / 9)).mean(1)
+    found = added(seen, keypoints=0.4)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    assert found.min() > -0.4 * 9 and found.max() < 0
+
+
+def overlap_of(fingers: np.ndarray) -> float:
+    """How much the fingers (5, 4, 3) of a hand of the mean size are in one another."""
+    total, steps = 0.0, np.diff(fingers, axis=1)
+    straight = np.linalg.norm(steps.sum(1), axis=1) / np.linalg.norm(steps, axis=2).sum(1)
+    straight = np.clip((straight - 0.7) / 0.2, 0, 1)
+    points = [[*f[1:], (f[1] + f[2]) / 2, (f[2] + f[3]) / 2] for f in fingers]
+    for a, b in itertools.combinations(range(5), 2):
+        strict = max(straight[a], straight[b]) if a > 0 else 0.0  # the thumb crosses the others
+        touch_m = (0.6 + 0.4 * strict) / 1e3
+        for p, radius in zip(points[a], RADII_MM[a], strict=True):
+            its = zip(points[b], RADII_MM[b], strict=True)
+            depth = max(1 - np.linalg.norm(p - q) / (touch_m * (radius + r)) for q, r in its)
+            total += (1 + 3 * strict) * max(0.0, depth) ** 2
+    return total
+
+
+def test_fingers_in_one_another_cost_their_overlap() -> None:
+    seen = frame()
+    overlap = [overlap_of(hand[1:].reshape(5, 4, 3)) for hand in joints_of(seen)]
+    assert max(overlap) > 0.1
+    found = added(seen, overlap=0.5)
+    np.testing.assert_allclose(found, -0.5 * np.array(overlap), rtol=1e-3, atol=1e-4)
+
+
+def test_another_hand_costs_the_joints_that_lie_in_it() -> None:
+    other = other_hand()
+    seen, expected = frame(other), []
+    for hand in joints_of(seen):
+        gaps = [
+            min(np.linalg.norm(mine - its) for its in other.joints_m.double().numpy())
+            for mine in hand
+        ]
+        expected.append(-3.0 * sum(max(0.0, 1 - gap / 0.018) for gap in gaps) / 21)
+    assert min(expected) < -0.1
+    np.testing.assert_allclose(added(seen, other_hand=3.0), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_hand_lies_wholly_in_itself_and_not_at_all_in_one_far_away() -> None:
+    other = other_hand().joints_m
+    assert float(touching(other[None], other)) == pytest.approx(1, abs=1e-2)
+    assert float(touching(other[None] + 0.5, other)) == 0
+
+
+def test_a_hand_that_is_not_certain_costs_nothing() -> None:
+    assert not added(frame(other_hand(certain=False)), other_hand=3.0).any()
+
+
+def test_each_other_hand_costs_its_own() -> None:
+    one, two = other_hand(0.03), other_hand(-0.03)
+    both = added(frame(one, two), other_hand=2.0)
+    alone = added(frame(one), other_hand=2.0) + added(frame(two), other_hand=2.0)
+    np.testing.assert_allclose(both, alone, atol=1e-5)
+
+
+def test_a_forearm_that_cannot_be_costs_what_is_set() -> None:
+    seen, states = frame(), poses().numpy()
+    conflict = forearm_conflict(states[:, :3], states[:, 3:6], arm_sight(seen.observation))
+    assert 0 == conflict.min() < conflict.max()
+    np.testing.assert_allclose(added(seen, forearm=0.4), -0.4 * conflict, atol=1e-5)
+
+
+ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0, "forearm": 0.6}
+
+
+def test_the_named_terms_add_up_to_the_posterior() -> None:
+    whole = posterior(frame(other_hand()), **ALL)
+    terms = whole.named(poses())
+    assert set(terms) == {"image", "joints", "other hand 0", "forearm"}
+    torch.testing.assert_close(sum(terms.values()), whole(poses()))
+    assert all(value.shape == (len(poses()),) and bool(value.any()) for value in terms.values())
+
+
+def test_terms_are_independent_of_one_another() -> None:
+    seen = frame(other_hand())
+    each = sum(added(seen, **{name: weight}) for name, weight in ALL.items())
+    np.testing.assert_allclose(added(seen, **ALL), each, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("names", "left"),
+    [
+        (("forearm",), {"joints", "other hand 0"}),
+        (("other_hand",), {"joints", "forearm"}),
+        (("keypoints", "overlap"), {"other hand 0", "forearm"}),
+        (tuple(ALL), set()),
+    ],
+)
+def test_a_term_of_weight_0_is_left_out(names: tuple[str, ...], left: set[str]) -> None:
+    weights = ALL | dict.fromkeys(names, 0.0)
+    assert set(posterior(frame(other_hand()), **weights).terms) == left
+
+
+def test_without_a_detection_keypoints_say_nothing() -> None:
+    blind = frame_of(image_of(TRUTH), track_of(TRUTH))
+    assert not added(blind, keypoints=0.4).any()
+    both = added(blind, keypoints=0.4, overlap=0.5)
+    np.testing.assert_array_equal(both, added(blind, overlap=0.5))
+
+
+@pytest.mark.parametrize("most", [1, 5, 23, 24, 100])
+def test_screening_agrees_with_the_full_posterior_on_the_rows_that_it_keeps(most: int) -> None:
+    whole = posterior(frame(other_hand()), **ALL)
+    full, image = whole(poses()), whole.named(poses())["image"]
+    screened = whole.screened(poses(), most)
+    kept = torch.isfinite(screened)
+    assert int(kept.sum()) == min(most, len(full))
+    torch.testing.assert_close(screened[kept], full[kept])
+    assert bool((screened[~kept] == -torch.inf).all())
+    assert kept.all() or image[kept].min() >= image[~kept].max(), "the best by the image"
+
+
+def test_the_posterior_of_a_pose_does_not_depend_on_the_others() -> None:
+    whole = posterior(frame(other_hand()), **ALL)
+    together = whole(poses())
+    for rows in ([3], [7, 2], list(range(5, 20))):
+        torch.testing.assert_close(whole(poses()[rows]), together[rows])
+
+
+@pytest.mark.parametrize("name", list(NONE))
+@pytest.mark.parametrize("value", [-0.1, math.nan, "much"])
+def test_a_weight_that_cannot_be_is_named(name: str, value: float) -> None:
+    with pytest.raises(ToftrackError, match=f"posterior.{name}"):
+        posterior_weights(**{name: value})
