@@ -363,20 +363,22 @@ def taking_part(state: TrackerState) -> list[int]:
 
 
 def reconcile(
-    before: TrackerState, after: TrackerState, poses: Callable[[int], PlacedHand], dt_s: float
+    before: TrackerState,
+    after: TrackerState,
+    place: Callable[[HandState, Track], PlacedHand],
+    dt_s: float,
 ) -> tuple[TrackerState, bool]:
     """Two hands after a frame: none is followed twice, and each is in its slot.
 
-    before: as of the frame's beginning.  poses: where a slot's hand was found.
+    before: as of the frame's beginning.  place: where a hand was found.
     Returns the state, and whether the slots were exchanged.
     """
     hands = list(after.hands)
     sought = len(taking_part(before)) == 2 and any(hand.track is None for hand in before.hands)
     second_s = 0.0 if sought else before.second_s
-    both = all(hand.track is not None for hand in hands)
-    merged = (
-        before.merged.extended(dt_s) if both and on_one_hand(poses(0), poses(1)) else Duration()
-    )
+    places = [place(hand, hand.track) for hand in hands if hand.track is not None]
+    one = len(places) == 2 and on_one_hand(*places)
+    merged = before.merged.extended(dt_s) if one else Duration()
     sure = all(hand.believed for hand in before.hands)
     if merged.begun and (merged.reached(_ONE_FRAMES) or not sure):
         worse = min((0, 1), key=lambda slot: sureness(hands[slot]))

@@ -21,7 +21,6 @@ from toftrack.compute.spans import Spans
 from toftrack.compute.threads import small_operations
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import image_term
@@ -30,7 +29,7 @@ from toftrack.tracking.filter import Found, predicted_depths, run_filter, veloci
 from toftrack.tracking.lifecycle import Absence, Status
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.state import StepInfo, Track, TrackerState
-from toftrack.tracking.step import emitted, estimate_of, no_hand
+from toftrack.tracking.step import Stepped, emitted, estimate_of, no_hand
 
 _WIDEST_PALM_M = 0.06
 """Half the breadth of the broadest hand's palm with the ball of the thumb."""
@@ -151,9 +150,7 @@ class PaperModel(FilterModel):
 
 
 @small_operations()
-def paper_step(
-    state: TrackerState, image: DepthImage, model: PaperModel
-) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
+def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Stepped:
     """One frame: segment, start if there is no hand yet, filter, take the mean.
 
     A pure function: the state given stays as it is, and gives the same again. In an image without

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -36,13 +38,16 @@ from toftrack.tracking.lifecycle import (
 )
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
 from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
-from toftrack.tracking.state import HandState, StepInfo, TrackerState
+from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
+
+Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
+"""The next state, and for each slot what was seen, None where nobody asked, and the estimate."""
+Concluded = tuple[int, HandState, StepInfo, Estimate]
+"""A slot and its hand after a frame."""
 
 
 @small_operations()
-def step(
-    state: TrackerState, image: DepthImage, model: TrackerModel
-) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
+def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped:
     """One frame of one hand or two; a pure function: the state given stays as it is.
 
     A particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and
@@ -58,15 +63,9 @@ def step(
     5. *Select* a pose for each hand, with hysteresis (Page's test, Biometrika 41, 1954).
     6. *Close*: steady the pose, judge it, carry the track on or end it, learn the hand's shape.
     7. Reconcile the slots of two hands.
-
-    Returns the next state, and for each slot what was seen, None where nobody looked, and the
-    estimate.
     """
     spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     before = state.at(image)
-    hands = list(before.hands)
-    infos: list[StepInfo | None] = [None] * len(hands)
-    estimates = [vacant(image, model) for _ in hands]
     with spans("detector"):
         opened = open_hands(before, image, model, dt_s)
     frames = [one for one in opened if isinstance(one, HandFrame)]
@@ -75,17 +74,14 @@ def step(
     with spans("detector"):
         frames = [waited_for(frame) for frame in frames]
     with spans("refinement"):
-        pairs = zip(frames, filtered, strict=True)
+        pairs = list(zip(frames, filtered, strict=True))
         candidates = [FilteredFrame.of(frame, found.mean) for frame, found in pairs]
         table = propose(candidates, generator)
         choices = [choose(row, one, table, dt_s) for row, one in enumerate(candidates)]
-    told = [conclude(*one, image, dt_s) for one in zip(frames, filtered, choices, strict=True)]
-    told += [no_hand(one, image, model) for one in opened if isinstance(one, Absence)]
-    for slot, hand, info, estimate in told:
-        hands[slot], estimates[slot] = hand, estimate
-        infos[slot] = replace(info, seconds=spans.seconds())
-    after = replace(before, generator=generator.get_state(), hands=tuple(hands))
-    return reconciled(after, before, infos, estimates, image, model, dt_s)
+    found = [conclude(*pair, one, image, dt_s) for pair, one in zip(pairs, choices, strict=True)]
+    found += [no_hand(one, image, model) for one in opened if isinstance(one, Absence)]
+    before = replace(before, generator=generator.get_state())
+    return reconciled(before, found, image, model, dt_s, spans)
 
 
 def open_hands(
@@ -139,7 +135,7 @@ def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) ->
 
 def conclude(
     frame: HandFrame, filtered: Filtered, choice: Choice, image: DepthImage, dt_s: float
-) -> tuple[int, HandState, StepInfo, Estimate]:
+) -> Concluded:
     """A slot's hand after a frame, from the pose that was chosen."""
     model, track, seen = frame.model, frame.track, frame.observation
     pose, trend = choice.pose, track.trend
@@ -202,32 +198,34 @@ def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
 
 
 def reconciled(
-    after: TrackerState,
     before: TrackerState,
-    infos: list[StepInfo | None],
-    estimates: list[Estimate],
+    found: Sequence[Concluded],
     image: DepthImage,
     model: TrackerModel,
     dt_s: float,
-) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
-    """What a step returns, with two hands each in its slot; one that is not followed is vacant."""
-    if len(after.hands) == 1:
+    spans: Spans,
+) -> Stepped:
+    """What a step returns; of two hands each in its slot, and vacant where none is followed."""
+    hands = list(before.hands)
+    infos: list[StepInfo | None] = [None] * len(hands)
+    estimates = [vacant(image, model) for _ in hands]
+    for slot, hand, info, estimate in found:
+        hands[slot], estimates[slot] = hand, estimate
+        infos[slot] = replace(info, seconds=spans.seconds())
+    after = replace(before, hands=tuple(hands))
+    if len(hands) == 1:
         return after, tuple(infos), tuple(estimates)
-    none, size = np.eye(3), (1, 1)
-
-    def pose_of(slot: int) -> PlacedHand:
-        hand = after.hands[slot]
-        assert hand.track is not None
-        return PlacedHand(hand.track.pose, model.hand(hand.side, hand.shape), none, size)
-
-    after, exchanged = reconcile(before, after, pose_of, dt_s)
+    after, exchanged = reconcile(before, after, partial(_found_hand, model), dt_s)
     if exchanged:
         infos, estimates = infos[::-1], estimates[::-1]
-    told = [
-        vacant(image, model) if hand.track is None else estimate
-        for hand, estimate in zip(after.hands, estimates, strict=True)
-    ]
-    return after, tuple(infos), tuple(told)
+    both = zip(after.hands, estimates, strict=True)
+    estimates = [vacant(image, model) if hand.track is None else one for hand, one in both]
+    return after, tuple(infos), tuple(estimates)
+
+
+def _found_hand(model: TrackerModel, hand: HandState, track: Track) -> PlacedHand:
+    """A hand where it was found; of its image nothing is asked."""
+    return PlacedHand(track.pose, model.hand(hand.side, hand.shape), np.eye(3), (1, 1))
 
 
 def estimate_of(
@@ -287,9 +285,7 @@ def emitted(
     return replace(hand, gesture=gesture, last=kept), estimate
 
 
-def no_hand(
-    absence: Absence, image: DepthImage, model: FilterModel
-) -> tuple[int, HandState, StepInfo, Estimate]:
+def no_hand(absence: Absence, image: DepthImage, model: FilterModel) -> Concluded:
     """Nothing in the frame can be a hand: the last estimate stands, and is lost."""
     hand = absence.hand
     estimate = lost_estimate(hand.last, image.index, image.timestamp_s, math.nan)

@@ -25,11 +25,10 @@ from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
-from toftrack.tracking.step import step
+from toftrack.tracking.step import Stepped, step
 
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
-Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 
 
 class HandsTracker:
