@@ -1,4 +1,4 @@
-"""When and where the detector looks for a hand."""
+"""When and where a hand is detected."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def search_due(hand: HandState, model: TrackerModel) -> bool:
 
 
 def detection_due(track: Track, settings: DetectorSettings, dt_s: float) -> bool:
-    """Whether the pose network looks at a hand that is followed; not always if it is sure."""
+    """Whether the pose network is asked about a hand that is followed; not always if it is sure."""
     sure = not track.doubted and track.log_odds > log_odds(settings.sure)
     waited = Duration(track.unseen_s + dt_s).reached(settings.every)
     return not sure or waited or track.challenged.begun

@@ -21,7 +21,7 @@ _BODY_COMPARISONS = 20
 _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
-"""Its least area that is seen, and rows of the image that it is looked for in."""
+"""Its least area that is seen, and rows of the image that it is searched in."""
 OTHER_SIDE = {"right": "left", "left": "right"}
 
 

@@ -107,7 +107,7 @@ class FilterModel:
         return HandState(side, handedness, first_shape(), seen, nothing)
 
     def first_state(self, seed: int, hands: int = 1) -> TrackerState:
-        """Before any frame. A second slot looks for the other side of the first one."""
+        """Before any frame. A second slot is for the other side of the first one."""
         generator = torch.Generator().manual_seed(seed)
         side, given = self.configured.shape.side, self.configured.side_given
         slots = (self.first_hand(side, given), self.first_hand(OTHER_SIDE[side], given))

@@ -39,7 +39,7 @@ class Track:
     challenged: how long a pose of another place has been better.
     log_odds: that the estimate is right, smoothed over time.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
-    unseen_s: how long ago the pose network looked at it.
+    unseen_s: how long ago the pose network was asked about it.
     features, joint_features: of the last estimate, (21, J); see confidence.py.
     nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
         at; 0 while nothing does.

@@ -104,7 +104,7 @@ def filtered_frame(
 ) -> Filtered:
     """The particles of a hand in a frame."""
     model, track = frame.model, frame.track
-    # A hand that was nearly lost is looked for farther away, but not ever farther.
+    # A hand that was nearly lost is searched farther away, but not ever farther.
     width = 1.0 + (track.doubtful.seconds / FRAME_S if model.lost.patience else 0.0)
     return run_filter(track, dt_s, frame.image, model, generator, spans, width)
 
@@ -280,7 +280,7 @@ def emitted(
     )
     size_px = image.depth_m.shape[1], image.depth_m.shape[0]
     estimate = in_all_conventions(_sided(estimate, hand), shape, image.k, size_px)
-    # While there is no hand, the last estimate that was believed is told, if one was.
+    # While there is no hand, the last estimate that was believed is reported, if one was.
     kept = hand.last if estimate.lost and not hand.last.lost else estimate
     return replace(hand, gesture=gesture, last=kept), estimate
 

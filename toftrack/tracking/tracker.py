@@ -35,7 +35,7 @@ class HandsTracker:
     """Follows `hands` hands, each in a slot of its own: slot 0 is the first one that was found.
 
     state: all that is carried between frames; one that was kept may be put back.
-    infos: what the last step saw and believed of each; None where it did not look.
+    infos: what the last step saw and believed of each; None where it was not searched.
     time: what frames take, and what may be spent on them.
     """
 
@@ -97,7 +97,7 @@ class HandsTracker:
         _stepped(self.state, _rendered_hand(), self.model)
 
     def restart(self, side: str | None = None) -> None:
-        """Forget the hands, also their size, and look for them anew; a side is the first hand's.
+        """Forget the hands, also their size, and search for them anew; a side is the first hand's.
 
         Only random numbers and frame numbers go on. Raises ToftrackError for an unknown side.
         """
