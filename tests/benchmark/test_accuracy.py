@@ -151,7 +151,7 @@ def test_an_ablation_has_the_differences_of_each_variant(folder, tmp_path, capsy
     chosen = ["--variants", "few-particles,no-refinement"]
     ablation.main([str(folder), *chosen, *files])
     said = capsys.readouterr().out
-    assert "20 particles" in said and "no refinement" in said and "no rivals" not in said
+    assert "20 particles" in said and "no refinement" in said and "no exchanged fingers" not in said
     result = json.loads((tmp_path / "a.json").read_text())
     assert set(result["variants"]) == {"default", "few-particles", "no-refinement"}
     assert result["variants"]["default"]["differences"]["usable_pct"]["mean"] == 0

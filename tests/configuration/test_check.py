@@ -38,7 +38,7 @@ WRONG = (
 
 
 @pytest.mark.parametrize(("override", "words"), WRONG)
-def test_a_wrong_value_is_told_in_one_sentence(override: str, words: str) -> None:
+def test_a_wrong_value_is_refused_in_one_sentence(override: str, words: str) -> None:
     with pytest.raises(ToftrackError, match=words) as error:
         configuration(override)
     assert "\n" not in str(error.value)
@@ -136,7 +136,7 @@ def test_a_configuration_that_is_damaged_is_one_sentence(tmp_path, name: str, te
     assert str(error.value) and "\n" not in str(error.value)
 
 
-def test_the_file_and_the_line_that_are_no_yaml_are_told() -> None:
+def test_the_file_and_the_line_that_are_no_yaml_are_reported() -> None:
     with pytest.raises(yaml.YAMLError) as error:
         yaml.safe_load("a: 1\nb: [")
     reported = sentence(error.value)

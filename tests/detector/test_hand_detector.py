@@ -163,12 +163,11 @@ def test_settings_are_checked() -> None:
     for name, value in {
         "places": 0,
         "hypotheses": 1.5,
-        "rivals": -1,
+        "candidates": -1,
         "least": 2.0,
         "merit": math.nan,
-        "prior": -0.1,
-        "rival_m": 0.0,
-        "rival_frames": 0,
+        "every": 0,
+        "sure": 0.4,
         "keypoint_m": 0.0,
     }.items():
         with pytest.raises(ToftrackError, match=f"detector.{name}="):

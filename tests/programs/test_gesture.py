@@ -72,7 +72,7 @@ def test_gestures_are_added_listed_replaced_and_removed(shows, capsys) -> None:
     assert not Path("gestures.json").exists(), "a file without poses is none"
 
 
-def test_what_cannot_be_told_apart_or_was_not_followed_is_refused(shows, here: Path) -> None:
+def test_what_cannot_be_distinguished_or_was_not_followed_is_refused(shows, here: Path) -> None:
     shows(basic_pose("fist").numpy())
     with pytest.raises(ToftrackError, match="'fist' and 'mine' are too much alike"):
         main(["add", "mine", "sample", *PART])

@@ -325,7 +325,6 @@ def test_swapped_hands_differ_from_the_first_in_exactly_one_finger(side: str) ->
         ("iterations", -1),
         ("points", 0),
         ("points", 2.5),
-        ("swaps", -1),
         ("reach_m", 0),
         ("point_m", -0.01),
         ("angle_rad", "wide"),

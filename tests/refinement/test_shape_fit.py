@@ -146,7 +146,7 @@ def test_another_person_s_hand_is_noticed_and_fitted_anew() -> None:
     assert applied.hand_length_m == pytest.approx(0.15, rel=0.04)
 
 
-def test_a_single_odd_look_reopens_nothing() -> None:
+def test_a_single_odd_frame_reopens_nothing() -> None:
     belief = fitted(first_shape(), default_hand_shape(0.19), poses(12))
     once = fitted(belief, default_hand_shape(0.15), poses(1, seed=1))
     assert once.poses >= belief.poses

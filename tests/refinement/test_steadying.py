@@ -25,7 +25,7 @@ def hand(x: float = 0.0) -> torch.Tensor:
 
 def followed(states: list[torch.Tensor], settings: Steadying = SETTINGS) -> torch.Tensor:
     """(T, 27) the steadied states."""
-    believed, trend, path = states[0], None, [states[0]]
+    believed, trend, path = states[0], torch.full((27,), torch.nan), [states[0]]
     for state in states[1:]:
         believed, trend = steadied(state, believed, trend, FRAME_S, settings, rigid.MOTIONS)
         path.append(believed)

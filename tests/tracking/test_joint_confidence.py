@@ -139,7 +139,7 @@ def test_a_hidden_joint_says_so() -> None:
     assert (less[behind] < sure[behind]).all() and (less[~behind] == sure[~behind]).all()
 
 
-def test_what_is_out_of_the_image_or_not_read_is_told_apart() -> None:
+def test_what_is_out_of_the_image_or_not_read_is_distinguished() -> None:
     away = joints_at() + np.array([1, 0, 0], np.float32)
     assert (features_of(away)["outside"] == 1).all() and (features_of(away)["unread"] == 0).all()
     blank = features_of(joints_at(), 0 * WALL)

@@ -94,7 +94,7 @@ def test_a_pose_can_be_given_on_the_command_line() -> None:
 
 
 @pytest.mark.parametrize("frame", range(0, 100, 20))
-def test_the_palm_is_looked_for_on_the_hand_or_the_wrist(frame: int) -> None:
+def test_the_palm_is_expected_on_the_hand_or_the_wrist(frame: int) -> None:
     scene = sample().cut(frame)
     centre = palm_centre(observed(scene), generator())
     assert centre.shape == (3,) and centre.dtype == np.float32

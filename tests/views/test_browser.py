@@ -99,7 +99,7 @@ def test_a_frame_without_a_hand_is_shown_as_lost(view) -> None:
     assert facts["lost"] and facts["index"] == 7 and facts["gesture_probability"] is None
 
 
-def test_two_hands_are_told_apart_from_the_frame(view) -> None:
+def test_two_hands_are_distinguished_from_the_frame(view) -> None:
     moment = two_hands(moments()[1], lost=True, gesture="fist")
     view.show(moment)
     facts, _ = next_picture(view, {})
