@@ -61,7 +61,7 @@ def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str)
     assert (reported.returncode, reported.stderr) == (130, "interrupted\n")
 
 
-def test_the_command_begins_where_interrupts_are_heard_first() -> None:
+def test_the_command_begins_where_interrupts_are_caught_first() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["scripts"]["toftrack"] == "toftrack.__main__:main"
     for name in ("toftrack/__main__.py", "track.py", "train_pose_space.py"):

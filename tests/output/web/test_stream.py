@@ -89,7 +89,7 @@ def test_a_client_that_leaves_disturbs_nobody(stream: WebSocketStream) -> None:
         assert json.loads(stays.recv(PATIENCE_S))["index"] == 1
 
 
-def test_what_a_client_sends_is_not_looked_at(stream: WebSocketStream) -> None:
+def test_what_a_client_sends_is_ignored(stream: WebSocketStream) -> None:
     with listening(stream) as one:
         one.send("restart")
         stream.send((hand_estimate(1),))
