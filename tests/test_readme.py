@@ -114,7 +114,7 @@ def overrides_of(words: tuple[str, ...]) -> list[str]:
     return kept
 
 
-def test_there_are_commands_to_look_at() -> None:
+def test_there_are_commands_to_check() -> None:
     assert len(TRACK) > 10 and len(TRAIN) >= 1 and len(MODULES) > 4
 
 

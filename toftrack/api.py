@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from toftrack.configuration.check import check_tracker
+from toftrack.configuration.check import check_groups, check_tracker
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
 
@@ -116,6 +116,7 @@ def build_model(config: DictConfig) -> FilterModel:
     from toftrack.tracking.model import TrackerModel
     from toftrack.tracking.paper import PaperModel
 
+    check_groups(config)
     check_tracker(config)
     device = compute_device(config.compute)
     detector = instantiate(config.detector)

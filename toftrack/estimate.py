@@ -17,7 +17,7 @@ STATES = {
     "recovering": "trying to recover",
     "dropped": "the frame came too late",
 }
-"""What the tracker does, Estimate.state_name, and how people are told."""
+"""What the tracker does, Estimate.state_name, and how it is said to people."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Estimate:
     side: str = ""
     """'right' or 'left', whose hand it is; empty where nobody says."""
     side_probability: float = math.nan
-    """How sure that is, 0..1; 1 where it was told."""
+    """How sure that is, 0..1; 1 where it was given."""
     gesture: str = ""
     """The gesture ("palm", "pointing_thumb", ... or a name of the user's), 'other' where it is none
     of the known; empty where gesture output is off or the hand is lost."""

@@ -73,7 +73,8 @@ def given_for(folder: Path) -> dict[tuple[str, str], list[str]]:
 
 def composed(group: str, option: str, *overrides: str) -> DictConfig:
     name = "train_pose_space" if group in OF_TRAINING else "config"
-    return configuration(f"{group}={option}", *overrides, name=name)
+    paper = ["experiment=paper"] if group == "start" else []
+    return configuration(*paper, f"{group}={option}", *overrides, name=name)
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)

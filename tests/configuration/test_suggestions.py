@@ -26,7 +26,7 @@ from toftrack.errors import ToftrackError
         ("device.path=a (1).npz", "give the recording by its name alone: toftrack track 'a (1)"),
         ("seed=[1", "'seed=[1' cannot be read as a setting"),
         ("start=search", "there is no start=search any more, since the networks find hands: leave"),
-        ("lost=score", "there is no lost=score any more, since the networks' signs are judged"),
+        ("lost=score", "there is no lost=score any more, since the networks' features count"),
         ("start.hypotheses=9", "or give detector.hypotheses"),
         ("start.islands=9", "there is no setting start.islands any more, since the networks"),
         (

@@ -35,7 +35,7 @@ def numbers(seen: NetworkOutput) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.2, -0.1, 0.4), (-0.3, 0.3, 0.3)])
-def test_a_crop_looks_along_the_ray_to_its_centre(centre: tuple[float, float, float]) -> None:
+def test_a_crop_faces_along_the_ray_to_its_centre(centre: tuple[float, float, float]) -> None:
     rotation = crop_rotation(np.array(centre))
     assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
@@ -129,7 +129,7 @@ def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int
 
 @pytest.mark.parametrize("side", ["right", "left"])
 @pytest.mark.parametrize("network", ["trained", "random"])
-def test_the_compiled_look_says_what_the_reference_says(side: str, network: str) -> None:
+def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> None:
     """Of hands, of places at the border, and of places beside the image."""
     pose = load_weights()[0] if network == "trained" else small_networks()[0]
     for frame in (0, 30, 60):

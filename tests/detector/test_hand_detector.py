@@ -71,7 +71,7 @@ def test_a_hand_s_length_is_the_mean_of_the_hypotheses() -> None:
     assert seen.length_m == pytest.approx(length, rel=1e-4)
 
 
-def test_nowhere_to_look_gives_nothing() -> None:
+def test_without_a_place_nothing_is_detected() -> None:
     assert detector().detect(sample().depth_m[0], sample().k, np.zeros((0, 3)), "right") == []
 
 
@@ -100,7 +100,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, found: dict[str, Places], **change
     return here.search(sample().depth_m[0], sample().k, "right"), inspected
 
 
-def test_a_search_looks_twice_at_places_that_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_detects_twice_at_places_that_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     found = found_at((0, 0, 0.4), (0.02, 0, 0.4), (0.2, 0, 0.5), left=((0, -0.2, 0.5),))
     detections, inspected = searched(monkeypatch, found, merit=-1e6, places=3)
     assert len(inspected) == 2 and len(detections) == 3
@@ -110,12 +110,12 @@ def test_a_search_looks_twice_at_places_that_are_apart(monkeypatch: pytest.Monke
     assert (away > 0).all(), "about the palms that the first one found"
 
 
-def test_a_search_looks_at_no_more_places_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_detects_at_no_more_places_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
     found = found_at((0, 0, 0.4), (0.2, 0, 0.5), (-0.2, 0, 0.5))
     assert len(searched(monkeypatch, found, merit=-1e6, places=1)[0]) == 1
 
 
-def test_what_does_not_look_like_a_hand_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_like_a_hand_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     found = found_at((0, 0, 0.4), (0.2, 0, 0.5))
     assert searched(monkeypatch, found, merit=1e6)[0] == []
     assert searched(monkeypatch, found_at())[0] == []

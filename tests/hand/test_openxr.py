@@ -162,7 +162,7 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("state", "side"), POSES)
-def test_palm_and_wrist_lie_and_look_as_specified(state, side) -> None:
+def test_palm_and_wrist_lie_and_face_as_specified(state, side) -> None:
     hand = placed(state, side)
     _, y, z = np.moveaxis(axes(hand), 1, 0)
     base, knuckle = hand.position_m[AT["middle_metacarpal"]], hand.position_m[AT["middle_proximal"]]

@@ -30,7 +30,7 @@ def test_without_components_the_hand_is_the_one_it_starts_from() -> None:
     assert same.thickness == first.thickness
 
 
-def test_only_the_length_makes_the_hand_longer() -> None:
+def test_only_the_length_changes_the_hands_length() -> None:
     first = default_hand_shape()
     assert with_components(length=0.1).hand_length_m == pytest.approx(0.19 * 1.10517, rel=1e-4)
     for name, sigma in zip(COMPONENTS[1:], POPULATION_SIGMA[1:], strict=True):
@@ -38,7 +38,7 @@ def test_only_the_length_makes_the_hand_longer() -> None:
         assert other.hand_length_m == pytest.approx(first.hand_length_m, rel=1e-5), name
 
 
-def test_longer_fingers_come_with_a_shorter_palm() -> None:
+def test_long_fingers_come_with_a_short_palm() -> None:
     first, other = default_hand_shape(), with_components(fingers=0.1)
     assert (fingers(other) > 1.03 * fingers(first)).all()
     palm = other.base_m[2].norm() / first.base_m[2].norm()

@@ -53,7 +53,7 @@ def test_hands_of_people_and_unsure_fits_are_not_doubted(shape: HandShape) -> No
     assert length_doubt(shape, K) == ""
 
 
-def test_how_long_a_lost_hand_looked_counts_where_most_was_lost_and_it_was_seen_often() -> None:
+def test_how_long_a_lost_hand_seemed_counts_where_most_was_lost_and_it_was_seen_often() -> None:
     seen = LostFrame("searching", 0.9, 0.3, 0.5, 2.0, 900, False, apparent_m=0.226)
     unseen = dataclasses.replace(seen, apparent_m=None)
 

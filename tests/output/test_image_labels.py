@@ -51,7 +51,7 @@ def test_what_is_nowhere_or_behind_the_camera_is_infinitely_far_off(tmp_path) ->
     assert all(row["wrong_pct"] == 100 for row in rows.values())
 
 
-def test_labels_of_a_longer_recording_are_refused(tmp_path) -> None:
+def test_labels_beyond_the_recordings_end_are_refused(tmp_path) -> None:
     seen = points(tmp_path, {"7": {"points": {"thumb_tip": [50, 40, "visible"]}}})
     with pytest.raises(ToftrackError, match="of frame 7, but the recording has 2 frames"):
         point_rows(seen, np.zeros((2, 21, 3)), np.zeros(2, bool), K, TIPS)

@@ -306,7 +306,7 @@ def test_a_unit_that_is_neither_metres_nor_millimetres_is_doubted(
 
 
 @pytest.mark.parametrize("kind", [np.uint16, np.int32, np.int64])
-def test_whole_numbers_look_like_millimetres(tmp_path: Path, kind: type) -> None:
+def test_whole_numbers_are_taken_for_millimetres(tmp_path: Path, kind: type) -> None:
     text = complaint(save(tmp_path, depth_m=np.full((T, H, W), 500, kind)))
     assert "millimetres" in text
     assert "/ 1000" in text

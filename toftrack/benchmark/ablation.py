@@ -30,7 +30,7 @@ from toftrack.output.paired import compared
 
 
 class Variant(NamedTuple):
-    """The default with something changed: overrides, and whether the side is told."""
+    """The default with something changed: overrides, and whether the side is given."""
 
     about: str
     overrides: tuple[str, ...] = ()
@@ -42,7 +42,7 @@ _STILL = tuple(
     f"filter.spread.{name}=0" for name in ("translation_m", "depth_m", "rotation_rad", "latent")
 )
 VARIANTS: dict[str, Variant] = {
-    DEFAULT: Variant("side told, one hand"),
+    DEFAULT: Variant("side given, one hand"),
     "few-particles": Variant("20 particles", ("filter.particles=20",)),
     "no-filter": Variant(
         "no filter: prediction and refinement",
@@ -56,7 +56,7 @@ VARIANTS: dict[str, Variant] = {
     "no-candidates": Variant("no candidates of the detector", ("detector.candidates=0",)),
     "no-exchange": Variant("no exchanged fingers", ("hysteresis.exchanged=0",)),
     "no-overlap": Variant("fingers may be in one another", ("posterior.overlap=0",)),
-    "side-found": Variant("the side found out", (), "auto"),
+    "side-found": Variant("handedness detected", (), "auto"),
     "two-hands": Variant("two hands", ("hands=2",)),
 }
 _SHOWN = (

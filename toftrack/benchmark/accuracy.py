@@ -105,7 +105,7 @@ def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], lis
         if key == "hand.side" or key.split(".")[0] in _GIVEN_ELSEWHERE:
             raise ToftrackError(
                 f"{word} cannot be given here: recordings are named, with the camera that they "
-                "have, sides, seeds and hands are told by --side, --seeds and --hands, and nothing "
+                "have, sides, seeds and hands are given by --side, --seeds and --hands, and nothing "
                 "is shown, streamed or smoothed"
             )
     if hands > 1:
@@ -209,7 +209,7 @@ def _parser() -> argparse.ArgumentParser:
         "--side",
         choices=SIDES,
         default="told",
-        help="whether the tracker is told whose hand it is, by the truth, or finds out (told)",
+        help="handedness: told, by the truth, or auto, detected while tracking (told)",
     )
     parser.add_argument("--hands", type=int, choices=(1, 2), default=1, help="followed at once (1)")
     parser.add_argument(

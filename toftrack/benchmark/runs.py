@@ -139,7 +139,7 @@ def jobs(
         for one in found:
             if not one.amplitude:
                 raise ToftrackError(
-                    f"'{one.path}' has no amplitude image, which --peer {peer[0]} looks at; leave "
+                    f"'{one.path}' has no amplitude image, which --peer {peer[0]} needs; leave "
                     "the recording out, or --peer"
                 )
     return [
@@ -221,7 +221,7 @@ def _true_rows(job: Job) -> list[Row]:
         if job.side == "told" and not truth.side:
             raise ToftrackError(
                 f"'{job.path}' does not say whose hand it shows ('side' in its metadata), and so "
-                "nobody can be told; give --side auto"
+                "no side can be given; give --side auto"
             )
         peer = None if job.peer is None else peer_process(*job.peer)
         if peer is not None:
@@ -274,7 +274,7 @@ def _tracked(
 def estimates_of(reported: Sequence[Sequence[Estimate]], found_side: bool) -> Estimates:
     """What was said in T frames of each slot; with one slot without its axis.
 
-    found_side: whether the side was found out.
+    found_side: whether handedness was detected.
     """
 
     def column(name: str) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""What every room computes with: compiled code, threads, rigid motions, and the one back end."""
+"""What every package computes with: compiled code, threads, rigid motions, and the one back end."""

@@ -34,7 +34,7 @@ class Quality:
 
     threads: at most. Beside another program that takes a core, helpers are waited for longer than
         they help.
-    every: frames from one detection to the next of a hand that is believed.
+    every: frames from one detection of a believed hand to the next.
     search: likewise from one search of the whole image to the next, while none is.
     exchanged: part of the poses with another finger that are tried.
     candidates, places: at most.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import toftrack
+from toftrack.configuration import renamed
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
@@ -70,11 +72,14 @@ def configuration_folder() -> Path:
 
 
 def setting_names() -> frozenset[str]:
-    """The groups, and the settings that stand in none: how the keys of overrides begin."""
+    """The groups, and the settings that stand in none: how the keys of overrides begin, also of
+    groups that are gone.
+    """
     folder = configuration_folder()
     own = [str(name) for path in folder.glob("*.yaml") for name in OmegaConf.load(path)]
     groups = [path.name for path in folder.iterdir() if path.is_dir()]
-    return frozenset({*own, *groups, "hydra"})
+    old = [re.split(r"[.=]", name)[0] for name in renamed.MOVED]
+    return frozenset({*own, *groups, *old, "hydra"})
 
 
 def devices_of_files() -> frozenset[str]:

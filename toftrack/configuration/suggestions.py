@@ -10,30 +10,12 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from toftrack.configuration.renamed import answer
+
 _ALIKE = 0.6
 """How much of a name must be right, 0..1."""
 _MOST = 12
 """So many names are listed at most."""
-_OR_PAPER = "or give experiment=paper, the tracker without networks"
-_GONE = {
-    "start=search": f"the networks find hands: leave it out, {_OR_PAPER}",
-    "start.hypotheses": "the networks find hands: leave it out, or give detector.hypotheses",
-    **dict.fromkeys(
-        (
-            *("start.islands", "start.samples", "start.improved", "start.coverage"),
-            *("start.position_m", "start.tilt_rad", "start.arm_rad"),
-        ),
-        f"the networks find hands: leave it out, {_OR_PAPER}",
-    ),
-    "lost=score": f"the networks' signs are judged, too: leave it out, {_OR_PAPER}",
-    "lost.score": f"lost.confidence says which estimates count: give that, {_OR_PAPER}",
-    **dict.fromkeys(
-        ("lost.start_score", "lost.rival_gain", "lost.outside_rad"),
-        "lost.confidence (in experiment=paper lost.score) says which estimates count: give that",
-    ),
-    "hand.fit": "the whole shape is fitted, by the settings of hand.adapt: give those",
-}
-"""What there was, and what is to be done instead."""
 
 
 def nearest(word: str, names: Sequence[str]) -> str | None:
@@ -70,8 +52,8 @@ def _of_syntax(error: OverrideParseException) -> str:
 
 def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     group, _, word = missing.rpartition("/")
-    if reported := _GONE.get(f"{group}={word}"):
-        return f"there is no {group}={word} any more, since {reported}"
+    if old := answer(group, word):
+        return old
     if not group or not options:
         return None
     likely = nearest(word, options)
@@ -81,6 +63,9 @@ def _of_choice(missing: str, options: Sequence[str]) -> str | None:
 
 def _of_key(chain: Sequence[BaseException]) -> str | None:
     reported = re.match(r"Could not override '([^']+)'", str(chain[0]))
+    proposed = re.search(r" use \+[^=]+=(.*)", str(chain[0]))
+    if reported and (old := answer(reported[1], proposed[1].strip() if proposed else "")):
+        return old
     for error in chain:
         parent = getattr(error, "parent_node", None)
         if (
@@ -95,9 +80,6 @@ def _of_key(chain: Sequence[BaseException]) -> str | None:
 def _unknown_key(key: str, parent: DictConfig) -> str:
     root = parent._get_root()
     assert isinstance(root, DictConfig)
-    for gone, reported in _GONE.items():
-        if f"{key}.".startswith(f"{gone}."):
-            return f"there is no setting {key} any more, since {reported}"
     keys = [name for name in _keys(root) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]
@@ -109,12 +91,14 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
     if likely is not None:
         return f"{text}; did you mean {likely}?"
-    inside = OmegaConf.select(root, key.rpartition(".")[0]) if "." in key else root
+    where = key.rpartition(".")[0]
+    while where and not isinstance(OmegaConf.select(root, where), DictConfig):
+        where = where.rpartition(".")[0]
+    inside = OmegaConf.select(root, where) if where else root
     some = [str(name) for name in inside if name not in ("_target_", "hydra")]
     if len(some) > _MOST:
         some = [*some[:_MOST], "..."]
-    where = key.rpartition(".")[0] or "the configuration"
-    return f"{text}; {where} has {', '.join(some)}"
+    return f"{text}; {where or 'the configuration'} has {', '.join(some)}"
 
 
 def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:

@@ -23,7 +23,7 @@ from toftrack.refinement.gauss_newton import Keypoints
 SAME_PLACE_M = 0.06
 """Places that lie closer together are one."""
 _AGAIN = 2.0
-"""Places whose merit is so much lower than the best are not looked at again."""
+"""Places whose merit is so much lower than the best are not considered again."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
@@ -177,8 +177,8 @@ class HandDetector:
 
         likely: what is known of places (3,) besides the image, log scale.
 
-        The best places are looked at twice, the second time about the palm that was found: poses
-        are the more exact the nearer the crop's centre is to the middle of the palm.
+        At the best places poses are proposed twice, the second time about the palm that was found:
+        they are the more exact the nearer the crop's centre is to the middle of the palm.
         """
         cfg = self.settings
         found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)

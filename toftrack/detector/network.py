@@ -2,7 +2,7 @@
 
 Free hypotheses collapse onto one another, so every hypothesis is anchored to one of the 24
 rotations of the cube: it answers for hands that are turned about as its anchor. Beside them the
-joints are regressed from every cell of a feature map, each cell voting for where each joint is and
+joints are regressed from every cell of a feature map, each cell saying where each joint is and
 how surely (as Xiong et al., "A2J: Anchor-to-joint regression network", ICCV 2019), which is more
 exact at what is seen. Hands are right hands; a left one is shown mirrored.
 """
@@ -55,7 +55,7 @@ class Proposed(NamedTuple):
 
     rotation: (N, 24, 3, 3).  angles: (N, 24, 21).  log_size: (N, 24).  pivot_m: (N, 24, 3).
     log_probability: (N, 24).  error_m: (N, 24) expected mean error of the joints.
-    joints_m: (N, 21, 3) and sigma_m: (N, 21), by the votes of the cells.
+    joints_m: (N, 21, 3) and sigma_m: (N, 21), by the keypoints of the cells.
     right: (N,) logit of a right hand.  present: (N,) logit of a hand near the centre.
     parts: (N, SEGMENTS, PARTS, PARTS) logits.
     """
@@ -136,7 +136,7 @@ class PoseNet(nn.Module):
         return self.decode(image, *self.features(image))
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The last layers' outputs: heads (N, ...), votes and parts (N, ..., 16, 16)."""
+        """The last layers' outputs: heads (N, ...), keypoints and parts (N, ..., 16, 16)."""
         fine = self.fine(self.stem(image))
         middle = self.middle(fine)
         dense = self.dense(self.coarse(middle))
@@ -170,7 +170,7 @@ class PoseNet(nn.Module):
         )
 
     def _joints(self, keypoints: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """Weighted means of the cells' votes, (N, 21, 3), and their deviations (N, 21)."""
+        """Weighted means of the cells' keypoints, (N, 21, 3), and their deviations (N, 21)."""
         weight, x, y, z, spread = keypoints.unflatten(1, (5, JOINTS)).flatten(3).unbind(1)
         weight = weight.softmax(2)
         across, down = self.cells.flatten(1)

@@ -20,7 +20,7 @@ _MARGIN = 2
 class PackedPoseNet(NamedTuple):
     """A PoseNet for `pose_outputs`; the first image is the crop.
 
-    heads, votes: where these outputs are.  vote_channels: of a cell, in memory.
+    heads, keypoints: where these outputs are.  keypoint_channels: of a cell, in memory.
     """
 
     network: Network
@@ -89,9 +89,9 @@ def _residual(builder: NetworkBuilder, x: Image, block: nn.Module, border: int =
 
 @compiled
 def pose_outputs(image, net):
-    """Of one crop (3, CROP, CROP): the heads' numbers and the votes, see PoseNet.features.
+    """Of one crop (3, CROP, CROP): the heads' numbers and the keypoints, see PoseNet.features.
 
-    net: PackedPoseNet.  The votes are (16, 16, channels); both have more numbers than outputs.
+    net: PackedPoseNet.  The keypoints are (16, 16, channels); both have more numbers than outputs.
     """
     network, heads, keypoints, channels = net
     steps, weights, capacity = network

@@ -24,9 +24,9 @@ from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_s
 from toftrack.hand.skeleton import forward_kinematics
 
 KEPT = 12
-"""Hypotheses of a crop that are looked at further."""
+"""Hypotheses of a crop that are used further."""
 DOUBT_M = 0.06
-"""How far off a finger's outer joints may be that lies in another one, by the votes."""
+"""How far off a finger's outer joints may be that lies in another one, by the keypoints."""
 MIRROR = torch.tensor([-1.0, 1.0, 1.0])
 MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
 
@@ -50,8 +50,8 @@ class NetworkOutput:
     log_size: (C, H) of the hand's length in units of the mean adult's.
     log_probability, error_m: (C, H).  Hypotheses are sorted by probability.
     joints_m: (C, H, 21, 3) of mean hands of these sizes.
-    votes_m: (C, 21, 3) joints by the cells' votes.  sigma_m: (C, 21) their deviations.
-    present, right: (C,) logits; `right` is of the side that was looked for.
+    keypoints_m: (C, 21, 3) joints by the cells' means.  sigma_m: (C, 21) their deviations.
+    present, right: (C,) logits; `right` is of the side that was searched for.
     """
 
     pivot_m: Tensor
@@ -142,7 +142,7 @@ def run_pose_network(
 
 
 def _sigma_m(keypoints_m: Tensor, sigma_m: Tensor, log_size: Tensor) -> Tensor:
-    """(C, 21) deviations of the votes: larger where two fingers are voted for in one place.
+    """(C, 21) deviations of the keypoints: larger where those of two fingers coincide.
 
     Of a single finger that is seen the cells do not know which one it is, and say surely that it is
     either.

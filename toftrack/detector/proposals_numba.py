@@ -1,6 +1,6 @@
-"""Hypotheses of a crop in one compiled call; see proposals.look.
+"""Hypotheses of a crop in one compiled call; see proposals.run_pose_network.
 
-The same formulas as PoseNet.decode's and proposals.look's, which are the reference, without the
+The same formulas as PoseNet.decode's and proposals.run_pose_network's, which are the reference, without the
 microseconds that every operation costs on a few numbers.
 """
 
@@ -55,7 +55,7 @@ _CELLS = 16
 def run_pose_network(
     pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
 ) -> NetworkOutput:
-    """See proposals.look, which it is where the network is on another device."""
+    """See proposals.run_pose_network, which it is where the network is on another device."""
     if pose.anchors.device.type != "cpu":
         return proposals.run_pose_network(pose, depth_m, k, centres_m, side)
     task, out = _prepared(pose, depth_m, k, centres_m, side)
@@ -191,7 +191,7 @@ def _crop(depth, mirror, k, centre, turn, image):
 
 @compiled
 def _decode(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
-    """What the network's outputs for a crop mean, see PoseNet.decode and proposals.look."""
+    """What the network's outputs for a crop mean, see PoseNet.decode and proposals.run_pose_network."""
     _, _, _, log_size, _, _, _, joints, sigma, present, right = out
     present[c], right[c] = heads[len(_ANCHORS) * _EACH], heads[len(_ANCHORS) * _EACH + 1]
     _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
@@ -315,7 +315,7 @@ def _into_camera(p, turn, centre, mirror, out):
 
 @compiled
 def _decode_keypoints(keypoints, depth, joints, sigma):
-    """Weighted means of the cells' votes (16, 16, 5 * JOINTS), see PoseNet._joints."""
+    """Weighted means of the cells' keypoints (16, 16, 5 * JOINTS), see PoseNet._joints."""
     top, total = np.full(JOINTS, -np.inf, np.float32), np.zeros(JOINTS)
     sums, spread = np.zeros((3, JOINTS)), np.zeros(JOINTS)
     for row in range(_CELLS):
@@ -325,7 +325,7 @@ def _decode_keypoints(keypoints, depth, joints, sigma):
     block = CROP // _CELLS
     for row in range(_CELLS):
         for column in range(_CELLS):
-            # Depth is voted for about the surface that the cell sees.
+            # Depth is predicted about the surface that the cell sees.
             seen = 0.0
             for i in range(block):
                 for k in range(block):

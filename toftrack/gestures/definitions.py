@@ -4,7 +4,7 @@ A finger's state is a range of its total flexion and of its split (see features.
 the ranges are those of functional motion (Bain et al., J. Hand Surg. Eur. 40(4), 2015): a straight
 finger is within 30 degrees of straight, one curled into the palm has about 90, 100 and 50 degrees
 in its joints, and the fingers of a resting hand 30, 40 and 15, the little one the most. The thumb
-is told by where its tip is. Nothing here was fitted to recordings.
+is recognised by where its tip is. Nothing here was fitted to recordings.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a gesture is told by: thirteen numbers of a hand's pose, whichever way the hand is turned.
+"""What a gesture is recognised by: thirteen numbers of a hand's pose, whichever way the hand is turned.
 
 Ten are sums of joint angles, which a depth image determines better than the angles themselves: of
 the thumb the abduction and the total flexion; of each other finger the total flexion, and how much
@@ -7,7 +7,7 @@ more of it the two outer joints have than the knuckle. Three are distances in un
 how far the thumb *reaches* away from the little finger's knuckle (0.6 .. 0.9 folded over palm or
 fist, 1.0 beside the index finger, 1.3 .. 1.7 stretched away), its *gap* to the index finger's tip,
 and how far index and middle fingertips are *apart* (0.25 side by side, 0.5 in a V). The fingers'
-abduction is not looked at else.
+abduction counts nowhere else.
 """
 
 from __future__ import annotations

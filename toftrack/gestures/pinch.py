@@ -49,7 +49,7 @@ class PinchSettings:
 class PinchState:
     """What is carried from frame to frame.
 
-    pinching: as told.  against: for how many times 1/25 s the pinch has said otherwise.
+    pinching: as reported.  against: for how many times 1/25 s the pinch has said otherwise.
     """
 
     pinching: bool = False

@@ -1,6 +1,6 @@
 """Which gesture a hand makes: one of those that are known, of those that a user names, or other.
 
-A pose is looked at through the numbers of `features`, which do not depend on how the hand is
+A pose is described by the numbers of `features`, which do not depend on how the hand is
 turned. A class says that these lie in its ranges, with normal tails to both sides; or says nothing
 of some of them. "other" says nothing at all: everything is equally likely within the joint limits.
 Bayes' rule with equal priors gives the probabilities. The tails are wide, for people make a gesture

@@ -40,7 +40,7 @@ class LostFrame:
     nearest_m, farthest_m: between which nearly all readings lie; NaN without any.
     hand_px: pixels that were taken for the hand; 0 where nothing was.
     other_side: whether it looks rather like the other hand; None where nobody says.
-    looked_m: how long the hand looked, from wrist to middle fingertip; None where nobody says.
+    apparent_m: how long the hand seemed, from wrist to middle fingertip; None where nobody says.
     """
 
     state_name: str
@@ -272,7 +272,7 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     if not found:
         which = "a bare hand" if side is None else f"a {side} hand (hand.side)"
         found.append(
-            f"If a hand was in view, look at overlay.png (view=video): it must be {which}, upright "
+            f"If a hand was in view, check overlay.png (view=video): it must be {which}, upright "
             "and not mirrored (x right, y down), with nothing else nearer to "
             "the camera, and depth_m must have the order frames, rows, columns."
         )

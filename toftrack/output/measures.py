@@ -68,8 +68,8 @@ class Estimates:
     gesture: np.ndarray | None = None
     """(T,) text."""
     side: np.ndarray | None = None
-    """(T,) text, 'right' or 'left', which it found out; empty where it names none. None where it
-    was told."""
+    """(T,) text, 'right' or 'left', as it was detected; empty where it names none. None where it
+    was given."""
     side_probability: np.ndarray | None = None
     """(T,)."""
 
@@ -179,7 +179,7 @@ def _jitter_mm(joints_m: np.ndarray, truth: Truth, said: np.ndarray) -> float | 
 
 
 def _side_figures(estimates: Estimates, of: Judged, truth: Truth) -> dict[str, Any]:
-    """Nothing where the side was told, or nobody knows it."""
+    """Nothing where the side was given, or nobody knows it."""
     if estimates.side is None or not truth.side:
         return {}
     side = np.asarray(estimates.side, str)

@@ -207,7 +207,7 @@ def _check(hand: Mapping[str, Any], needed: Set[str]) -> None:
 
 
 def _hands(line: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Those of a line that is of several; none of another one, which is told of later."""
+    """Those of a line that is of several; none of another one, which is reported later."""
     hands = line.get("hands")
     reported = hands if isinstance(hands, list) else []
     return [hand for hand in reported if isinstance(hand, dict)]

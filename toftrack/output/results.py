@@ -43,7 +43,7 @@ _MOST_HELD = 10_000_000
 _MOST_DIMS = 100
 _TEXTS = ("joint_names", "metadata")
 _PARTS = ("camera", "config", "device", "hand_shape", "pose_space")
-"""Of the metadata: what is told of each."""
+"""Of the metadata: what is said of each."""
 
 
 class ResultWriter:
@@ -80,7 +80,7 @@ class ResultWriter:
         self.realtime: RealTime | None = None
         """How a live run kept up, for summary.json; to be set before the writer is closed."""
         self.apparent_m: Sequence[float | None] = ()
-        """Of Watch.looked_m, for summary.json; to be set likewise."""
+        """Of Watch.apparent_m, for summary.json; to be set likewise."""
         self._truth = truth
         self._facts = {
             "format": RUN_FORMAT,
@@ -181,7 +181,7 @@ def finish(
 
     folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
     realtime: what summary.json says of a live run; the lines do not tell it.
-    looked_m: for run_doubts; the lines do not tell it either.
+    apparent_m: for run_doubts; the lines do not have it either.
 
     Raises OSError when something cannot be read or written.
     """

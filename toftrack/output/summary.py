@@ -106,9 +106,9 @@ def run_doubts(
     apparent_m: Sequence[float | None] = (),
 ) -> list[str]:
     """What speaks against a run's input, a sentence each: what its device found, the frames' times
-    where the device did not look at them, and how long the fitted hands are.
+    where the device dropped them, and how long the fitted hands are.
 
-    looked_m: of the slots, how long the hand looked where it was mostly lost; () where the run did
+    apparent_m: of the slots, how long the hand seemed where it was mostly lost; () where the run did
     not say.
     """
     configured = (metadata.get("device") or {}).get("doubts")
@@ -152,7 +152,7 @@ def run_metrics(
 
 
 def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of a track without its side where that was told: it is no finding then."""
+    """The arrays of a track without its side where that was given: it is no finding then."""
     probability = arrays.get("side_probability", np.ones(0))
     known = probability[np.isfinite(probability)]
     configured = bool((known == 1).all())

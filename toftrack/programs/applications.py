@@ -16,7 +16,7 @@ from toftrack.programs.recording_argument import with_recording
 @command_line.sweep_job
 def track_job(config: DictConfig) -> float:
     """Track, write the results, and return what a sweep minimises."""
-    # The device comes before the seconds that torch takes: a missing camera is told at once.
+    # The device comes before the seconds that torch takes: a missing camera is reported at once.
     device = hydra.utils.instantiate(config.device)
     from toftrack.programs import track as app
 

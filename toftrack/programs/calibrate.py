@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--keep-lens", action="store_true", help="correct the depth only, trust the lens"
     )
-    parser.add_argument("--frames", type=int, default=80, help="frames to look at, at most (80)")
+    parser.add_argument("--frames", type=int, default=80, help="frames to use, at most (80)")
     parser.add_argument(
         "--modulation",
         type=int,

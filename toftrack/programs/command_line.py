@@ -58,7 +58,7 @@ class _JobFailedError(BaseException):
 
 
 def run(main: Callable[[], object]) -> int:
-    """Run a program and return its exit status, with errors told in one sentence.
+    """Run a program and return its exit status, with errors reported in one sentence.
 
     With HYDRA_FULL_ERROR=1 in the environment the traceback comes before the sentence.
 
@@ -105,7 +105,7 @@ def run(main: Callable[[], object]) -> int:
 def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
     """Decorate the function under `@hydra.main` so that a failing job does not stop a sweep.
 
-    In a sweep (`-m`) an error is told in one sentence, also as `error` in the summary.json of the
+    In a sweep (`-m`) an error is reported in one sentence, also as `error` in the summary.json of the
     job's output folder, and the job returns infinity: the worst there is for a sweeper that
     minimises, where NaN would stop it. Otherwise the error is raised.
     """

@@ -1,4 +1,4 @@
-"""Fit the tracker's belief on rendered sequences, whose hands and sensors are none that it is
+"""Fit the tracker's confidence on rendered sequences, whose hands and sensors are none that it is
 judged on:
 
 python -m toftrack.programs.fit_confidence
@@ -35,7 +35,7 @@ from toftrack.views.pictures import write_picture
 RIGHT_M = 0.04
 """An estimate is right when every joint is within this."""
 _SHRINK = 100.0
-"""Prior precision of the weights of signs in standard deviations, in frames."""
+"""Prior precision of the weights of features in standard deviations, in frames."""
 _HELD_OUT = 5
 """Every so manieth sequence is kept to check the fit."""
 
@@ -44,7 +44,7 @@ _HELD_OUT = 5
 class Observed:
     """What the tracker's estimates of T frames were formed from, and how right they were.
 
-    signs: (T, S).  right: (T,) every joint is within 40 mm.  joints: of each joint.
+    features: (T, S).  right: (T,) every joint is within 40 mm.  joints: of each joint.
     sequence: (T,) numbers of the sequences.
     """
 
@@ -69,7 +69,9 @@ def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--sequences", type=int, default=150, help="how many are rendered (150)")
     parser.add_argument("--frames", type=int, default=50, help="of each (50)")
     parser.add_argument("--seed", type=int, default=1, help="of everything random (1)")
-    parser.add_argument("--output", type=Path, default=Path("belief"), help="folder (belief)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("confidence"), help="folder (confidence)"
+    )
     parser.add_argument(
         "--sequences-from",
         type=Path,
@@ -99,12 +101,12 @@ def main(arguments: list[str] | None = None) -> None:
     seen = with_doubt(seen, log_odds, _memory(asked.overrides))
     more, joint_lines = _fitted_joints(seen, kept)
     summary |= more
-    write_whole(asked.output / "belief.json", json.dumps(summary, indent=1) + "\n")
+    write_whole(asked.output / "confidence.json", json.dumps(summary, indent=1) + "\n")
     pasted = "\n".join(lines + joint_lines)
-    write_whole(asked.output / "belief.yaml", pasted + "\n")
+    write_whole(asked.output / "confidence.yaml", pasted + "\n")
     picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
     write_picture(asked.output / "reliability.png", picture)
-    with whole_file(asked.output / "signs.npz") as stream:
+    with whole_file(asked.output / "features.npz") as stream:
         np.savez_compressed(
             stream,
             features=seen.features,
@@ -153,8 +155,8 @@ def _fitted_frames(
         "intercept": round(intercept, 3),
         "weights": fitted,
     }
-    lines = [f"intercept: {summary['intercept']} # log odds where all signs are 0; fitted"]
-    lines += ["weights: # of the signs, see toftrack/tracking/confidence.py"]
+    lines = [f"intercept: {summary['intercept']} # log odds where all features are 0; fitted"]
+    lines += ["weights: # of the features, see toftrack/tracking/confidence.py"]
     return log_odds, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
 
 
@@ -167,7 +169,7 @@ def _memory(overrides: list[str]) -> float:
 
 
 def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
-    """The same with the sign `doubt` of joints as newly fitted log odds (T,) of the frames make it.
+    """The same with the feature `doubt` of joints as newly fitted log odds (T,) of the frames make it.
 
     As the tracker does, it smooths them within each track.
     """
@@ -203,7 +205,7 @@ def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], li
         "  odds: 1.5 # added to all log odds; larger trusts joints more",
         "  kinds: # log cm along ray, finger, across; log odds of being within 40 mm; fitted",
         *_table(belief.kinds),
-        "  weights: # of the signs, see JOINT_FEATURES, likewise; fitted",
+        "  weights: # of the features, see JOINT_FEATURES, likewise; fitted",
         *_table(belief.weights),
     ]
     return summary, lines
@@ -222,10 +224,10 @@ def _words(summary: dict[str, Any]) -> str:
 
 
 def fitted_weights(features: np.ndarray, right: np.ndarray) -> tuple[float, np.ndarray]:
-    """Intercept and weights (S,) of a logistic model of signs (N, S) and what was right (N,).
+    """Intercept and weights (S,) of a logistic model of features (N, S) and what was right (N,).
 
-    Only the score may speak for an estimate and all other signs against it: signs that go together
-    would otherwise get weights of both kinds, which hold for rendered hands only.
+    Only the score may speak for an estimate and all other features against it: those that go
+    together would otherwise get weights of both kinds, which hold for rendered hands only.
     """
     mean, spread = features.mean(0), features.std(0) + 1e-9
     z, y = (features - mean) / spread, right.astype(float)

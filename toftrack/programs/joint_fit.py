@@ -1,4 +1,4 @@
-"""The fit of a JointBelief to errors that are known; a part of fit_confidence."""
+"""The fit of a JointConfidence to errors that are known; a part of fit_confidence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TAILS = 4.0
 """Degrees of freedom of the Student t that errors are taken for: wrong fingers are no outliers of a
 Gaussian."""
 _SHRINK = 1e-3
-"""Prior precision of the weights of signs in standard deviations, per joint."""
+"""Prior precision of the weights of features in standard deviations, per joint."""
 _SHRINK_QUANTILE = 0.1
 """The same of what the quantile changes. It is that strong because tails belong to few sequences,
 those with wrong tracks: weaker, regions of good frames get too small, and of doubtful too large."""
@@ -28,7 +28,7 @@ _SOFT = 0.05
 class JointRows(NamedTuple):
     """What T estimates said of their joints, and how it was.
 
-    signs: (T, 21, S).  error_cm: (T, 21, 3) along joint_axes.
+    features: (T, 21, S).  error_cm: (T, 21, 3) along joint_axes.
     near: (T, 21) the hand is there, and the joint within 40 mm.
     counted: (T,) the hand is there and the estimate not flagged lost.
     """
@@ -44,12 +44,12 @@ class JointRows(NamedTuple):
 
 
 def fitted_joint_belief(rows: JointRows) -> JointConfidence:
-    """The belief that suits the rows best.
+    """The confidence that suits the rows best.
 
     Standard deviations are those of Student's t, which says how errors differ; then all three of a
-    joint are changed alike, so that the 90 % regions hold what they should under any signs. Signs
-    only ever make a joint less sure: those that go together would otherwise get weights of both
-    kinds, which hold for rendered hands only.
+    joint are changed alike, so that the 90 % regions hold what they should under any features.
+    Features only ever make a joint less sure: those that go together would otherwise get weights of
+    both kinds, which hold for rendered hands only.
     """
     used = rows.of(rows.counted)
     design, unit = _design(used.features)
@@ -70,7 +70,7 @@ def fitted_joint_belief(rows: JointRows) -> JointConfidence:
 
 
 def _design(features: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """(N, K + S) kinds and signs in standard deviations; means and deviations of the signs."""
+    """(N, K + S) kinds and features in standard deviations; means and deviations of the features."""
     flat = features.reshape(-1, features.shape[-1])
     mean, spread = flat.mean(0), flat.std(0) + 1e-9
     kinds = np.eye(len(KINDS))[np.tile(KIND_OF_JOINT, len(features))]
@@ -78,7 +78,7 @@ def _design(features: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndar
 
 
 def _plain(weights: np.ndarray, unit: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Weights (K + S, C) for signs as they are."""
+    """Weights (K + S, C) for features as they are."""
     kinds, features = weights[: len(KINDS)], weights[len(KINDS) :] / unit[1][:, None]
     return np.concatenate((kinds - unit[0] @ features, features))
 
@@ -100,7 +100,7 @@ def _fit_spread(design: np.ndarray, error: np.ndarray) -> np.ndarray:
 def _fit_quantile(design: np.ndarray, log_off: np.ndarray, most_less: np.ndarray) -> np.ndarray:
     """(K + S,) to be added, so that log_off (N,) is below it in 90 %.
 
-    most_less: (K + S,) weights of signs go down by no more.
+    most_less: (K + S,) weights of features go down by no more.
     """
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
@@ -126,7 +126,7 @@ def _fit_odds(design: np.ndarray, near: np.ndarray) -> np.ndarray:
 def _minimised(
     loss: Callable[[np.ndarray], tuple[float, np.ndarray]], least: np.ndarray, shrink: float
 ) -> np.ndarray:
-    """Weights (K + S, C); those of signs are shrunk, and at least `least`."""
+    """Weights (K + S, C); those of features are shrunk, and at least `least`."""
     shape, features = least.shape, slice(len(KINDS), None)
 
     def shrunk(flat: np.ndarray) -> tuple[float, np.ndarray]:

@@ -26,7 +26,7 @@ _APART_S = 1.0
 def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> dict[str, Any]:
     """The metadata of run.json and track.npz, JSON-able.
 
-    The hand's shape is the first slot's at the start, its side 'auto' where none was told.
+    The hand's shape is the first slot's at the start, its side 'auto' where none was given.
     """
     camera, shape = device.camera, tracker.shapes[0]
     return {
@@ -59,7 +59,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
 
 
 def configured_side(config: Mapping[str, Any], side: str) -> str | None:
-    """The side that was told; None where either hand may come, or both.
+    """The side that was given; None where either hand may come, or both.
 
     config: of the run.  side: of the hand that is looked for.
     """

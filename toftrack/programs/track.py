@@ -87,7 +87,7 @@ def _pace(configured: Pace, device: Device) -> Pace:
 def _notes(parts: _Parts, side: str | None) -> tuple[str, ...]:
     """What is to be said of a run at its end."""
     dropped = tuple(filter(None, (parts.realtime.words(),)))
-    # Hands are lost, too, where most frames are not looked at.
+    # Hands are lost, too, where most frames are dropped.
     return dropped if parts.realtime.too_slow else dropped + parts.watch.advice(side)
 
 

@@ -1,4 +1,4 @@
-"""What is told of images that do not say it themselves: lens, unit, frame rate."""
+"""What is given of images that do not say it themselves: lens, unit, frame rate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BESIDE = "camera.json"
 
 @dataclass(frozen=True)
 class BareFacts:
-    """None = not told.
+    """None = not given.
 
     Raises ToftrackError for a unit or a rate that is not positive, and for intrinsics that are not
     four numbers, the first two of them positive.
@@ -42,7 +42,7 @@ class BareFacts:
             )
 
     def camera(self, width: int, height: int) -> Camera | None:
-        """The camera of the intrinsics for images of that size; None when they are not told."""
+        """The camera of the intrinsics for images of that size; None when they are not given."""
         if self.intrinsics is None:
             return None
         fx, fy, cx, cy = self.intrinsics
@@ -62,7 +62,7 @@ NOTHING_GIVEN = BareFacts()
 def bare_camera(
     path: Path, camera_file: str | Path | None, bare: BareFacts, width: int, height: int
 ) -> Camera:
-    """The camera of a file of bare images of that size: as told, else camera.json beside it.
+    """The camera of a file of bare images of that size: as given, else camera.json beside it.
 
     Raises ToftrackError where there is none, or it is of another size.
     """

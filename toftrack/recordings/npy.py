@@ -1,6 +1,6 @@
 """Stacks of depth images as numpy.save writes them: `.npy`, (T, H, W) or one image (H, W).
 
-Whole numbers are steps of a millimetre, unless another unit is told; floats are metres.
+Whole numbers are steps of a millimetre, unless another unit is given; floats are metres.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) 
 
     Args:
         path: the `.npy`.
-        camera_file: of the camera; None = the told intrinsics, or camera.json beside the file.
-        bare: intrinsics, unit of whole numbers (a millimetre) and frame rate (25) where told.
+        camera_file: of the camera; None = the given intrinsics, or camera.json beside the file.
+        bare: intrinsics, unit of whole numbers (a millimetre) and frame rate (25) where given.
 
     Raises:
         ToftrackError: it is no such stack, holds pickled objects, or nothing tells its camera.

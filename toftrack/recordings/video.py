@@ -132,7 +132,7 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
 
     Args:
         path: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of 16 bits (FFV1).
-        camera_file: a camera file; None = the recording's own calibration, or what is told.
+        camera_file: a camera file; None = the recording's own calibration, or what is given.
         bare: intrinsics, unit (a millimetre) and frame rate of a video that does not tell them.
 
     Raises:

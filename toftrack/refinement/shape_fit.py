@@ -43,10 +43,10 @@ _KEY_RAD, _KEY_TURN_RAD = 0.25, 0.35
 _KEYS = 24
 """Key poses that are kept; then only surer ones come in."""
 _EVERY = 3
-"""Frames from one fit to the next: they are alike, and a fit costs a millisecond."""
+"""Frames from one update to the next: they are alike, and an update costs a millisecond."""
 _ENOUGH, _ENOUGH_FRAMES, _SURER = 1.5, 3, 1.2
-"""Weight of the frames of a key pose from which on no more are fitted; or their number, from
-which on only frames that count so many times as much are: a fit costs a millisecond."""
+"""Weight of the frames of a key pose from which on no more are used; or their number, from
+which on only frames that count so many times as much are: an update costs a millisecond."""
 _KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
 """By how much the keypoints put the components wrong: means of uncertain places shorten fingers.
 Of rendered sequences of other hands, like what is said above."""
@@ -161,7 +161,7 @@ class ShapeEstimate:
     applied: the components of the hand in use, which follows the mean in steps.
     off, considered: by how much the network's log length has differed from the mean lately, summed
     by weight, and the sum of these weights.
-    frames: how many were seen, fitted or not.
+    frames: how many were seen, used or not.
     """
 
     mean: Tensor

@@ -24,7 +24,7 @@ class Steadying:
     translation_m, rotation_rad, finger_rad: noise of the refined pose of a hand that moves, in
         translation, rotation and all angles of a finger together. Smaller changes are mostly noise.
     calm: by how much more, in parts of it, the noise counts while the whole hand rests; 0 = none.
-    memory: part of the trend that is kept over FRAME_S; towards 1, rest is told from slow
+    memory: part of the trend that is kept over FRAME_S; towards 1, rest is distinguished from slow
         movement more surely and later.
     """
 

@@ -58,7 +58,7 @@ def draw_hands(
 def side_words(estimate: Estimate) -> str:
     """Whose hand it is and how sure, for people: "right", "left 83 %"; empty where nobody says."""
     sure = estimate.side_probability
-    # What was told needs no number.
+    # What was given needs no number.
     share = f"{min(round(100 * sure), 99)} %" if math.isfinite(sure) and sure < 1 else ""
     return f"{estimate.side} {share}".strip()
 

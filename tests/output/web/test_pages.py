@@ -72,7 +72,7 @@ def select(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
     return picture(browser)
 
 
-def test_the_hand_is_drawn_bends_and_turns_grey_when_it_is_lost(stream: Any, page: Any) -> None:
+def test_the_hand_is_drawn_bends_and_becomes_grey_when_it_is_lost(stream: Any, page: Any) -> None:
     page.get(stream.url)
     open_hand = select(page, stream, hand_estimate(1))
     rows, columns = np.nonzero(open_hand)

@@ -52,7 +52,7 @@ class Sr3000(BaseDevice):
             `every` delivers all, and asks the camera for no more while `queue_frames` wait.
         queue_frames: see `keep`.
         stop: end before this index; None = go on.
-        fps: the rate that is told to those who must know one in advance (the overlay video); the
+        fps: the rate that is given to those who must know one in advance (the overlay video); the
             emulated camera has its own.
         modulation_mhz, integration_time, amplitude_threshold: see `Exposure`.
         usb, libmesasr, emulated, persistence: settings of the parts.

@@ -1,4 +1,4 @@
-"""What the virtual SR3000 is told to do."""
+"""What the virtual SR3000 does."""
 
 from __future__ import annotations
 

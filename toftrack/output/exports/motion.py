@@ -117,7 +117,7 @@ def _motion(
     held = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked)), -1))
     held = np.where(held < 0, tracked.argmax(), held)
     there = openxr_hand(hand["joints_m"], hand["state"], openxr_rig(shape))
-    # Until it was found out whose hand it is, or where a slot took another one.
+    # Until handedness was detected, or where a slot took another one.
     (opposite,) = set(SIDES) - {shape.side}
     other = side == opposite
     mirrored = openxr_rig(shape.of_side(opposite))
