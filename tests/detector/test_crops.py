@@ -13,6 +13,7 @@ from helpers.tracking import sample
 from toftrack.detector import proposals, proposals_numba
 from toftrack.detector.crops import (
     CROP,
+    CROP_CHANNELS,
     CROP_M,
     WIDE_F_PX,
     WIDE_LARGEST_PX,
@@ -51,7 +52,7 @@ def test_a_crop_shows_depths_about_its_centre() -> None:
     rays = np.concatenate((rays / K[0, 0], np.ones((144, 176, 1))), -1)
     depth = ((distance + 0.03) / (rays @ normal)).astype(np.float32)
     image, _ = crop(depth, K, centre)
-    assert image.shape == (3, CROP, CROP) and image.dtype == np.float32
+    assert image.shape == (CROP_CHANNELS, CROP, CROP) and image.dtype == np.float32
     u, v = (K @ centre)[:2] / centre[2]
     assert u > 120 and v < 60, "the image cuts the right of the crop"
     inner = image[:, 12:-8, 8:40]
@@ -120,7 +121,7 @@ def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int
     turn = torch.tensor([1.0, -1.0, -1.0])
     for name, value in right.items():
         reported = left[name]
-        if name in ("pivot_m", "joints_m", "votes_m"):
+        if name in ("pivot_m", "joints_m", "keypoints_m"):
             reported = reported * torch.from_numpy(flip).float()
         elif name == "rotvec":
             reported = reported * turn

@@ -13,6 +13,7 @@ from torch import nn
 
 from toftrack.api import build_tracker
 from toftrack.detector import weights as module
+from toftrack.detector.crops import CROP_CHANNELS
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.weights import (
     DEFAULT_FILE,
@@ -24,7 +25,7 @@ from toftrack.errors import ToftrackError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-CROPS = 2 * torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
+CROPS = 2 * torch.rand(2, CROP_CHANNELS, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
 WHOLE = torch.rand(1, 2, 40, 48, generator=torch.Generator().manual_seed(0))
 ABOUT = {"seed": 3, "images": 12}
 

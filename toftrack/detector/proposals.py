@@ -50,7 +50,7 @@ class NetworkOutput:
     log_size: (C, H) of the hand's length in units of the mean adult's.
     log_probability, error_m: (C, H).  Hypotheses are sorted by probability.
     joints_m: (C, H, 21, 3) of mean hands of these sizes.
-    votes_m: (C, 21, 3) joints by the cells' votes.  sigma_m: (C, 21) their deviations.
+    keypoints_m: (C, 21, 3) joints by the cells' votes.  sigma_m: (C, 21) their deviations.
     present, right: (C,) logits; `right` is of the side that was looked for.
     """
 
@@ -111,7 +111,8 @@ def run_pose_network(
         depth_m, k = mirrored(depth_m, k)
         centres_m = centres_m * MIRROR.numpy()
     crops, crop_turns = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
-    image = torch.from_numpy(np.stack(crops)).to(memory_format=torch.channels_last)
+    image = torch.from_numpy(np.stack(crops)[:, : pose.inputs])
+    image = image.to(memory_format=torch.channels_last)
     p = Proposed(*on_host(*pose(on_device(image, pose.anchors.device))))
     turn = torch.from_numpy(np.stack(crop_turns)).float()  # (C, 3, 3)
     centre = torch.from_numpy(centres_m).float()

@@ -138,7 +138,7 @@ def _empty(count: int) -> dict[str, np.ndarray]:
         "log_probability": (KEPT,),
         "error_m": (KEPT,),
         "joints_m": (KEPT, JOINTS, 3),
-        "votes_m": (JOINTS, 3),
+        "keypoints_m": (JOINTS, 3),
         "sigma_m": (JOINTS,),
         "present": (),
         "right": (),
@@ -154,7 +154,7 @@ def detect_at(depth, mirror, k, centres, rotations, net, hand, out, counter):
     net: PackedPoseNet.  hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
     counter: (1,) int64 crops taken, by threads that share them.
     """
-    image = np.empty((3, CROP, CROP), np.float32)
+    image = np.empty((net.inputs, CROP, CROP), np.float32)
     while True:
         c = take(counter)
         if c >= len(centres):
