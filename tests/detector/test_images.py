@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers.detection import small_bank
 
-from toftrack.detector.crops import CROP, CROP_M
+from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
 from toftrack.detector.images import (
     WIDE_SIZE,
     Crops,
@@ -35,7 +35,7 @@ def images() -> WideImages:
 
 
 def test_crops_are_complete(crops: Crops) -> None:
-    assert crops.image.shape == (N, 3, CROP, CROP)
+    assert crops.image.shape == (N, CROP_CHANNELS, CROP, CROP)
     assert crops.image[:, 0].abs().max() <= 1
     assert crops.image[:, 1:].min() >= 0 and crops.image[:, 1:].max() <= 1
     for field in fields(crops):
