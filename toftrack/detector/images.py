@@ -29,6 +29,7 @@ from toftrack.detector.scenes import (
     random_views,
     room_behind,
     surroundings,
+    tables_under,
     things,
 )
 from toftrack.detector.shapes import ShapeBank
@@ -223,11 +224,11 @@ def random_scenes(
     other_labels = torch.where(there[:, None], second.labels, -1)
     centres = (hands.centres_m, second.centres_m, body[0], stuff[0])
     axes = (hands.axes_m, second.axes_m, body[1], stuff[1])
-    behind = hands.pivot_m[:, 2] + 0.1
-    if views is None:
-        behind = behind.clamp(min=0.4)
-    else:
-        behind = torch.where(views == FRONT, behind.clamp(min=0.4), behind)
+    planes = room_behind((hands.pivot_m[:, 2] + 0.1).clamp(min=0.4), dice)
+    if views is not None:
+        # Whoever looks down sees a table, or the floor far below.
+        planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)
+        planes = torch.cat((planes, tables_under(hands, views, dice)), 1)
     all_labels = torch.cat((labels, other_labels, body[2], stuff[2]), 1)
     covered = torch.cat((hands.skins.covered, second.skins.covered), 1)
     plain = torch.zeros(n, all_labels.shape[1] - covered.shape[1], dtype=torch.bool)
@@ -241,7 +242,7 @@ def random_scenes(
         torch.cat(centres, 1),
         torch.cat(axes, 1),
         all_labels,
-        room_behind(behind, dice, views),
+        planes,
         torch.cat((covered, plain), 1),
         skins,
         torch.cat((hands.parts, parts), 1),

@@ -368,11 +368,10 @@ def things(around_m: Tensor, n_things: int, p: float, dice: Dice) -> tuple[Tenso
     return around_m[:, None] + offset, rotation * log_axes.exp()[..., None, :], labels
 
 
-def room_behind(behind_m: Tensor, dice: Dice, views: Tensor | None = None) -> Tensor:
+def room_behind(behind_m: Tensor, dice: Dice) -> Tensor:
     """(N, 2, 4) a wall behind everything, and sometimes a table.
 
-    behind_m: (N,) how far away the hands are, and a little more.  views: (N,) where the cameras
-    are; None = before the persons. From above, the table is what is behind, often under the hand.
+    behind_m: (N,) how far away the hands are, and a little more.
     """
     n = len(behind_m)
     wall = torch.cat((0.2 * dice.normal(n, 2), torch.ones(n, 1)), 1)
@@ -383,18 +382,27 @@ def room_behind(behind_m: Tensor, dice: Dice, views: Tensor | None = None) -> Te
     table = torch.nn.functional.normalize(table, dim=1)
     below = dice.uniform(n, low=0.12, high=0.4)
     below = torch.where(dice.chance(0.15, n), below, torch.inf)
-    if views is not None:
-        head, above = views == HEAD, views == ABOVE
-        top = torch.cat((0.1 * dice.normal(n, 2), torch.ones(n, 1)), 1)
-        desk = torch.cat(
-            (0.1 * dice.normal(n, 1), dice.uniform(n, 1, low=0.3, high=1.2), torch.ones(n, 1)), 1
-        )
-        top, desk = (torch.nn.functional.normalize(plane, dim=1) for plane in (top, desk))
-        near = behind_m - dice.uniform(n, low=-0.15, high=0.085)
-        wall = torch.where(above[:, None], top, torch.where(head[:, None], desk, wall))
-        under = (behind_m + dice.uniform(n, low=-0.05, high=0.5)) * desk[:, 2]
-        distance = torch.where(above, near, torch.where(head, under, distance))
-        below = torch.where(head | above, torch.inf, below)
     return torch.stack(
         (torch.cat((wall, distance[:, None]), 1), torch.cat((table, below[:, None]), 1)), 1
     )
+
+
+def tables_under(hands: Hands, views: Tensor, dice: Dice) -> Tensor:
+    """(N, 1, 4) the tables that cameras see which look down, under the hands; others see none.
+
+    views: (N,) where the cameras are. From above, hands often lie on the table.
+    """
+    n = len(views)
+    above = torch.cat((0.1 * dice.normal(n, 2), torch.ones(n, 1)), 1)
+    tilt = dice.uniform(n, 1, low=0.3, high=1.2)
+    head = torch.cat((0.1 * dice.normal(n, 1), tilt, torch.ones(n, 1)), 1)
+    normal = torch.where((views == ABOVE)[:, None], above, head)
+    normal = torch.nn.functional.normalize(normal, dim=1)
+    points = torch.cat((hands.joints_m, hands.elbow_m[:, None]), 1)
+    # Joints lie a finger's half thickness above what the hand lies on.
+    lowest = (points * normal[:, None]).sum(-1).amax(1) + 0.010
+    reach = torch.where(views == ABOVE, 0.25, 0.5)
+    distance = lowest + reach * dice.uniform(n).square()
+    seen = (views == ABOVE) | ((views == HEAD) & dice.chance(0.75, n))
+    distance = torch.where(seen, distance, torch.inf)
+    return torch.cat((normal, distance[:, None]), 1)[:, None]
