@@ -13,9 +13,10 @@ from helpers.configured import detector_settings
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.detector.dice import Dice
 from toftrack.detector.hand_detector import Detection
+from toftrack.detector.hands import HAND, Hands, posed_hands
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
-from toftrack.detector.scenes import HAND, Hands, Scenes, plain_scenes, posed_hands
+from toftrack.detector.scenes import Scenes, plain_scenes
 from toftrack.detector.shapes import ShapeBank, shape_bank
 from toftrack.detector.weights import make_ready
 from toftrack.hand.shape import default_hand_shape

@@ -13,10 +13,10 @@ import numpy as np
 from toftrack.compute import rigid_numba
 from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid_numba import mix_columns
-from toftrack.detector import surfaces_numba
-from toftrack.detector.surfaces_numba import part_distance
+from toftrack.detector import things_numba
+from toftrack.detector.things_numba import part_distance
 
-_entry = entry_point(__file__, surfaces_numba.__file__, rigid_numba.__file__)
+_entry = entry_point(__file__, things_numba.__file__, rigid_numba.__file__)
 CLOSE, YIELD = range(2)
 """What a finger does: it closes on the thing, or gives way where it is in it."""
 _STEP, _BACK = math.radians(6.0), math.radians(9.0)

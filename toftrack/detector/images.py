@@ -10,10 +10,7 @@ from torch import Tensor
 
 from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, wide_channels
 from toftrack.detector.dice import Dice
-from toftrack.detector.images_numba import read_pictures
-from toftrack.detector.network import SEGMENTS, STRIDE
-from toftrack.detector.pictures import Lens, random_sensors, take_pictures
-from toftrack.detector.scenes import (
+from toftrack.detector.hands import (
     BACKGROUND,
     FOREARM,
     FOREARM_PIECES,
@@ -23,15 +20,13 @@ from toftrack.detector.scenes import (
     OTHER_HAND,
     THING,
     Hands,
-    Scenes,
-    moved,
     posed_hands,
     random_views,
-    room_behind,
-    surroundings,
-    tables_under,
-    things,
 )
+from toftrack.detector.images_numba import read_pictures
+from toftrack.detector.network import SEGMENTS, STRIDE
+from toftrack.detector.pictures import Lens, random_sensors, take_pictures
+from toftrack.detector.scenes import Scenes, moved, room_behind, surroundings, tables_under, things
 from toftrack.detector.shapes import ShapeBank
 
 _SAMPLES = 2 * CROP

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -112,3 +113,15 @@ def pose_outputs(image, net):
         (cells, cells, channels)
     )
     return images[heads:], keypoint_map
+
+
+@compiled
+def sigmoid(x):
+    """Of a number."""
+    return 1 / (1 + math.exp(-x))
+
+
+@compiled
+def softplus(x):
+    """Of a number: log(1 + exp(x))."""
+    return x + math.log1p(math.exp(-x)) if x > 0 else math.log1p(math.exp(x))

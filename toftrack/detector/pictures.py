@@ -1,8 +1,8 @@
 """Depth pictures of scenes, as sensors take them; compiled, one picture after another.
 
 An ellipsoid {c + F u : |u| <= 1} is met by the ray z (x, y, 1) where |z W d - W c| = 1, W = F^-1: a
-quadratic in z. Skin and things are met as surfaces_numba says. Then the sensor: noise that grows
-with the square of the distance, pixels on depth edges that mix both depths, readings that are
+quadratic in z. For skin and things see skin_numba and things_numba. Then the sensor: noise that
+grows with the square of the distance, pixels on depth edges that mix both depths, readings that are
 missing, steps, shadows beside near things.
 """
 
@@ -16,13 +16,15 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import announced, compiled, entry_point
-from toftrack.detector import surfaces_numba
+from toftrack.detector import skin_numba, things_numba
 from toftrack.detector.dice import Dice
-from toftrack.detector.scenes import THING, Scenes
+from toftrack.detector.hands import THING
+from toftrack.detector.scenes import Scenes
 from toftrack.detector.skin import PRIMITIVE
-from toftrack.detector.surfaces_numba import TILE, draw_part, draw_skin
+from toftrack.detector.skin_numba import TILE, draw_skin
+from toftrack.detector.things_numba import draw_part
 
-_entry = entry_point(__file__, surfaces_numba.__file__)
+_entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
     NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK,
 ) = range(10)  # fmt: skip

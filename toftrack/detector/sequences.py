@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from toftrack.archives import read_archive
+from toftrack.detector.dice import Dice
+from toftrack.detector.hands import HAND, posed_hands, random_rotations
 from toftrack.detector.images import random_scenes
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
-from toftrack.detector.scenes import HAND, Dice, posed_hands, random_rotations
 from toftrack.detector.shapes import ShapeBank
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.shown_poses import shown_poses

@@ -2,8 +2,9 @@
 
 python -m toftrack.programs.measure_detector FOLDER_OR_FILE ... --weights FILE --weights OTHER
 
-Nothing is tracked and nothing searched for: the crop lies about the true middle of the palm, the side
-is told, and the keypoints are compared with the true joints, in frames in which the hand is visible.
+Nothing is tracked and nothing searched for: the crop lies about the true middle of the palm, the
+side is told, and the keypoints are compared with the true joints, in frames in which the hand is
+visible.
 """
 
 from __future__ import annotations
