@@ -33,6 +33,8 @@ HOLDING = 0.30
 """How many hands hold a thing, or try to."""
 FOREARM_PIECES = 6
 """Ellipsoids of a forearm, the last one a cuff over the back of the hand."""
+UPRIGHT_THUMBS = 0.6
+"""How many of those who put a thumb up hold it upright in the image; the others, any way."""
 _FOREARM_M = 0.25
 _ALONG = FOREARM_PIECES - 1
 
@@ -98,7 +100,23 @@ def random_rotations(n: int, dice: Dice, views: Tensor | None = None) -> Tensor:
     return torch.where(pointing[:, None, None], held, roma.unitquat_to_rotmat(q))
 
 
+def thumb_is_up(angles: Tensor) -> Tensor:
+    """(N,) which of the poses (N, 21) have a straight thumb away from four curled fingers."""
+    degrees = torch.rad2deg(angles)
+    curled = (degrees[:, 7::4] > 65).all(1) & (degrees[:, 6::4] > 45).all(1)
+    away = (degrees[:, 0] > -12) & (degrees[:, 1] < 22) & (degrees[:, 3] < 18)
+    return curled & away & (degrees[:, 4] < 25)
+
+
+def upright_thumbs(n: int, dice: Dice) -> Tensor:
+    """(n, 3, 3) hands whose thumb's side is up in the image, seen from anywhere around them."""
+    around = turn(dice.uniform(n, low=-math.pi, high=math.pi), 1)
+    leaning = turn(0.35 * dice.normal(n), 2) @ turn(0.35 * dice.normal(n), 0)
+    return leaning @ around @ turn(torch.full((n,), -0.5 * math.pi), 2)
+
+
 def turn(angle: Tensor, axis: int) -> Tensor:
+    """(N, 3, 3) rotations by angles (N,) about the x, y or z axis, 0 to 2."""
     vector = torch.zeros(len(angle), 3)
     vector[:, axis] = angle
     return roma.rotvec_to_rotmat(vector)
@@ -121,12 +139,14 @@ def posed_hands(
     n = len(pivot_m)
     rows = dice.rows(len(bank.log_size), n)
     shape, surface = bank.rows(rows)
-    rotation = random_rotations(n, dice, views) if rotation is None else rotation
     size = bank.log_size[rows].exp()
+    parts = torch.zeros(n, 0, PART)
     if angles is None:
         angles, parts = _posed(shape, surface, size, dice)
-    else:
-        parts = torch.zeros(n, 0, PART)
+    if rotation is None:
+        raised = thumb_is_up(angles) & dice.chance(UPRIGHT_THUMBS, n)
+        rotation = random_rotations(n, dice, views)
+        rotation = torch.where(raised[:, None, None], upright_thumbs(n, dice), rotation)
     state = torch.zeros(n, 27)
     state[:, 3:6] = roma.rotmat_to_rotvec(rotation)
     state[:, 6:] = angles
