@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from toftrack.checks import check_number
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector.network import PoseNet
 from toftrack.detector.proposals_numba import run_pose_network
@@ -92,6 +93,7 @@ def misses(pose: PoseNet, paths: Sequence[Path], every: int) -> Misses:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, measure, print the table. Raises ToftrackError."""
     options = _parser().parse_args(arguments)
+    check_number("--every", options.every, 1, whole=True)
     paths = [path for given in options.recordings for path in _recordings(given)]
     weights = options.weights or [None]
     tables = {}
