@@ -13,6 +13,7 @@ from helpers.tracking import sample
 from toftrack.detector import proposals, proposals_numba
 from toftrack.detector.crops import (
     CROP,
+    CROP_CHANNELS,
     CROP_M,
     WIDE_F_PX,
     WIDE_LARGEST_PX,
@@ -20,8 +21,9 @@ from toftrack.detector.crops import (
     crop_rotation,
     wide,
 )
+from toftrack.detector.network import PoseNet
 from toftrack.detector.proposals import NetworkOutput, find_hands, mirrored
-from toftrack.detector.weights import load_weights
+from toftrack.detector.weights import load_weights, make_ready
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 run_pose_network = proposals_numba.run_pose_network
@@ -51,7 +53,7 @@ def test_a_crop_shows_depths_about_its_centre() -> None:
     rays = np.concatenate((rays / K[0, 0], np.ones((144, 176, 1))), -1)
     depth = ((distance + 0.03) / (rays @ normal)).astype(np.float32)
     image, _ = crop(depth, K, centre)
-    assert image.shape == (3, CROP, CROP) and image.dtype == np.float32
+    assert image.shape == (CROP_CHANNELS, CROP, CROP) and image.dtype == np.float32
     u, v = (K @ centre)[:2] / centre[2]
     assert u > 120 and v < 60, "the image cuts the right of the crop"
     inner = image[:, 12:-8, 8:40]
@@ -128,10 +130,14 @@ def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize("network", ["trained", "random"])
+@pytest.mark.parametrize("network", ["trained", "random", "older"])
 def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> None:
     """Of hands, of places at the border, and of places beside the image."""
     pose = load_weights()[0] if network == "trained" else small_networks()[0]
+    if network == "older":
+        torch.manual_seed(0)
+        pose = PoseNet(4, 3, 4)
+        make_ready(pose)
     for frame in (0, 30, 60):
         scene = sample().cut(frame)
         centres = np.concatenate((scene.joints_m[0, [0, 9]], [[0.2, 0.0, 0.45], [2.0, 0.1, 0.3]]))
@@ -141,6 +147,17 @@ def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> 
             # The file's weights hold the limits of the angles and the cells' places in half
             # precision, which only the reference uses.
             assert torch.allclose(numbers(reported)[name], value, atol=1e-3, rtol=1e-3), name
+
+
+def test_a_crop_says_what_lies_outside_of_the_image() -> None:
+    depth = np.zeros((144, 176), np.float32)
+    centre = np.array([0.19, 0.0, 0.45])
+    image, _ = crop(depth, K, centre)
+    border = image[3].mean(0)
+    assert border[0] == 0 and border[-1] == 1 and (np.diff(border) >= 0).all()
+    assert (image[2] == 1).all(), "where nothing is read in the image, either"
+    middle, _ = crop(depth, K, PRECOMPILED[0])
+    assert (middle[3] == 0).all()
 
 
 def test_a_mirror_twice_is_the_image() -> None:

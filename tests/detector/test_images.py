@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+import numpy as np
 import pytest
 import torch
 from helpers.detection import small_bank
 
-from toftrack.detector.crops import CROP, CROP_M
+from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M, channels
 from toftrack.detector.images import (
     WIDE_SIZE,
     Crops,
@@ -16,6 +17,7 @@ from toftrack.detector.images import (
     crop_images,
     wide_images,
 )
+from toftrack.detector.images_numba import read_pictures
 from toftrack.detector.network import PARTS, SEGMENTS
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
@@ -35,7 +37,7 @@ def images() -> WideImages:
 
 
 def test_crops_are_complete(crops: Crops) -> None:
-    assert crops.image.shape == (N, 3, CROP, CROP)
+    assert crops.image.shape == (N, CROP_CHANNELS, CROP, CROP)
     assert crops.image[:, 0].abs().max() <= 1
     assert crops.image[:, 1:].min() >= 0 and crops.image[:, 1:].max() <= 1
     for field in fields(crops):
@@ -89,6 +91,42 @@ def test_hands_are_seen_where_it_is_said(images: WideImages) -> None:
         near = images.image[i, 0, max(0, v - 2) : v + 3, max(0, u - 2) : u + 3] * 1.6
         good += bool(((near - images.depth_m[i, 0]).abs() < 0.07).any())
     assert good > 0.8 * len(use)
+
+
+def test_what_lies_outside_of_the_image_is_told_and_has_no_parts(crops: Crops) -> None:
+    outside = crops.image[:, 3]
+    cut = outside.amax((1, 2)) == 1
+    assert 0.1 < float(cut.float().mean()) < 0.45
+    assert (crops.image[:, 2] >= outside - 1e-6).all(), "nothing is read there"
+    coarse = torch.nn.functional.avg_pool2d(outside[:, None], CROP // PARTS)[:, 0]
+    assert (crops.parts[coarse == 1] == -1).all() and (crops.parts[coarse == 0] >= 0).all()
+    # The truth is that of the whole hand: some joints lie where nothing is seen.
+    joints = crops.joints_m[cut & crops.present]
+    assert (joints.norm(dim=-1).amax(1) > 0.03).all()
+
+
+def test_crops_are_read_as_the_reference_reads_them() -> None:
+    generator = np.random.default_rng(0)
+    n, side = 5, 2 * CROP
+    depth = generator.uniform(0.3, 0.7, (n, side, side)).astype(np.float32)
+    depth[generator.random(depth.shape) < 0.2] = 0
+    labels = generator.integers(0, 5, depth.shape).astype(np.int8)
+    distance = generator.uniform(0.4, 0.6, n).astype(np.float32)
+    border = np.tile(np.array([1.0, 0.0, 9.0], np.float32), (n, 2, 1))
+    border[2:, 0] = (0.0, 1.0, 0.1)
+    border[3:, 1] = (-1.0, 0.0, 0.25)
+    sides = np.full(n, side, np.int32)
+    image, parts = read_pictures(depth, labels, sides, distance, border)
+    steps = (np.arange(side) + 0.5) / side - 0.5
+    inside = np.ones(depth.shape, bool)
+    inside[2:] &= (steps < 0.1)[:, None]
+    inside[3:] &= steps > -0.25
+    expected = channels(np.where(inside, depth, 0), inside, distance)
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+    step = side // PARTS
+    seen = labels[:, step // 2 :: step, step // 2 :: step]
+    known = inside[:, step // 2 :: step, step // 2 :: step]
+    assert np.array_equal(parts[known], seen[known]) and (parts[~known] == -1).all()
 
 
 @pytest.mark.parametrize("make", [crop_images, wide_images])

@@ -9,6 +9,7 @@ import roma
 import torch
 from helpers.detection import dice, small_bank
 
+from toftrack.detector.hands import random_rotations
 from toftrack.detector.images import (
     WIDE_SIZE,
     Crops,
@@ -27,7 +28,6 @@ from toftrack.detector.network import (
     Proposed,
     cube_rotations,
 )
-from toftrack.detector.scenes import random_rotations
 from toftrack.pose_space.data.natural_poses import sample_poses
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers.detection import small_networks
 
-from toftrack.detector.crops import CROP
+from toftrack.detector.crops import CROP, CROP_CHANNELS
 from toftrack.detector.network import STRIDE, PoseNet, Proposed, cube_rotations
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
@@ -34,7 +34,7 @@ def answers(image: torch.Tensor, scale: float = 1.0) -> Proposed:
 @pytest.mark.parametrize("scale", [0.0, 1.0, 300.0])
 @pytest.mark.parametrize("kind", ["random", "zeros", "ones"])
 def test_every_hypothesis_is_a_hand(kind: str, scale: float) -> None:
-    size = (3, 3, CROP, CROP)
+    size = (3, CROP_CHANNELS, CROP, CROP)
     images = {
         "random": 2 * torch.rand(size, generator=torch.Generator().manual_seed(0)) - 1,
         "zeros": torch.zeros(size),
@@ -54,7 +54,7 @@ def test_every_hypothesis_is_a_hand(kind: str, scale: float) -> None:
 
 
 def test_an_untrained_network_s_hypotheses_are_its_anchors() -> None:
-    p = answers(torch.zeros(1, 3, CROP, CROP), 0.0)
+    p = answers(torch.zeros(1, CROP_CHANNELS, CROP, CROP), 0.0)
     trace = (p.rotation[0] * cube_rotations()).sum((1, 2))
     assert trace == pytest.approx(3, abs=0.2)
 

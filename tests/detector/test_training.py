@@ -11,6 +11,8 @@ import pytest
 import torch
 from helpers.tracking import ROOT
 
+from toftrack.detector import checkpoints
+from toftrack.detector.checkpoints import Checkpoints, Progress, save
 from toftrack.detector.training import Schedule, train_finder, train_poses
 from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
@@ -71,3 +73,55 @@ def test_the_program_refuses_what_cannot_be(tmp_path: Path) -> None:
     done = command(tmp_path, "shapes=0")
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("error: shapes")
+
+
+class SwitchedOffError(Exception):
+    """As if the machine were switched off."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("train", [train_poses, train_finder])
+def test_an_interrupted_training_ends_with_the_same_weights(
+    train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("whole", "part", "rest", "end"):
+        (tmp_path / name).mkdir()
+    whole, course = train(TINY, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
+    kept = checkpoints.save
+
+    def save(path: Path, progress: Progress, settings: dict) -> None:
+        kept(path, progress, settings)
+        if progress.step == 2:
+            raise SwitchedOffError
+
+    monkeypatch.setattr(checkpoints, "save", save)
+    with pytest.raises(SwitchedOffError):
+        train(TINY, 6, 0, Checkpoints(tmp_path / "part", 1e-9))
+    monkeypatch.undo()
+    again = Checkpoints(tmp_path / "rest", 1e-9, resume=tmp_path / "part")
+    rest, other = train(TINY, 6, 0, again)
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, rest.state_dict()[key]), key
+    errors = [{k: v for k, v in row.items() if k != "seconds"} for row in (course[-1], other[-1])]
+    assert errors[0] == errors[1]
+    done, _ = train(TINY, 6, 0, Checkpoints(tmp_path / "end", 1e-9, resume=tmp_path / "rest"))
+    assert torch.equal(done.state_dict()["heads.weight"], rest.state_dict()["heads.weight"])
+
+
+def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
+    network = torch.nn.Linear(2, 2)
+    progress = Progress(network, network, torch.optim.AdamW(network.parameters()))
+    resumed = Checkpoints(tmp_path, 1.0, resume=tmp_path)
+    save(resumed.path("poses"), progress, {"images": 24, "seed": 0})
+    resumed.restore("poses", progress, {"images": 24, "seed": 0})
+    with pytest.raises(ToftrackError, match="a training with images=24, and now it is 32"):
+        resumed.restore("poses", progress, {"images": 32, "seed": 0})
+    other = torch.nn.Linear(3, 2)
+    wrong = Progress(other, other, torch.optim.AdamW(other.parameters()))
+    with pytest.raises(ToftrackError, match=r"poses.checkpoint.npz is no checkpoint"):
+        resumed.restore("poses", wrong, {"images": 24})
+    resumed.path("poses").write_bytes(b"PK no archive")
+    with pytest.raises(ToftrackError, match="is no checkpoint"):
+        resumed.restore("poses", progress, {})
+    with pytest.raises(ToftrackError, match="there is no folder"):
+        Checkpoints(tmp_path, 1.0, resume=tmp_path / "gone").restore("poses", progress, {})

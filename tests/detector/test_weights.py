@@ -13,6 +13,7 @@ from torch import nn
 
 from toftrack.api import build_tracker
 from toftrack.detector import weights as module
+from toftrack.detector.crops import CROP_CHANNELS
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.weights import (
     DEFAULT_FILE,
@@ -24,7 +25,7 @@ from toftrack.errors import ToftrackError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-CROPS = 2 * torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
+CROPS = 2 * torch.rand(2, CROP_CHANNELS, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
 WHOLE = torch.rand(1, 2, 40, 48, generator=torch.Generator().manual_seed(0))
 ABOUT = {"seed": 3, "images": 12}
 
@@ -216,3 +217,56 @@ def test_training_goes_on_from_the_weights_of_a_file(
         torch.testing.assert_close(going_on.state_dict()[name], value)
     with pytest.raises(ToftrackError, match="width of 8, and the width to train is 16"):
         trained_weights(file, "finder", 16)
+
+
+def older(path: Path) -> PoseNet:
+    """A file of a network that knows nothing of borders and things, and the network."""
+    torch.manual_seed(2)
+    pose = used(PoseNet(4, 3, 4), CROPS[:, :3])
+    save_weights(path, pose, used(Finder(8), WHOLE), ABOUT)
+    return pose
+
+
+@torch.no_grad()
+def test_older_weights_see_and_tell_apart_what_they_did(tmp_path: Path) -> None:
+    before = older(tmp_path / "older.npz")
+    after, *_ = load_weights(tmp_path / "older.npz")
+    assert after.inputs == 3
+    for one, two in zip(before(CROPS[:, :3]), after(CROPS[:, :3]), strict=True):
+        assert one.shape == two.shape
+        assert torch.allclose(one, two, atol=2e-3, rtol=1e-3)
+
+
+@torch.no_grad()
+def test_training_that_goes_on_from_older_weights_begins_with_what_they_say(
+    tmp_path: Path,
+) -> None:
+    before = older(tmp_path / "older.npz")
+    going_on = PoseNet(4)
+    going_on.load_state_dict(trained_weights(tmp_path / "older.npz", "pose", 4))
+    one, two = before(CROPS[:, :3]), going_on.eval()(CROPS)
+    for name, value in one._asdict().items():
+        new = getattr(two, name)
+        if name == "parts":
+            assert (new[:, 4] < new[:, :4].amax(1) + 4).all(), "things are not said at first"
+            new = new[:, :4]
+        torch.testing.assert_close(new, value)
+
+
+@pytest.mark.parametrize(("inputs", "segments"), [(2, 4), (3, 3), (5, 4), (4, 6)])
+def test_weights_of_networks_that_see_something_else_are_refused(
+    tmp_path: Path, inputs: int, segments: int
+) -> None:
+    path = tmp_path / "other.npz"
+    save_weights(path, PoseNet(4, inputs, segments), Finder(8), ABOUT)
+    refused(path, "holds weights of another network")
+
+
+def test_files_of_before_the_detector_had_its_name_are_read(file: Path) -> None:
+    with np.load(file) as content:
+        arrays = dict(content)
+    metadata = json.loads(str(arrays.pop("metadata")))
+    arrays = {k.replace("pose.keypoints.", "pose.votes."): v for k, v in arrays.items()}
+    metadata |= {"format": "toftrack-relocaliser", "sha256": module._checksum(arrays)}
+    np.savez(file, metadata=np.array(json.dumps(metadata)), **arrays)
+    assert load_weights(file)[2] == ABOUT

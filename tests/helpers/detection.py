@@ -11,10 +11,12 @@ import torch
 from helpers.configured import detector_settings
 
 from toftrack.compute.rigid import rotated_pivot
+from toftrack.detector.dice import Dice
 from toftrack.detector.hand_detector import Detection
+from toftrack.detector.hands import HAND, Hands, posed_hands
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
-from toftrack.detector.scenes import HAND, Dice, Hands, Scenes, posed_hands
+from toftrack.detector.scenes import Scenes, plain_scenes
 from toftrack.detector.shapes import ShapeBank, shape_bank
 from toftrack.detector.weights import make_ready
 from toftrack.hand.shape import default_hand_shape
@@ -60,7 +62,7 @@ def cut_off(hands: Hands) -> Hands:
 def alone(hands: Hands) -> Scenes:
     """Hands and nothing else."""
     planes = torch.tensor([[[0.0, 0.0, 1.0, torch.inf]]]).expand(len(hands.labels), 1, 4)
-    return Scenes(hands.centres_m, hands.axes_m, hands.labels, planes)
+    return plain_scenes(hands.centres_m, hands.axes_m, hands.labels, planes)
 
 
 def clean_sensors(n: int) -> torch.Tensor:

@@ -15,6 +15,8 @@ CROP_M = 0.30
 """Side of the cube that a crop shows."""
 CROP = 64
 """Cells of a crop, each of 2 x 2 readings."""
+CROP_CHANNELS = 4
+"""Of a crop, see `channels`; weights of before the last one was added see the others."""
 WIDE_F_PX = 100.0
 """Focal length of the whole image that the finder sees, pixels."""
 WIDE_LARGEST_PX = 512
@@ -37,7 +39,7 @@ def crop(depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray) -> tuple[np.n
     """What is in the cube about a point.
 
     depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).  centre_m: (3,) in the camera frame.
-    Returns (3, CROP, CROP) float32, see `channels`, and the crop's rotation (3, 3).
+    Returns (CROP_CHANNELS, CROP, CROP) float32, see `channels`, and the crop's rotation (3, 3).
     """
     rotation = crop_rotation(centre_m)
     distance = float(np.linalg.norm(centre_m))
@@ -49,39 +51,48 @@ def crop(depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray) -> tuple[np.n
         [[1 / focal, 0, -middle / focal], [0, 1 / focal, -middle / focal], [0, 0, 1]]
     )
     mapping = np.asarray(k, np.float64) @ rotation @ inverse
-    read = cv2.warpPerspective(
-        depth_m,
-        mapping,
-        (samples, samples),
-        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=0,
-    )
+
+    def warped(image: np.ndarray) -> np.ndarray:
+        return cv2.warpPerspective(
+            image,
+            mapping,
+            (samples, samples),
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=0,
+        )
+
+    read = warped(depth_m)
     # Z of the camera to z of the crop: along a ray d of the crop, z_crop = Z / (R d)_z.
     steps = (np.arange(samples) - middle) / focal
     slope = rotation[2, 0] * steps[None, :] + rotation[2, 1] * steps[:, None] + rotation[2, 2]
     read = np.where(slope > 0.05, read / np.maximum(slope, 0.05), 0).astype(np.float32)
-    return channels(read[None], np.array([distance], np.float32))[0], rotation
+    inside = (warped(np.ones(depth_m.shape, np.uint8)) > 0) & (slope > 0.05)
+    return channels(read[None], inside[None], np.array([distance], np.float32))[0], rotation
 
 
-def channels(read_m: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
-    """(N, 2 CROP, 2 CROP) readings in crop frames to (N, 3, CROP, CROP) float32.
+def channels(read_m: np.ndarray, inside: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+    """(N, 2 CROP, 2 CROP) readings in crop frames to (N, CROP_CHANNELS, CROP, CROP) float32.
 
+    inside: (N, 2 CROP, 2 CROP) whether a sample lies in the image.
     distance_m: (N,) of the crops' centres.
     The channels: mean depth about the centre in half cubes, -1 .. 1 (1 where nothing is read);
-    share of readings in the cube; share without a reading.
+    share of readings in the cube; share without a reading; share outside of the image, so that a
+    hand that the border cuts is not taken for a smaller one.
     """
     n = len(read_m)
     blocks = np.ascontiguousarray(read_m).reshape(n, CROP, 2, CROP, 2)
     valid = blocks > 0
     relative = (blocks - distance_m[:, None, None, None, None]) * np.float32(2 / CROP_M)
-    inside = valid & (np.abs(relative) < 1)
+    near = valid & (np.abs(relative) < 1)
     count = valid.sum((2, 4), dtype=np.float32)
     total = np.where(valid, relative.clip(-1, 1), 0).sum((2, 4), dtype=np.float32)
-    out = np.empty((n, 3, CROP, CROP), np.float32)
+    out = np.empty((n, CROP_CHANNELS, CROP, CROP), np.float32)
     out[:, 0] = np.where(count > 0, total / np.maximum(count, 1), 1.0)
-    out[:, 1] = inside.sum((2, 4), dtype=np.float32) * np.float32(0.25)
+    out[:, 1] = near.sum((2, 4), dtype=np.float32) * np.float32(0.25)
     out[:, 2] = 1 - count * np.float32(0.25)
+    within = inside.reshape(blocks.shape).sum((2, 4), dtype=np.float32)
+    out[:, 3] = 1 - within * np.float32(0.25)
     return out
 
 

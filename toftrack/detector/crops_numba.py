@@ -18,8 +18,9 @@ def read_crop(depth, flip, mapping, slope, scale, distance, image):
     mapping: (3, 3) float32 from the crop's samples to pixels.
     slope: (3,) float32, of a sample: its Z over its z along the crop's axis.
     scale: from metres to half cubes.  distance: of the crop's centre, metres.
-    image: (3, CROP, CROP) float32, written.
+    image: (C, CROP, CROP) float32, written: the first C of crops.CROP_CHANNELS, at least 3.
     """
+    border = image.shape[0] > 3
     size = image.shape[1]
     samples = 2 * size
     places, share = np.empty(samples, np.int64), np.empty(samples, np.float32)
@@ -29,6 +30,8 @@ def read_crop(depth, flip, mapping, slope, scale, distance, image):
             _place(depth.shape, flip, mapping, slope, np.float32(line), places, share)
             for sample in range(samples):
                 if places[sample] < 0:
+                    if border:
+                        image[3, row, sample // 2] += np.float32(0.25)
                     continue
                 z = depth.flat[places[sample]] * share[sample]
                 if z > _ZERO:

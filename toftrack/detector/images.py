@@ -5,28 +5,28 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, channels, wide_channels
-from toftrack.detector.network import PARTS, STRIDE
-from toftrack.detector.pictures import Lens, random_sensors, take_pictures
-from toftrack.detector.scenes import (
+from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, wide_channels
+from toftrack.detector.dice import Dice
+from toftrack.detector.hands import (
     BACKGROUND,
     FOREARM,
+    FOREARM_PIECES,
+    FRONT,
     HAND,
     OTHER_FOREARM,
     OTHER_HAND,
-    Dice,
+    THING,
     Hands,
-    Scenes,
-    moved,
     posed_hands,
-    room_behind,
-    surroundings,
-    things,
+    random_views,
 )
+from toftrack.detector.images_numba import read_pictures
+from toftrack.detector.network import SEGMENTS, STRIDE
+from toftrack.detector.pictures import Lens, random_sensors, take_pictures
+from toftrack.detector.scenes import Scenes, moved, room_behind, surroundings, tables_under, things
 from toftrack.detector.shapes import ShapeBank
 
 _SAMPLES = 2 * CROP
@@ -40,7 +40,8 @@ _HAND_M2 = 0.0105
 class Crops:
     """Crops and what is in them, in the crop's frame about its centre.
 
-    image: (N, 3, CROP, CROP).  parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
+    image: (N, CROP_CHANNELS, CROP, CROP).
+    parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
     present: (N,) there is a hand near the centre.  right: (N,) and it is a right one.
     pivot_m: (N, 3).  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
     joints_m: (N, 21, 3).
@@ -83,13 +84,14 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     present = ~dice.chance(0.16, n)
     pivot = centre + torch.where(present[:, None], near.clamp(-0.09, 0.09), away)
     left = dice.chance(0.3, n)
-    hands = posed_hands(bank, pivot, left, dice, HAND)
+    views = random_views(n, dice)
+    hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
     labels = hands.labels.clone()
     # Most of the crops about something else: there is no hand at all, only its arm, or nothing.
     gone = ~present & dice.chance(0.7, n)
-    pieces = labels.shape[1] - 5
+    pieces = labels.shape[1] - FOREARM_PIECES
     labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
-    scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12)
+    scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12, views=views)
     scenes = moved(scenes, torch.where(gone[:, None], _onto_something(scenes, centre, dice), 0.0))
 
     pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
@@ -97,16 +99,15 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     middle = (side - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, side, side)
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_SAMPLES, _SAMPLES), dice)
-    read, seen_parts = _resampled(depth, which, side.int().numpy())
-    _cut(read, seen_parts, dice)
-    # One by one, so that each stays in the cache.
-    each = [channels(read[i : i + 1], distance[i : i + 1].numpy()) for i in range(n)]
-    image = torch.from_numpy(np.concatenate(each))
+    image, seen_parts = read_pictures(
+        depth, which, side.int().numpy(), distance.numpy(), _borders(n, dice).numpy()
+    )
     parts = torch.from_numpy(seen_parts).long()
     parts[parts == OTHER_HAND] = OTHER_FOREARM
+    parts[parts == THING] = SEGMENTS - 1
     visible = (parts == HAND).sum((1, 2)) >= 12
     return Crops(
-        image=image,
+        image=torch.from_numpy(image),
         parts=parts,
         present=present & visible,
         right=~left,
@@ -120,7 +121,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
 
 def _onto_something(scenes: Scenes, centre_m: Tensor, dice: Dice) -> Tensor:
     """(N, 3) by how much to move scenes so that the crop shows some thing or part of a body."""
-    drawn = (scenes.labels == BACKGROUND) | (scenes.labels == FOREARM)
+    drawn = (scenes.labels == BACKGROUND) | (scenes.labels == FOREARM) | (scenes.labels == THING)
     weights = drawn.float() + 1e-6
     one = torch.multinomial(weights, 1, generator=dice.generator)[:, 0]
     at = scenes.centres_m[torch.arange(len(one)), one]
@@ -148,10 +149,11 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     v = high * dice.uniform(n, low=-0.05, high=1.05)
     pivot = torch.stack(((u - lens.cx) / WIDE_F_PX * z, (v - lens.cy) / WIDE_F_PX * z, z), 1)
     left = dice.chance(0.5, n)
-    hands = posed_hands(bank, pivot, left, dice, HAND)
+    views = random_views(n, dice)
+    hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
     labels = hands.labels.clone()
     raised = ~dice.chance(0.17, n)
-    pieces = labels.shape[1] - 5
+    pieces = labels.shape[1] - FOREARM_PIECES
     labels[:, :pieces] = torch.where(raised[:, None], labels[:, :pieces], -1)
     # Without its hand, mostly no forearm is held up either.
     no_arm = ~raised & dice.chance(0.7, n)
@@ -159,7 +161,7 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     other, other_left = _other_hands(hands, bank, dice)
     there = dice.chance(0.35, n) & raised
     scenes = random_scenes(
-        hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there)
+        hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there), views=views
     )
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
 
@@ -201,56 +203,56 @@ def random_scenes(
     others: float,
     objects: float,
     other: tuple[Hands, Tensor] | None = None,
+    views: Tensor | None = None,
 ) -> Scenes:
-    """Everything around a batch of hands; another hand with probability `others`, or as given."""
+    """Everything around a batch of hands; another hand with probability `others`, or as given.
+
+    labels: (N, E) of the hands' ellipsoids.  views: (N,) where the cameras are, see scenes; None =
+    before the persons.
+    """
     n = len(labels)
     if other is None:
         other = _other_hands(hands, bank, dice)[0], dice.chance(others, n)
     second, there = other
-    body = surroundings(hands, hands.pivot_m[:, 2], dice)
+    body = surroundings(hands, hands.pivot_m[:, 2], dice, views)
     stuff = things(hands.pivot_m, 2, objects, dice)
     other_labels = torch.where(there[:, None], second.labels, -1)
     centres = (hands.centres_m, second.centres_m, body[0], stuff[0])
     axes = (hands.axes_m, second.axes_m, body[1], stuff[1])
-    behind = (hands.pivot_m[:, 2] + 0.1).clamp(min=0.4)
+    planes = room_behind((hands.pivot_m[:, 2] + 0.1).clamp(min=0.4), dice)
+    if views is not None:
+        # Whoever looks down sees a table, or the floor far below.
+        planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)
+        planes = torch.cat((planes, tables_under(hands, views, dice)), 1)
+    all_labels = torch.cat((labels, other_labels, body[2], stuff[2]), 1)
+    covered = torch.cat((hands.skins.covered, second.skins.covered), 1)
+    plain = torch.zeros(n, all_labels.shape[1] - covered.shape[1], dtype=torch.bool)
+    parts = second.parts.clone()
+    parts[..., 0] = torch.where(there[:, None], parts[..., 0], -1.0)
+    skins = tuple(
+        (one.skins, one.skins.labels(each))
+        for one, each in ((hands, labels), (second, other_labels))
+    )
     return Scenes(
         torch.cat(centres, 1),
         torch.cat(axes, 1),
-        torch.cat((labels, other_labels, body[2], stuff[2]), 1),
-        room_behind(behind, dice),
+        all_labels,
+        planes,
+        torch.cat((covered, plain), 1),
+        skins,
+        torch.cat((hands.parts, parts), 1),
     )
 
 
-def _resampled(
-    depth: np.ndarray, which: np.ndarray, side: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures of `side` pixels at a crop's samples, and their parts, as crops.crop reads them."""
-    n = len(depth)
-    read = np.empty((n, _SAMPLES, _SAMPLES), np.float32)
-    parts = np.empty((n, PARTS, PARTS), np.int8)
-    step = _SAMPLES // PARTS
-    for i in range(n):
-        index = ((np.arange(_SAMPLES) + 0.5) * (side[i] / _SAMPLES)).astype(int)
-        read[i] = depth[i][index][:, index]
-        coarse = index[step // 2 :: step]
-        parts[i] = which[i][coarse][:, coarse]
-    return read, parts
+def _borders(n: int, dice: Dice) -> Tensor:
+    """(N, 2, 3) what lies in the image: a x + b y < c for x, y in -0.5 .. 0.5 across the crop.
 
-
-def _cut(read: np.ndarray, parts: np.ndarray, dice: Dice) -> None:
-    """Beyond the image's border there is nothing: a fifth of the crops are cut, in place."""
-    n = len(read)
-    which = dice.uniform(n).numpy()
-    where = dice.uniform(n, low=0.05, high=0.55).numpy()
-    for i in np.flatnonzero(which < 0.2):
-        cells = int(where[i] * PARTS)
-        for image, label, size in ((read, 0.0, cells * _SAMPLES // PARTS), (parts, -1, cells)):
-            side = int(which[i] * 20)
-            if side == 0:
-                image[i, :size] = label
-            elif side == 1:
-                image[i, -size:] = label
-            elif side == 2:
-                image[i, :, :size] = label
-            else:
-                image[i, :, -size:] = label
+    A quarter of the crops is cut by a border of the image, some of them in a corner; crops are
+    turned a little against the image.
+    """
+    which = dice.uniform(n)
+    c = dice.uniform(n, 2, low=-0.2, high=0.45)
+    angle = 0.5 * math.pi * dice.rows(4, n)[:, None] + 0.12 * dice.normal(n, 1)
+    angle = angle + torch.tensor([0.0, 0.5 * math.pi])
+    cut = which[:, None] < torch.tensor([0.25, 0.04])
+    return torch.stack((angle.cos(), angle.sin(), torch.where(cut, c, 9.0)), 2)

@@ -18,11 +18,13 @@ from torch import Tensor, nn
 
 from toftrack.compute.rotations import special_gramschmidt
 from toftrack.compute.transfer import table
-from toftrack.detector.crops import CROP_M
+from toftrack.detector.crops import CROP_CHANNELS, CROP_M
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
-SEGMENTS = 4
-"""Background and things, the hand, its forearm, another hand or forearm."""
+SEGMENTS = 5
+"""Background, the hand, its forearm, another hand or forearm, things. Weights of before things had
+a class of their own know the first four.
+"""
 PARTS = 32
 """Side of the picture of parts that the pose network also learns."""
 STRIDE = 4
@@ -57,7 +59,7 @@ class Proposed(NamedTuple):
     log_probability: (N, 24).  error_m: (N, 24) expected mean error of the joints.
     joints_m: (N, 21, 3) and sigma_m: (N, 21), by the keypoints of the cells.
     right: (N,) logit of a right hand.  present: (N,) logit of a hand near the centre.
-    parts: (N, SEGMENTS, PARTS, PARTS) logits.
+    parts: (N, segments, PARTS, PARTS) logits.
     """
 
     rotation: Tensor
@@ -95,17 +97,23 @@ class Residual(nn.Module):
 
 
 class PoseNet(nn.Module):
-    """Crops (N, 3, 64, 64) to Proposed."""
+    """Crops (N, inputs, 64, 64) to Proposed.
+
+    inputs: the first channels of crops.channels that it sees.  segments: the first classes of
+    SEGMENTS that it tells apart. Both are told by a file's weights, see weights.load_weights.
+    """
 
     anchors: Tensor
     limits: Tensor
     cells: Tensor
 
-    def __init__(self, width: int = 24) -> None:
+    def __init__(
+        self, width: int = 24, inputs: int = CROP_CHANNELS, segments: int = SEGMENTS
+    ) -> None:
         super().__init__()
         w1, w2, w3, w4 = width, 2 * width, 4 * width, 6 * width
         self.stem = nn.Sequential(
-            nn.Conv2d(3, w1, 5, 2, 2, bias=False), nn.BatchNorm2d(w1), nn.ReLU()
+            nn.Conv2d(inputs, w1, 5, 2, 2, bias=False), nn.BatchNorm2d(w1), nn.ReLU()
         )
         self.fine = Residual(w1, w2, 2)  # 16 x 16
         self.middle = nn.Sequential(Residual(w2, w3, 2), Residual(w3, w3))  # 8 x 8
@@ -126,10 +134,17 @@ class PoseNet(nn.Module):
             nn.ReLU(),
         )
         self.keypoints = nn.Conv2d(2 * width, 5 * JOINTS, 1)
-        self.painted = nn.Conv2d(2 * width, 4 * SEGMENTS, 1)
+        self.painted = nn.Conv2d(2 * width, 4 * segments, 1)
         steps = (torch.arange(16) + 0.5) / 16 - 0.5
         cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy")) * CROP_M
         self.register_buffer("cells", cells)  # (2, 16, 16) metres across, x then y
+
+    @property
+    def inputs(self) -> int:
+        """Channels of a crop that it sees."""
+        stem = self.stem[0]
+        assert isinstance(stem, nn.Conv2d)
+        return stem.in_channels
 
     def forward(self, image: Tensor) -> Proposed:
         """See the class."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -20,10 +21,12 @@ _MARGIN = 2
 class PackedPoseNet(NamedTuple):
     """A PoseNet for `pose_outputs`; the first image is the crop.
 
-    heads, keypoints: where these outputs are.  keypoint_channels: of a cell, in memory.
+    inputs: channels of the crop.  heads, keypoints: where these outputs are.
+    keypoint_channels: of a cell, in memory.
     """
 
     network: Network
+    inputs: int
     heads: int
     keypoints: int
     keypoint_channels: int
@@ -32,7 +35,7 @@ class PackedPoseNet(NamedTuple):
 def pack_pose_net(pose: PoseNet) -> PackedPoseNet:
     """The layers of a network on the CPU that is ready for use, see weights.make_ready."""
     builder = NetworkBuilder()
-    crop = builder.image(CROP, CROP, 3, _MARGIN)
+    crop = builder.image(CROP, CROP, pose.inputs, _MARGIN)
     half = _layer(builder, crop, pose.stem[0], border=1, relu=True)
     at_16 = _residual(builder, half, pose.fine)
     at_8 = _residual(builder, _residual(builder, at_16, pose.middle[0]), pose.middle[1])
@@ -51,7 +54,9 @@ def pack_pose_net(pose: PoseNet) -> PackedPoseNet:
     smooth = _layer(builder, merged, pose.smooth[0], relu=True)
     keypoints = _layer(builder, smooth, pose.keypoints)
     heads = _dense(builder, bent, pose.heads.weight, pose.heads.bias)
-    return PackedPoseNet(builder.network(), heads.place, keypoints.place, keypoints.channels)
+    return PackedPoseNet(
+        builder.network(), pose.inputs, heads.place, keypoints.place, keypoints.channels
+    )
 
 
 def _layer(
@@ -89,18 +94,18 @@ def _residual(builder: NetworkBuilder, x: Image, block: nn.Module, border: int =
 
 @compiled
 def pose_outputs(image, net):
-    """Of one crop (3, CROP, CROP): the heads' numbers and the keypoints, see PoseNet.features.
+    """Of one crop (inputs, CROP, CROP): the heads' numbers and the keypoints, see PoseNet.features.
 
     net: PackedPoseNet.  The keypoints are (16, 16, channels); both have more numbers than outputs.
     """
-    network, heads, keypoints, channels = net
+    network, inputs, heads, keypoints, channels = net
     steps, weights, capacity = network
     images = np.zeros(capacity, np.float32)
     size = image.shape[1]
     for row in range(size):
         for column in range(size):
-            at = ((row + _MARGIN) * (size + 2 * _MARGIN) + column + _MARGIN) * 3
-            for channel in range(3):
+            at = ((row + _MARGIN) * (size + 2 * _MARGIN) + column + _MARGIN) * inputs
+            for channel in range(inputs):
                 images[at + channel] = image[channel, row, column]
     run(steps, weights, images)
     cells = size // 4
@@ -108,3 +113,15 @@ def pose_outputs(image, net):
         (cells, cells, channels)
     )
     return images[heads:], keypoint_map
+
+
+@compiled
+def sigmoid(x):
+    """Of a number."""
+    return 1 / (1 + math.exp(-x))
+
+
+@compiled
+def softplus(x):
+    """Of a number: log(1 + exp(x))."""
+    return x + math.log1p(math.exp(-x)) if x > 0 else math.log1p(math.exp(x))

@@ -1,8 +1,9 @@
 """Depth pictures of scenes, as sensors take them; compiled, one picture after another.
 
 An ellipsoid {c + F u : |u| <= 1} is met by the ray z (x, y, 1) where |z W d - W c| = 1, W = F^-1: a
-quadratic in z. Then the sensor: noise that grows with the square of the distance, pixels on depth
-edges that mix both depths, readings that are missing, steps, shadows beside near things.
+quadratic in z. For skin and things see skin_numba and things_numba. Then the sensor: noise that
+grows with the square of the distance, pixels on depth edges that mix both depths, readings that are
+missing, steps, shadows beside near things.
 """
 
 from __future__ import annotations
@@ -15,9 +16,15 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import announced, compiled, entry_point
-from toftrack.detector.scenes import Dice, Scenes
+from toftrack.detector import skin_numba, things_numba
+from toftrack.detector.dice import Dice
+from toftrack.detector.hands import THING
+from toftrack.detector.scenes import Scenes
+from toftrack.detector.skin import PRIMITIVE
+from toftrack.detector.skin_numba import TILE, draw_skin
+from toftrack.detector.things_numba import draw_part
 
-_entry = entry_point(__file__)
+_entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
     NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK,
 ) = range(10)  # fmt: skip
@@ -77,8 +84,10 @@ def take_pictures(
             _array(scenes.centres_m),
             _array(scenes.axes_m),
             _array(whiten),
-            scenes.labels.to(torch.int8).numpy(),
+            torch.where(scenes.skinned, -1, scenes.labels).to(torch.int8).numpy(),
             _array(scenes.planes),
+            *_skin_arrays(scenes),
+            _array(scenes.parts),
             _array(torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)),
             _array(sensors),
             seeds.numpy().astype(np.uint32),
@@ -86,6 +95,21 @@ def take_pictures(
             labels,
         )
     return depth, labels
+
+
+def _skin_arrays(scenes: Scenes) -> tuple[np.ndarray, ...]:
+    """Primitives (N, S, P, PRIMITIVE), labels (N, S, P) and (N, S, 2) widths of S hands' skins."""
+    skins = scenes.skins
+    if not skins:
+        n = len(scenes.labels)
+        none = np.zeros((n, 0, 1, PRIMITIVE), np.float32), np.zeros((n, 0, 1), np.int8)
+        return *none, np.zeros((n, 0, 2), np.float32)
+    widths = [torch.stack((skin.blend_m, skin.outside_m), 1) for skin, _ in skins]
+    return (
+        _array(torch.stack([skin.primitives for skin, _ in skins], 1)),
+        torch.stack([labels for _, labels in skins], 1).to(torch.int8).contiguous().numpy(),
+        _array(torch.stack(widths, 1)),
+    )
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -201,9 +225,31 @@ def _sense(sensor, lens, state, depth, labels, clean):
 
 
 @_entry
-def _take(centres, axes, whiten, which, planes, lenses, sensors, seeds, depth, labels):
-    """All pictures of a batch, see take_pictures."""
+def _take(
+    centres,
+    axes,
+    whiten,
+    which,
+    planes,
+    skins,
+    whose,
+    widths,
+    parts,
+    lenses,
+    sensors,
+    seeds,
+    depth,
+    labels,
+):
+    """All pictures of a batch, see take_pictures; skins as _skin_arrays has them."""
     state = np.zeros(1, np.uint32)
+    tiles = (depth.shape[1] // TILE + 1) * (depth.shape[2] // TILE + 1)
+    count = skins.shape[2]
+    balls, lists = np.empty((count, 4), np.float32), np.empty((tiles, count), np.int64)
+    counts, on = np.empty(tiles, np.int64), np.empty(count, np.int64)
+    near = np.empty(count, np.float32)
+    six = np.empty((6, TILE * TILE), np.float32)
+    rays = six[0], six[1], six[2], six[3], six[4], six[5]
     clean = np.zeros(depth.shape[1:], np.float32)
     for n in range(len(depth)):
         lens = lenses[n]
@@ -224,4 +270,23 @@ def _take(centres, axes, whiten, which, planes, lenses, sensors, seeds, depth, l
         for e in range(centres.shape[1]):
             if which[n, e] >= 0:
                 _draw(centres[n, e], axes[n, e], whiten[n, e], which[n, e], lens, clean, labels[n])
+        for q in range(parts.shape[1]):
+            if parts[n, q, 0] >= 0:
+                draw_part(parts[n, q], THING, lens, clean, labels[n])
+        for s in range(skins.shape[1]):
+            draw_skin(
+                skins[n, s],
+                whose[n, s],
+                widths[n, s, 0],
+                widths[n, s, 1],
+                lens,
+                clean,
+                labels[n],
+                balls,
+                lists,
+                counts,
+                on,
+                near,
+                rays,
+            )
         _sense(sensors[n], lens, state, depth[n], labels[n], clean)

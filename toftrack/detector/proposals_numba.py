@@ -1,6 +1,6 @@
 """Hypotheses of a crop in one compiled call; see proposals.run_pose_network.
 
-The same formulas as PoseNet.decode's and proposals.run_pose_network's, which are the reference, without the
+The same formulas as PoseNet.decode's and those of proposals, which are the reference, without the
 microseconds that every operation costs on a few numbers.
 """
 
@@ -34,7 +34,13 @@ from toftrack.detector.network import (
     PoseNet,
     cube_rotations,
 )
-from toftrack.detector.network_numba import PackedPoseNet, pack_pose_net, pose_outputs
+from toftrack.detector.network_numba import (
+    PackedPoseNet,
+    pack_pose_net,
+    pose_outputs,
+    sigmoid,
+    softplus,
+)
 from toftrack.detector.proposals import DOUBT_M, KEPT, MIRROR, NetworkOutput, mean_hand
 from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
@@ -129,7 +135,7 @@ def _packed(pose: PoseNet) -> PackedPoseNet:
 
 
 def _empty(count: int) -> dict[str, np.ndarray]:
-    """Arrays of Look's fields, in their order."""
+    """Arrays of NetworkOutput's fields, in their order."""
     shapes = {
         "pivot_m": (KEPT, 3),
         "rotvec": (KEPT, 3),
@@ -148,13 +154,13 @@ def _empty(count: int) -> dict[str, np.ndarray]:
 
 @_cached
 def detect_at(depth, mirror, k, centres, rotations, net, hand, out, counter):
-    """Crops about centres (C, 3), turned by (C, 3, 3), through the network, into Look's arrays.
+    """Crops about centres (C, 3), turned by (C, 3, 3), through the network, into `_empty`.
 
     mirror: the image is to be read as a mirror shows it; k and centres are those of the mirrored.
     net: PackedPoseNet.  hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
     counter: (1,) int64 crops taken, by threads that share them.
     """
-    image = np.empty((3, CROP, CROP), np.float32)
+    image = np.empty((net.inputs, CROP, CROP), np.float32)
     while True:
         c = take(counter)
         if c >= len(centres):
@@ -191,7 +197,7 @@ def _crop(depth, mirror, k, centre, turn, image):
 
 @compiled
 def _decode(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
-    """What the network's outputs for a crop mean, see PoseNet.decode and proposals.run_pose_network."""
+    """What the network's outputs for a crop mean, see PoseNet.decode and proposals."""
     _, _, _, log_size, _, _, _, joints, sigma, present, right = out
     present[c], right[c] = heads[len(_ANCHORS) * _EACH], heads[len(_ANCHORS) * _EACH + 1]
     _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
@@ -235,13 +241,13 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
             rotvec[c, kept, i] = state[3 + i]
         for j in range(ANGLES):
             low, high = _LIMITS[j]
-            state[6 + j] = low + (high - low) * _sigmoid(one[6 + j])
+            state[6 + j] = low + (high - low) * sigmoid(one[6 + j])
             angles[c, kept, j] = state[6 + j]
         log_size[c, kept] = LOG_SIZE * one[6 + ANGLES]
         p = one[7 + ANGLES : 10 + ANGLES]
         at = (OFFSET_M * p[0], OFFSET_M * p[1], OFFSET_M * p[2])
         _into_camera(at, turn, centre, mirror, pivot[c, kept])
-        error[c, kept] = ERROR_M * _softplus(one[_EACH - 1]) + LEAST_ERROR_M
+        error[c, kept] = ERROR_M * softplus(one[_EACH - 1]) + LEAST_ERROR_M
         pose_hand(state, hand[0], hand[1], hand[2], sign, frames, posed)
         size = math.exp(log_size[c, kept])
         for i in range(3):
@@ -343,20 +349,10 @@ def _decode_keypoints(keypoints, depth, joints, sigma):
     for j in range(JOINTS):
         for i in range(3):
             joints[j, i] = sums[i, j] / total[j]
-        sigma[j] = SIGMA_M * _softplus(spread[j] / total[j]) + LEAST_SIGMA_M
+        sigma[j] = SIGMA_M * softplus(spread[j] / total[j]) + LEAST_SIGMA_M
 
 
 @compiled
 def _cell(number):
     """Where the middle of a cell is, metres from the crop's."""
     return ((number + 0.5) / _CELLS - 0.5) * CROP_M
-
-
-@compiled
-def _sigmoid(x):
-    return 1 / (1 + math.exp(-x))
-
-
-@compiled
-def _softplus(x):
-    return x + math.log1p(math.exp(-x)) if x > 0 else math.log1p(math.exp(x))

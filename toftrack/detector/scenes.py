@@ -7,186 +7,75 @@ lengths are metres in the camera frame of the picture that will be taken.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import roma
 import torch
 from torch import Tensor
 
-from toftrack.compute.rigid import PIVOT_M
-from toftrack.detector.shapes import ShapeBank
-from toftrack.hand.skeleton import forward_kinematics
-from toftrack.pose_space.data.natural_poses import sample_poses
-
-BACKGROUND, HAND, FOREARM, OTHER_FOREARM, OTHER_HAND = range(5)
-"""Labels of surfaces."""
-_FOREARM_M = 0.25
-_FOREARM_PIECES = 5
-
-
-@dataclass(frozen=True)
-class Hands:
-    """A batch of posed hands.
-
-    pivot_m: (N, 3) middle of the palm.  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
-    joints_m: (N, 21, 3) truth.  elbow_m: (N, 3).
-    centres_m, axes_m: (N, E, 3), (N, E, 3, 3) the hand's ellipsoids and the forearm's.
-    labels: (N, E), -1 = not drawn.
-    """
-
-    pivot_m: Tensor
-    rotation: Tensor
-    angles: Tensor
-    log_size: Tensor
-    joints_m: Tensor
-    elbow_m: Tensor
-    centres_m: Tensor
-    axes_m: Tensor
-    labels: Tensor
+from toftrack.detector.dice import Dice
+from toftrack.detector.hands import ABOVE, BACKGROUND, FRONT, HEAD, THING, Hands, turn
+from toftrack.detector.skin import Skins
+from toftrack.detector.things_numba import PART
 
 
 @dataclass(frozen=True)
 class Scenes:
     """What a batch of pictures is taken of.
 
-    centres_m, axes_m: (N, M, 3), (N, M, 3, 3).  labels: (N, M), -1 = not drawn.
+    centres_m, axes_m: (N, M, 3), (N, M, 3, 3) ellipsoids.  labels: (N, M), -1 = there is none.
     planes: (N, P, 4): points X with n.X = d, as (n, d); d = inf is none.
+    skinned: (N, M) ellipsoids that a skin is drawn instead of.
+    skins: of some hands, each with the labels (N, P) of its primitives.
+    parts: (N, Q, PART) of things, see things_numba.
     """
 
     centres_m: Tensor
     axes_m: Tensor
     labels: Tensor
     planes: Tensor
+    skinned: Tensor
+    skins: tuple[tuple[Skins, Tensor], ...]
+    parts: Tensor
+
+
+def plain_scenes(centres_m: Tensor, axes_m: Tensor, labels: Tensor, planes: Tensor) -> Scenes:
+    """Ellipsoids and planes alone."""
+    n = len(labels)
+    return Scenes(
+        centres_m,
+        axes_m,
+        labels,
+        planes,
+        torch.zeros_like(labels, dtype=torch.bool),
+        (),
+        torch.zeros(n, 0, PART),
+    )
 
 
 def moved(scenes: Scenes, by_m: Tensor) -> Scenes:
     """The same scenes elsewhere; by_m: (N, 3)."""
     planes = scenes.planes.clone()
     planes[..., 3] += (planes[..., :3] * by_m[:, None]).sum(-1)
-    return Scenes(scenes.centres_m + by_m[:, None], scenes.axes_m, scenes.labels, planes)
-
-
-class Dice:
-    """Draws of one generator, short to write."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self.generator = generator
-
-    def uniform(self, *size: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-        """Between low and high."""
-        return low + (high - low) * torch.rand(*size, generator=self.generator)
-
-    def normal(self, *size: int) -> Tensor:
-        """Mean 0, standard deviation 1."""
-        return torch.randn(*size, generator=self.generator)
-
-    def chance(self, p: float, *size: int) -> Tensor:
-        """True with probability p."""
-        return torch.rand(*size, generator=self.generator) < p
-
-    def rows(self, count: int, n: int) -> Tensor:
-        """n whole numbers below count."""
-        return torch.randint(count, (n,), generator=self.generator)
-
-
-def random_rotations(n: int, dice: Dice) -> Tensor:
-    """(n, 3, 3) hands as people hold them: palms and backs alike, edge-on, at the camera, any."""
-    kind = dice.uniform(n)
-    upright, sideways, pointing = kind < 0.42, kind < 0.65, kind < 0.85
-    roll = 0.6 * dice.normal(n)
-    roll = torch.where(sideways & ~upright, dice.uniform(n, low=-2.4, high=2.4), roll)
-    roll = torch.where(pointing & ~sideways, 1.0 * dice.normal(n), roll)
-    tilt = torch.where(upright, 0.45, 0.7) * dice.normal(n)
-    at_camera = 1.25 + 0.4 * dice.normal(n)
-    tilt = torch.where(pointing & ~sideways, at_camera, tilt)
-    face = dice.uniform(n)
-    azimuth = 0.5 * dice.normal(n) + torch.where(face < 0.4, 0.0, math.pi)
-    azimuth = torch.where(face > 0.75, dice.uniform(n, low=-math.pi, high=math.pi), azimuth)
-    rotations = [_turn(roll, 2), _turn(tilt, 0), _turn(azimuth, 1)]
-    held = rotations[0] @ rotations[1] @ rotations[2]
-    q = torch.nn.functional.normalize(dice.normal(n, 4), dim=1)
-    return torch.where(pointing[:, None, None], held, roma.unitquat_to_rotmat(q))
-
-
-def _turn(angle: Tensor, axis: int) -> Tensor:
-    vector = torch.zeros(len(angle), 3)
-    vector[:, axis] = angle
-    return roma.rotvec_to_rotmat(vector)
-
-
-def posed_hands(
-    bank: ShapeBank,
-    pivot_m: Tensor,
-    left: Tensor,
-    dice: Dice,
-    label: int,
-    rotation: Tensor | None = None,
-    angles: Tensor | None = None,
-) -> Hands:
-    """Random hands about given middles of the palm (N, 3); `left` (N,) are mirror images."""
-    n = len(pivot_m)
-    rows = dice.rows(len(bank.log_size), n)
-    shape, surface = bank.rows(rows)
-    angles = sample_poses(n, dice.generator) if angles is None else angles
-    rotation = random_rotations(n, dice) if rotation is None else rotation
-    size = bank.log_size[rows].exp()
-    state = torch.zeros(n, 27)
-    state[:, 3:6] = roma.rotmat_to_rotvec(rotation)
-    state[:, 6:] = angles
-    pose = forward_kinematics(state, shape)
-    ellipsoids = surface.pose(pose)
-    elbow, arm_centres, arm_axes, arm_labels = _forearms(rotation, size, label, dice)
-    centres = torch.cat((ellipsoids.centres_m[:, :-1], arm_centres), 1)
-    axes = torch.cat((ellipsoids.axes_m[:, :-1], arm_axes), 1)
-    hand_labels = torch.full((n, centres.shape[1] - arm_labels.shape[1]), label)
-    labels = torch.cat((hand_labels, arm_labels), 1)
-
-    # Everything is about the wrist so far. A left hand is the mirror image of the whole.
-    pivot = (rotation @ torch.tensor(PIVOT_M)) * size[:, None]
-    mirror = torch.where(left[:, None], torch.tensor([-1.0, 1.0, 1.0]), torch.ones(3))
-    shift = pivot_m - pivot * mirror
-    return Hands(
-        pivot_m=pivot_m,
-        rotation=rotation,
-        angles=angles,
-        log_size=bank.log_size[rows],
-        joints_m=pose.joints_m * mirror[:, None] + shift[:, None],
-        elbow_m=elbow * mirror + shift,
-        centres_m=centres * mirror[:, None] + shift[:, None],
-        axes_m=axes * mirror[:, None, :, None],
-        labels=labels,
+    parts = scenes.parts.clone()
+    parts[..., 1:4] += by_m[:, None]
+    return replace(
+        scenes,
+        centres_m=scenes.centres_m + by_m[:, None],
+        planes=planes,
+        skins=tuple((skin.moved(by_m), labels) for skin, labels in scenes.skins),
+        parts=parts,
     )
 
 
-def _forearms(
-    rotation: Tensor, size: Tensor, label: int, dice: Dice
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Elbows, and the forearms' ellipsoids, about the wrist: bent, bare or in sleeves, or none."""
-    n = len(size)
-    flexion = (0.4 * dice.normal(n)).clamp(-1.1, 1.1)
-    deviation = (0.2 * dice.normal(n)).clamp(-0.6, 0.5)
-    bent = rotation @ _turn(flexion, 0) @ _turn(deviation, 2)
-    along = bent[:, :, 1]
-    length = _FOREARM_M * size * (1 + 0.08 * dice.normal(n))
-    sleeve = torch.where(dice.chance(0.35, n), dice.uniform(n, low=1.1, high=1.7), 1.0)
-    start = torch.where(sleeve > 1, dice.uniform(n, high=0.25), 0.0)
-    breadth, depth = 0.027 + 0.004 * dice.normal(n), 0.020 + 0.003 * dice.normal(n)
-    part = torch.linspace(0, 1, _FOREARM_PIECES)
-    centres = along[:, None] * (length[:, None] * part)[..., None]
-    grown = size[:, None] * (1 + 0.55 * part * (1.3 - part))
-    grown = grown * torch.where(part >= start[:, None], sleeve[:, None], 1.0)
-    half = (0.75 * length / (_FOREARM_PIECES - 1))[:, None].expand_as(grown)
-    scales = torch.stack((breadth[:, None] * grown, half * 1.1, depth[:, None] * grown), -1)
-    axes = bent[:, None] * scales[..., None, :]
-    # Without an arm (cut off by a dark sleeve, say) only the first piece is left, or not even that.
-    kept = torch.where(dice.chance(0.08, n), dice.rows(2, n), _FOREARM_PIECES)
-    arm = FOREARM if label == HAND else OTHER_FOREARM
-    labels = torch.where(torch.arange(_FOREARM_PIECES) < kept[:, None], arm, -1)
-    return along * length[:, None], centres, axes, labels
+def surroundings(
+    hands: Hands, distance_m: Tensor, dice: Dice, views: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The person behind a raised hand: upper arm, torso, head; (N, B, 3), (N, B, 3, 3), (N, B).
 
-
-def surroundings(hands: Hands, distance_m: Tensor, dice: Dice) -> tuple[Tensor, Tensor, Tensor]:
-    """The person behind a raised hand: upper arm, torso, head; (N, B, 3), (N, B, 3, 3), (N, B)."""
+    views: (N,) where the cameras are; None = before the persons. From the head nothing is seen of
+    the person, from above seldom.
+    """
     n = len(distance_m)
     away = torch.tensor([0.0, -0.35, 0.8]) + 0.6 * dice.normal(n, 3)
     away = torch.nn.functional.normalize(away, dim=1)
@@ -216,7 +105,7 @@ def surroundings(hands: Hands, distance_m: Tensor, dice: Dice) -> tuple[Tensor, 
     upper = (hands.elbow_m + shoulder) / 2
     centres = torch.stack((torso, head, neck, upper, other, shoulder), 1)
     stout = 1 + 0.15 * dice.normal(n, 1)
-    straight = torch.eye(3).expand(n, 3, 3) @ _turn(0.15 * dice.normal(n), 2)
+    straight = torch.eye(3).expand(n, 3, 3) @ turn(0.15 * dice.normal(n), 2)
     arm = hands.elbow_m - shoulder
     arm_axes = _along(arm, 0.045 * stout[:, 0], (0.5 * arm.norm(dim=1) + 0.02).clamp(max=0.35))
     sizes = torch.tensor([[0.19, 0.30, 0.12], [0.075, 0.11, 0.095], [0.05, 0.09, 0.05]])
@@ -225,6 +114,8 @@ def surroundings(hands: Hands, distance_m: Tensor, dice: Dice) -> tuple[Tensor, 
     ball = straight * torch.tensor([0.07, 0.07, 0.07])
     axes = torch.cat((body_axes, arm_axes[:, None], hanging[:, None], ball[:, None]), 1)
     there = dice.chance(0.7, n)
+    if views is not None:
+        there &= (views == FRONT) | ((views == ABOVE) & dice.chance(0.25, n))
     labels = torch.where(there[:, None], BACKGROUND, -1).expand(n, 6).clone()
     labels[:, 3] = torch.where(there & (arm.norm(dim=1) < 0.5), BACKGROUND, -1)
     return centres, axes, labels
@@ -258,12 +149,15 @@ def things(around_m: Tensor, n_things: int, p: float, dice: Dice) -> tuple[Tenso
     rotation = roma.unitquat_to_rotmat(q).view(n, n_things, 3, 3)
     flat = dice.chance(0.5, n, n_things)[..., None, None]
     rotation = torch.where(flat, torch.eye(3), rotation)
-    labels = torch.where(dice.chance(p, n, n_things), BACKGROUND, -1)
+    labels = torch.where(dice.chance(p, n, n_things), THING, -1)
     return around_m[:, None] + offset, rotation * log_axes.exp()[..., None, :], labels
 
 
 def room_behind(behind_m: Tensor, dice: Dice) -> Tensor:
-    """(N, 2, 4) a wall behind everything, and sometimes a table."""
+    """(N, 2, 4) a wall behind everything, and sometimes a table.
+
+    behind_m: (N,) how far away the hands are, and a little more.
+    """
     n = len(behind_m)
     wall = torch.cat((0.2 * dice.normal(n, 2), torch.ones(n, 1)), 1)
     wall = torch.nn.functional.normalize(wall, dim=1)
@@ -276,3 +170,24 @@ def room_behind(behind_m: Tensor, dice: Dice) -> Tensor:
     return torch.stack(
         (torch.cat((wall, distance[:, None]), 1), torch.cat((table, below[:, None]), 1)), 1
     )
+
+
+def tables_under(hands: Hands, views: Tensor, dice: Dice) -> Tensor:
+    """(N, 1, 4) the tables that cameras see which look down, under the hands; others see none.
+
+    views: (N,) where the cameras are. From above, hands often lie on the table.
+    """
+    n = len(views)
+    above = torch.cat((0.1 * dice.normal(n, 2), torch.ones(n, 1)), 1)
+    tilt = dice.uniform(n, 1, low=0.3, high=1.2)
+    head = torch.cat((0.1 * dice.normal(n, 1), tilt, torch.ones(n, 1)), 1)
+    normal = torch.where((views == ABOVE)[:, None], above, head)
+    normal = torch.nn.functional.normalize(normal, dim=1)
+    points = torch.cat((hands.joints_m, hands.elbow_m[:, None]), 1)
+    # Joints lie a finger's half thickness above what the hand lies on.
+    lowest = (points * normal[:, None]).sum(-1).amax(1) + 0.010
+    reach = torch.where(views == ABOVE, 0.25, 0.5)
+    distance = lowest + reach * dice.uniform(n).square()
+    seen = (views == ABOVE) | ((views == HEAD) & dice.chance(0.75, n))
+    distance = torch.where(seen, distance, torch.inf)
+    return torch.cat((normal, distance[:, None]), 1)[:, None]

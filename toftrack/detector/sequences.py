@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from toftrack.archives import read_archive
+from toftrack.detector.dice import Dice
+from toftrack.detector.hands import HAND, posed_hands, random_rotations
 from toftrack.detector.images import random_scenes
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
-from toftrack.detector.scenes import HAND, Dice, posed_hands, random_rotations
 from toftrack.detector.shapes import ShapeBank
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.data.natural_poses import sample_poses
+from toftrack.pose_space.data.shown_poses import shown_poses
 from toftrack.safe_files import whole_file
 
 CAMERAS = ((176, 144, 200.0), (176, 144, 200.0), (320, 240, 280.0), (512, 424, 365.0))
@@ -56,7 +57,7 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
     left, empty = dice.chance(0.5, 1), bool(dice.chance(0.125, 1))
     place = _places(keys, width / focal, height / focal, dice)
     rotations = _rotations(keys, dice)
-    angles = _held(sample_poses(keys, generator), dice)
+    angles = _held(shown_poses(keys, generator), dice)
     scene = int(torch.randint(2**31 - 1, (1,), generator=generator))
     sensor = random_sensors(1, dice)
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]])

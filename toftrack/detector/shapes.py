@@ -13,6 +13,8 @@ from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_s
 from toftrack.hand.surface import HandSurface, hand_surface
 
 _SHORTEST_M, _LONGEST_M = 0.135, 0.215
+_LONGEST_TIP = 0.42
+"""By how much more than the mean shape's a hand's last bones may be longer than its others."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ def _random_shape(generator: torch.Generator) -> HandShape:
     base = mean.base_m * palm + 0.002 * scale * normal(5, 3)
     base[0] += 0.003 * scale * normal(3)
     lengths = 1 + 0.05 * normal(1, 1) + 0.05 * normal(5, 1) + 0.03 * normal(5, 3)
+    # Against the others, people's last bones are longer than the mean shape's.
+    lengths[:, 2] *= 1.0 + _LONGEST_TIP * torch.rand(1, generator=generator) + 0.04 * normal(5)
     rotations = normal(5, 3) * math.radians(3.0)
     rotations[0] *= 2.5
     frames = mean.base_frames @ roma.rotvec_to_rotmat(rotations)

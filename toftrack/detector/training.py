@@ -1,4 +1,8 @@
-"""Training of the detector: one process makes images, one trains; everything from a seed."""
+"""Training of the detector: one process makes images, one trains; everything from a seed.
+
+Each batch is drawn by a generator of its own, of the seed and the batch's number, so that an
+interrupted training goes on with the batches that it would have seen (checkpoints.py).
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from toftrack.detector.checkpoints import Checkpoints, Progress
 from toftrack.detector.images import Crops, WideImages, crop_images, wide_images
 from toftrack.detector.losses import finder_loss, pose_losses
 from toftrack.detector.network import Finder, PoseNet
@@ -59,7 +64,9 @@ Course = list[dict[str, Any]]
 """How training went: a row every few thousand images, with running means of the errors."""
 
 
-def train_poses(schedule: Schedule, shapes: int, seed: int) -> tuple[PoseNet, Course]:
+def train_poses(
+    schedule: Schedule, shapes: int, seed: int, checkpoints: Checkpoints | None = None
+) -> tuple[PoseNet, Course]:
     """Train the pose network; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
     network = PoseNet(schedule.width)
@@ -81,10 +88,12 @@ def train_poses(schedule: Schedule, shapes: int, seed: int) -> tuple[PoseNet, Co
         }
         return losses.total, reported
 
-    return _train(network, "poses", crop_images, step, schedule, shapes, seed)
+    return _train(network, "poses", crop_images, step, schedule, shapes, seed, checkpoints)
 
 
-def train_finder(schedule: Schedule, shapes: int, seed: int) -> tuple[Finder, Course]:
+def train_finder(
+    schedule: Schedule, shapes: int, seed: int, checkpoints: Checkpoints | None = None
+) -> tuple[Finder, Course]:
     """Train the finder; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
     network = Finder(schedule.width)
@@ -99,7 +108,7 @@ def train_finder(schedule: Schedule, shapes: int, seed: int) -> tuple[Finder, Co
         loss = finder_loss(found, images)
         return loss, {"loss": float(loss.detach())}
 
-    return _train(network, "finder", wide_images, step, schedule, shapes, seed + 1)
+    return _train(network, "finder", wide_images, step, schedule, shapes, seed + 1, checkpoints)
 
 
 def _train(
@@ -110,18 +119,28 @@ def _train(
     schedule: Schedule,
     shapes: int,
     seed: int,
+    checkpoints: Checkpoints | None,
 ) -> tuple[Network, Course]:
     _keep_memory()
     steps = math.ceil(schedule.images / schedule.batch)
     optimiser = torch.optim.AdamW(network.parameters(), schedule.rate, weight_decay=0.02)
     averaged = deepcopy(network)
-    course: Course = []
-    recent: dict[str, float] = {}
-    began = time.perf_counter()
-    bar = tqdm(total=steps * schedule.batch, unit=" images", desc=name, file=sys.stderr)
-    with bar:
-        batches = _batches(make, schedule.batch, steps, shapes, seed)
-        for number, batch in enumerate(batches):
+    progress = Progress(network, averaged, optimiser)
+    settings = {"images": schedule.images, "batch": schedule.batch, "rate": schedule.rate}
+    settings |= {"width": schedule.width, "shapes": shapes, "seed": seed}
+    writing: Any = contextlib.nullcontext(lambda: None)
+    if checkpoints is not None:
+        checkpoints.restore(name, progress, settings)
+        writing = checkpoints.writing(name, progress, settings)
+    recent, course = progress.recent, progress.course
+    before, began = progress.seconds, time.perf_counter()
+    done = progress.step * schedule.batch
+    bar = tqdm(
+        total=steps * schedule.batch, initial=done, unit=" images", desc=name, file=sys.stderr
+    )
+    with bar, writing as stepped:
+        for batch in _batches(make, schedule.batch, range(progress.step, steps), shapes, seed):
+            number = progress.step
             warm = min(1.0, (number + 1) / 300)
             cosine = 0.5 * (1 + math.cos(math.pi * number / steps))
             for group in optimiser.param_groups:
@@ -135,11 +154,14 @@ def _train(
             for key, value in reported.items():
                 recent[key] = 0.99 * recent.get(key, value) + 0.01 * value
             bar.update(schedule.batch)
+            progress.step = number + 1
+            progress.seconds = before + time.perf_counter() - began
             if (number + 1) % 100 == 0 or number + 1 == steps:
                 bar.set_postfix({k: f"{v:.3g}" for k, v in recent.items()}, refresh=False)
-                seconds = time.perf_counter() - began
                 images = (number + 1) * schedule.batch
-                course.append({"images": images, "seconds": round(seconds, 1)} | recent)
+                seconds = round(progress.seconds, 1)
+                course.append({"images": images, "seconds": seconds} | recent)
+            stepped()
     return averaged, course
 
 
@@ -164,17 +186,19 @@ def _average(averaged: nn.Module, network: nn.Module, kept: float) -> None:
 
 
 def _batches(
-    make: Callable[..., Any], batch: int, steps: int, shapes: int, seed: int
+    make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int
 ) -> Iterator[Any]:
-    """Batches made by another process, in order."""
+    """The batches of these numbers, made by another process, in order."""
+    if len(numbers) == 0:
+        return
     context = multiprocessing.get_context("spawn")
     queue = context.Queue(_READY)
     worker = context.Process(
-        target=_make_batches, args=(queue, make, batch, steps, shapes, seed), daemon=True
+        target=_make_batches, args=(queue, make, batch, numbers, shapes, seed), daemon=True
     )
     worker.start()
     try:
-        for _ in range(steps):
+        for _ in numbers:
             while True:
                 try:
                     yield _tensors(*queue.get(timeout=10))
@@ -191,13 +215,15 @@ def _batches(
 
 
 def _make_batches(
-    queue: Any, make: Callable[..., Any], batch: int, steps: int, shapes: int, seed: int
+    queue: Any, make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int
 ) -> None:
     torch.set_num_threads(1)
     _keep_memory()
     generator = torch.Generator().manual_seed(seed)
     bank = shape_bank(shapes, generator)
-    for _ in range(steps):
+    first = int(torch.randint(2**31, (1,), generator=generator))
+    for number in numbers:
+        generator.manual_seed((first + number) % 2**32)
         queue.put(_arrays(make(batch, bank, generator)))
 
 

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from toftrack.archives import read_archive
-from toftrack.detector.network import Finder, PoseNet, Residual
+from toftrack.detector.crops import CROP_CHANNELS
+from toftrack.detector.network import SEGMENTS, Finder, PoseNet, Residual
 from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
 from toftrack.safe_files import whole_file
@@ -22,12 +23,14 @@ FORMAT = "toftrack-detector"
 VERSION = 1
 _FORMATS = (FORMAT, "toftrack-relocaliser")
 """As files say it; the second one until the detector had its name."""
-_RENAMED = {"votes.": "keypoints."}
-"""Layers of older files, and what they are called now."""
+_RENAMED = {"pose.votes.": "pose.keypoints."}
+"""Arrays of older files, and what they are called now."""
 DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
 _LARGEST_BYTES = 64 << 20
 _WIDEST = 256
 """Channels; ten times those of the package's networks."""
+_NEW_CLASS = -4.0
+"""Bias of the logits of a class that was not known before: at first it is hardly ever said."""
 _AGAIN = "train them anew with python -m toftrack.programs.train_detector, or install again"
 
 
@@ -60,11 +63,11 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
     """
     arrays, metadata = _read(DEFAULT_FILE if path is None else Path(path))
     try:
-        pose = PoseNet(_width(metadata, "pose"))
+        pose = PoseNet(_width(metadata, "pose"), *_pose_channels(arrays))
         finder = Finder(_width(metadata, "finder"))
         for name, network in (("pose", pose), ("finder", finder)):
             network.load_state_dict(_tensors(arrays, name))
-    except (KeyError, TypeError, ValueError, RuntimeError):
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
     make_ready(pose)
     make_ready(finder)
@@ -74,6 +77,7 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
 def trained_weights(path: str | Path, name: str, width: int) -> dict[str, Tensor]:
     """One network's weights, "pose" or "finder" of so many channels, to go on training from.
 
+    What older pose networks lack, a channel of the crop or a class of parts, begins without effect.
     Raises ToftrackError as load_weights does, and for another width.
     """
     arrays, metadata = _read(Path(path))
@@ -82,7 +86,33 @@ def trained_weights(path: str | Path, name: str, width: int) -> dict[str, Tensor
             f"{path} holds weights for a width of {metadata.get(f'{name}_width')}, and the width to"
             f" train is {width}; give the same"
         )
-    return _tensors(arrays, name)
+    tensors = _tensors(arrays, name)
+    if name == "pose":
+        _extend(tensors, *_pose_channels(arrays))
+    return tensors
+
+
+def _pose_channels(arrays: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Channels of the crop and classes of parts that a pose network's arrays are for.
+
+    Raises KeyError or ValueError where they are for none.
+    """
+    stem, painted = arrays["pose.stem.0.weight"], arrays["pose.painted.weight"]
+    inputs, segments = stem.shape[1], painted.shape[0] // 4
+    if not (3 <= inputs <= CROP_CHANNELS and 4 <= segments <= SEGMENTS):
+        raise ValueError(f"{inputs} channels of a crop and {segments} classes of parts")
+    return inputs, segments
+
+
+def _extend(tensors: dict[str, Tensor], inputs: int, segments: int) -> None:
+    """Give a pose network's weights the channels and the classes that they lack, in place."""
+    stem = tensors["stem.0.weight"]
+    added = stem.new_zeros(len(stem), CROP_CHANNELS - inputs, *stem.shape[2:])
+    tensors["stem.0.weight"] = torch.cat((stem, added), 1)
+    new = 4 * (SEGMENTS - segments)
+    weight, bias = tensors["painted.weight"], tensors["painted.bias"]
+    tensors["painted.weight"] = torch.cat((weight, weight.new_zeros(new, *weight.shape[1:])))
+    tensors["painted.bias"] = torch.cat((bias, bias.new_full((new,), _NEW_CLASS)))
 
 
 def _width(metadata: dict[str, Any], name: str) -> int:
@@ -96,20 +126,12 @@ def _width(metadata: dict[str, Any], name: str) -> int:
 def _tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
     """One network's arrays as it takes them."""
     return {
-        _layer(key.split(".", 1)[1]): torch.from_numpy(array).float()
+        key.split(".", 1)[1]: torch.from_numpy(array).float()
         if array.dtype.kind == "f"
         else torch.from_numpy(array)
         for key, array in arrays.items()
         if key.startswith(name + ".")
     }
-
-
-def _layer(key: str) -> str:
-    """The name of a network's array, as it is now."""
-    for old, new in _RENAMED.items():
-        if key.startswith(old):
-            return new + key.removeprefix(old)
-    return key
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -134,6 +156,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         )
     if metadata.get("sha256") != _checksum(arrays):
         raise ToftrackError(f"{path} is damaged, its checksum is wrong; {_AGAIN}")
+    for before, now in _RENAMED.items():
+        arrays = {name.replace(before, now): array for name, array in arrays.items()}
     return arrays, metadata
 
 

@@ -1,19 +1,22 @@
 """Train the networks that find hands and propose poses, from nothing:
 
 python -m toftrack.programs.train_detector
+
+What was interrupted goes on by the same command with resume=FOLDER, the folder of its output.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-import time
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
+from toftrack.checks import check_number
 from toftrack.configuration.compose import configuration_folder
 from toftrack.programs import command_line
 from toftrack.safe_files import write_whole
@@ -33,6 +36,7 @@ def train(config: DictConfig) -> float:
     """See main; everything goes into Hydra's output folder."""
     import torch
 
+    from toftrack.detector.checkpoints import Checkpoints
     from toftrack.detector.training import train_finder, train_poses
     from toftrack.detector.weights import save_weights
     from toftrack.errors import ToftrackError
@@ -43,12 +47,15 @@ def train(config: DictConfig) -> float:
     finder = hydra.utils.instantiate(config.finder)
     if not (isinstance(config.shapes, int) and config.shapes > 0):
         raise ToftrackError("shapes must be a whole number above 0: how many hands are drawn from")
-    began = time.perf_counter()
+    check_number("checkpoint_minutes", config.checkpoint_minutes, 0, above=True)
+    resume = None if config.resume is None else Path(to_absolute_path(config.resume))
+    checkpoints = Checkpoints(folder, config.checkpoint_minutes, resume)
     write_picture(folder / "images.png", images_figure(config.seed))
     torch.set_num_threads(1)  # the other core makes the images
-    finder_network, finder_course = train_finder(finder, config.shapes, config.seed)
-    pose_network, pose_course = train_poses(poses, config.shapes, config.seed)
-    minutes = round((time.perf_counter() - began) / 60, 1)
+    each = (config.shapes, config.seed, checkpoints)
+    finder_network, finder_course = train_finder(finder, *each)
+    pose_network, pose_course = train_poses(poses, *each)
+    minutes = round((finder_course[-1]["seconds"] + pose_course[-1]["seconds"]) / 60, 1)
     about = {
         "seed": config.seed,
         "shapes": config.shapes,

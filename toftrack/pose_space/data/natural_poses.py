@@ -62,6 +62,8 @@ _SHOWN = (
 )
 _SPREAD = (12.0, 2.0, -8.0, -16.0)
 _TOUCHING_M = 0.020
+FINGER_OF_ANGLE = torch.tensor([0] * 5 + [f for f in range(1, 5) for _ in range(4)])
+"""(21,) the finger, thumb 0, that each angle bends."""
 
 
 def recorded_poses() -> Tensor:
@@ -98,19 +100,12 @@ def sample_poses(n: int, generator: torch.Generator) -> Tensor:
         return torch.where(shown, _shown(n, generator), _by_finger(n, generator))
 
     first, second = any_or_shown(), any_or_shown()
-    recorded = recorded_poses()
-
-    def drawn() -> Tensor:
-        rows = torch.randint(len(recorded), (n,), generator=generator)
-        return recorded[rows] + math.radians(3.0) * normal(n, 21)
-
-    captured, other = drawn(), drawn()
+    captured, other = near_recorded(n, generator), near_recorded(n, generator)
     # Fingers of two recorded frames together.
-    of_angle = torch.tensor([0] * 5 + [f for f in range(1, 5) for _ in range(4)])
-    chosen = uniform(n, 5)[:, of_angle] < 0.5
+    chosen = uniform(n, 5)[:, FINGER_OF_ANGLE] < 0.5
     crossed = torch.where(chosen, captured, other)
     # On the way from one pose to another, each finger ahead or behind.
-    part = (uniform(n, 1) + 0.15 * normal(n, 5)).clamp(0, 1)[:, of_angle]
+    part = (uniform(n, 1) + 0.15 * normal(n, 5)).clamp(0, 1)[:, FINGER_OF_ANGLE]
     moving = torch.lerp(first, second, part)
     pinched = _pinching(first, generator)
     kind = uniform(n, 1)
@@ -119,6 +114,25 @@ def sample_poses(n: int, generator: torch.Generator) -> Tensor:
         angles = torch.where(kind < limit, poses, angles)
     low, high = angles.new_tensor(ANGLE_LIMITS).unbind(1)
     return torch.minimum(torch.maximum(angles, low), high)
+
+
+def any_fingers(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, each finger in any state; not yet within the joint limits."""
+    return _by_finger(n, generator)
+
+
+def near_recorded(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, recorded poses, each a little changed; not yet within the limits."""
+    recorded = recorded_poses()
+    rows = torch.randint(len(recorded), (n,), generator=generator)
+    return recorded[rows] + math.radians(3.0) * torch.randn(n, 21, generator=generator)
+
+
+def fingers_of_two_recorded(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, each finger of one of two recorded poses; not yet within the limits."""
+    first, second = near_recorded(n, generator), near_recorded(n, generator)
+    chosen = torch.rand(n, 5, generator=generator)[:, FINGER_OF_ANGLE] < 0.5
+    return torch.where(chosen, first, second)
 
 
 def _by_finger(n: int, generator: torch.Generator) -> Tensor:

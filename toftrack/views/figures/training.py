@@ -12,8 +12,11 @@ from toftrack.detector.images import crop_images, wide_images
 from toftrack.detector.shapes import shape_bank
 from toftrack.views.figures.chart import BLUE, VERMILLION, Axes, canvas, legend, titled
 
-_CROPS, _COLUMNS, _SIDE = 24, 8, 128
-_PART_COLOURS = np.array([[0, 0, 0], [0, 70, 0], [80, 0, 0], [0, 0, 90]], np.uint8)
+_CROPS, _COLUMNS, _SIDE = 48, 8, 128
+_PART_COLOURS = np.array(
+    [[0, 0, 0], [0, 70, 0], [80, 0, 0], [0, 0, 90], [0, 80, 80], [60, 0, 60]], np.uint8
+)
+"""Of SEGMENTS, and of what lies outside of the image; BGR."""
 
 
 def images_figure(seed: int) -> np.ndarray:
@@ -24,7 +27,7 @@ def images_figure(seed: int) -> np.ndarray:
     tiles = []
     for image, parts in zip(crops.image.numpy(), crops.parts.numpy(), strict=True):
         tile = _grey(1 - (image[0] + 1) / 2, (_SIDE, _SIDE))
-        colours = _PART_COLOURS[np.maximum(parts, 0)]
+        colours = _PART_COLOURS[parts]  # -1 is the last
         tiles.append(cv2.add(tile, cv2.resize(colours, (_SIDE, _SIDE), interpolation=0)))
     crop_rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, _CROPS, _COLUMNS)]
     scale = 2 * _SIDE / wides.image.shape[-1]
@@ -39,8 +42,8 @@ def images_figure(seed: int) -> np.ndarray:
         tiles.append(tile)
     wide_rows = [np.hstack(tiles[i : i + 4]) for i in (0, 4)]
     note = (
-        "Above, crops: hand green, forearm blue, another hand red. Below, whole images: a blue ring"
-        " on a right hand's palm, a red one on a left one's."
+        "Above, crops: hand green, forearm blue, another hand red, things yellow, outside violet."
+        " Below, whole images: a blue ring on a right palm, a red one on a left one."
     )
     return titled(np.vstack(crop_rows + wide_rows), "Training images", note)
 

@@ -1,0 +1,153 @@
+"""The state of a training, written while it goes on, so that it can be gone on with exactly.
+
+Arrays and JSON, as everything here. What is read must be of the same training: the number of
+images, the batch, the rates and the seed make the schedule, which continues where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from toftrack.archives import read_archive
+from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
+from toftrack.safe_files import whole_file
+
+FORMAT = "toftrack-detector-training"
+_VERSION = 1
+_OF_OPTIMISER = ("step", "exp_avg", "exp_avg_sq")
+
+
+@dataclass
+class Progress:
+    """What changes while a network is trained.
+
+    step: batches that it has seen.  seconds: that took.  recent: running means.
+    course: rows of the errors so far.
+    """
+
+    network: nn.Module
+    averaged: nn.Module
+    optimiser: torch.optim.Optimizer
+    step: int = 0
+    seconds: float = 0.0
+    recent: dict[str, float] = field(default_factory=dict)
+    course: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Checkpoints:
+    """Where a training's checkpoints are.
+
+    folder: they are written into, one for each network.  minutes: between two.
+    resume: folder of an interrupted training to go on with; None = begin.
+    """
+
+    folder: Path
+    minutes: float
+    resume: Path | None = None
+
+    def path(self, name: str, folder: Path | None = None) -> Path:
+        """The file of a network's checkpoint."""
+        return (self.folder if folder is None else folder) / f"{name}.checkpoint.npz"
+
+    def restore(self, name: str, progress: Progress, settings: dict[str, Any]) -> None:
+        """Bring a network's training to where it was, if it had begun; settings: what it is by.
+
+        Raises ToftrackError where the folder to resume is none, or the checkpoint is damaged or of
+        another training.
+        """
+        if self.resume is None:
+            return
+        if not self.resume.is_dir():
+            raise ToftrackError(f"there is no folder {self.resume} of a training to resume")
+        path = self.path(name, self.resume)
+        if path.exists():
+            _restore(path, progress, settings)
+
+    @contextmanager
+    def writing(self, name: str, progress: Progress, settings: dict[str, Any]) -> Iterator[Any]:
+        """Yields what to call after each step: it writes now and then; the end is written too."""
+        last = time.monotonic()
+
+        def stepped() -> None:
+            nonlocal last
+            if time.monotonic() - last > 60 * self.minutes:
+                save(self.path(name), progress, settings)
+                last = time.monotonic()
+
+        yield stepped
+        save(self.path(name), progress, settings)
+
+
+def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
+    """Write a checkpoint; an older one there is replaced only by a whole one."""
+    arrays: dict[str, np.ndarray] = {}
+    for name in ("network", "averaged"):
+        for key, tensor in getattr(progress, name).state_dict().items():
+            arrays[f"{name}.{key}"] = tensor.detach().cpu().numpy()
+    for number, state in progress.optimiser.state_dict()["state"].items():
+        for key in _OF_OPTIMISER:
+            arrays[f"optimiser.{number}.{key}"] = state[key].detach().cpu().numpy()
+    metadata = {
+        "format": FORMAT,
+        "version": _VERSION,
+        "settings": settings,
+        "step": progress.step,
+        "seconds": progress.seconds,
+        "recent": progress.recent,
+        "course": progress.course,
+    }
+    content: dict[str, Any] = {"metadata": np.array(json.dumps(metadata)), **arrays}
+    with whole_file(path) as stream:
+        np.savez(stream, **content)
+
+
+def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
+    broken = f"{path} is no checkpoint of a training of the detector; train without resume"
+    try:
+        arrays = read_archive(path)
+        metadata = parse_json(str(arrays.pop("metadata")))
+        if metadata["format"] != FORMAT or metadata["version"] != _VERSION:
+            raise ValueError("another format")
+        before = metadata["settings"]
+        for name, value in settings.items():
+            if before[name] != value:
+                raise ToftrackError(
+                    f"{path} is a checkpoint of a training with {name}={before[name]}, and now it"
+                    f" is {value}; give the same, or train without resume"
+                )
+        for name in ("network", "averaged"):
+            tensors = {key: torch.from_numpy(array) for key, array in _of(arrays, name).items()}
+            getattr(progress, name).load_state_dict(tensors)
+        optimiser = progress.optimiser.state_dict()
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for key, array in _of(arrays, "optimiser").items():
+            number, name = key.split(".")
+            state.setdefault(int(number), {})[name] = torch.from_numpy(array)
+        progress.optimiser.load_state_dict(
+            {"state": state, "param_groups": optimiser["param_groups"]}
+        )
+        progress.step, progress.seconds = int(metadata["step"]), float(metadata["seconds"])
+        progress.recent, progress.course = dict(metadata["recent"]), list(metadata["course"])
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ToftrackError(f"{broken} ({error})") from None
+
+
+def _of(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    """Arrays of one part, by their names there."""
+    return {
+        key.removeprefix(name + "."): array
+        for key, array in arrays.items()
+        if key.startswith(name + ".")
+    }
