@@ -18,7 +18,7 @@ def after(frames: int, dt_s: float, **most: float) -> Duration:
     return duration
 
 
-def test_what_has_not_begun_has_lasted_for_no_frame() -> None:
+def test_what_has_not_begun_has_not_reached_a_frame() -> None:
     assert not Duration().begun
     assert not any(Duration().reached(frames) for frames in (1, 2, 10))
 

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 N = 1500
 
 
-def test_thumbs_that_are_up_are_told_from_all_else() -> None:
+def test_thumbs_that_are_up_are_distinguished() -> None:
     generator = torch.Generator().manual_seed(0)
     shares = {}
     for row, shown in enumerate(SHOWN):

@@ -93,7 +93,7 @@ def test_hands_are_seen_where_it_is_said(images: WideImages) -> None:
     assert good > 0.8 * len(use)
 
 
-def test_what_lies_outside_of_the_image_is_told_and_has_no_parts(crops: Crops) -> None:
+def test_what_lies_outside_of_the_image_is_marked_and_has_no_parts(crops: Crops) -> None:
     outside = crops.image[:, 3]
     cut = outside.amax((1, 2)) == 1
     assert 0.1 < float(cut.float().mean()) < 0.45

@@ -127,8 +127,8 @@ def by_a_loop(
         for v, u in np.argwhere(hand & border)
     ]
     if leaves and pixel(wrist) is not None:
-        ahead = max(axis @ point for point in leaves) - axis @ wrist
-        if ahead < (1 - slack) * 0.05:
+        farthest = max(axis @ point for point in leaves) - axis @ wrist
+        if farthest < (1 - slack) * 0.05:
             return 1.0
     return through / 3
 
@@ -137,9 +137,9 @@ def by_a_loop(
 def test_the_conflict_is_what_a_loop_over_the_forearm_finds(image: np.ndarray) -> None:
     draw, observation, exact = np.random.default_rng(1), observed(image), 0
     wrists = draw.uniform((-0.12, -0.1, 0.4), (0.12, 0.2, 0.6), (60, 3)).astype(np.float32)
-    turns = draw.uniform(-2.5, 2.5, (60, 3)).astype(np.float32)
-    found = conflict(observation, wrists, turns)
-    for value, wrist, turn in zip(found, wrists.astype(float), turns.astype(float), strict=True):
+    rotvecs = draw.uniform(-2.5, 2.5, (60, 3)).astype(np.float32)
+    found = conflict(observation, wrists, rotvecs)
+    for value, wrist, turn in zip(found, wrists.astype(float), rotvecs.astype(float), strict=True):
         # The distances are those of a chamfer mask, and only some of the blob's edge counts.
         most, least = (by_a_loop(observation, wrist, turn, slack) for slack in (0.9, 1.1))
         assert least - 1e-6 <= value <= most + 1e-6

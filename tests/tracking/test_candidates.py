@@ -163,7 +163,7 @@ def sure_track(frames: int, **changes: object) -> Track:
     return track_of(hand_at(), **(usual | changes))
 
 
-def test_the_detector_and_other_fingers_take_turns_on_a_sure_hand() -> None:
+def test_the_detector_and_other_fingers_alternate_on_a_sure_hand() -> None:
     found = [schedule(sure_track(frames), False, 0.9) for frames in range(1, 7)]
     assert found == [(False, True), (True, False)] * 3
 

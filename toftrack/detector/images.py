@@ -26,7 +26,14 @@ from toftrack.detector.hands import (
 from toftrack.detector.images_numba import read_pictures
 from toftrack.detector.network import SEGMENTS, STRIDE
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
-from toftrack.detector.scenes import Scenes, moved, room_behind, surroundings, tables_under, things
+from toftrack.detector.scenes import (
+    Scenes,
+    moved,
+    background_behind,
+    surroundings,
+    tables_under,
+    things,
+)
 from toftrack.detector.shapes import ShapeBank
 
 _SAMPLES = 2 * CROP
@@ -219,7 +226,7 @@ def random_scenes(
     other_labels = torch.where(there[:, None], second.labels, -1)
     centres = (hands.centres_m, second.centres_m, body[0], stuff[0])
     axes = (hands.axes_m, second.axes_m, body[1], stuff[1])
-    planes = room_behind((hands.pivot_m[:, 2] + 0.1).clamp(min=0.4), dice)
+    planes = background_behind((hands.pivot_m[:, 2] + 0.1).clamp(min=0.4), dice)
     if views is not None:
         # Whoever looks down sees a table, or the floor far below.
         planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)

@@ -110,11 +110,11 @@ def run_pose_network(
     if side == "left":
         depth_m, k = mirrored(depth_m, k)
         centres_m = centres_m * MIRROR.numpy()
-    crops, crop_turns = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
+    crops, crop_rotations = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
     image = torch.from_numpy(np.stack(crops)[:, : pose.inputs])
     image = image.to(memory_format=torch.channels_last)
     p = Proposed(*on_host(*pose(on_device(image, pose.anchors.device))))
-    turn = torch.from_numpy(np.stack(crop_turns)).float()  # (C, 3, 3)
+    turn = torch.from_numpy(np.stack(crop_rotations)).float()  # (C, 3, 3)
     centre = torch.from_numpy(centres_m).float()
     order = p.log_probability.argsort(1, descending=True)[:, :KEPT]
 

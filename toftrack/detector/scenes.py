@@ -153,7 +153,7 @@ def things(around_m: Tensor, n_things: int, p: float, dice: Dice) -> tuple[Tenso
     return around_m[:, None] + offset, rotation * log_axes.exp()[..., None, :], labels
 
 
-def room_behind(behind_m: Tensor, dice: Dice) -> Tensor:
+def background_behind(behind_m: Tensor, dice: Dice) -> Tensor:
     """(N, 2, 4) a wall behind everything, and sometimes a table.
 
     behind_m: (N,) how far away the hands are, and a little more.
