@@ -28,8 +28,8 @@ from toftrack.detector.network import SEGMENTS, STRIDE
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
 from toftrack.detector.scenes import (
     Scenes,
-    moved,
     background_behind,
+    moved,
     surroundings,
     tables_under,
     things,

@@ -37,7 +37,7 @@ def hypothesis_joints(
 
 @dataclass(frozen=True)
 class PoseLosses:
-    """Sums to the loss; joints_mm, keypoints_mm: mean errors of the likeliest hypothesis and of
+    """Sums to the loss; hypothesis_mm, keypoints_mm: mean errors of the likeliest hypothesis and of
     the keypoints.
     """
 
