@@ -30,7 +30,8 @@ from breaks import BREAKS, OTHER_SIDE, Break, scaled
 
 from toftrack.api import make_tracker
 from toftrack.output.measures import Estimates, MeasuredRecording, mean_of, measured
-from toftrack.recordings.store import FrameStore, open_recording, open_source
+from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.store import open_recording, open_source
 
 DATA = Path(__file__).parents[1] / "data"
 WHOLE = Break("nothing is broken")

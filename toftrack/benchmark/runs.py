@@ -26,8 +26,8 @@ from toftrack.output.accuracy import Row, group_counts, row_figures
 from toftrack.output.evaluation import TIPS
 from toftrack.output.image_labels import Points, Stills, point_rows, read_labels, still_row
 from toftrack.output.measures import Estimates, measured
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import read_recording
-from toftrack.recordings.store import FrameStore
 
 SIDES = ("told", "auto")
 

@@ -18,7 +18,6 @@ from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import toftrack
 from toftrack.configuration import renamed
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import sentence
@@ -66,7 +65,7 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
 
 def configuration_folder() -> Path:
     """toftrack's own conf/: in the package where a wheel was installed, beside it in a checkout."""
-    package = Path(toftrack.__file__).parent
+    package = Path(__file__).parents[1]
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
 

@@ -18,8 +18,9 @@ from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.doubts import doubts
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
-from toftrack.recordings.store import FrameStore, open_recording
+from toftrack.recordings.store import open_recording
 
 _log = logging.getLogger(__name__)
 

@@ -24,9 +24,10 @@ from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
 from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
-from toftrack.recordings.store import FrameStore, open_recording, open_source
+from toftrack.recordings.store import open_recording, open_source
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
 from toftrack.safe_files import open_to_read

@@ -24,8 +24,9 @@ from toftrack.calibration import fitting as calibration
 from toftrack.calibration.fitting import DepthFit, DepthPairs, Lens, View
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
-from toftrack.recordings.store import FrameStore, open_recording
+from toftrack.recordings.store import open_recording
 from toftrack.safe_files import write_whole
 from toftrack.views.figures.calibration import corner_sheet, error_plot
 from toftrack.views.pictures import write_picture

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npy import NpyStack
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.npz_stream import write_npz_streamed
@@ -35,7 +36,7 @@ from toftrack.recordings.sr_frame import (
 )
 from toftrack.recordings.srs import SrsRecording, SrsWriter
 from toftrack.recordings.srs_facts import SrsFacts
-from toftrack.recordings.store import FrameStore, open_recording
+from toftrack.recordings.store import open_recording
 from toftrack.recordings.video import DepthVideo
 
 _MILLIMETRE = 0.001

@@ -25,7 +25,8 @@ from toftrack.gestures.files import NamedPose, read_poses, save_poses
 from toftrack.gestures.learning import learned_pose
 from toftrack.gestures.recognition import Gestures, gestures_with
 from toftrack.programs import command_line
-from toftrack.recordings.store import FrameStore, open_source
+from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.store import open_source
 
 _FILE = "gestures.json"
 _LEAD_S = 1.0

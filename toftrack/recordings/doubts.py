@@ -8,17 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import median_reading, nearest_reading
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.streamed_images import Images, StreamedImages
-
-if TYPE_CHECKING:
-    from toftrack.recordings.store import FrameStore
 
 _PER_FRAME = (
     *("timestamp_s", "joints_m", "visible", "in_space"),

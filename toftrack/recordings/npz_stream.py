@@ -12,8 +12,8 @@ from typing import IO, Any
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz_camera import camera_arrays
-from toftrack.recordings.store import FrameStore
 from toftrack.safe_files import whole_file
 
 

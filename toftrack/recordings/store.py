@@ -5,15 +5,11 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
 
-import numpy as np
-
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import Truth
 from toftrack.recordings.bag_names import is_bag
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npy import read_npy
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import read_png_folder
@@ -41,40 +37,6 @@ ELSEWHERE = {
     ".raw": "say what it is: read it with numpy, save .npy (frames, rows, columns), convert that",
 }
 """What to do with files of other kinds."""
-
-
-class FrameStore(Protocol):
-    """T frames in an order, each to be had by its number."""
-
-    @property
-    def camera(self) -> Camera: ...
-
-    @property
-    def fps(self) -> float: ...
-
-    @property
-    def radial(self) -> bool:
-        """True: the depth is the distance along each pixel's ray; False: Z along the axis."""
-        ...
-
-    @property
-    def timestamp_s(self) -> np.ndarray:
-        """(T,) float64, not decreasing."""
-        ...
-
-    @property
-    def truth(self) -> Truth | None: ...
-
-    @property
-    def metadata(self) -> dict[str, Any]: ...
-
-    def __len__(self) -> int: ...
-
-    def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Depth, (H, W) float32 metres, 0 = no reading, and amplitude, (H, W) uint16 or None."""
-        ...
-
-    def close(self) -> None: ...
 
 
 def open_recording(

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from toftrack.errors import ToftrackError
-from toftrack.recordings.store import FrameStore, open_source
+from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.store import open_source
 
 _log = logging.getLogger(__name__)
 FIRST_NUMBER = 1

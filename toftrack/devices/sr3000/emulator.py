@@ -32,8 +32,8 @@ from toftrack.devices.sr3000.faults import (
     transfer,
 )
 from toftrack.devices.sr3000.transport import UsbSettings, parse_id
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import REGISTERS, encode_frame, to_radial
-from toftrack.recordings.store import FrameStore
 
 _TURN_S = 0.01  # how soon a waiting transfer notices that the camera was unplugged
 _CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
