@@ -67,12 +67,17 @@ def confidence_model(**changes: Any) -> ConfidenceModel:
     return replace(_part("lost"), **changes)
 
 
-def detector_settings(**changes: Any) -> DetectorSettings:
-    """conf/detector/network.yaml, without its weights"""
+@cache
+def _detector_settings() -> DetectorSettings:
     config = OmegaConf.to_container(configuration("detector=network").detector)
     assert isinstance(config, dict)
     del config["_target_"], config["weights"]
-    return replace(DetectorSettings(**config), **changes)
+    return DetectorSettings(**config)
+
+
+def detector_settings(**changes: Any) -> DetectorSettings:
+    """conf/detector/network.yaml, without its weights"""
+    return replace(_detector_settings(), **changes)
 
 
 def handedness_settings(**changes: Any) -> HandednessSettings:

@@ -1,4 +1,4 @@
-"""What the tests of the detector share: small networks, told ones, scenes with one hand."""
+"""What the tests of the detector share: small networks, fixed ones, scenes with one hand."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def detection_of(states: torch.Tensor, log_size: float = 0.0, side: str = "right
 
 
 class FixedDetector:
-    """In the networks' place: finds what it is given, and records where it was asked to look.
+    """In the networks' place: finds what it is given, and records the places it was asked about.
 
     found: what a search of the whole image finds, whichever side is searched for.
     searched: the sides of all searches.  likely: of the last one, None before any.

@@ -140,7 +140,7 @@ def test_the_conflict_is_what_a_loop_over_the_forearm_finds(image: np.ndarray) -
     turns = draw.uniform(-2.5, 2.5, (60, 3)).astype(np.float32)
     found = conflict(observation, wrists, turns)
     for value, wrist, turn in zip(found, wrists.astype(float), turns.astype(float), strict=True):
-        # The distances are those of a chamfer mask, and of the blob's edge a part is looked at.
+        # The distances are those of a chamfer mask, and only some of the blob's edge counts.
         most, least = (by_a_loop(observation, wrist, turn, slack) for slack in (0.9, 1.1))
         assert least - 1e-6 <= value <= most + 1e-6
         exact += least == most

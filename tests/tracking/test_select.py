@@ -101,7 +101,7 @@ def reference(
 @pytest.mark.parametrize("hidden", [True, False])
 def test_the_choice_is_that_of_a_plain_reference(detected: bool, hidden: bool) -> None:
     draw, seen = np.random.default_rng(0), set()
-    for _ in range(500):
+    for _ in range(250):
         table = random_table(draw)
         track, dt_s = random_incumbent(draw, table), float(draw.choice((0.02, 0.04, 0.05, 0.2)))
         joints = joints_of(table.pose)
