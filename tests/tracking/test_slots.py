@@ -50,13 +50,11 @@ def two(*names: str | None, **changes: object) -> TrackerState:
 def afterwards(
     before: TrackerState, after: TrackerState | None = None
 ) -> tuple[TrackerState, bool]:
-    def pose_of(slot: int) -> PlacedHand:
-        hand = (after or before).hands[slot]
-        assert hand.track is not None
+    def place(hand: HandState, track: Track) -> PlacedHand:
         fitted = right_hand_model().hand("right", hand.shape)
-        return PlacedHand(hand.track.pose, fitted, np.eye(3), (1, 1))
+        return PlacedHand(track.pose, fitted, np.eye(3), (1, 1))
 
-    return reconcile(before, after or before, pose_of, FRAME_S)
+    return reconcile(before, after or before, place, FRAME_S)
 
 
 def followed_after(frames: int, *names: str | None) -> list[bool]:
