@@ -7,8 +7,7 @@ import pytest
 
 from toftrack.programs.fit_confidence import Observed, with_doubt
 from toftrack.programs.joint_fit import JointRows
-from toftrack.tracking.features import FEATURES
-from toftrack.tracking.joint_confidence import JOINT_FEATURES
+from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES
 
 
 def test_doubt_of_joints_follows_the_new_log_odds_within_each_track() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from toftrack.hand.regions import REGION_90
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
-from toftrack.tracking.joint_confidence import JOINT_FEATURES
+from toftrack.tracking.confidence import JOINT_FEATURES
 
 FRAMES = 600
 UNSURE, DOUBT = JOINT_FEATURES.index("unsure"), JOINT_FEATURES.index("doubt")

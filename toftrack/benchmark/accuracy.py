@@ -105,8 +105,8 @@ def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], lis
         if key == "hand.side" or key.split(".")[0] in _GIVEN_ELSEWHERE:
             raise ToftrackError(
                 f"{word} cannot be given here: recordings are named, with the camera that they "
-                "have, sides, seeds and hands are given by --side, --seeds and --hands, and nothing "
-                "is shown, streamed or smoothed"
+                "have, sides, seeds and hands are given by --side, --seeds and --hands, and "
+                "nothing is shown, streamed or smoothed"
             )
     if hands > 1:
         overrides.append(f"hands={hands}")

@@ -37,7 +37,7 @@ def hypothesis_joints(
 
 @dataclass(frozen=True)
 class PoseLosses:
-    """Sums to the loss; joints_mm, best_mm: mean errors of the likeliest hypothesis, the keypoints."""
+    """Sums to the loss; joints_mm, best_mm: mean errors of likeliest hypothesis, keypoints."""
 
     total: Tensor
     hypothesis_mm: float

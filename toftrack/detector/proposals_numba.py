@@ -1,7 +1,7 @@
 """Hypotheses of a crop in one compiled call; see proposals.run_pose_network.
 
-The same formulas as PoseNet.decode's and proposals.run_pose_network's, which are the reference, without the
-microseconds that every operation costs on a few numbers.
+The same formulas as PoseNet.decode's and proposals.run_pose_network's, which are the reference,
+without the microseconds that every operation costs on a few numbers.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def _crop(depth, mirror, k, centre, turn, image):
 
 @compiled
 def _decode(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
-    """What the network's outputs for a crop mean, see PoseNet.decode and proposals.run_pose_network."""
+    """A crop's outputs decoded, see PoseNet.decode and proposals.run_pose_network."""
     _, _, _, log_size, _, _, _, joints, sigma, present, right = out
     present[c], right[c] = heads[len(_ANCHORS) * _EACH], heads[len(_ANCHORS) * _EACH + 1]
     _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)

@@ -1,7 +1,7 @@
 """Short recordings of random scenes: a hand that moves, as a whole camera sees it.
 
-They calibrate the tracker's confidence: other hands, persons and sensors than any recording that it is
-judged on, and hands whose proportions and flesh are not those of the tracker's model.
+They calibrate the tracker's confidence: other hands, persons and sensors than any recording that
+it is judged on, and hands whose proportions and flesh are not those of the tracker's model.
 """
 
 from __future__ import annotations

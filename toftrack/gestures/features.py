@@ -1,4 +1,4 @@
-"""What a gesture is recognised by: thirteen numbers of a hand's pose, whichever way the hand is turned.
+"""What a gesture is recognised by: thirteen numbers of a hand's pose, however it is turned.
 
 Ten are sums of joint angles, which a depth image determines better than the angles themselves: of
 the thumb the abduction and the total flexion; of each other finger the total flexion, and how much

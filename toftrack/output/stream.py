@@ -1,7 +1,7 @@
 """Estimates for other programs, one frame's after the other's as they are made.
 
 Each frame is a line of JSON, the same as in track.jsonl. Sending never waits for who reads: the
-tracker keeps its pace, and what a reader is too slow for is dropped, counted, and reported at the end.
+tracker keeps its pace, and what a reader is too slow for is dropped, counted and reported.
 """
 
 from __future__ import annotations

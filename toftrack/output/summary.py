@@ -108,8 +108,8 @@ def run_doubts(
     """What speaks against a run's input, a sentence each: what its device found, the frames' times
     where the device dropped them, and how long the fitted hands are.
 
-    apparent_m: of the slots, how long the hand seemed where it was mostly lost; () where the run did
-    not say.
+    apparent_m: of the slots, how long the hand seemed where it was mostly lost; () where the run
+        did not say.
     """
     configured = (metadata.get("device") or {}).get("doubts")
     found = [times_doubt(records.column("timestamp_s"))] if configured is None else list(configured)

@@ -105,8 +105,8 @@ def run(main: Callable[[], object]) -> int:
 def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
     """Decorate the function under `@hydra.main` so that a failing job does not stop a sweep.
 
-    In a sweep (`-m`) an error is reported in one sentence, also as `error` in the summary.json of the
-    job's output folder, and the job returns infinity: the worst there is for a sweeper that
+    In a sweep (`-m`) an error is reported in one sentence, also as `error` in the summary.json of
+    the job's output folder, and the job returns infinity: the worst there is for a sweeper that
     minimises, where NaN would stop it. Otherwise the error is raised.
     """
 

@@ -169,7 +169,7 @@ def _memory(overrides: list[str]) -> float:
 
 
 def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
-    """The same with the feature `doubt` of joints as newly fitted log odds (T,) of the frames make it.
+    """The same with the joints' feature `doubt` as newly fitted log odds (T,) have it.
 
     As the tracker does, it smooths them within each track.
     """

@@ -70,7 +70,7 @@ def fitted_joint_belief(rows: JointRows) -> JointConfidence:
 
 
 def _design(features: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """(N, K + S) kinds and features in standard deviations; means and deviations of the features."""
+    """(N, K + S) kinds and features in standard deviations; means and deviations of these."""
     flat = features.reshape(-1, features.shape[-1])
     mean, spread = flat.mean(0), flat.std(0) + 1e-9
     kinds = np.eye(len(KINDS))[np.tile(KIND_OF_JOINT, len(features))]

@@ -18,7 +18,7 @@ def joints_penalty(
     keypoints: Keypoints | None,
     keypoints_weight: float,
 ) -> Tensor:
-    """(N,) at least 0, of joints (N, 21, 3): fingers in one another, and joints away from keypoints.
+    """(N,) at least 0, of joints (N, 21, 3): fingers in one another, joints away from keypoints.
 
     keypoints: (21, 3) and (21,); None where there are none.  The weights: in units of log scores.
     """

@@ -1,6 +1,6 @@
 """A virtual SR3000 beneath pyusb: the real driver runs against it, without a camera.
 
-It serves the frames of a recording as the camera would, at a chosen rate, and misbehaves as configured.
+It serves the frames of a recording as the camera would, at a chosen rate, and fails as configured.
 What it does is what is assumed of the camera, so it proves that the driver is consistent and
 robust, not that the assumptions hold.
 """
