@@ -90,7 +90,7 @@ PERSONS = {
         (0.7, 0.75), (-0.03, 0.1, 0.85), 3.1, 0.03, 0.3, 2.2,
     ),
 }  # fmt: skip
-PACKAGES = ("shelf", "table", "chair", "plant")
+SCENES = ("shelf", "table", "chair", "plant")
 
 
 def read_body(folder: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
@@ -197,7 +197,7 @@ def wall(rng: np.random.Generator, z: float) -> list[Solid]:
     ]
 
 
-def capacity(kind: str, rng: np.random.Generator) -> list[Solid]:
+def scene_with(kind: str, rng: np.random.Generator) -> list[Solid]:
     """What stands in an empty room."""
     things = wall(rng, rng.uniform(1.4, 2.0))
     if kind == "shelf":
@@ -317,8 +317,8 @@ def main() -> None:
         raise SystemExit(__doc__)
     (HERE / "empty").mkdir(exist_ok=True)
     rng = np.random.default_rng(SEED)
-    for kind in PACKAGES:
-        things = capacity(kind, rng)
+    for kind in SCENES:
+        things = scene_with(kind, rng)
         frames = []
         for t in range(FRAMES):  # the camera trembles
             by = 0.004 * np.sin([0.5 * t, 0.7 * t, 0.3 * t]) + [0.001 * t, 0, 0]
