@@ -228,7 +228,9 @@ class JointConfidence:
     def judge(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations (21, 3), m, and probabilities (21,) from features (21, J)."""
         predicted = features @ self._weights + self._kinds
-        sigma = (self.scale * np.exp(predicted[:, :3])).clip(_LEAST_CM, _MOST_CM) / 100
+        sigma = (self.scale * np.exp(predicted[:, :3].clip(-30.0, 30.0))).clip(
+            _LEAST_CM, _MOST_CM
+        ) / 100
         odds = (predicted[:, 3] + self.odds).clip(-30.0, 30.0)
         return sigma.astype(np.float32), (1 / (1 + np.exp(-odds))).astype(np.float32)
 
