@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -97,12 +98,13 @@ class FilteredFrame:
 
     pose: (1, 27) the filter's estimate.
     detection: as far as it is considered: not of a hand that is mostly out of sight, where the
-        detector sees another one in the rest.
+        detector sees another one in the rest.  keypoints: as the refinement takes them.
     """
 
     frame: HandFrame
     pose: Tensor
     detection: Detection
+    keypoints: Keypoints
     posterior: Posterior
     seen: SeenPoints
 
@@ -118,9 +120,11 @@ class FilteredFrame:
             detection,
             frame.others,
             frame.model,
-            image=frame.image,
+            frame.image,
+            forearm=_is_elsewhere(detection, pose, frame),
         )
-        return cls(frame, pose, detection, posterior, seen_points(frame.observation))
+        keypoints = keypoints_of(detection, frame.model)
+        return cls(frame, pose, detection, keypoints, posterior, seen_points(frame.observation))
 
     @property
     def covered(self) -> bool:
@@ -129,9 +133,8 @@ class FilteredFrame:
 
     def refined(self, poses: Tensor) -> Tensor:
         """Hands (N, 27) brought onto the seen points and the keypoints."""
-        cfg, model = self.frame.model.refinement, self.frame.model
-        keypoints = keypoints_of(self.detection, model)
-        return self.frame.fitted.refiner(poses, poses[:, 6:], self.seen, cfg, keypoints)
+        cfg, refiner = self.frame.model.refinement, self.frame.fitted.refiner
+        return refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
 
 
 def image_term(
@@ -152,8 +155,12 @@ def posterior_of(
     others: Sequence[OtherHand],
     model: TrackerModel,
     image: ImageTerm,
+    forearm: bool = True,
 ) -> Posterior:
-    """The posterior of one hand in one frame; terms of weight 0 are left out."""
+    """The posterior of one hand in one frame; terms of weight 0 are left out.
+
+    forearm: whether poses of different places are compared. Those of one place share a forearm.
+    """
     weights, terms = model.weights, dict[str, Term]()
     keypoints = 0.0 if detection.empty else weights.keypoints
     if keypoints or weights.overlap:
@@ -170,9 +177,17 @@ def posterior_of(
             f"other hand {n}": OtherHandTerm(joints, weights.other_hand)
             for n, joints in enumerate(touched)
         }
-    if weights.forearm:
+    if weights.forearm and forearm:
         terms["forearm"] = ForearmTerm(arm_sight(observation), weights.forearm)
     return Posterior(image, fitted.refiner.joints, terms)
+
+
+def _is_elsewhere(detection: Detection, pose: Tensor, frame: HandFrame) -> bool:
+    """Whether a hypothesis of the detector is of another place than a hand (1, 27)."""
+    settings, joints = frame.model.detector.settings, frame.fitted.refiner.joints(pose)[0]
+    away = detection.joints_m[: settings.candidates].numpy() - joints.numpy()
+    mean = np.sqrt(np.square(away).sum(-1)).mean(-1)
+    return bool((mean >= frame.model.hysteresis.place_m).any())
 
 
 def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
@@ -242,7 +257,7 @@ def propose(frames: Sequence[FilteredFrame], generator: torch.Generator) -> Hypo
         _second_round(number, frame, first.of_hand(number), donors, generator)
         for number, (frame, (_, donors)) in enumerate(zip(frames, proposed, strict=True))
     ]
-    return Hypotheses.joined((first, *second))
+    return Hypotheses.joined([table for table in (first, *second) if len(table)])
 
 
 def _first_round(number: int, filtered: FilteredFrame) -> tuple[Hypotheses, Tensor]:
@@ -279,7 +294,7 @@ def _second_round(
     generator: torch.Generator,
 ) -> Hypotheses:
     """The best pose with single fingers of other poses, as they are and refined, scored."""
-    frame, none = filtered.frame, table.rows(table.hand < 0)
+    frame, none = filtered.frame, table.rows(slice(0))
     standing = table.of_source(Source.PREVIOUS, Source.DYNAMICS)
     due = schedule(frame.track, frame.hidden, frame.model.hysteresis.alternate)[1]
     if not (frame.model.refinement.iterations and len(standing) and due):

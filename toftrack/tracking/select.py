@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -69,7 +70,9 @@ class Hypotheses:
     @classmethod
     def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
         """One below the other; of no tables, one without rows."""
-        tables = [cls.of(torch.zeros(0, 27), 0, Source.HELD), *tables]
+        tables = tables or [cls.of(torch.zeros(0, 27), 0, Source.HELD)]
+        if len(tables) == 1:
+            return tables[0]
         return cls(
             torch.cat([table.pose for table in tables]),
             torch.cat([table.hand for table in tables]),
@@ -77,24 +80,26 @@ class Hypotheses:
             torch.cat([table.log_posterior for table in tables]),
         )
 
-    def rows(self, rows: Tensor) -> Hypotheses:
-        """Some rows, by number or as a mask."""
+    def rows(self, rows: Tensor | slice) -> Hypotheses:
+        """Some rows, by number, as a mask or a slice."""
         return Hypotheses(
             self.pose[rows], self.hand[rows], self.source[rows], self.log_posterior[rows]
         )
 
     def of_hand(self, hand: int) -> Hypotheses:
         """The rows of one hand."""
-        return self.rows(self.hand == hand)
+        mine = self.hand == hand
+        return self if bool(mine.all()) else self.rows(mine)
 
     def of_source(self, *sources: Source) -> Hypotheses:
         """The rows of some sources."""
-        return self.rows(torch.isin(self.source, torch.tensor([int(s) for s in sources])))
+        return self.rows(torch.stack([self.source == int(source) for source in sources]).any(0))
 
     @property
     def best(self) -> Hypotheses:
         """The row with the highest posterior, the first of equals."""
-        return self.rows(self.log_posterior.argmax()[None])
+        row = int(self.log_posterior.argmax())
+        return self.rows(slice(row, row + 1))
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -173,12 +178,14 @@ def select(
     table: the hand's hypotheses, scored.  joints_m: (N, 21, 3) of them.
     dt_s: since the last frame.  detected: the detector was asked in this frame.
     """
-    rows = torch.arange(len(table))
-    stands = table.source <= Source.DYNAMICS
-    base = int(rows[stands][table.log_posterior[stands].argmax()])
-    score = table.log_posterior - table.log_posterior[base]
-    elsewhere = (joints_m - joints_m[base]).norm(dim=-1).mean(1) >= settings.place_m
-    elsewhere &= table.source == Source.DETECTOR
+    # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
+    joints, source = joints_m.numpy(), table.source.numpy()
+    values = table.log_posterior.numpy()
+    stands = source <= Source.DYNAMICS
+    base = _best_of(values, stands)
+    score = values - values[base]
+    elsewhere = _distances(joints, joints[base]).mean(1) >= settings.place_m
+    elsewhere &= source == Source.DETECTOR
     best, challenged = _best_of(score, elsewhere), incumbent.challenged
     if detected:
         leads = best >= 0 and float(score[best]) > settings.place_lead and not hidden
@@ -186,11 +193,11 @@ def select(
         if leads and (incumbent.new or challenged.reached(settings.place_frames)):
             return Choice(table.pose[best][None], True, table.pose[:0], 0.0, Duration())
     others = ~elsewhere & ~stands
-    far = others & _apart(joints_m, joints_m[base])
+    far = others & _apart(joints, joints[base])
     same = _best_of(score, others & ~far)
     if same >= 0 and float(score[same]) > 0:
         base, score = same, score - score[same]
-    contender, lead = _contender(score, far, joints_m, incumbent, dt_s, settings)
+    contender, lead = _contender(score, far, joints, incumbent, dt_s, settings)
     if contender >= 0 and float(score[contender]) > 0 and lead > _needed(incumbent, settings):
         return Choice(table.pose[contender][None], False, table.pose[:0], 0.0, challenged)
     kept = table.pose[contender][None] if contender >= 0 and lead > 0 else table.pose[:0]
@@ -198,9 +205,9 @@ def select(
 
 
 def _contender(
-    score: Tensor,
-    far: Tensor,
-    joints_m: Tensor,
+    score: np.ndarray,
+    far: np.ndarray,
+    joints_m: np.ndarray,
     incumbent: Incumbent,
     dt_s: float,
     settings: Hysteresis,
@@ -209,25 +216,32 @@ def _contender(
 
     score: (N,) in units of the standing pose's.  far: (N,) bool, the other poses.
     """
-    if not bool(far.any()):
+    if not far.any():
         return -1, 0.0
     # After a pause a frame speaks for those that were dropped, too.
     weight = dt_s / FRAME_S if dt_s < FRAME_S or dt_s > _PAUSE_S else 1.0
     lead = score * weight - settings.drift
     if len(incumbent.contender_m):
-        lead = lead + incumbent.lead * ~_apart(joints_m, incumbent.contender_m[0])
+        lead = lead + incumbent.lead * ~_apart(joints_m, incumbent.contender_m[0].numpy())
     row = _best_of(lead, far)
     return row, float(lead[row])
 
 
-def _best_of(values: Tensor, mask: Tensor) -> int:
+def _best_of(values: np.ndarray, mask: np.ndarray) -> int:
     """The row of the largest value under a mask; -1 where the mask has none."""
-    return int(values.masked_fill(~mask, -torch.inf).argmax()) if bool(mask.any()) else -1
+    return int(np.where(mask, values, -np.inf).argmax()) if mask.any() else -1
 
 
-def _apart(joints_m: Tensor, from_m: Tensor) -> Tensor:
+def _distances(joints_m: np.ndarray, from_m: np.ndarray) -> np.ndarray:
+    """(N, 21) how far the joints of hands (N, 21, 3) are from another hand's (21, 3)."""
+    away: np.ndarray = np.sqrt(np.square(joints_m - from_m).sum(-1))
+    return away
+
+
+def _apart(joints_m: np.ndarray, from_m: np.ndarray) -> np.ndarray:
     """(N,) whether hands (N, 21, 3) have a joint that is far from another hand's (21, 3)."""
-    return (joints_m - from_m).norm(dim=-1).amax(1) > _OTHER_M
+    apart: np.ndarray = _distances(joints_m, from_m).max(1) > _OTHER_M
+    return apart
 
 
 def _needed(incumbent: Incumbent, settings: Hysteresis) -> float:
