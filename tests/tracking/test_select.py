@@ -355,3 +355,14 @@ def test_of_equally_good_rows_the_first_is_the_best() -> None:
 def test_a_setting_that_cannot_be_is_named(name: str, value: float) -> None:
     with pytest.raises(ToftrackError, match=f"hysteresis.{name}"):
         hysteresis(**{name: value})
+
+
+def test_poses_that_explain_nothing_stand_and_have_no_lead() -> None:
+    poses = torch.cat((pose(), pose(finger=0.06)))
+    sources = torch.tensor([int(Source.PREVIOUS), int(Source.EXCHANGED)])
+    values = torch.full((2,), -math.inf)
+    table = Hypotheses(poses, torch.zeros(2, dtype=torch.long), sources, values)
+    track = Incumbent(joints_of(poses[:0]), 0.0, Duration(), 2.0, False)
+    choice = select(table, joints_of(poses), track, FRAME_S, False, False, SETTINGS)
+    assert torch.equal(choice.pose, pose())
+    assert choice.lead == 0.0 and not len(choice.contender)

@@ -25,6 +25,8 @@ _OTHER_M = 0.025
 """Poses with a joint that is farther off are other ones."""
 _PAUSE_S = 0.06
 """A time between two frames that is not the usual one."""
+_WORST = -1e6
+"""Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
 _LEAST_CREDIT = 0.2
 """Of the lead that is needed against a pose that is surely right, so much is needed against any."""
 
@@ -180,7 +182,7 @@ def select(
     """
     # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
     joints, source = joints_m.numpy(), table.source.numpy()
-    values = table.log_posterior.numpy()
+    values = np.maximum(table.log_posterior.numpy(), _WORST)
     stands = source <= Source.DYNAMICS
     base = _best_of(values, stands)
     score = values - values[base]
