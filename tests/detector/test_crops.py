@@ -71,6 +71,17 @@ def test_what_is_not_in_the_cube_differs_from_what_is_not_read() -> None:
     assert (image[0] == 1).all()
 
 
+def test_the_last_channels_are_the_readings_whose_mean_the_first_one_is() -> None:
+    depth = (0.4 + 0.2 * np.random.default_rng(0).random((144, 176))).astype(np.float32)
+    depth[60:70] = 0.0
+    image, _ = crop(depth, K, PRECOMPILED[0])
+    whole, none = image[2] == 0, image[2] == 1
+    assert whole.any() and none.any()
+    assert image[4:].mean(0)[whole] == pytest.approx(image[0][whole], abs=1e-5)
+    assert (image[4:, none] == 1).all()
+    assert image[4:].std(0)[whole].mean() > 0.01, "pixels are larger than cells"
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_scene_at_two_resolutions_gives_the_same_crop(seed: int) -> None:
     place = (0.05, -0.04, 0.5)

@@ -17,9 +17,9 @@ from toftrack.detector.crops import CROP_CHANNELS
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.weights import (
     DEFAULT_FILE,
+    go_on_from,
     load_weights,
     save_weights,
-    trained_weights,
 )
 from toftrack.errors import ToftrackError
 
@@ -212,11 +212,24 @@ def test_training_goes_on_from_the_weights_of_a_file(
     networks: tuple[nn.Module, nn.Module], file: Path
 ) -> None:
     going_on = PoseNet(4)
-    going_on.load_state_dict(trained_weights(file, "pose", 4))
+    go_on_from(file, "pose", going_on, 4)
     for name, value in networks[0].state_dict().items():
         torch.testing.assert_close(going_on.state_dict()[name], value)
-    with pytest.raises(ToftrackError, match="width of 8, and the width to train is 16"):
-        trained_weights(file, "finder", 16)
+    with pytest.raises(ToftrackError, match="width of 8, and the width to train is 6"):
+        go_on_from(file, "finder", Finder(6), 6)
+
+
+@torch.no_grad()
+def test_training_of_a_wider_network_begins_with_what_the_narrower_one_says(
+    networks: tuple[nn.Module, nn.Module], file: Path
+) -> None:
+    wider = PoseNet(7).train()
+    go_on_from(file, "pose", wider, 7)
+    narrow, *_ = load_weights(file)
+    for one, two in zip(narrow.features(CROPS), wider.eval().features(CROPS), strict=True):
+        torch.testing.assert_close(two, one, atol=1e-4, rtol=1e-4)
+    seeing = wider.fine.first.weight[8:]
+    assert (seeing[:, :4] != 0).all()  # the new channels see the old ones
 
 
 def older(path: Path) -> PoseNet:
@@ -243,7 +256,7 @@ def test_training_that_goes_on_from_older_weights_begins_with_what_they_say(
 ) -> None:
     before = older(tmp_path / "older.npz")
     going_on = PoseNet(4)
-    going_on.load_state_dict(trained_weights(tmp_path / "older.npz", "pose", 4))
+    go_on_from(tmp_path / "older.npz", "pose", going_on, 4)
     one, two = before(CROPS[:, :3]), going_on.eval()(CROPS)
     for name, value in one._asdict().items():
         new = getattr(two, name)

@@ -15,8 +15,8 @@ CROP_M = 0.30
 """Side of the cube that a crop shows."""
 CROP = 64
 """Cells of a crop, each of 2 x 2 readings."""
-CROP_CHANNELS = 4
-"""Of a crop, see `channels`; weights of before the last one was added see the others."""
+CROP_CHANNELS = 8
+"""Of a crop, see `channels`; older weights see the first three or four."""
 WIDE_F_PX = 100.0
 """Focal length of the whole image that the finder sees, pixels."""
 WIDE_LARGEST_PX = 512
@@ -78,7 +78,8 @@ def channels(read_m: np.ndarray, inside: np.ndarray, distance_m: np.ndarray) -> 
     distance_m: (N,) of the crops' centres.
     The channels: mean depth about the centre in half cubes, -1 .. 1 (1 where nothing is read);
     share of readings in the cube; share without a reading; share outside of the image, so that a
-    hand that the border cuts is not taken for a smaller one.
+    hand that the border cuts is not taken for a smaller one; the four readings themselves, as the
+    first channel, row by row: a finger is only three cells wide.
     """
     n = len(read_m)
     blocks = np.ascontiguousarray(read_m).reshape(n, CROP, 2, CROP, 2)
@@ -93,6 +94,8 @@ def channels(read_m: np.ndarray, inside: np.ndarray, distance_m: np.ndarray) -> 
     out[:, 2] = 1 - count * np.float32(0.25)
     within = inside.reshape(blocks.shape).sum((2, 4), dtype=np.float32)
     out[:, 3] = 1 - within * np.float32(0.25)
+    each = np.where(valid, relative.clip(-1, 1), np.float32(1))
+    out[:, 4:] = each.transpose(0, 2, 4, 1, 3).reshape(n, 4, CROP, CROP)
     return out
 
 

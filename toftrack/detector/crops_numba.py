@@ -18,14 +18,15 @@ def read_crop(depth, flip, mapping, slope, scale, distance, image):
     mapping: (3, 3) float32 from the crop's samples to pixels.
     slope: (3,) float32, of a sample: its Z over its z along the crop's axis.
     scale: from metres to half cubes.  distance: of the crop's centre, metres.
-    image: (C, CROP, CROP) float32, written: the first C of crops.CROP_CHANNELS, at least 3.
+    image: (C, CROP, CROP) float32, written: the first 3, 4 or all of crops.CROP_CHANNELS.
     """
-    border = image.shape[0] > 3
+    border, each = image.shape[0] > 3, image.shape[0] > 4
     size = image.shape[1]
     samples = 2 * size
     places, share = np.empty(samples, np.int64), np.empty(samples, np.float32)
     for row in range(size):
-        image[:, row] = _ZERO
+        image[:4, row] = _ZERO
+        image[4:, row] = _ONE
         for line in range(2 * row, 2 * row + 2):
             _place(depth.shape, flip, mapping, slope, np.float32(line), places, share)
             for sample in range(samples):
@@ -37,7 +38,10 @@ def read_crop(depth, flip, mapping, slope, scale, distance, image):
                 if z > _ZERO:
                     relative = (z - distance) * scale
                     column = sample // 2
-                    image[0, row, column] += min(max(relative, -_ONE), _ONE)
+                    clipped = min(max(relative, -_ONE), _ONE)
+                    image[0, row, column] += clipped
+                    if each:
+                        image[4 + 2 * (line - 2 * row) + sample % 2, row, column] = clipped
                     image[1, row, column] += np.float32(0.25) * (abs(relative) < _ONE)
                     image[2, row, column] += np.float32(0.25)
         for column in range(size):

@@ -44,6 +44,7 @@ def _read(depth, labels, side, distance, border, image, parts):
         for row in range(CROP):
             for column in range(CROP):
                 total, near, count, outside = np.float32(0), 0, 0, 0
+                image[n, 4:, row, column] = 1
                 for line in range(2 * row, 2 * row + 2):
                     y = (line + 0.5) / (2 * CROP) - 0.5
                     for sample in range(2 * column, 2 * column + 2):
@@ -57,7 +58,10 @@ def _read(depth, labels, side, distance, border, image, parts):
                         z = depth[n, index[line], index[sample]]
                         if z > 0:
                             relative = (z - distance[n]) * _SCALE
-                            total += min(max(relative, np.float32(-1)), np.float32(1))
+                            clipped = min(max(relative, np.float32(-1)), np.float32(1))
+                            total += clipped
+                            each = 4 + 2 * (line - 2 * row) + sample - 2 * column
+                            image[n, each, row, column] = clipped
                             near += abs(relative) < 1
                             count += 1
                 image[n, 0, row, column] = total / count if count > 0 else 1

@@ -28,7 +28,7 @@ from toftrack.detector.images import Crops, WideImages, crop_images, wide_images
 from toftrack.detector.losses import finder_loss, pose_losses
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.shapes import shape_bank
-from toftrack.detector.weights import trained_weights
+from toftrack.detector.weights import go_on_from
 from toftrack.errors import ToftrackError
 
 _READY = 6
@@ -71,7 +71,7 @@ def train_poses(
     torch.manual_seed(seed)
     network = PoseNet(schedule.width)
     if schedule.start is not None:
-        network.load_state_dict(trained_weights(schedule.start, "pose", schedule.width))
+        go_on_from(schedule.start, "pose", network, schedule.width)
     network.train().to(memory_format=torch.channels_last)
 
     def step(crops: Crops) -> tuple[Tensor, dict[str, float]]:
@@ -98,7 +98,7 @@ def train_finder(
     torch.manual_seed(seed)
     network = Finder(schedule.width)
     if schedule.start is not None:
-        network.load_state_dict(trained_weights(schedule.start, "finder", schedule.width))
+        go_on_from(schedule.start, "finder", network, schedule.width)
     network.train().to(memory_format=torch.channels_last)
 
     def step(images: WideImages) -> tuple[Tensor, dict[str, float]]:

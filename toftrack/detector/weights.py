@@ -74,22 +74,43 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
     return pose, finder, metadata.get("about", {})
 
 
-def trained_weights(path: str | Path, name: str, width: int) -> dict[str, Tensor]:
-    """One network's weights, "pose" or "finder" of so many channels, to go on training from.
+def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> None:
+    """Give a new network, "pose" or "finder" of a width, the weights of a file to train on from.
 
-    What older pose networks lack, a channel of the crop or a class of parts, begins without effect.
-    Raises ToftrackError as load_weights does, and for another width.
+    What the file's network lacks begins without effect on what is there: channels of the crop,
+    classes of parts, and a wider network's channels (as Chen et al., "Net2Net: accelerating
+    learning via knowledge transfer", ICLR 2016, with new channels instead of copies).
+    Raises ToftrackError as load_weights does, and for a narrower network.
     """
     arrays, metadata = _read(Path(path))
-    if metadata.get(f"{name}_width") != width:
-        raise ToftrackError(
-            f"{path} holds weights for a width of {metadata.get(f'{name}_width')}, and the width to"
-            f" train is {width}; give the same"
-        )
-    tensors = _tensors(arrays, name)
-    if name == "pose":
-        _extend(tensors, *_pose_channels(arrays))
-    return tensors
+    try:
+        before = _width(metadata, name)
+        tensors = _tensors(arrays, name)
+        if name == "pose":
+            _extend(tensors, *_pose_channels(arrays))
+        if before > width:
+            raise ToftrackError(
+                f"{path} holds weights for a width of {before}, and the width to train is {width};"
+                " give that width or more"
+            )
+        network.load_state_dict(_widened(tensors, network.state_dict()))
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
+        raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
+
+
+def _widened(tensors: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights of a network in one that has more channels, whose own are `fresh`.
+
+    The new channels see all others, and none of those that were there sees them, at first.
+    """
+    widened = {}
+    for key, new in fresh.items():
+        old, out = tensors[key], new.clone()
+        if old.ndim > 1 and old.is_floating_point():
+            out[: len(old)] = 0
+        out[tuple(slice(size) for size in old.shape)] = old
+        widened[key] = out
+    return widened
 
 
 def _pose_channels(arrays: dict[str, np.ndarray]) -> tuple[int, int]:
@@ -99,7 +120,7 @@ def _pose_channels(arrays: dict[str, np.ndarray]) -> tuple[int, int]:
     """
     stem, painted = arrays["pose.stem.0.weight"], arrays["pose.painted.weight"]
     inputs, segments = stem.shape[1], painted.shape[0] // 4
-    if not (3 <= inputs <= CROP_CHANNELS and 4 <= segments <= SEGMENTS):
+    if not (inputs in (3, 4, CROP_CHANNELS) and 4 <= segments <= SEGMENTS):
         raise ValueError(f"{inputs} channels of a crop and {segments} classes of parts")
     return inputs, segments
 
