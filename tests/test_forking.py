@@ -147,11 +147,11 @@ def test_a_program_that_forks_goes_on_in_both_processes(when: str) -> None:
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize("name", ["auto", "cuda"])
 def test_after_a_fork_of_a_process_with_a_gpu_it_is_refused(
-    name: str, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(torch.cuda, "_is_in_bad_fork", lambda: True)
     with pytest.raises(ToftrackError, match="multiprocessing's spawn, or give compute=cpu"):
-        compute_device(name)
-    assert compute_device("cpu").type == "cpu"
+        compute_device("cuda")
+    for name in ("auto", "cpu"):
+        assert compute_device(name).type == "cpu"

@@ -145,13 +145,13 @@ def compute_device(name: str) -> torch.device:
     """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
     import torch
 
-    if name != "cpu" and torch.cuda._is_in_bad_fork():
+    if name == "cuda" and torch.cuda._is_in_bad_fork():
         raise ToftrackError(
             f"compute={name}: the process that this one was forked from has used the GPU, which "
             "CUDA does not allow; start it by multiprocessing's spawn, or give compute=cpu"
         )
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "auto":  # until a GPU was measured to be right and faster, see docs/gpu.md
+        return torch.device("cpu")
     if name == "cuda" and not torch.cuda.is_available():
         raise ToftrackError("compute=cuda, but torch finds no CUDA GPU here; give compute=cpu")
     if name not in ("cpu", "cuda"):

@@ -14,7 +14,7 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.render.closed_form import project
-from toftrack.render.disc import disc_steps
+from toftrack.render.disc import disc_square, disc_steps
 from toftrack.render.numba import hand, missed, vector, words
 from toftrack.render.numba.hand import LANES, TERMS
 from toftrack.render.numba.kernel import pack_evidence
@@ -180,7 +180,7 @@ def bits_of(mask: np.ndarray, words: int) -> np.ndarray:
 def test_the_compiled_dilation_is_the_disc_s(radius_px: float, size: tuple[int, int]) -> None:
     g = np.random.default_rng(int(radius_px) + size[1])
     height, width = size
-    words, steps = -(-width // 64), disc_steps(radius_px, *size)
+    words, steps = -(-width // 64), disc_steps(disc_square(radius_px, *size), *size)
     reach = int(steps[:, 1].max())
     for density in (0.0, 0.003, 0.3):
         mask, wanted = g.random(size) < density, g.random(size) < 0.5

@@ -10,6 +10,7 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.refinement.gauss_newton import TorchRefiner
 from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+from toftrack.render.disc import disc_square
 from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.torch_scorer import TorchScorer
 from toftrack.tracking.backend import choose_backend, make_scorer
@@ -45,3 +46,16 @@ def test_unknown_back_ends_are_refused(name: str) -> None:
 def test_triton_is_refused_where_it_cannot_run() -> None:
     with pytest.raises(ToftrackError, match="renderer=triton cannot run here"):
         choose_backend("triton")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_on_a_device_no_slow_back_end_is_taken_without_being_asked_for() -> None:
+    """Any device but the CPU stands for CUDA: triton is looked for before anything runs there."""
+    with pytest.raises(ToftrackError, match="renderer=torch, which is slow, or compute=cpu"):
+        choose_backend("auto", torch.device("cuda"))
+
+
+def test_a_hand_that_comes_nearer_has_few_discs() -> None:
+    radii = torch.linspace(3.0, 6.0, 1000).tolist()
+    squares = {disc_square(radius, 144, 176) for radius in radii}
+    assert squares == set(range(9, 37))

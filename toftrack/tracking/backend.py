@@ -67,9 +67,10 @@ def choose_backend(renderer: str, device: torch.device | str = "cpu") -> Backend
     try:
         return _MAKERS[wanted](device)
     except ImportError as error:
-        if renderer != "auto":
+        if renderer != "auto" or device.type != "cpu":
             raise ToftrackError(
-                f"renderer={renderer} cannot run here ({error}); install it or give renderer=torch"
+                f"renderer={wanted} cannot run here ({error}); install it or give renderer=torch"
+                + ("" if device.type == "cpu" else ", which is slow, or compute=cpu")
             ) from None
         log.info("renderer: %s is not available (%s), using torch", wanted, error)
         return _torch(device)

@@ -13,7 +13,7 @@ from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
-from toftrack.render.disc import disc_steps
+from toftrack.render.disc import disc_square, disc_steps
 from toftrack.render.numba.hand import LANES
 from toftrack.render.numba.kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence
@@ -86,7 +86,7 @@ class NumbaScorer:
                 hand,
                 height,
                 width,
-                disc_steps(evidence.radius_px, height, width),
+                disc_steps(disc_square(evidence.radius_px, height, width), height, width),
             )
             self._frame = evidence, packed
         return packed

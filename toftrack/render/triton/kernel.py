@@ -277,7 +277,8 @@ def _below(bits):
     return tl.where(bits >= 64, -1, ones)
 
 
-@triton.jit
+# These change as the hand comes nearer: a kernel for each would be compiled while tracking.
+@triton.jit(do_not_specialize=["step_count", "reach"])
 def missed_kernel(
     conics,
     model,

@@ -18,7 +18,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.render.closed_form import _NEAREST_M
-from toftrack.render.disc import disc_steps
+from toftrack.render.disc import disc_square, disc_steps
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.torch_scorer import TorchScorer
 from toftrack.render.triton.kernel import (
@@ -80,7 +80,8 @@ class TritonScorer:
         pack_kernel[(height, words)](
             evidence.hand.contiguous().view(torch.uint8), hand, width, words
         )
-        steps = _steps(evidence.radius_px, height, width, device)
+        square = disc_square(evidence.radius_px, height, width)
+        steps = _steps(square, height, width, device)
         bands = (evidence.low, evidence.high, evidence.occluder)
         images = tuple(band.float().contiguous() for band in bands)
         camera = evidence.k.float().contiguous()
@@ -146,10 +147,10 @@ class TritonScorer:
         return counts
 
 
-@functools.lru_cache(maxsize=16)
-def _steps(radius_px: float, height: int, width: int, device: torch.device) -> tuple[Tensor, int]:
+@functools.lru_cache(maxsize=256)
+def _steps(square: int, height: int, width: int, device: torch.device) -> tuple[Tensor, int]:
     """Steps of the disc on the device, and its reach; kept, a copy to the device takes time."""
-    steps = torch.from_numpy(disc_steps(radius_px, height, width)).int()
+    steps = torch.from_numpy(disc_steps(square, height, width)).int()
     return on_device(steps, device), int(steps[:, 1].max())
 
 
