@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from toftrack.detector.network import CELLS, JOINTS, REPORTED, Finder, Found, PoseNet
-from toftrack.detector.weights import DEFAULT_FILE, load_weights
+from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
 from toftrack.safe_files import open_to_read
 
@@ -100,19 +100,15 @@ def load_networks(
     path: of the weights; None: those of the package.
     Raises ToftrackError when a file is damaged, or the weights are missing.
     """
-    path = DEFAULT_FILE if path is None else Path(path)
     weights = load_weights(path)
     sessions = []
     for network in ("pose", "finder"):
-        file = onnx_file(path, network)
-        session = _session(file, path)
-        if session is None:
-            _warn(
-                f"there is no {file} of these weights, and torch runs them, slower; {_make(path)}"
-            )
-            return weights.pose, weights.finder
-        if _made_of(session) != (FORMAT, VERSION, network, weights.sha256):
-            _warn(f"{file} is of other weights, and torch runs these, slower; {_make(path)}")
+        file = onnx_file(weights.path, network)
+        session = _session(file, weights.path)
+        known = session is not None
+        if not known or _made_of(session) != (FORMAT, VERSION, network, weights.sha256):
+            why = f"{file} is of other weights" if known else f"there is no {file}"
+            _warn(f"{why}: torch runs the detector's networks, slower; {_make(weights.path)}")
             return weights.pose, weights.finder
         sessions.append(session)
     pose, finder = sessions

@@ -57,11 +57,12 @@ def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any
 
 
 class Weights(NamedTuple):
-    """Both networks ready for use, how they were trained, and the checksum of their arrays."""
+    """Both networks ready for use, how they were trained, their file, its arrays' checksum."""
 
     pose: PoseNet
     finder: Finder
     about: dict[str, Any]
+    path: Path
     sha256: str
 
 
@@ -81,7 +82,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
     make_ready(pose)
     make_ready(finder)
-    return Weights(pose, finder, metadata.get("about", {}), metadata["sha256"])
+    return Weights(pose, finder, metadata.get("about", {}), path, metadata["sha256"])
 
 
 def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> None:
