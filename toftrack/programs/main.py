@@ -33,6 +33,7 @@ _COMMANDS = {
     "recover": _Command("toftrack.programs.recover", "finish a run or a recording that was killed"),
 }
 _HELP = ("-h", "--help")
+_VERSION = "--version"
 
 _OVERVIEW = """toftrack follows a human hand in the depth images of a camera or a recording.
 
@@ -88,10 +89,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not given or given[0] in (*_HELP, "help"):
         print(overview())
         return 0
-    if given[0] == "--version":
+    name, rest = given[0], given[1:]
+    if name == _VERSION or (name in _COMMANDS and _VERSION in rest):
         print(f"toftrack {toftrack.__version__}")
         return 0
-    name, rest = given[0], given[1:]
     if name not in _COMMANDS:
         print(f"error: {_unknown(name)}", file=sys.stderr)
         return 1
