@@ -124,7 +124,7 @@ def long_help(name: str) -> str:
 
 def _configuration_folder() -> Path:
     """As configuration.compose has it, which takes the time to load Hydra."""
-    inside = Path(toftrack.__file__).parent / "conf"
+    inside = Path(toftrack.__file__).resolve().parent / "conf"
     return inside if inside.is_dir() else inside.parent.parent / "conf"
 
 
