@@ -67,7 +67,7 @@ _TRAIN = """toftrack train learns the space of hand poses that the tracker searc
 
   toftrack train                              from the poses of the paper
   toftrack train pose_space=lle pose_space.dims=5     of another kind and size
-  toftrack train data=leap data.path=FILE     from recorded joint positions
+  toftrack train data=run data.path=RUN       from the poses of a run, outputs/DATE/TIME
 
 The model goes into the folder that is named at the end, or where hydra.run.dir=DIR says; use it
 with toftrack track pose_space=KIND pose_space.file=FILE. Settings are KEY=VALUE, or GROUP=CHOICE of
