@@ -3,8 +3,8 @@
 
     python tests/data/make_samples.py DATA
 
-DATA: the folder that holds `crowd` and `grasps`. Writes toftrack/data/sample_*.npz: depth, amplitude
-and truth of all frames as they are, and their licence and origin in `metadata`.
+DATA: the folder that holds `crowd` and `grasps`. Writes toftrack/data/sample_*.npz: depth,
+amplitude and truth of all frames as they are, and their licence and origin in `metadata`.
 """
 
 from __future__ import annotations
