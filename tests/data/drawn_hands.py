@@ -20,6 +20,8 @@ _TO_CAMERA = np.array([0.1, -0.1, -0.1])
 """From MakeHuman's decimetres, y up, z to the front, to a person who faces the camera."""
 _FINGERS = (2, 3, 4, 5)
 _THUMB_TURNS = 5
+_WRIST_BENDS = 0.9
+"""Radians at most."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class RightHand:
 
     folder: Path
     shape: tuple[str, ...]
-    _thumbs: dict[float, np.ndarray] = field(default_factory=dict)
+    _thumbs: dict[Pose, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         points, faces, joints = read_body(self.folder)
@@ -59,7 +61,9 @@ class RightHand:
             for finger in (1, *_FINGERS)
             for bone in (1, 2, 3, 4)
         }
-        self.wrist = points[joints["joint-r-hand"]].mean(0)
+        self.wrist, self._elbow = (
+            points[joints[f"joint-r-{name}"]].mean(0) for name in ("hand", "elbow")
+        )
         bones = ["lowerarm", "wrist", *(f"{f}-{b}" for f in (1, *_FINGERS) for b in (1, 2, 3))]
         weights = np.zeros((len(bones), len(points)))
         for bone, rows in given.items():
@@ -102,9 +106,7 @@ class RightHand:
                 has = np.arctan2(np.cross(before, along) @ axis, before @ along)
                 way = way @ _about(self.rest[f"{finger}-{bone}"], (np.radians(wanted) - has) * axis)
                 turns[f"{finger}-{bone}"], before = way, along
-        bend = np.cross(
-            self.rest["1-2"] - self.rest["1-1"], self.rest["1-4"] - self.rest["1-3"]
-        )
+        bend = np.cross(self.rest["1-2"] - self.rest["1-1"], self.rest["1-4"] - self.rest["1-3"])
         bend /= np.linalg.norm(bend)
         way = np.eye(4)
         for bone, vector in ((1, thumb[:3]), (2, thumb[3] * bend), (3, thumb[4] * bend)):
@@ -134,15 +136,30 @@ class RightHand:
             wanted = pose.pinch * index + (1 - pose.pinch) * middle
             return np.concatenate((100 * (tip - wanted), 0.25 * turn))
 
-        return least_squares(off, np.zeros(_THUMB_TURNS)).x
+        if pose not in self._thumbs:
+            self._thumbs[pose] = least_squares(off, np.zeros(_THUMB_TURNS)).x
+        return self._thumbs[pose]
 
-    def posed(self, pose: Pose, turn: np.ndarray, place: np.ndarray) -> tuple[Solid, np.ndarray]:
+    def joints(self, pose: Pose) -> np.ndarray:
+        """(21, 3) the joints in the hand's own frame, the index finger's base at 0."""
+        joints = self._tips(self._turns(pose, self._thumb(pose)))
+        return (joints - joints[5]) @ self.frame
+
+    def posed(
+        self, pose: Pose, turn: np.ndarray, place: np.ndarray, elbow: np.ndarray
+    ) -> tuple[Solid, np.ndarray]:
         """The mesh, and the true joints (21, 3).
 
         turn: (3, 3) from the hand's own frame (see `frame`) to the camera's.
         place: of the index finger's base.
+        elbow: (3,) the direction in which it is wanted; the wrist bends as far as it can.
         """
         turns = self._turns(pose, self._thumb(pose))
+        arm = self._elbow - self.wrist
+        axis = np.cross(arm, self.frame @ turn.T @ elbow)
+        bent = np.arctan2(np.linalg.norm(axis), arm @ (self.frame @ turn.T @ elbow))
+        axis *= min(bent, _WRIST_BENDS) / np.linalg.norm(axis)
+        turns["lowerarm"] = _about(self.wrist, axis)
         moved = np.zeros_like(self.points)
         for bone, weight in zip(self.bones, self.weights, strict=True):
             at = turns[bone]

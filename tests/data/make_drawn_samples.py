@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from drawn_hands import Pose, RightHand
-from make_empty import F_PX, HEIGHT, WIDTH, Solid, sensed
+from make_empty import F_PX, HEIGHT, WIDTH, Solid, drawn, sensed
 from make_guards import write
 from make_samples import LICENCE, ORIGIN, PACKAGED
 from tqdm import tqdm
@@ -45,6 +45,8 @@ VICTORY = Pose((_STRAIGHT, _STRAIGHT, _CURLED, _CURLED))
 TARGETS, GAME_SEED, SCREEN_M = 12, 1, 0.5
 _FIELD, _RADIUS = 0.45, 0.07
 _FIRST, _MOVE, _REST, _CLOSE, _HOLD, _OPEN = 15, 10, 7, 4, 5, 4
+_ELBOW = np.array([-0.1, 0.5, 0.8])
+"""Direction from the wrist."""
 _ROUND = _MOVE + _REST + _CLOSE + _HOLD + _OPEN
 """Frames."""
 
@@ -103,10 +105,10 @@ def pointing_at(hand: RightHand, moment: Moment) -> tuple[Solid, np.ndarray]:
     """The hand of a moment, and its joints: the ray from the index finger's base meets the aim."""
     base = np.array([0.4 * moment.aim[0] - 0.01, 0.03 + 0.15 * moment.aim[1], 0.4])
     way = np.append(moment.aim, 0.0) - base
-    _, joints = hand.posed(POINTING, np.eye(3), np.zeros(3))
+    joints = hand.joints(POINTING)
     own = basis(joints[8] - joints[5], np.array([0.0, 1.0, 0.0]))
     rolled = basis(way, np.array([-0.5, -0.85, 0.0]))  # the thumb's side is up
-    return hand.posed(moment.pose, rolled @ own.T, base)
+    return hand.posed(moment.pose, rolled @ own.T, base, _ELBOW)
 
 
 def basis(along: np.ndarray, towards: np.ndarray) -> np.ndarray:
@@ -117,20 +119,21 @@ def basis(along: np.ndarray, towards: np.ndarray) -> np.ndarray:
     return np.stack((np.cross(towards, along), towards, along), 1)
 
 
-def seen(solids: Sequence[Solid], rng: np.random.Generator) -> np.ndarray:
+def seen(rays: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> np.ndarray:
     """(H, W) float16 metres, the body behind in coarse steps."""
-    depth = sensed(list(solids), rng).astype(np.float32)
+    depth = sensed(rays, rng).astype(np.float32)
     coarse = np.round(depth / COARSE_M) * COARSE_M
     return np.where(depth > COARSE_FROM_M, coarse, depth).astype(np.float16)
 
 
 def draw_game(hand: RightHand, aims: np.ndarray) -> dict[str, np.ndarray]:
     """The recording of who points and pinches."""
-    rng, body = np.random.default_rng(SEED), behind(hand, np.array([0.16, 0.1, 0.85]))
+    rng = np.random.default_rng(SEED)
+    body = drawn([behind(hand, np.array([0.16, 0.1, 0.85]))])
     frames, truth, names = [], [], []
     for moment in tqdm(game_moments(aims), "point and pinch"):
         solid, joints = pointing_at(hand, moment)
-        frames.append(seen((body, solid), rng))
+        frames.append(seen(drawn([solid], body), rng))
         truth.append(joints)
         names.append("transition" if 0 < moment.pose.pinch < 1 else "point")
     return recording(frames, {"joints_m": truth}, "right")
