@@ -28,7 +28,7 @@ from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
-from toftrack.recordings.store import open_recording, open_source
+from toftrack.recordings.store import FIRST_SAMPLE, open_recording, open_sample
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
 from toftrack.safe_files import open_to_read
@@ -331,7 +331,7 @@ def open_tracked(
     if recording is None and kind == "synthetic":
         return _synthetic(device), "the synthetic frames"
     if recording is None and kind == "sample":
-        return open_source("sample"), name
+        return open_sample(about.get("name", FIRST_SAMPLE)), name
     if recording is None and name is None:
         return None
     path = Path(recording).expanduser() if recording is not None else found(str(name))
