@@ -67,6 +67,9 @@ class Estimate:
     and across both; see hand/regions.py. NaN where nothing says."""
     joint_confidence: np.ndarray = field(default_factory=lambda: np.full(21, np.nan, np.float32))
     """(21,) float32 probabilities that the joints are within 40 mm; NaN where nothing says."""
+    joint_ok: np.ndarray = field(default_factory=lambda: np.ones(21, bool))
+    """(21,) bool: the joint may be used. False for all of a hand that is lost, and for those joints
+    of another one that are likely off by more than 40 mm: see `lost.joints.ok` in conf/lost."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, with or without
     the thumb stretched away, else NaN."""
@@ -101,6 +104,7 @@ def no_estimate(
         effective_sample_size=0.0,
         compute_s=compute_s,
         confidence=0.0,
+        joint_ok=np.zeros(21, bool),
     )
 
 
@@ -116,6 +120,7 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         confidence=0.0,
         joint_sigma_m=np.full((21, 3), np.nan, np.float32),
         joint_confidence=np.zeros(21, np.float32),
+        joint_ok=np.zeros(21, bool),
         compute_s=compute_s,
     )
 

@@ -177,6 +177,11 @@ def test_every_estimate_says_how_far_off_its_joints_may_be(overrides: tuple[str,
     assert estimate.joint_sigma_m.dtype == estimate.joint_confidence.dtype == np.float32
     assert ((estimate.joint_sigma_m > 5e-4) & (estimate.joint_sigma_m < 0.1)).all()
     known = np.isfinite(estimate.joint_confidence)
+    assert estimate.joint_ok.shape == (21,) and not estimate.lost
+    least = 0 if overrides else tracker.model.lost.joint_ok
+    assert (estimate.joint_ok == ~(estimate.joint_confidence < least)).all()
+    assert estimate.joint_ok.sum() > 15
     assert known.all() if not overrides else not known.any()
     gone = tracker.step(np.zeros_like(depth), scene.k, 3, 3 / 25)
     assert np.isnan(gone.joint_sigma_m).all() and (gone.joint_confidence == 0).all()
+    assert gone.joint_ok.dtype == bool and not gone.joint_ok.any()

@@ -14,7 +14,8 @@ radians. Camera axes: x right, y down, z forward; pixel centres lie at whole num
 u = K[0,0] x/z + K[0,2], v = K[1,1] y/z + K[1,2] in the undistorted image of image_size_px (width,
 height). joint_names, joint_parents: of joints_m and landmarks, in MediaPipe's order;
 openxr_joint_names, openxr_joint_parents: of openxr_*, whose axes are x right, y up, -z forward. The
-parent of a root is -1. Do not use rows with lost; NaN is unknown. metadata is JSON."""
+parent of a root is -1. Do not use rows with lost, nor joints without joint_ok; NaN is unknown.
+metadata is JSON."""
 
 
 def facts_for_readers(metadata: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -322,6 +322,7 @@ class ConfidenceModel:
         is believed.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
+    joint_ok: joints of an estimate that are near with a lower probability are not ok.
     probation: frames after a start during which the hand is not remembered as seen.
     intercept, weights: of the features, by name.
     joints: of each joint.
@@ -333,13 +334,14 @@ class ConfidenceModel:
     give_up: float
     patience: int
     memory: float
+    joint_ok: float
     probation: int
     intercept: float
     weights: Mapping[str, float]
     joints: JointConfidence
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "second", "give_up"):
+        for name in ("confidence", "believe", "second", "give_up", "joint_ok"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
         for name in ("patience", "probation"):
