@@ -141,20 +141,8 @@ def point_rows(
 
     Raises ToftrackError when a frame is labelled that the track has not.
     """
-    if max(points.frames) >= len(joints_m):
-        raise ToftrackError(
-            f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
-            f"{len(joints_m)} frames; give the recording that was labelled"
-        )
     found = {}
-    for number, places in points.frames.items():
-        off = {
-            row: _lateral_mm(np.asarray(joints_m[number], np.float64), row, place, K)
-            for row, place in places.items()
-            if row in tips
-        }
-        if not off:
-            continue
+    for number, off in lateral_errors_mm(points, joints_m, K, tips).items():
         worst, flagged = max(off.values()), bool(lost[number])
         found[number] = {
             "tips_20_pct": 100.0 * (worst < 20),
@@ -164,6 +152,29 @@ def point_rows(
             "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
         }
     return found
+
+
+def lateral_errors_mm(
+    points: Points, joints_m: np.ndarray, K: np.ndarray, rows: Sequence[int]
+) -> dict[int, dict[int, float]]:
+    """How far off those of some joints are that are visible: by frame, if it has any, and joint.
+
+    Args and errors: as of point_rows.
+    """
+    if max(points.frames) >= len(joints_m):
+        raise ToftrackError(
+            f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
+            f"{len(joints_m)} frames; give the recording that was labelled"
+        )
+    found = {
+        number: {
+            row: _lateral_mm(np.asarray(joints_m[number], np.float64), row, place, K)
+            for row, place in places.items()
+            if row in rows
+        }
+        for number, places in points.frames.items()
+    }
+    return {number: off for number, off in found.items() if off}
 
 
 def _lateral_mm(joints: np.ndarray, row: int, place: tuple[float, float], K: np.ndarray) -> float:

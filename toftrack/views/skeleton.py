@@ -134,9 +134,7 @@ def _draw_skeleton(
     return x, y
 
 
-def _strokes(
-    begin: np.ndarray, end: np.ndarray, width: float
-) -> list[tuple[list[int], list[int]]]:
+def _strokes(begin: np.ndarray, end: np.ndarray, width: float) -> list[tuple[list[int], list[int]]]:
     """The lines from one place (2,) to another; dashes for a line of that width, one for 0."""
     length = float(np.hypot(*(end - begin)))
     if width == 0 or length == 0:
