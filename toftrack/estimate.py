@@ -56,10 +56,12 @@ class Estimate:
     """How sure that is, 0..1; 1 where it was given."""
     gesture: str = ""
     """The gesture ("palm", "pointing_thumb", ... or a name of the user's), 'other' where it is none
-    of the known; empty where gesture output is off or the hand is lost."""
+    of the known; empty where gesture output is off, the hand is lost, or a joint is not ok that
+    would decide."""
     gesture_probability: float = math.nan
     pinch: float = math.nan
-    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where no gesture is."""
+    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where gesture output is
+    off, the hand is lost, or one of their last joints is not ok."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
     joint_sigma_m: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan, np.float32))

@@ -10,8 +10,10 @@ A joint is compared laterally: the distance in pixels between its projection and
 its own depth over the focal length. Of visible fingertips, which are moved 5 mm towards the joint
 before them, as the labels are: `tips_20_pct`, `tips_40_pct` are the frames in which all are within
 20 and 40 mm; `wrong_pct` those in which one is farther than 40 mm off, unflagged; `flagged_pct`
-those flagged lost; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that is not finite
-or not in front of the camera is infinitely far off, and left out of the mean).
+those flagged lost; `wrong_no_flag_pct` those not flagged lost in which a tip is so far off that
+`joint_ok` does not flag; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that
+is not finite or not in front of the camera is infinitely far off, and left out of the mean). What
+`joint_ok` flags is counted as in measures.py.
 
 **Stills**: images that have nothing to do with one another, each with what it shows. Every one has
 a fresh start and is shown so many frames, the last of which counts:
@@ -38,12 +40,15 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.json_text import read_json
+from toftrack.output.measures import FLAG_COUNTS, flag_counts
+from toftrack.output.trust import OK_MM
 
 IMAGE_MEANS = (
     "tips_20_pct",
     "tips_40_pct",
     "wrong_pct",
     "flagged_pct",
+    "wrong_no_flag_pct",
     "found_pct",
     "named_pct",
     "wrong_name_pct",
@@ -129,13 +134,19 @@ def _visible(points: Any) -> dict[int, tuple[float, float]]:
 
 
 def point_rows(
-    points: Points, joints_m: np.ndarray, lost: np.ndarray, K: np.ndarray, tips: Sequence[int]
+    points: Points,
+    joints_m: np.ndarray,
+    lost: np.ndarray,
+    joint_ok: np.ndarray,
+    K: np.ndarray,
+    tips: Sequence[int],
 ) -> dict[int, dict[str, Any]]:
     """The figures of each labelled frame that has a visible fingertip, by its number.
 
     Args:
         joints_m: (T, 21, 3) metres, camera frame.
         lost: (T,) bool.
+        joint_ok: (T, 21) bool.
         K: (3, 3), of undistorted pixels.
         tips: rows of the fingertips.
 
@@ -144,11 +155,15 @@ def point_rows(
     found = {}
     for number, off in lateral_errors_mm(points, joints_m, K, tips).items():
         worst, flagged = max(off.values()), bool(lost[number])
+        ok = joint_ok[number][list(off)]
+        errors = np.array(list(off.values()))
         found[number] = {
             "tips_20_pct": 100.0 * (worst < 20),
             "tips_40_pct": 100.0 * (worst < 40),
             "wrong_pct": 100.0 * (worst > 40 and not flagged),
             "flagged_pct": 100.0 * flagged,
+            "wrong_no_flag_pct": 100.0 * (not flagged and bool((ok & (errors > OK_MM)).any())),
+            **(dict.fromkeys(FLAG_COUNTS, 0) if flagged else flag_counts(errors, ~ok)),
             "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
         }
     return found
