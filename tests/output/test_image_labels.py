@@ -9,6 +9,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.output.image_labels import Points, Stills, point_rows, read_labels, still_row
+from toftrack.output.measures import FLAG_COUNTS
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 TIPS = (4, 8, 12, 16, 20)
@@ -42,11 +43,7 @@ def test_tips_are_compared_across_5_mm_inside_of_the_finger(tmp_path) -> None:
     assert unflagged[2]["wrong_pct"] == unflagged[2]["wrong_no_flag_pct"] == 100
     doubted = point_rows(seen, joints, np.zeros(3, bool), ~ALL_OK, K, TIPS)[2]
     assert (doubted["wrong_pct"], doubted["wrong_no_flag_pct"]) == (100, 0)
-    assert (doubted["tips_wrong"], doubted["tips_wrong_flagged"], doubted["tips_right"]) == (
-        1,
-        1,
-        0,
-    )
+    assert [doubted[name] for name in FLAG_COUNTS] == [1, 1, 0, 0]
 
 
 def test_what_is_nowhere_or_behind_the_camera_is_infinitely_far_off(tmp_path) -> None:
