@@ -75,7 +75,7 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
         *("covariance", "effective_sample_size", "compute_s", "gesture", "gesture_probability"),
         *("pinch", "pinching"),
         *("pointing_origin_m", "pointing_direction", "confidence", "outside_rad"),
-        *("side", "side_probability", "joint_sigma_m", "joint_confidence"),
+        *("side", "side_probability", "joint_sigma_m", "joint_confidence", "joint_ok"),
         *("landmarks", "openxr_position_m", "openxr_orientation", "openxr_radius_m"),
     }
 

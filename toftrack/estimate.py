@@ -60,11 +60,13 @@ class Estimate:
     """How sure that is, 0..1; 1 where it was given."""
     gesture: str = ""
     """The gesture ("palm", "pointing_thumb", ... or a name of the user's), 'other' where it is none
-    of the known; empty where gesture output is off or the hand is lost."""
+    of the known; empty where gesture output is off, the hand is lost, or a joint is not ok that
+    would decide."""
     gesture_probability: float = math.nan
     """How sure the gesture is, 0..1; NaN where there is none."""
     pinch: float = math.nan
-    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where no gesture is."""
+    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where gesture output is
+    off, the hand is lost, or one of their last joints is not ok."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
     joint_sigma_m: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan, np.float32))
@@ -72,6 +74,9 @@ class Estimate:
     and across both; see hand/regions.py. NaN where nothing says."""
     joint_confidence: np.ndarray = field(default_factory=lambda: np.full(21, np.nan, np.float32))
     """(21,) float32 probabilities that the joints are within 40 mm; NaN where nothing says."""
+    joint_ok: np.ndarray = field(default_factory=lambda: np.ones(21, bool))
+    """(21,) bool: the joint may be used. False for all of a hand that is lost, and for those joints
+    of another one that are likely off by more than 40 mm: see `lost.joints.ok` in conf/lost."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, with or without
     the thumb stretched away, else NaN."""
@@ -106,6 +111,7 @@ def no_estimate(
         effective_sample_size=0.0,
         compute_s=compute_s,
         confidence=0.0,
+        joint_ok=np.zeros(21, bool),
     )
 
 
@@ -121,6 +127,7 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         confidence=0.0,
         joint_sigma_m=np.full((21, 3), np.nan, np.float32),
         joint_confidence=np.zeros(21, np.float32),
+        joint_ok=np.zeros(21, bool),
         compute_s=compute_s,
     )
 

@@ -15,7 +15,8 @@ u = K[0,0] x/z + K[0,2], v = K[1,1] y/z + K[1,2] in the undistorted image of ima
 height). joint_names, joint_parents: of joints_m and landmarks, in MediaPipe's order;
 angle_names: of the 21 joint angles, radians, flexion positive, which are state[..., 6:];
 openxr_joint_names, openxr_joint_parents: of openxr_*, whose axes are x right, y up, -z forward. The
-parent of a root is -1. Do not use rows with lost; NaN is unknown. metadata is JSON."""
+parent of a root is -1. Do not use rows with lost, nor joints without joint_ok; NaN is unknown.
+metadata is JSON."""
 
 
 def facts_for_readers(metadata: dict[str, Any]) -> dict[str, np.ndarray]:

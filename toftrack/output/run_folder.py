@@ -125,6 +125,8 @@ class Run:
             if np.ndim(value) == 0:
                 values[name] = value.item()
         values |= {"index": int(self.frames[row]), "state_name": self.state_names[row]}
+        # Older runs do not say it of the joints.
+        values.setdefault("joint_ok", np.full(21, not values["lost"]))
         return Estimate(**values)
 
     def likelihood(self) -> FMeasure:
