@@ -22,7 +22,7 @@ from toftrack.detector.network import ANGLES, JOINTS, PoseNet
 from toftrack.detector.onnx_networks import OnnxPoseNet
 from toftrack.detector.proposals import KEPT, MIRROR, NetworkOutput, mean_hand
 
-_COMPILING = "detector: compiling its numba kernels (once, about 3 s)"
+_COMPILING = "detector: compiling its numba kernels (once, about 4 s)"
 
 
 def run_pose_network(
