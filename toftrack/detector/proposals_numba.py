@@ -55,12 +55,12 @@ def start_pose_network(
     if isinstance(pose, PoseNet) or not _may_be_shared(pose):
         return functools.partial(run_pose_network, pose, depth_m, k, centres_m, side)
     task, out = _prepared(pose, depth_m, k, centres_m, side)
-    _, depth, left, k, centres, *written, _ = task.args
+    _, depth, left, k, centres, hand, written, _ = task.args
     turn, image = _crop(pose, depth, left, k, centres[0])
     wait = beside(functools.partial(pose.outputs, image))
 
     def reported() -> NetworkOutput:
-        _decode(wait(), image, turn, centres[0], left, *written, 0)
+        _decode(wait(), image, turn, centres[0], left, hand, written, 0)
         return _reported(out)
 
     return reported
