@@ -40,10 +40,12 @@ VICTORY = Pose((_STRAIGHT, _STRAIGHT, _CURLED, _CURLED))
 
 # The game of toftrack/output/web/point.html with the address of GAME; this seed's targets lie where
 # an arm need not reach far, and near each other.
-TARGETS, GAME_SEED, SCREEN_M, REACH = 12, 8874982, 1.0, 0.5
+TARGETS, GAME_SEED, SCREEN_M, REACH = 12, 15411478, 1.0, 0.5
 GAME = f"point?seed={GAME_SEED}&width={SCREEN_M:g}&reach={REACH:g}"
+_LOWER = np.array([0.0, 0.01])
+"""Metres. The cursor lies about that much above where the finger points; who sees it aims lower."""
 _FIELD, _RADIUS = 0.45, 0.07
-_FIRST, _MOVE, _REST, _CLOSE, _HOLD, _OPEN = 22, 10, 8, 4, 5, 4
+_FIRST, _MOVE, _REST, _CLOSE, _HOLD, _OPEN = 22, 10, 9, 3, 5, 4
 _SHOWN, _CHANGE, _SWAY = 25, 10, 60
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """From the hand's own frame: fingers up, the palm to the camera."""
@@ -66,8 +68,8 @@ def game_targets() -> np.ndarray:
 
     while len(found) < TARGETS:
         across, down = chance(), chance()
-        across, down = 0.12 + 0.76 * across - 0.5, 0.18 + 0.6 * down
-        there = REACH * np.array([across, _FIELD * down])
+        across, down = 0.12 + 0.76 * across - 0.5, 0.18 + 0.6 * down - 0.5
+        there = np.array([REACH * across, _FIELD * (0.5 + REACH * down)])
         if not found or np.linalg.norm(there - found[-1]) >= 3 * _RADIUS * _FIELD:
             found.append(there)
     # The camera is in the middle of the upper edge, and its right is the person's left.
@@ -107,7 +109,7 @@ def game_moments(aims: np.ndarray) -> list[Moment]:
 
 def pointing_at(hand: RightHand, moment: Moment) -> tuple[Solid, np.ndarray]:
     """The hand of a moment, and its joints: the ray from the index finger's base meets the aim."""
-    base = np.array([0.4 * moment.aim[0] - 0.01, 0.03 + 0.15 * moment.aim[1], 0.4])
+    base = np.array([0.4 * moment.aim[0] - 0.01, 0.12 * moment.aim[1] - 0.01, 0.4])
     way = np.append(moment.aim, 0.0) - base
     joints = hand.joints(POINTING)
     own = basis(joints[8] - joints[5], np.array([0.0, 1.0, 0.0]))
@@ -214,7 +216,7 @@ def main() -> None:
         raise SystemExit(__doc__)
     player, targets = RightHand(folder, PLAYER), game_targets()
     save("two_hands", draw_both(RightHand(folder, BOTH)))
-    save("point_and_pinch", draw_game(player, targets))
+    save("point_and_pinch", draw_game(player, targets + _LOWER))
 
 
 if __name__ == "__main__":
