@@ -112,7 +112,7 @@ class RightHand:
         for bone, vector in ((1, thumb[:3]), (2, thumb[3] * bend), (3, thumb[4] * bend)):
             way = way @ _about(self.rest[f"1-{bone}"], vector)
             rotations[f"1-{bone}"] = way
-        return turns
+        return rotations
 
     def _tips(self, rotations: dict[str, np.ndarray]) -> np.ndarray:
         """(21, 3) joints in toftrack's order, the hand itself at rest."""
@@ -124,7 +124,7 @@ class RightHand:
         return np.array(found)
 
     def _thumb(self, pose: Pose) -> np.ndarray:
-        """The thumb's rotations (5,): its tip beside the index finger's, or on the middle finger."""
+        """The thumb angles (5,): its tip beside the index finger's, or on the middle finger."""
 
         def off(turn: np.ndarray) -> np.ndarray:
             joints = self._tips(self._rotations(pose, turn))
