@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from toftrack.help_text import fields_in_help
+
 STATES = {
     "tracking": "tracking",
     "searching": "searching for the hand",
@@ -20,6 +22,7 @@ STATES = {
 """What the tracker does, Estimate.state_name, and how it is said to people."""
 
 
+@fields_in_help
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The hand in one frame, on the host. Arrays are NaN where there never was an estimate."""
@@ -27,6 +30,7 @@ class Estimate:
     index: int
     """Number of the input frame."""
     timestamp_s: float
+    """Seconds, the frame's time as it was given."""
     state_name: str
     """'tracking', or why not: 'searching', 'hidden', 'out of view', 'initialising', 'lost' or
     'recovering'; of a frame of a finished run that was not tracked 'dropped'. See STATES."""
@@ -49,7 +53,7 @@ class Estimate:
     confidence: float = math.nan
     """Probability that every joint is within 40 mm; NaN where nothing says."""
     outside_rad: float = math.nan
-    """How far the pose lies off the pose space, rms."""
+    """How far the pose lies off the pose space: radians, rms over the 21 joint angles."""
     side: str = ""
     """'right' or 'left', whose hand it is; empty where nobody says."""
     side_probability: float = math.nan
@@ -59,6 +63,7 @@ class Estimate:
     of the known; empty where gesture output is off, the hand is lost, or a joint is not ok that
     would decide."""
     gesture_probability: float = math.nan
+    """How sure the gesture is, 0..1; NaN where there is none."""
     pinch: float = math.nan
     """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where gesture output is
     off, the hand is lost, or one of their last joints is not ok."""

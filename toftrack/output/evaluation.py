@@ -145,6 +145,23 @@ def metrics_table(summary: dict[str, Any]) -> str:
     return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
 
 
+def metrics_line(summary: dict[str, Any]) -> str:
+    """The same in a line, for the jobs of a sweep."""
+    metrics = summary.get("metrics") or {}
+    trust = metrics.get("trust") or {}
+    parts = [
+        f"{summary['frames']} frames",
+        f"{summary['lost_frames']} lost",
+        f"{_figure(summary['mean_ms'])} ms a frame",
+        f"mean score {_figure(summary['mean_score'], 3)}",
+    ]
+    if trust:
+        parts.append(f"usable {_figure(trust['usable_pct'])} %")
+    if metrics:
+        parts.append(f"joint error {_figure(metrics['mean_mm'])} mm")
+    return ", ".join(parts)
+
+
 def _frames_text(summary: dict[str, Any]) -> str:
     text = f"{summary['frames']}, {summary['lost_frames']} of them lost"
     if dropped := summary.get("dropped_frames"):

@@ -117,17 +117,15 @@ def observed(one: Source, seed: int, shown: bool, settings: list[str]) -> Tips:
         for frame in device:
             depth = device.camera.rectify(frame.depth, frame.radial)
             estimate = tracker.step(depth, k, frame.index, frame.timestamp_s)
-            info = tracker.info
-            nothing = info is None or info.joint_features is None or estimate.lost
             joints.append(estimate.joints_m)
-            columns.append(
-                np.full((21, 3), np.nan)
-                if nothing
-                else flag_columns(
-                    estimate.joint_confidence, estimate.confidence, info.joint_features
-                )
-            )
-    off = _tips_off_mm(np.array(joints), truth if labels is None else labels, k)
+            columns.append(np.full((21, 3), np.nan))
+            features = None if tracker.info is None else tracker.info.joint_features
+            if features is not None and not estimate.lost:
+                sure = estimate.joint_confidence, estimate.confidence
+                columns[-1] = flag_columns(*sure, features)
+    known = truth if labels is None else labels
+    assert known is not None  # or there would be no side
+    off = _tips_off_mm(np.array(joints), known, k)
     of_tips = np.array(columns)[:, TIPS]
     used = np.isfinite(off) & np.isfinite(of_tips).all(2)
     return Tips(of_tips[used], off[used] > OK_MM, np.full(used.sum(), shown))

@@ -25,7 +25,10 @@ from toftrack.output.exports.motion import motions_of
 from toftrack.output.exports.table import csv_of
 
 NAMES = ("index", "timestamp_s", "state_name", "lost", "side", "joints_m", "state", "gesture")
-MORE = ("joint_ok", "confidence", "pinching", "pointing_origin_m", "pointing_direction", "openxr_position_m")
+MORE = (
+    *("confidence", "joint_ok", "pinching", "pointing_origin_m", "pointing_direction"),
+    "openxr_position_m",
+)
 
 
 def results_of(estimates: list[Estimate]) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from toftrack.hand.skeleton import ANGLE_NAMES
+
 _PLAIN = (
     *("state_name", "lost", "dropped", "confidence", "side", "side_probability", "score"),
     *("outside_rad", "gesture", "gesture_probability", "pinch", "pinching"),
@@ -39,6 +41,7 @@ def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
     header += [f"{joint}_{axis}_m" for joint in results["joint_names"] for axis in "xyz"]
     flags = [name for name in ("joint_ok",) if name in results]  # older runs have none
     header += [f"{joint}_ok" for _ in flags for joint in results["joint_names"]]
+    header += [f"{angle}_rad" for angle in ANGLE_NAMES]
     yield header
     index = results.get("index", np.arange(len(results["lost"])))
     for row, number in enumerate(index):
@@ -50,6 +53,7 @@ def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
             cells += [np.asarray(results[name])[here[: np.ndim(results[name])]] for name in plain]
             for name in (*points, "joints_m", *flags):
                 cells += results[name][here].ravel().tolist()
+            cells += results["state"][here][-len(ANGLE_NAMES) :].tolist()
             yield [_cell(value) for value in cells]
 
 
