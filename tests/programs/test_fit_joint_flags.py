@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toftrack.benchmark.runs import Source
 from toftrack.errors import ToftrackError
 from toftrack.programs.fit_joint_flags import Tips, chosen, curve, is_shown, lines, rates
 
@@ -49,5 +48,5 @@ def test_without_a_wrong_tip_nothing_can_be_chosen() -> None:
 
 
 def test_every_second_recording_of_a_folder_is_shown() -> None:
-    found = [Source(Path(name), name, 9) for name in ("a/1", "a/2", "b/1", "a/3", "b/2")]
+    found = [Path(name) for name in ("a/1", "a/2", "b/1", "a/3", "b/2")]
     assert [is_shown(one, found) for one in found] == [False, True, False, False, True]

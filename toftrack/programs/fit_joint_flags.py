@@ -19,7 +19,6 @@ from scipy.special import expit
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
-from toftrack.benchmark.runs import Source, sources
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
@@ -78,11 +77,12 @@ def main(arguments: list[str] | None = None) -> None:
     asked = read_arguments(arguments)
     if not 0 < asked.right < 100:
         raise ToftrackError(f"--right {asked.right:g} is no share; give per cent, as 4")
-    found = sources(asked.recordings, asked.labels)
-    todo = [(one, seed) for one in found for seed in range(1, asked.seeds + 1)]
+    labels = [read_points(path) for path in asked.labels]
+    found = recordings(asked.recordings)
+    todo = [(path, seed) for path in found for seed in range(1, asked.seeds + 1)]
     parts = [
-        observed(one, seed, is_shown(one, found), asked.settings)
-        for one, seed in tqdm(todo, unit=" recordings", file=sys.stderr)
+        observed(path, labels, seed, is_shown(path, found), asked.settings)
+        for path, seed in tqdm(todo, unit=" recordings", file=sys.stderr)
     ]
     tips = joined(parts)
     flags = chosen(tips.half(False), asked.right)
@@ -97,21 +97,45 @@ def main(arguments: list[str] | None = None) -> None:
     print("\n".join(lines(report)))
 
 
-def is_shown(one: Source, found: list[Source]) -> bool:
+def recordings(paths: list[str]) -> list[Path]:
+    """The .npz files that are named, and those of folders in the order of their names."""
+    found: list[Path] = []
+    for path in (Path(name).expanduser() for name in paths):
+        mine = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+        if not mine:
+            raise ToftrackError(f"the folder '{path}' has no .npz; give one with recordings")
+        found += mine
+    return found
+
+
+def read_points(path: str) -> Points:
+    """Labels of points; ToftrackError for others."""
+    labels = read_labels(path)
+    if not isinstance(labels, Points):
+        raise ToftrackError(f"'{path}' labels no points; give labels of fingertips")
+    return labels
+
+
+def is_shown(path: Path, found: list[Path]) -> bool:
     """Whether nothing is chosen on a recording: every second one of its folder."""
-    return [source for source in found if source.path.parent == one.path.parent].index(one) % 2 == 1
+    return [one for one in found if one.parent == path.parent].index(path) % 2 == 1
 
 
-def observed(one: Source, seed: int, shown: bool, settings: list[str]) -> Tips:
-    """The fingertips of a recording.  shown: as in Tips."""
-    labels = None if one.labels is None else read_labels(one.labels)
-    if labels is not None and not isinstance(labels, Points):
-        raise ToftrackError(f"'{one.labels}' labels no points; give labels of fingertips")
-    with Replay(one.path) as device:
-        truth, k = device.truth, device.camera.K
-        side = labels.side if labels is not None else truth.side if truth else ""
-        if side not in ("right", "left"):
-            raise ToftrackError(f"'{one.path}' does not say whose hand it shows; leave it out")
+def observed(path: Path, labels: list[Points], seed: int, shown: bool, settings: list[str]) -> Tips:
+    """The fingertips of a recording with truth, or else with labels of images of its size.
+
+    shown: as in Tips.
+    """
+    with Replay(path) as device:
+        k, size = device.camera.K, (device.camera.width, device.camera.height)
+        known = device.truth or next((one for one in labels if one.size == size), None)
+        if known is None:
+            raise ToftrackError(
+                f"'{path}' has no truth, and no labels fit it; give --labels, or leave it out"
+            )
+        if known.side not in ("right", "left"):
+            raise ToftrackError(f"'{path}' does not say whose hand it shows; leave it out")
+        side = known.side
         tracker = make_tracker(f"hand.side={side}", f"seed={seed}", *settings)
         joints, columns = [], []
         for frame in device:
@@ -123,8 +147,6 @@ def observed(one: Source, seed: int, shown: bool, settings: list[str]) -> Tips:
             if features is not None and not estimate.lost:
                 sure = estimate.joint_confidence, estimate.confidence
                 columns[-1] = flag_columns(*sure, features)
-    known = truth if labels is None else labels
-    assert known is not None  # or there would be no side
     off = _tips_off_mm(np.array(joints), known, k)
     of_tips = np.array(columns)[:, TIPS]
     used = np.isfinite(off) & np.isfinite(of_tips).all(2)
