@@ -1,5 +1,5 @@
-"""Choose from which confidence on a joint may be used, `joint_ok`, on half of some recordings, and show what it does on
-the other half:
+"""Choose from which confidence on a joint may be used, `joint_ok`, on half of some recordings, and
+show what it does on the other half:
 
 python -m toftrack.programs.fit_joint_flags FOLDER... [--labels FILE]
 """
