@@ -83,7 +83,7 @@ def ours() -> list[str]:
 
 
 def eventually(reported: Callable[[], object]) -> object:
-    """Wait until `asked` says something true."""
+    """Wait until `told` says something true."""
     deadline = time.monotonic() + PATIENCE_S
     while not (value := reported()):
         assert time.monotonic() < deadline
