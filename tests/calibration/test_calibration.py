@@ -90,7 +90,7 @@ def test_no_board_is_reported_without_searching_every_frame_for_corners(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(calibration, "find_corners", lambda *_: pytest.fail("this takes seconds"))
-    monkeypatch.setattr(calibrate, "_LOOKS", 3)
+    monkeypatch.setattr(calibrate, "_SEARCHED", 3)
     with pytest.raises(ToftrackError, match="no 7x5 chequerboard was seen in 3 frames"):
         calibrate.main(
             [str(ROOT / "toftrack/data/sample.npz"), "--board", "7x5", "--square", "0.03"]

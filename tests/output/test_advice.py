@@ -95,7 +95,7 @@ def test_a_frames_facts_are_read_off_its_image() -> None:
     assert "0 % of the pixels had readings." in watch.advice("right")[0]
 
 
-def test_who_watches_is_told_of_what_is_recent() -> None:
+def test_advice_to_who_watches_is_of_what_is_recent() -> None:
     lost, nothing = no_estimate(0, 0.0, "lost", 4, 0.01), np.zeros((6, 8), np.float32)
     watch = Watch(REACH_M)
     for count in range(1, 61):

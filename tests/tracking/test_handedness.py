@@ -65,7 +65,7 @@ def test_a_side_that_is_reported_at_a_restart_stays_reported() -> None:
         tracker.restart()
 
 
-def test_a_restart_may_detect_the_side_of_a_hand_that_was_told() -> None:
+def test_a_restart_may_detect_the_side_of_a_hand_that_was_given() -> None:
     scene, tracker = first(2), make_tracker("hand.side=left", *SMALL)
     tracker.restart("auto")
     estimate = tracker.step(scene.depth_m[0], scene.k, 0, 0.0)

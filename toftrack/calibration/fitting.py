@@ -24,7 +24,7 @@ ORDERS = tuple(range(1, 8))
 # Enlargements, tried in turn: the finder wants squares of more than a few pixels, and puts corners
 # least off at 5 (the focal length by 0.1 %, at 3 by 0.2 %).
 _SCALES = (5, 3, 7)
-_GLANCE_SCALE, _GLANCE_PX = 5, 900
+_QUICK_SCALE, _QUICK_PX = 5, 900
 """A first look enlarges less where an image would be wider than this: 0.2 s an image."""
 _FEWEST_VIEWS = 5
 _FOLDS = 5
@@ -110,7 +110,7 @@ def shows_board(amplitude: np.ndarray, board: tuple[int, int]) -> bool:
     """Whether a quick look finds the board in an (H, W) uint16 amplitude image: ten times faster
     than `find_corners`, which also finds boards that are far or much turned.
     """
-    grey = _enlarged(amplitude, max(1.0, min(_GLANCE_SCALE, _GLANCE_PX / amplitude.shape[1])))
+    grey = _enlarged(amplitude, max(1.0, min(_QUICK_SCALE, _QUICK_PX / amplitude.shape[1])))
     return grey is not None and cv2.findChessboardCornersSB(grey, board, None, 0)[0]
 
 

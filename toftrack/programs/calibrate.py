@@ -32,7 +32,7 @@ from toftrack.views.pictures import write_picture
 
 _PICTURES = 12
 _LENS = "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tauX tauY".split()
-_LOOKS = 24
+_SEARCHED = 24
 """So many frames are looked at for a board before all are searched for its corners: 5 s."""
 
 
@@ -147,7 +147,7 @@ def calibrate(
 def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> list[View]:
     """The frames of these numbers that show the board. Raises ToftrackError soon where none does,
     for searching a frame in vain takes seconds."""
-    _look_for_board(store, board, numbers)
+    _require_board(store, board, numbers)
     views: list[View] = []
     for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):
         corners = calibration.find_corners(_amplitude(store, number), board)
@@ -156,8 +156,8 @@ def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> li
     return views
 
 
-def _look_for_board(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> None:
-    places = np.unique(np.linspace(0, len(numbers) - 1, _LOOKS).round().astype(int))
+def _require_board(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> None:
+    places = np.unique(np.linspace(0, len(numbers) - 1, _SEARCHED).round().astype(int))
     # From the middle outwards: at both ends somebody still carries the board.
     for place in sorted(places, key=lambda at: abs(at - len(numbers) / 2)):
         if calibration.shows_board(_amplitude(store, numbers[place]), board):

@@ -92,10 +92,10 @@ def _notes(parts: _Parts) -> tuple[str, ...]:
     # Hands are lost, too, where most frames are dropped.
     if parts.realtime.too_slow:
         return dropped
-    return dropped + parts.watch.advice(_told_side(parts.tracker))
+    return dropped + parts.watch.advice(_given_side(parts.tracker))
 
 
-def _told_side(tracker: HandsTracker) -> str | None:
+def _given_side(tracker: HandsTracker) -> str | None:
     """Of the only hand, by the configuration or in a view; None where it is detected."""
     one = tracker.states[0]
     return one.side if len(tracker.states) == 1 and one.handedness.given else None
@@ -218,10 +218,10 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 parts.shapes.save()
                 parts.stream.send(calm)
                 hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
-                told = _told_side(tracker)
-                advice = parts.watch.advice(told, recent=True)
+                given = _given_side(tracker)
+                advice = parts.watch.advice(given, recent=True)
                 view.show(
-                    TrackedFrame(frame, depth, device.camera, hands, told is not None, advice)
+                    TrackedFrame(frame, depth, device.camera, hands, given is not None, advice)
                 )
                 bar.update()
                 if device.live:

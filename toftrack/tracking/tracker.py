@@ -251,11 +251,11 @@ def restarted(state: TrackerState, model: FilterModel, side: str | None = None) 
     Raises ToftrackError for an unknown side.
     """
     fresh = model.first_state(0, len(state.hands))
-    told = None if side == AUTO else side
+    wanted = None if side == AUTO else side
     keeps = side is None or isinstance(model, PaperModel)
-    given = told is not None or (keeps and state.hands[0].handedness.given)
+    given = wanted is not None or (keeps and state.hands[0].handedness.given)
     first = state.hands[0].side if given else fresh.hands[0].side
-    first = model.configured.shape.of_side(told).side if told is not None else first
+    first = model.configured.shape.of_side(wanted).side if wanted is not None else first
     sides = (first, OTHER_SIDE[first])
     hands = tuple(model.first_hand(sides[slot], given) for slot in range(len(state.hands)))
     return replace(fresh, hands=hands, generator=state.generator, next_index=state.next_index)
