@@ -318,5 +318,5 @@ def test_results_are_read_without_this_package_as_it_is_shown(
         for estimate in (lost_hand(0), hand_estimate(1), hand_estimate(2)):
             results.append((estimate,))
     monkeypatch.chdir(tmp_path)
-    exec(compile(block("npz"), "exports.md", "exec"), {})
+    exec(compile(block("npz"), "formats.md", "exec"), {})
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["1", "2"]

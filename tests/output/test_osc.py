@@ -82,7 +82,7 @@ def test_a_tracked_hand_is_reported_with_all_its_joints(receiver: socket.socket)
     assert not any("pointing" in address or "openxr" in address for address in found)
 
 
-def test_a_pinch_that_a_doubted_tip_ends_is_told(receiver: socket.socket) -> None:
+def test_a_pinch_that_a_doubted_tip_ends_is_reported(receiver: socket.socket) -> None:
     reported = {"gesture": "", "gesture_probability": np.nan, "pinch": np.nan}
     found = sent(receiver, replace(hand_estimate(7), joint_ok=np.arange(21) != 8, **reported))
     assert found["/toftrack/right/joint_ok"] == [1] * 8 + [0] + [1] * 12

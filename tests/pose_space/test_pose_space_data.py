@@ -138,7 +138,7 @@ def test_a_run_that_cannot_be_learned_from_is_reported(tmp_path, changes, words)
 
 
 def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
-    text = (ROOT / "docs" / "pose_spaces.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     example = text.split("```\n# units")[1].split("```")[0]
     (tmp_path / "mine.csv").write_text("# units" + example)
     data = file_data(str(tmp_path / "mine.csv"))
