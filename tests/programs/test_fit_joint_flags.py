@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.programs.fit_joint_flags import Tips, chosen, curve, is_shown, lines, rates
+from toftrack.programs.fit_joint_flags import Tips, chosen, curve, halves, is_shown, lines, rates
 
 
 def tips(count: int = 4000, seed: int = 0) -> Tips:
@@ -28,8 +28,9 @@ def test_the_share_of_right_tips_that_are_flagged_is_kept_on_the_other_half() ->
     assert other["wrong_flagged_pct"] > 15 and other["wrong"] == there.wrong.sum()
     shares = [wrong for _, wrong in curve(there)]
     assert shares == sorted(shares) and shares[0] < shares[-1]
-    report = {"joint_ok": least, "chosen_on": other, "shown_on": other, "curve": curve(there)}
-    assert lines(report)[0] == f"joint_ok: {least:g}"
+    report = halves(tips(), True, right_pct=5)
+    assert report["shown_on"] == other and lines(report)[0] == f"joint_ok: {least:g}"
+    assert halves(tips(), False, right_pct=5)["shown_on"]["wrong"] == here.wrong.sum()
 
 
 def test_without_a_right_tip_nothing_can_be_chosen() -> None:

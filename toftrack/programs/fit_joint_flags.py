@@ -80,16 +80,22 @@ def main(arguments: list[str] | None = None) -> None:
         for path, seed in tqdm(todo, unit=" recordings", file=sys.stderr)
     ]
     tips = joined(parts)
-    least = chosen(tips.half(False), asked.right)
-    report = {
-        "joint_ok": least,
-        "chosen_on": rates(tips.half(False), least),
-        "shown_on": rates(tips.half(True), least),
-        "curve": curve(tips.half(True)),
-    }
+    # Both ways round: what halves of few recordings differ by is to be seen.
+    report = [halves(tips, shown, asked.right) for shown in (True, False)]
     if asked.output is not None:
         asked.output.write_text(json.dumps(report, indent=1) + "\n")
-    print("\n".join(lines(report)))
+    print("\n\nthe other way round\n".join("\n".join(lines(one)) for one in report))
+
+
+def halves(tips: Tips, shown: bool, right_pct: float) -> dict[str, Any]:
+    """What is chosen on a half, and what it does there and on the one that is shown."""
+    least = chosen(tips.half(not shown), right_pct)
+    return {
+        "joint_ok": least,
+        "chosen_on": rates(tips.half(not shown), least),
+        "shown_on": rates(tips.half(shown), least),
+        "curve": curve(tips.half(shown)),
+    }
 
 
 def recordings(paths: list[str]) -> list[Path]:
