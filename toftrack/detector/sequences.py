@@ -29,6 +29,8 @@ CAMERAS = ((176, 144, 200.0), (176, 144, 200.0), (320, 240, 280.0), (512, 424, 3
 """Columns, rows and focal length in pixels."""
 _KEY = 14
 """Frames between two poses that are drawn."""
+_STILL_SHARE = 0.4
+"""Scenes in which the fingers do not move; in hands.HOLDING of them the hand holds a thing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +51,13 @@ class Sequence:
 def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) -> Sequence:
     """One random scene: `frames` images at 25 frames/s of one hand in its surroundings.
 
-    In an eighth of the scenes there is no hand at all.
+    In an eighth of the scenes there is no hand at all; in some a hand holds a thing.
     """
     dice = Dice(generator)
     width, height, focal = CAMERAS[int(dice.rows(len(CAMERAS), 1))]
     keys = frames // _KEY + 2
     left, empty = dice.chance(0.5, 1), bool(dice.chance(0.125, 1))
+    still = bool(dice.chance(_STILL_SHARE, 1))
     place = _places(keys, width / focal, height / focal, dice)
     rotations = _rotations(keys, dice)
     angles = _held(shown_poses(keys, generator), dice)
@@ -73,11 +76,11 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         key, part = divmod(frame / _KEY, 1)
         key, smooth = int(key), 0.5 - 0.5 * math.cos(math.pi * part)
         turn = roma.rotmat_slerp(rotations[key], rotations[key + 1], torch.tensor(smooth))
-        pose = torch.lerp(angles[key], angles[key + 1], smooth)
+        pose = None if still else torch.lerp(angles[key], angles[key + 1], smooth)[None]
         pivot = torch.lerp(place[key], place[key + 1], smooth)
         # The same draws in every frame: the scene stays, only the hand moves.
         same = Dice(torch.Generator().manual_seed(scene))
-        hands = posed_hands(bank, pivot[None], left, same, HAND, turn[None], pose[None])
+        hands = posed_hands(bank, pivot[None], left, same, HAND, turn[None], pose)
         labels = torch.where(hands.labels == HAND, -1, hands.labels) if empty else hands.labels
         scenes = random_scenes(hands, labels, bank, same, others=0.2, objects=0.06)
         depth, which = take_pictures(scenes, lens, sensor, (height, width), dice)
