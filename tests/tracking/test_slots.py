@@ -141,7 +141,7 @@ def test_a_second_hand_that_was_never_believed_ends(
 def test_the_surest_hand_comes_first_and_a_second_one_is_searched_for_now_and_then(
     tracks: tuple[str | None, str | None], second_s: float, slots: list[int]
 ) -> None:
-    assert taking_part(two(*tracks, second_s=second_s)) == slots
+    assert taking_part(two(*tracks, second_s=second_s), 0.5) == slots
 
 
 def test_a_search_for_a_second_hand_is_the_last_one_for_a_while() -> None:

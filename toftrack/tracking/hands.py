@@ -103,11 +103,15 @@ def placed(
 
 
 def others_of(
-    hands: Sequence[HandState], image: DepthImage, model: TrackerModel, dt_s: float
+    hands: Sequence[HandState],
+    slots: Sequence[int],
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
 ) -> list[tuple[OtherHand, ...]]:
-    """For each slot, the other hands as they are predicted in a frame."""
-    if len(hands) == 1:
-        return [()]
+    """For each of the slots that take part, the other hands as they are predicted in a frame."""
+    if not any(hands[own - 1].track is not None for own in slots):
+        return [() for _ in hands]
     depth_m, k = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
     size = (depth_m.shape[0], depth_m.shape[1])
     there = [
@@ -118,7 +122,7 @@ def others_of(
         tuple(
             _other_hand(hands[slot].track, theirs, mine, depth_m)
             for slot, theirs in enumerate(there)
-            if theirs is not None and slot != own
+            if theirs is not None and slot != own and own in slots
         )
         for own, mine in enumerate(there)
     ]
@@ -177,8 +181,6 @@ def without(image: DepthImage, others: Sequence[OtherHand]) -> DepthImage:
 
 def partnered(hands: Sequence[HandState], model: TrackerModel) -> list[HandState]:
     """The hands, with what the other hand's side says of each one's."""
-    if len(hands) == 1:
-        return list(hands)
     settings = model.configured.handedness
     return [
         replace(hand, handedness=hand.handedness.beside(other.handedness, settings))

@@ -101,7 +101,8 @@ class FilterModel:
 
     def first_hand(self, side: str, side_given: bool) -> HandState:
         """A slot before any frame."""
-        handedness = HandednessEstimate(given=side_given)
+        told = self.configured.handedness.told * (1 if side == "right" else -1)
+        handedness = HandednessEstimate(side_given, told if side_given else 0.0)
         seen = LastSeen(torch.zeros(1, 6 + self.space.dims), math.inf)
         nothing = no_estimate(-1, math.nan, "lost", self.space.dims, math.nan)
         return HandState(side, handedness, first_shape(), seen, nothing)
@@ -196,6 +197,15 @@ class TrackerModel(FilterModel):
     @cached_property
     def _at_quality(self) -> Callable[[Quality], TrackerModel]:
         return lru_cache(partial(_at_quality, self))
+
+    def first_state(self, seed: int, hands: int = 1) -> TrackerState:
+        """See FilterModel. Beside one hand that is asked for, the other one is watched."""
+        state = super().first_state(seed, 2)
+        if hands == 2:
+            return state
+        first, other = state.hands
+        watched = self.first_hand(other.side, side_given=False)
+        return replace(state, hands=(first, watched), watched=True, second_s=0.0)
 
     @property
     def fit(self) -> ShapeFit:
