@@ -373,6 +373,12 @@ def taking_part(state: TrackerState, watch_s: float) -> list[int]:
     return sorted(slots, key=lambda slot: -sureness(state.hands[slot]))
 
 
+def since_search(before: TrackerState, slots: Sequence[int]) -> float:
+    """Seconds since a slot without a hand was searched for, after a frame about these slots."""
+    sought = len(slots) == 2 and any(hand.track is None for hand in before.hands)
+    return 0.0 if sought else before.second_s
+
+
 def reconcile(
     before: TrackerState,
     after: TrackerState,

@@ -34,6 +34,7 @@ from toftrack.tracking.lifecycle import (
     observed_shape,
     open_hand,
     reconcile,
+    since_search,
     taking_part,
 )
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
@@ -214,8 +215,7 @@ def reconciled(
     for slot, hand, info, estimate in found:
         hands[slot], estimates[slot] = hand, estimate
         infos[slot] = replace(info, seconds=spans.seconds())
-    sought = len(found) == 2 and any(hand.track is None for hand in before.hands)
-    second_s = 0.0 if sought else before.second_s
+    second_s = since_search(before, [slot for slot, _, _, _ in found])
     after = replace(before, hands=tuple(hands), second_s=second_s)
     after, exchanged = reconcile(before, after, partial(_found_hand, model), dt_s)
     if before.watched:
