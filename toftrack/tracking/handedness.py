@@ -18,6 +18,8 @@ from toftrack.frames import DepthImage
 
 _BODY_COMPARISONS = 20
 """Comparisons over which the body's place is averaged."""
+_FIRST_COMPARISONS = 5
+"""Whatever a given side is taken for, a new hand is compared so often before it is sure."""
 _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
@@ -86,7 +88,8 @@ class HandednessEstimate:
         if not tracked:
             return True
         interval = settings.interval_unsure_s
-        if abs(self.log_odds) > math.log(settings.sure / (1 - settings.sure)):
+        new = self.given and self.comparisons < _FIRST_COMPARISONS
+        if abs(self.log_odds) > math.log(settings.sure / (1 - settings.sure)) and not new:
             interval = settings.interval_told_s if self.given else settings.interval_sure_s
         return self.age_s + dt_s >= interval
 
@@ -121,6 +124,7 @@ class HandednessEstimate:
         """After the hand has left: the next one is likely, but not surely, the same."""
         before = self.fits + self.shoulder
         kept = min(max(before, -settings.kept), settings.kept)
+        kept = 0.0 if self.given else kept  # which hand it was says nothing of which one it is
         return replace(self, fits=kept, shoulder=0.0, body_m=0.0, comparisons=0)
 
     def beside(self, other: HandednessEstimate, settings: HandednessSettings) -> HandednessEstimate:

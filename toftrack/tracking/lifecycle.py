@@ -65,7 +65,7 @@ from toftrack.tracking.hands import (
 )
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
-from toftrack.tracking.watching import WATCHED_TRIED_S, watched_slots
+from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S, watched_slots
 
 _HIDDEN = 0.3
 """Share of the joints behind something from which on a hand is hidden."""
@@ -79,9 +79,6 @@ _SWITCHED = 0.4
 """The side is changed when it has become less probable than this, so that it does not flicker."""
 _LEAST_PRESENT = 0.5
 """Where a hand is less probable than this, its sides are not compared."""
-_OTHER = 0.4
-"""Where it is less probable than this that what is followed is the hand of the given side, the
-frame is flagged."""
 _SECOND_S = 0.12
 """How often a second hand is searched for."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
@@ -298,7 +295,7 @@ def close(
     seems = whose.seems(frame.hand.side) if whose.given else 1.0
     side = whose.probability(frame.hand.side)
     status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
-    if seems < _OTHER and not status.lost:
+    if seems < OTHER_HAND and not status.lost:
         status = replace(status, lost=True, state_name="other hand")
     # Without refinement the particles stay where they are.
     followed = drawn_to(found, model) if model.refinement.iterations else found.filtered

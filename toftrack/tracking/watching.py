@@ -10,6 +10,7 @@ import math
 from dataclasses import replace
 
 from toftrack.estimate import Estimate
+from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.handedness import OTHER_SIDE, HandednessSettings
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
 
@@ -19,7 +20,12 @@ _GONE_S = 2.0
 """The first hand that has been away so long makes way for the other; not one of a given side."""
 _BACK = 0.9
 """A hand that turns out to be of the given side after all is the first one again."""
-WATCHED_TRIED_S = 0.16
+_RATHER = 0.7
+"""Likewise while what is taken for the first one does not seem to be of that side."""
+OTHER_HAND = 0.4
+"""Where it is less probable than this that what is followed is of the given side, the frame is
+flagged."""
+WATCHED_TRIED_S = 0.3
 """A watched track ends when it was not believed for so long: things are tried, too."""
 
 
@@ -35,6 +41,8 @@ def watched_slots(state: TrackerState, watch_s: float) -> list[int]:
     if first is None:
         return [1, 0] if state.second_s >= _SOUGHT_S else [1]
     if other is None:
+        if state.second_s == math.inf:
+            return [1, 0]
         return [0, 1] if state.second_s >= watch_s else [0]
     return [0, 1] if not first.doubted or other.doubted else [1, 0]
 
@@ -49,7 +57,7 @@ def watched_over(state: TrackerState, settings: HandednessSettings) -> TrackerSt
     state = replace(state, hands=(first, other))
     if first.track is not None and first.handedness.contradicted(first.side, settings):
         return _other_after_all(state, first.track)
-    if first.track is None and other.track is not None and _is_first(first, other):
+    if other.track is not None and _is_first(first, other):
         return _first_after_all(state, other.track)
     return state
 
@@ -63,34 +71,44 @@ def told_apart(estimate: Estimate, state: TrackerState) -> Estimate:
 
 
 def _other_after_all(state: TrackerState, track: Track) -> TrackerState:
-    """The first slot has followed the other hand, which the watched slot goes on with."""
+    """The first slot has followed the other hand, which the watched slot is to go on with."""
     first, other = state.hands
-    side, handedness = OTHER_SIDE[first.side], first.handedness
-    known = replace(handedness, given=False, told=0.0, fits=handedness.fits)
     if other.track is None:
-        other = replace(other, side=side, handedness=known, seen=LastSeen(track.mean, 0.0))
-    first = replace(first, track=None, handedness=replace(handedness, fits=0.0))
+        other = _passed_on(first, other, track)
+    first = replace(first, track=None, handedness=replace(first.handedness, fits=0.0))
     return replace(state, hands=(first, other), second_s=math.inf)
+
+
+def _passed_on(first: HandState, other: HandState, track: Track) -> HandState:
+    """The watched slot before it finds the other hand where the first slot's track is."""
+    return replace(
+        other,
+        side=OTHER_SIDE[first.side],
+        handedness=replace(first.handedness, given=False, told=0.0),
+        shape=first_shape(),
+        seen=LastSeen(track.mean, 0.0),
+        track=None,
+        beside=False,
+    )
 
 
 def _is_first(first: HandState, other: HandState) -> bool:
     """Whether the hand that is watched is the one that was asked for."""
     if not first.handedness.given:
-        return other.believed and not first.seen.age_s < _GONE_S
-    sure = other.handedness.probability(first.side) > _BACK
-    return other.side == first.side and sure and not other.beside
+        return first.track is None and other.believed and not first.seen.age_s < _GONE_S
+    probable = other.handedness.probability(first.side) if other.side == first.side else 0.0
+    if first.track is not None:
+        return probable > _RATHER and first.handedness.seems(first.side) < OTHER_HAND
+    return probable > _BACK and not other.beside
 
 
 def _first_after_all(state: TrackerState, track: Track) -> TrackerState:
+    """The watched slot has followed the hand that was asked for, and the first slot the other one."""
     first, other = state.hands
-    told = replace(first.handedness, fits=other.handedness.fits)
-    handedness = told if told.given else other.handedness
-    first = replace(
-        first,
-        side=other.side,
-        handedness=handedness,
-        shape=other.shape,
-        track=track,
-        seen=other.seen,
-    )
-    return replace(state, hands=(first, replace(other, track=None, beside=False)), second_s=0.0)
+    left, second_s = replace(other, track=None, beside=False), 0.0
+    if first.track is not None:
+        left, second_s = _passed_on(first, other, first.track), math.inf
+    fits, given = other.handedness.fits, first.handedness.given
+    handedness = replace(first.handedness, fits=fits) if given else other.handedness
+    first = replace(first, handedness=handedness, side=other.side, shape=other.shape, track=track)
+    return replace(state, hands=(replace(first, seen=other.seen), left), second_s=second_s)
