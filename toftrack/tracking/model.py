@@ -35,6 +35,8 @@ from toftrack.tracking.state import HandState, LastSeen, TrackerState
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
+_LONG_S = 1e3
+"""Another hand was looked for so long ago before any frame: it is as soon as there is a first."""
 _HANDS = 32
 """Hands of some side and shape that are kept made."""
 
@@ -205,7 +207,7 @@ class TrackerModel(FilterModel):
             return state
         first, other = state.hands
         watched = self.first_hand(other.side, side_given=False)
-        return replace(state, hands=(first, watched), watched=True, second_s=0.0)
+        return replace(state, hands=(first, watched), watched=True, second_s=_LONG_S)
 
     @property
     def fit(self) -> ShapeFit:

@@ -103,7 +103,7 @@ def _is_first(first: HandState, other: HandState) -> bool:
 
 
 def _first_after_all(state: TrackerState, track: Track) -> TrackerState:
-    """The watched slot has followed the hand that was asked for, and the first slot the other one."""
+    """The watched slot has followed the hand that was asked for; perhaps the first one another."""
     first, other = state.hands
     left, second_s = replace(other, track=None, beside=False), 0.0
     if first.track is not None:
