@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import os
 import subprocess
 import sys
 import threading
+import zipfile
 from pathlib import Path
 
 import hydra
@@ -19,6 +22,7 @@ from hydra.core.global_hydra import GlobalHydra
 import toftrack
 from toftrack.compute.threads import small_operations, threads
 from toftrack.configuration.compose import configuration
+from toftrack.estimate import no_estimate
 
 QUICK = ("filter.particles=100",)
 
@@ -71,7 +75,7 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
         *("covariance", "effective_sample_size", "compute_s", "gesture", "gesture_probability"),
         *("pinch", "pinching"),
         *("pointing_origin_m", "pointing_direction", "confidence", "outside_rad"),
-        *("side", "side_probability", "joint_sigma_m", "joint_confidence"),
+        *("side", "side_probability", "joint_sigma_m", "joint_confidence", "joint_ok"),
         *("landmarks", "openxr_position_m", "openxr_orientation", "openxr_radius_m"),
     }
 
@@ -290,3 +294,79 @@ print(toftrack.__file__, configuration("smooth=one_euro").smooth.results)
 """
     path, smooth = python(code, folder=tmp_path).split()
     assert Path(path).is_relative_to(built) and smooth == "False"
+
+
+def test_help_shows_every_field_with_what_is_written_below_it() -> None:
+    shown = inspect.getdoc(toftrack.Estimate) or ""
+    for field in dataclasses.fields(toftrack.Estimate):
+        assert f"\n    {field.name}: " in shown
+        below = shown.split(f"\n    {field.name}: ")[1].splitlines()[1]
+        assert below.startswith(" " * 8) and len(below.split()) > 2, field.name
+    assert "(21, 3) float32 metres, camera frame" in shown
+
+
+@pytest.mark.parametrize("kind", ["depth", "amplitude", "colours"])
+def test_a_skeleton_is_drawn_where_the_hand_is(kind: str) -> None:
+    scene, estimate = sample().cut(0), _estimate()
+    image = {
+        "depth": scene.depth_m[0],
+        "amplitude": (1000 * scene.depth_m[0]).astype(np.uint16),
+        "colours": np.full((*scene.depth_m[0].shape, 3), 128, np.uint8),
+    }[kind]
+    before = toftrack.draw(image, dataclasses.replace(estimate, joints_m=NOWHERE), scene.k)
+    picture = toftrack.draw(image, estimate, scene.k)
+    rows, columns = np.nonzero((picture != before).any(-1))
+    scale = picture.shape[1] / image.shape[1]
+    pixels = scene.joints_m[0] @ scene.k.T
+    pixels = scale * pixels[:, :2] / pixels[:, 2:]
+    reached = np.array([columns.min(), rows.min(), columns.max(), rows.max()])
+    assert np.abs(reached - [*pixels.min(0), *pixels.max(0)]).max() < 6 * scale
+    lost = toftrack.draw(image, dataclasses.replace(estimate, lost=True), scene.k, scale=1)
+    assert lost.shape == (*image.shape[:2], 3)
+    assert lost[0, 0, 0] > lost[0, 0, 2], "red is first"
+
+
+def test_what_cannot_be_drawn_is_reported() -> None:
+    scene, estimate = sample(), _estimate()
+    with pytest.raises(toftrack.ToftrackError, match="of the shape \\(3,\\)"):
+        toftrack.draw(np.zeros(3), estimate, scene.k)
+    small = toftrack.Camera(np.array([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]), 40, 30)
+    with pytest.raises(toftrack.ToftrackError, match="but the camera 40x30"):
+        toftrack.draw(scene.depth_m[0], estimate, small)
+
+
+NOWHERE = np.full((21, 3), np.nan, np.float32)
+
+
+def _estimate() -> toftrack.Estimate:
+    """The truth of the sample's first frame."""
+    joints = sample().joints_m[0].astype(np.float32)
+    nothing = no_estimate(0, 0.0, "tracking", 4, 0.0)
+    return dataclasses.replace(nothing, lost=False, joints_m=joints)
+
+
+@pytest.mark.slow
+def test_a_type_checker_in_another_folder_knows_the_types_of_a_wheel(tmp_path: Path) -> None:
+    """Unpacked, which is what installing a wheel does."""
+    pytest.importorskip("mypy")
+    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "-w", str(tmp_path), str(ROOT)], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    (tmp_path / "client.py").write_text(
+        "import toftrack\n"
+        "estimate = toftrack.make_tracker().step([[0.5]], [[1.0]])\n"
+        "reveal_type(estimate.confidence)\n"
+        "reveal_type(toftrack.read_run('x').camera)\n"
+        "estimate.no_such_field\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "client.py"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True,
+        text=True,
+    )
+    assert 'Revealed type is "float"' in done.stdout, done.stdout + done.stderr
+    assert 'Revealed type is "toftrack.camera.Camera"' in done.stdout
+    assert '"Estimate" has no attribute "no_such_field"' in done.stdout

@@ -8,6 +8,9 @@ For a program of one's own:
     estimate = tracker.step(depth_m, K)
     estimate.joints_m
 
+    toftrack.draw(depth_m, estimate, K)  # a picture
+    toftrack.read_run("outputs/...").arrays["joints_m"]  # of a finished run
+
 or, of two hands:
 
     tracker = toftrack.make_hands_tracker("hands=2")
@@ -33,7 +36,9 @@ if TYPE_CHECKING:
     from toftrack.hand.openxr import OPENXR_JOINT_NAMES
     from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
     from toftrack.output.results import read_results
+    from toftrack.output.run_folder import Run, read_run
     from toftrack.tracking.tracker import HandsTracker, Tracker
+    from toftrack.views.drawing import draw
 
     __version__: str
 
@@ -46,13 +51,16 @@ _PLACES = {
     "Frame": "toftrack.frames",
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
+    "Run": "toftrack.output.run_folder",
     "ToftrackError": "toftrack.errors",
     "HandsTracker": "toftrack.tracking.tracker",
     "Tracker": "toftrack.tracking.tracker",
+    "draw": "toftrack.views.drawing",
     "make_device": "toftrack.api",
     "make_hands_tracker": "toftrack.api",
     "make_tracker": "toftrack.api",
     "read_results": "toftrack.output.results",
+    "read_run": "toftrack.output.run_folder",
 }
 
 __all__ = [
@@ -64,13 +72,16 @@ __all__ = [
     "HandsTracker",
     "JOINT_NAMES",
     "OPENXR_JOINT_NAMES",
+    "Run",
     "ToftrackError",
     "Tracker",
     "__version__",
+    "draw",
     "make_device",
     "make_hands_tracker",
     "make_tracker",
     "read_results",
+    "read_run",
 ]
 
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.help_text import fields_in_help
 from toftrack.json_text import read_json
 from toftrack.safe_files import write_whole
 
@@ -72,6 +73,7 @@ def _check_plausible(K: np.ndarray, width: int, height: int) -> None:
 
 
 # Compared by identity: the fields are arrays, and the tables below are cached per object.
+@fields_in_help
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A camera with one of OpenCV's two lens models and a correction of the measured depth.
@@ -84,6 +86,7 @@ class Camera:
     K: np.ndarray
     """(3, 3) float64, pixels."""
     width: int
+    """Pixels, as the height."""
     height: int
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(5))
     """(4,), (5,), (8,), (12,) or (14,) float64: OpenCV's k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4,

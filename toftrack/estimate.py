@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from toftrack.help_text import fields_in_help
+
 STATES = {
     "tracking": "tracking",
     "searching": "searching for the hand",
@@ -21,6 +23,7 @@ STATES = {
 """What the tracker does, Estimate.state_name, and how it is said to people."""
 
 
+@fields_in_help
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The hand in one frame, on the host. Arrays are NaN where there never was an estimate."""
@@ -28,6 +31,7 @@ class Estimate:
     index: int
     """Number of the input frame."""
     timestamp_s: float
+    """Seconds, the frame's time as it was given."""
     state_name: str
     """'tracking', or why not: 'searching', 'hidden', 'out of view', 'initialising', 'lost' or
     'recovering'; of a frame of a finished run that was not tracked 'dropped'. See STATES."""
@@ -50,17 +54,20 @@ class Estimate:
     confidence: float = math.nan
     """Probability that every joint is within 40 mm; NaN where nothing says."""
     outside_rad: float = math.nan
-    """How far the pose lies off the pose space, rms."""
+    """How far the pose lies off the pose space: radians, rms over the 21 joint angles."""
     side: str = ""
     """'right' or 'left', whose hand it is; empty where nobody says."""
     side_probability: float = math.nan
     """How sure that is, 0..1; 1 where it was given."""
     gesture: str = ""
     """The gesture ("palm", "pointing_thumb", ... or a name of the user's), 'other' where it is none
-    of the known; empty where gesture output is off or the hand is lost."""
+    of the known; empty where gesture output is off, the hand is lost, or a joint is not ok that
+    would decide."""
     gesture_probability: float = math.nan
+    """How sure the gesture is, 0..1; NaN where there is none."""
     pinch: float = math.nan
-    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where no gesture is."""
+    """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN where gesture output is
+    off, the hand is lost, or one of their last joints is not ok."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
     joint_sigma_m: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan, np.float32))
@@ -68,6 +75,9 @@ class Estimate:
     and across both; see hand/regions.py. NaN where nothing says."""
     joint_confidence: np.ndarray = field(default_factory=lambda: np.full(21, np.nan, np.float32))
     """(21,) float32 probabilities that the joints are within 40 mm; NaN where nothing says."""
+    joint_ok: np.ndarray = field(default_factory=lambda: np.ones(21, bool))
+    """(21,) bool: the joint may be used. False for all of a hand that is lost, and for those joints
+    of another one that are likely off by more than 40 mm: see `lost.joints.ok` in conf/lost."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, with or without
     the thumb stretched away, else NaN."""
@@ -102,6 +112,7 @@ def no_estimate(
         effective_sample_size=0.0,
         compute_s=compute_s,
         confidence=0.0,
+        joint_ok=np.zeros(21, bool),
     )
 
 
@@ -117,6 +128,7 @@ def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: flo
         confidence=0.0,
         joint_sigma_m=np.full((21, 3), np.nan, np.float32),
         joint_confidence=np.zeros(21, np.float32),
+        joint_ok=np.zeros(21, bool),
         compute_s=compute_s,
     )
 

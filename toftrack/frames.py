@@ -9,6 +9,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.help_text import fields_in_help
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
 LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
@@ -61,6 +62,7 @@ def _percentile(depth: np.ndarray, percent: float) -> float:
     return float(np.percentile(readings.astype(np.float32), percent)) if readings.size else 0.0
 
 
+@fields_in_help
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One image as the device delivered it: neither rectified nor cleaned up."""
@@ -68,6 +70,7 @@ class Frame:
     index: int
     """Number of the frame within its recording, or since a live camera was opened."""
     timestamp_s: float
+    """Seconds."""
     depth: np.ndarray
     """(H, W) float32 metres; 0, NaN, infinities and negative values are no reading."""
     amplitude: np.ndarray | None

@@ -16,6 +16,7 @@ import gzip
 import json
 import sys
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -268,18 +269,30 @@ def draw(points, faces, albedo, f, cx, cy, depth, bright):
                     bright[v, u] = albedo * cosine / (z * ray) ** 2
 
 
-def sensed(solids: list[Solid], rng: np.random.Generator) -> np.ndarray:
-    """(H, W) float16 metres as a Time-of-Flight camera measures them.
+def drawn(
+    solids: Sequence[Solid], before: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth in metres and light along the rays, each (FINER H, FINER W).
 
-    Rays of one pixel are mixed as it mixes them: weighted by what each surface sends back, so that
-    pixels on edges lie between. Noise grows as the light gets less.
+    before: what was drawn already, as this returns it; it is left as it is.
     """
     size = (HEIGHT * FINER, WIDTH * FINER)
-    depth, bright = np.full(size, 99.0), np.zeros(size)
+    first = (np.full(size, 99.0), np.zeros(size)) if before is None else before
+    depth, bright = (values.copy() for values in first)
     f, shift = F_PX * FINER, (FINER - 1) / 2
     cx, cy = WIDTH / 2 * FINER + shift, HEIGHT / 2 * FINER + shift
     for solid in solids:
         draw(solid.points, solid.faces, solid.albedo, f, cx, cy, depth, bright)
+    return depth, bright
+
+
+def sensed(rays: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """(H, W) float16 metres as a Time-of-Flight camera measures what is drawn.
+
+    Rays of one pixel are mixed as it mixes them: weighted by what each surface sends back, so that
+    pixels on edges lie between. Noise grows as the light gets less.
+    """
+    depth, bright = rays
     blocks = (HEIGHT, FINER, WIDTH, FINER)
     light = bright.reshape(blocks).mean((1, 3))
     mixed = (bright * depth).reshape(blocks).mean((1, 3)) / np.maximum(light, 1e-9)
@@ -322,7 +335,8 @@ def main() -> None:
         frames = []
         for t in range(FRAMES):  # the camera trembles
             by = 0.004 * np.sin([0.5 * t, 0.7 * t, 0.3 * t]) + [0.001 * t, 0, 0]
-            frames.append(sensed([Solid(s.points + by, s.faces, s.albedo) for s in things], rng))
+            moved = [Solid(s.points + by, s.faces, s.albedo) for s in things]
+            frames.append(sensed(drawn(moved), rng))
         write(HERE / "empty" / f"room_{kind}.npz", np.stack(frames), f"an empty room: {kind}")
     for name, person in PERSONS.items():
         body, behind = posed_body(folder, person), wall(rng, rng.uniform(1.4, 1.9))
@@ -332,7 +346,7 @@ def main() -> None:
             turn = about(1, person.turn + person.sway_rad * wave)
             place = np.array(person.place) + [person.sway_m * wave, 0, 0.5 * person.sway_m * wave]
             there = Solid(body.points @ turn.T + place, body.faces, body.albedo)
-            frames.append(sensed([*behind, there], rng))
+            frames.append(sensed(drawn([*behind, there]), rng))
         write(HERE / "empty" / f"person_{name}.npz", np.stack(frames), f"a person: {name}")
 
 

@@ -13,6 +13,7 @@ from helpers.tracking import ROOT
 
 from toftrack.detector import checkpoints
 from toftrack.detector.checkpoints import Checkpoints, Progress, save
+from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.training import Schedule, train_finder, train_poses
 from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
@@ -59,10 +60,13 @@ def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> Non
     sizes = ("poses.images=256", "finder.images=256", "poses.batch=32", "finder.batch=32")
     done = command(tmp_path, *sizes, "shapes=6", "poses.width=4", "finder.width=8")
     assert done.returncode == 0, done.stderr
-    for name in ("detector.npz", "images.png", "course.png", "summary.json"):
+    derived = ("detector.pose.onnx", "detector.finder.onnx")
+    for name in ("detector.npz", *derived, "images.png", "course.png", "summary.json"):
         assert (tmp_path / name).stat().st_size > 0
         assert name in done.stdout
-    *_, about = load_weights(tmp_path / "detector.npz")
+    about = load_weights(tmp_path / "detector.npz").about
+    pose, finder = load_networks(tmp_path / "detector.npz")
+    assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
     assert (about["pose_images"], about["finder_images"], about["shapes"]) == (256, 256, 6)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["poses"][-1]["images"] == summary["finder"][-1]["images"] == 256

@@ -1,4 +1,4 @@
-"""A camera of one's own: the code and configuration of docs/own_device.md, as they stand there."""
+"""A camera of one's own: the code and configuration of docs/cameras.md, as they stand there."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FRAMES = 12
 
 def from_page(name: str) -> str:
     """The block of code that follows the page's marker of that name."""
-    text = (ROOT / "docs" / "own_device.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "cameras.md").read_text(encoding="utf-8")
     blocks = re.findall(rf"<!-- test: {name} -->\n```\w+\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 1, f"the page has {len(blocks)} blocks marked {name}"
     return blocks[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -292,6 +293,26 @@ def test_only_a_pointing_hand_that_is_followed_has_a_ray() -> None:
             np.isnan(reported.pointing_origin_m).all()
             and np.isnan(reported.pointing_direction).all()
         )
+
+
+@pytest.mark.parametrize(
+    ("made", "doubted", "name"),
+    [
+        ("gun", 7, ""),  # a joint of the index finger
+        ("gun", 20, ""),  # the little finger, which is curled in both gestures that point
+        ("gun", 4, ""),  # the thumb tells one of them from the other
+        ("palm", 16, ""),
+        ("palm", 0, "palm"),  # no finger bends at the wrist
+    ],
+)
+def test_a_gesture_is_not_named_where_a_joint_that_decides_is_not_ok(
+    made: str, doubted: int, name: str
+) -> None:
+    one = dataclasses.replace(estimate(pose(made)), joint_ok=np.arange(21) != doubted)
+    _, reported = tell_gesture(GESTURES, None, one, SPACE)
+    assert reported.gesture == name
+    assert math.isnan(reported.gesture_probability) == (name == "")
+    assert np.isnan(reported.pointing_direction).all()
 
 
 def test_a_followed_hand_out_of_the_pose_space_is_other() -> None:

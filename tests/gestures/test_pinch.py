@@ -42,6 +42,18 @@ def test_a_pinch_goes_from_1_to_0_as_the_fingers_open() -> None:
     assert any(0.2 < pinch < 0.8 for pinch in pinches)
 
 
+def test_a_tip_that_is_not_ok_begins_no_pinch_and_ends_one() -> None:
+    ok = np.ones(21, bool)
+    ok[20] = False
+    assert pinch_of(joints(0.0), SETTINGS, ok) == 1.0, "the little finger does not matter"
+    ok[8] = False
+    unknown = pinch_of(joints(0.0), SETTINGS, ok)
+    assert np.isnan(unknown)
+    assert not any(follow([unknown] * 9))
+    assert follow([1.0] * 5 + [unknown, 1.0])[-3:] == [True] * 3, "a short doubt passes"
+    assert follow([1.0] * 5 + [unknown] * 5)[-1] is False
+
+
 def test_a_small_hand_pinches_as_a_large_one() -> None:
     assert tip_gap(joints(0.3, 0.14)) == pytest.approx(tip_gap(joints(0.3, 0.21)), abs=1e-4)
 

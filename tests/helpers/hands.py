@@ -41,6 +41,7 @@ def hand_estimate(index: int, side: str = "right", bent: float = 0.0, **changes:
         state=state,
         joints_m=joints,
         confidence=0.9,
+        joint_ok=np.ones(21, bool),
         side=side,
         side_probability=1.0,
         gesture="palm",

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from toftrack.frames import Truth
-from toftrack.output.accuracy import group_counts, groups, image_totals, row_figures, totals
+from toftrack.output.accuracy import (
+    by_recording,
+    group_counts,
+    groups,
+    image_totals,
+    row_figures,
+    totals,
+)
 from toftrack.output.accuracy_tables import accuracy_tables, markdown, plain
-from toftrack.output.measures import Estimates, measured
+from toftrack.output.measures import FLAG_COUNTS, Estimates, measured
 from toftrack.output.paired import compared, rows_of
 
 
@@ -90,6 +97,21 @@ def test_a_recording_is_the_mean_of_its_seeds_and_the_total_that_of_recordings()
     assert total["usable_pct"] == 70 and total["usable_90"] == [50, 90]
     assert (total["recordings"], total["frames"], total["longest_silent"]) == (2, 20, 3)
     assert (total["never_right"], total["median_first_right"]) == (1, 4)
+
+
+def test_what_is_flagged_is_pooled_over_recordings_and_seeds() -> None:
+    counts = {"s/a": (1, 1, 10, 0), "s/b": (9, 3, 30, 4)}
+    rows = [
+        {"recording": name, "seed": seed, "usable_pct": 80.0, "silent_pct": 0.0}
+        | dict(zip(FLAG_COUNTS, numbers, strict=True))
+        for name, numbers in counts.items()
+        for seed in (0, 1)
+    ]
+    total = totals(rows)
+    assert (total["tips_wrong"], total["tips_right"]) == (10, 40)
+    assert (total["wrong_flagged_pct"], total["right_flagged_pct"]) == (40, 10)
+    of_one = by_recording(rows)["s/b"]
+    assert (of_one["tips_wrong"], of_one["wrong_flagged_pct"]) == (9, pytest.approx(33.333))
 
 
 def test_a_recording_without_a_visible_hand_has_no_share_of_usable_frames() -> None:

@@ -9,9 +9,11 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.output.image_labels import Points, Stills, point_rows, read_labels, still_row
+from toftrack.output.measures import FLAG_COUNTS
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 TIPS = (4, 8, 12, 16, 20)
+ALL_OK = np.ones((3, 21), bool)
 
 
 def labels(tmp_path, content) -> Points | Stills:
@@ -33,12 +35,15 @@ def test_tips_are_compared_across_5_mm_inside_of_the_finger(tmp_path) -> None:
     places = {"index_tip": [51, 40, "visible"], "wrist": [0, 0, "visible"]}
     far = {"index_tip": [60, 40, "visible"], "little_tip": [0, 0, "guessed"]}
     seen = points(tmp_path, {"0": {"points": places}, "2": {"points": far}})
-    rows = point_rows(seen, joints, np.array([False, False, True]), K, TIPS)
+    rows = point_rows(seen, joints, np.array([False, False, True]), ALL_OK, K, TIPS)
     assert rows[0]["tips_mm"] == [0] and rows[0]["tips_20_pct"] == 100
     assert rows[2]["tips_mm"] == [45] and rows[2]["tips_40_pct"] == 0
     assert (rows[2]["flagged_pct"], rows[2]["wrong_pct"]) == (100, 0)
-    unflagged = point_rows(seen, joints, np.zeros(3, bool), K, TIPS)
-    assert unflagged[2]["wrong_pct"] == 100
+    unflagged = point_rows(seen, joints, np.zeros(3, bool), ALL_OK, K, TIPS)
+    assert unflagged[2]["wrong_pct"] == unflagged[2]["wrong_no_flag_pct"] == 100
+    doubted = point_rows(seen, joints, np.zeros(3, bool), ~ALL_OK, K, TIPS)[2]
+    assert (doubted["wrong_pct"], doubted["wrong_no_flag_pct"]) == (100, 0)
+    assert [doubted[name] for name in FLAG_COUNTS] == [1, 1, 0, 0]
 
 
 def test_what_is_nowhere_or_behind_the_camera_is_infinitely_far_off(tmp_path) -> None:
@@ -46,7 +51,7 @@ def test_what_is_nowhere_or_behind_the_camera_is_infinitely_far_off(tmp_path) ->
     joints[1] = np.nan
     frame = {"points": {"thumb_tip": [50, 40, "visible"]}}
     seen = points(tmp_path, {"0": frame, "1": frame})
-    rows = point_rows(seen, joints, np.zeros(2, bool), K, TIPS)
+    rows = point_rows(seen, joints, np.zeros(2, bool), ALL_OK, K, TIPS)
     assert [row["tips_mm"] for row in rows.values()] == [[None], [None]]
     assert all(row["wrong_pct"] == 100 for row in rows.values())
 
@@ -54,7 +59,7 @@ def test_what_is_nowhere_or_behind_the_camera_is_infinitely_far_off(tmp_path) ->
 def test_labels_beyond_the_recordings_end_are_refused(tmp_path) -> None:
     seen = points(tmp_path, {"7": {"points": {"thumb_tip": [50, 40, "visible"]}}})
     with pytest.raises(ToftrackError, match="of frame 7, but the recording has 2 frames"):
-        point_rows(seen, np.zeros((2, 21, 3)), np.zeros(2, bool), K, TIPS)
+        point_rows(seen, np.zeros((2, 21, 3)), np.zeros(2, bool), ALL_OK, K, TIPS)
 
 
 def test_a_still_may_have_several_names_and_other_is_no_wrong_one(tmp_path) -> None:

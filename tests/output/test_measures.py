@@ -11,7 +11,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
-from toftrack.output.measures import POSE_GESTURES, Estimates, measured
+from toftrack.output.measures import FLAG_COUNTS, POSE_GESTURES, Estimates, measured
 from toftrack.recordings.npz import read_recording
 
 TIPS = [4, 8, 12, 16, 20]
@@ -40,6 +40,20 @@ def test_a_fingertip_at_another_finger_is_a_swap_and_one_between_two_is_none() -
     found.joints_m[2, 8] = np.nan
     found.joints_m[5, 8] = true.joints_m[5, 12]  # is flagged lost
     assert measured(found, true).first.figures["swap_pct"] == pytest.approx(100 / 6)
+
+
+def test_flags_count_for_visible_fingertips_in_frames_that_are_not_lost() -> None:
+    visible = np.ones((6, 21), bool)
+    visible[2, 8] = False
+    true = truth(joint_visible=visible)
+    ok = np.ones((6, 21), bool)
+    ok[0, 8] = ok[:2, 12] = ok[:, 7] = False  # 7 is no tip
+    found = estimates(true, lost=np.array([False] * 5 + [True]), joint_ok=ok)
+    found.joints_m[[0, 1, 2, 5], 8, 1] += 0.05
+    figures = measured(found, true).first.figures
+    assert [figures[name] for name in FLAG_COUNTS] == [2, 1, 5 * 5 - 3, 2]
+    unseen = estimates(truth(), joint_ok=ok)
+    assert not set(FLAG_COUNTS) & set(measured(unseen, truth()).first.figures)
 
 
 def test_jitter_is_the_movement_beyond_the_true_one_while_the_hand_rests() -> None:

@@ -76,9 +76,17 @@ def test_a_tracked_hand_is_reported_with_all_its_joints(receiver: socket.socket)
     assert found["/toftrack/left/confidence"] == pytest.approx([0.9])
     assert found["/toftrack/left/gesture"] == ["palm", pytest.approx(0.8)]
     assert found["/toftrack/left/pinch"] == [0.75, 1]
+    assert found["/toftrack/left/joint_ok"] == [1] * 21
     for name, place in zip(JOINT_NAMES, estimate.joints_m, strict=True):
         assert found[f"/toftrack/left/joint/{name}"] == pytest.approx(place.tolist())
     assert not any("pointing" in address or "openxr" in address for address in found)
+
+
+def test_a_pinch_that_a_doubted_tip_ends_is_told(receiver: socket.socket) -> None:
+    reported = {"gesture": "", "gesture_probability": np.nan, "pinch": np.nan}
+    found = sent(receiver, replace(hand_estimate(7), joint_ok=np.arange(21) != 8, **reported))
+    assert found["/toftrack/right/joint_ok"] == [1] * 8 + [0] + [1] * 12
+    assert found["/toftrack/right/pinch"] == [0, 0] and "/toftrack/right/gesture" not in found
 
 
 def test_the_pointing_ray_is_sent_while_there_is_one(receiver: socket.socket) -> None:

@@ -88,6 +88,7 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "covariance": ((6, 10, 10), "f4"),
         "joint_sigma_m": ((6, 21, 3), "f4"),
         "joint_confidence": ((6, 21), "f4"),
+        "joint_ok": ((6, 21), "?"),
         "effective_sample_size": ((6,), "f4"),
         "gesture_probability": ((6,), "f4"),
         "pinch": ((6,), "f4"),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import programs
+from helpers.tracking import ROOT
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
@@ -23,6 +24,7 @@ from toftrack.pose_space.data.pose_data import (
     synthetic_data,
 )
 from toftrack.pose_space.data.pose_files import file_data
+from toftrack.pose_space.data.run_poses import run_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, make_pose_space
 from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
 from toftrack.pose_space.reach import nearest_latents
@@ -90,6 +92,57 @@ def test_an_npz_of_angles_is_read(tmp_path: Path) -> None:
     data = file_data(str(tmp_path / "mine.npz"))
     torch.testing.assert_close(data.angles_rad, radians)
     assert data.clips.tolist() == [0, 1, 0, 1]
+
+
+def write_run(folder: Path, angles: torch.Tensor, slots: int = 1, **changes) -> Path:
+    """A track.npz with these angles, of two slots in both."""
+    state = np.concatenate([np.zeros((len(angles), 6)), angles.numpy()], 1).astype(np.float32)
+    state = state if slots == 1 else np.stack([state, state], 1)
+    shape = state.shape[:-1]
+    arrays = {"state": state, "lost": np.zeros(shape, bool), "confidence": np.full(shape, 0.95)}
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / "track.npz", **(arrays | changes))
+    return folder
+
+
+@pytest.mark.parametrize("slots", [1, 2])
+def test_the_poses_of_a_run_are_those_that_are_sure(tmp_path: Path, slots: int) -> None:
+    radians = random_angles(200)
+    shape = (200,) if slots == 1 else (200, 2)
+    lost, sure = np.zeros(shape, bool), np.full(shape, 0.9)
+    lost[:10], sure[10:20] = True, 0.5
+    folder = write_run(tmp_path / "mine", radians, slots, lost=lost, confidence=sure)
+    data = run_data(str(folder), None, 0.8)
+    expected = torch.cat([radians[20:]] * slots)
+    torch.testing.assert_close(data.angles_rad, expected, atol=1e-6, rtol=0)
+    assert set(data.labels) == {"mine"} and len(data.clips.unique()) > 2
+    assert len(run_data(str(folder / "track.npz"), 50, 0.0)) == 50
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"lost": np.ones(9, bool)}, "has 0 frames that are not lost"),
+        ({"state": np.zeros((9, 20), np.float32)}, "no states of 27 numbers"),
+        ({"confidence": np.ones(8)}, "damaged"),
+    ],
+)
+def test_a_run_that_cannot_be_learned_from_is_reported(tmp_path, changes, words) -> None:
+    folder = write_run(tmp_path / "mine", random_angles(9), **changes)
+    with pytest.raises(ToftrackError, match=words):
+        run_data(str(folder), None, 0.8)
+    with pytest.raises(ToftrackError, match="output folder of a run"):
+        run_data(str(tmp_path / "gone"), None, 0.8)
+    with pytest.raises(ToftrackError, match="give data=run data.path="):
+        file_data(str(folder / "track.npz"))
+
+
+def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "pose_spaces.md").read_text(encoding="utf-8")
+    example = text.split("```\n# units")[1].split("```")[0]
+    (tmp_path / "mine.csv").write_text("# units" + example)
+    data = file_data(str(tmp_path / "mine.csv"))
+    assert data.labels == ("open", "half", "fist") and data.clips.tolist() == [0, 0, 1]
 
 
 def broken(kind: str, path: Path) -> str:

@@ -70,6 +70,11 @@ if __name__ == "__main__":
 """
 
 
+CALLBACK = """
+hydra: {callbacks: {failed_jobs: {_target_: toftrack.programs.sweeps.FailedJobs}}}
+"""
+
+
 @pytest.fixture
 def app(tmp_path: Path) -> Path:
     folder = tmp_path / "app"
@@ -135,6 +140,26 @@ def test_an_error_is_one_sentence(app: Path, arguments: list[str], words: str) -
     assert "replayed" not in out
 
 
+def test_a_failing_run_leaves_no_folder_but_keeps_one_with_files(app: Path) -> None:
+    """Whoever gives a folder that there is finds it as it was."""
+    with open(app / "conf" / "app.yaml", "a") as config:
+        config.write(CALLBACK)
+    (app / "mine").mkdir()
+    (app / "mine" / "notes.txt").touch()
+    before = set(app.rglob("*"))
+    for words in (
+        ("fail=clear",),
+        ("fail=clear", "hydra.run.dir=deep/er"),
+        ("-m", "nope=1,2"),
+    ):
+        assert call(app, *words)[0] == 1
+        assert set(app.rglob("*")) == before, words
+    assert call(app, "fail=clear", "hydra.run.dir=mine")[0] == 1
+    assert (app / "mine" / "notes.txt").exists()
+    assert call(app, "fail=late", "hydra.run.dir=late")[0] == 1
+    assert (app / "late" / "summary.json").exists(), "what was written is kept"
+
+
 def test_full_errors_show_the_traceback_and_the_sentence(app: Path) -> None:
     status, _, err = call(app, "fail=clear", HYDRA_FULL_ERROR="1")
     assert status == 1
@@ -167,9 +192,10 @@ def test_one_failing_job_does_not_stop_the_others(app: Path) -> None:
     assert values == ["value inf"] * 3 + ["value 1.0"], "a sweeper dies of NaN"
     assert "Traceback" not in err
     assert err.splitlines() == [
-        "error: the reason, and what to do",
-        "error: after three frames",
-        "error: unexpected ValueError: two lines (HYDRA_FULL_ERROR=1 shows the traceback)",
+        "error: #0 fail=clear: the reason, and what to do",
+        "error: #1 fail=late: after three frames",
+        "error: #2 fail=unexpected: unexpected ValueError: two lines (HYDRA_FULL_ERROR=1 shows the"
+        " traceback)",
         "error: 3 of the jobs failed, see above",
     ]
 
@@ -213,8 +239,7 @@ def test_jobs_that_fail_in_other_processes_are_counted(app: Path) -> None:
     (app / "hydra_plugins").mkdir()
     (app / "hydra_plugins" / "forking.py").write_text(LAUNCHER)
     with open(app / "conf" / "app.yaml", "a") as config:
-        called = "{failed_jobs: {_target_: toftrack.programs.sweeps.FailedJobs}}"
-        config.write(f"hydra: {{callbacks: {called}}}\n")
+        config.write(CALLBACK)
     sweep = ("-m", "hydra/launcher=forking", "hydra.sweep.dir=sweep")
     status, _, err = call(app, *sweep, "fail=clear,late,''")
     assert status == 1 and err.splitlines()[-1] == "error: 2 of the jobs failed, see above"

@@ -99,6 +99,7 @@ def test_a_csv_has_a_row_a_frame_and_slot(sides: tuple[str | None, ...], tmp_pat
         there = sides[slot] is not None and frame != LOST
         assert (row["side"], row["lost"]) == ((sides[slot], "0") if there else ("", "1"))
         assert (row["wrist_x_m"] != "") == there
+        assert (row["little_dip_flexion_rad"] != "") == there
 
 
 def test_of_two_hands_of_one_side_the_joints_have_names_of_their_own(tmp_path: Path) -> None:

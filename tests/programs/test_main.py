@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 from helpers.tracking import ROOT, configuration
 
+import toftrack
 from toftrack.configuration.compose import devices_of_files, setting_names
 from toftrack.errors import ToftrackError
 from toftrack.programs import main as front
 from toftrack.programs import record
-from toftrack.programs.recording_argument import quoted, with_recording
+from toftrack.programs.recording_argument import options_first, quoted, with_recording
 
 KNOWN = setting_names(), devices_of_files()
 ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')
@@ -107,6 +108,34 @@ def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypat
     Path("my_conf").mkdir()
     Path("seed=1").mkdir()  # as sweeps name their folders
     assert with_recording(words, *KNOWN) == words
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["a.npz", "-m", "seed=1,2", "view=none"],
+        ["seed=1,2", "a.npz", "view=none", "-m"],
+        ["-m", "seed=1,2", "view=none", "a.npz"],
+    ],
+)
+def test_a_sweep_of_a_recording_may_be_written_in_any_order(words: list[str]) -> None:
+    option, *overrides = options_first(with_recording(words, *KNOWN))
+    assert option == "-m"
+    expected = ["device=replay", "device.path='a.npz'", "seed=1,2", "view=none"]
+    assert sorted(overrides) == sorted(expected)
+
+
+def test_options_keep_their_values() -> None:
+    words = ["seed=1", "--config-dir", "my", "--info", "view=none", "--cfg", "job"]
+    assert options_first(words) == [
+        *("--config-dir", "my", "--info=all", "--cfg", "job", "seed=1", "view=none")
+    ]
+
+
+@pytest.mark.parametrize("words", ["--version", "track seed=1 --version", "record --version"])
+def test_the_version_is_ours(words: str, capsys) -> None:
+    assert front.main(words.split()) == 0
+    assert capsys.readouterr().out == f"toftrack {toftrack.__version__}\n"
 
 
 def test_a_device_that_plays_files_may_be_chosen_beside_the_name() -> None:

@@ -44,7 +44,11 @@ def hand(lost: bool = False) -> Estimate:
         joints[4 * finger + 1 : 4 * finger + 5] = reach * direction
     joints[:, 2] = 0.5
     return dataclasses.replace(
-        no_estimate(7, 0.28, "tracking", 4, 0.01), joints_m=joints, lost=lost, score=0.9
+        no_estimate(7, 0.28, "tracking", 4, 0.01),
+        joints_m=joints,
+        lost=lost,
+        score=0.9,
+        joint_ok=np.full(21, not lost),
     )
 
 
@@ -150,15 +154,21 @@ def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None)
     assert is_grey(right)
 
 
-def test_joints_that_are_not_trusted_are_hollow() -> None:
-    confidence = np.full(21, 0.9, np.float32)
-    confidence[4] = 0.3
-    one = dataclasses.replace(hand(), joint_confidence=confidence)
+def test_joints_that_are_not_ok_are_hollow_and_their_bones_dashed() -> None:
+    ok = np.arange(21) != 4
+    one = dataclasses.replace(hand(), joint_ok=ok)
     _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
     for joint, colour in ((4, (0, 0, 0)), (20, LITTLE)):
         u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
         np.testing.assert_allclose(left[v, u], colour, atol=2)
-    assert colour_share(left, THUMB) > 0  # the ring has the finger's colour
+    whole = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(),), (None,), 3))[1]
+    assert 0 < colour_share(left, THUMB) < colour_share(whole, THUMB)
+    assert colour_share(left, LITTLE) == colour_share(whole, LITTLE)
+    along = np.linspace(one.joints_m[3], one.joints_m[4], 40)[10:30]
+    pixels = np.round((CAMERA.project(along) + 0.5) * 3 - 0.5).astype(int)
+    gaps = np.abs(left[pixels[:, 1], pixels[:, 0]].astype(int) - THUMB).max(1) > 60
+    assert 0.2 < gaps.mean() <= 1
+    assert (np.abs(whole[pixels[:, 1], pixels[:, 0]].astype(int) - THUMB).max(1) < 12).all()
 
 
 def test_a_nearer_hand_has_thicker_bones() -> None:

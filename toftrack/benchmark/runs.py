@@ -282,7 +282,7 @@ def estimates_of(reported: Sequence[Sequence[Estimate]], found_side: bool) -> Es
         return values[:, 0] if values.shape[1] == 1 else values
 
     sides = ("side", "side_probability") if found_side else ()
-    names = ("joints_m", "lost", "joint_sigma_m", "gesture", *sides)
+    names = ("joints_m", "lost", "joint_sigma_m", "joint_ok", "gesture", *sides)
     return Estimates(**{name: column(name) for name in names})
 
 
@@ -291,7 +291,8 @@ def _points(job: Job, labels: Points) -> Iterator[tuple[str, dict[str, Any]]]:
         track, _, _ = _tracked(device, job, labels.side)
         if track.joints_m.ndim == 4:
             raise ToftrackError("labelled images are of one hand; leave out --hands 2")
-        rows = point_rows(labels, track.joints_m, track.lost, device.camera.K, TIPS)
+        assert track.joint_ok is not None
+        rows = point_rows(labels, track.joints_m, track.lost, track.joint_ok, device.camera.K, TIPS)
     for number, figures in rows.items():
         yield f"{job.name}#{number:04d}", {"kind": "points", **figures}
 

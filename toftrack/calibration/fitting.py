@@ -24,6 +24,8 @@ ORDERS = tuple(range(1, 8))
 # Enlargements, tried in turn: the finder wants squares of more than a few pixels, and puts corners
 # least off at 5 (the focal length by 0.1 %, at 3 by 0.2 %).
 _SCALES = (5, 3, 7)
+_GLANCE_SCALE, _GLANCE_PX = 5, 900
+"""A first look enlarges less where an image would be wider than this: 0.2 s an image."""
 _FEWEST_VIEWS = 5
 _FOLDS = 5
 _STEP_M = 0.1  # of true distance, within which pixels are averaged
@@ -92,20 +94,35 @@ def find_corners(amplitude: np.ndarray, board: tuple[int, int]) -> np.ndarray | 
 
     None when the board is not, or not wholly, in view.
     """
-    # The root evens out what falls with the square of the distance.
-    image = np.sqrt(amplitude.astype(np.float32))
-    low, high = np.percentile(image, (1, 99))
-    if high - low < 1:
-        return None
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     for scale in _SCALES:
-        large = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        grey = np.clip((large - low) * (255 / (high - low)), 0, 255).astype(np.uint8)
+        grey = _enlarged(amplitude, scale)
+        if grey is None:
+            return None
         found, corners = cv2.findChessboardCornersSB(grey, board, None, flags)
         if found:
             # Pixel centres lie at integers in both images.
             return (corners.reshape(-1, 2).astype(np.float64) + 0.5) / scale - 0.5
     return None
+
+
+def shows_board(amplitude: np.ndarray, board: tuple[int, int]) -> bool:
+    """Whether a quick look finds the board in an (H, W) uint16 amplitude image: ten times faster
+    than `find_corners`, which also finds boards that are far or much turned.
+    """
+    grey = _enlarged(amplitude, max(1.0, min(_GLANCE_SCALE, _GLANCE_PX / amplitude.shape[1])))
+    return grey is not None and cv2.findChessboardCornersSB(grey, board, None, 0)[0]
+
+
+def _enlarged(amplitude: np.ndarray, scale: float) -> np.ndarray | None:
+    """An enlarged uint8 image of even brightness; None where there is nothing to see."""
+    # The root evens out what falls with the square of the distance.
+    image = np.sqrt(amplitude.astype(np.float32))
+    low, high = np.percentile(image, (1, 99))
+    if high - low < 1:
+        return None
+    large = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    return np.clip((large - low) * (255 / (high - low)), 0, 255).astype(np.uint8)
 
 
 def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, guess: Camera) -> Lens:

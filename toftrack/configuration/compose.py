@@ -65,7 +65,8 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
 
 def configuration_folder() -> Path:
     """toftrack's own conf/: in the package where a wheel was installed, beside it in a checkout."""
-    package = Path(__file__).parents[1]
+    # An editable installation in strict mode has links to the files of the checkout.
+    package = Path(__file__).resolve().parents[1]
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
 

@@ -2,16 +2,49 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from toftrack.compute.compiling import compiled
+from toftrack.compute.compiling import compiled, entry_point
+from toftrack.detector import crops
+from toftrack.detector.crops import CROP, CROP_M
 
+_cached = entry_point(__file__, crops.__file__)
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _LEAST_SLOPE = np.float32(0.05)
 
 
+@_cached
+def crop_at(depth, mirror, k, centre, turn, image):
+    """See crops.crop: about a centre (3,), turned by (3, 3), into an image (C, CROP, CROP).
+
+    mirror: the depth is read as a mirror shows it; k and the centre are those of the mirrored.
+    """
+    mapping, single, slope = np.empty((3, 3)), np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
+    focal, middle = 2 * CROP * distance / CROP_M, (2 * CROP - 1) / 2
+    largest = 0.0
+    for i in range(3):
+        for j in range(3):
+            mapping[i, j] = k[i, 0] * turn[0, j] + k[i, 1] * turn[1, j] + k[i, 2] * turn[2, j]
+        # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.
+        mapping[i, 0] /= focal
+        mapping[i, 1] /= focal
+        mapping[i, 2] -= middle * (mapping[i, 0] + mapping[i, 1])
+        for j in range(3):
+            largest = max(largest, abs(mapping[i, j]))
+    for i in range(3):
+        for j in range(3):  # only the ratios count, and a large scale says infinity in float32
+            single[i, j] = mapping[i, j] / largest
+    slope[0], slope[1] = turn[2, 0] / focal, turn[2, 1] / focal
+    slope[2] = turn[2, 2] - middle * (turn[2, 0] + turn[2, 1]) / focal
+    scale = np.float32(2 / CROP_M)
+    _read_crop(depth, mirror, single, slope, scale, np.float32(distance), image)
+
+
 @compiled
-def read_crop(depth, flip, mapping, slope, scale, distance, image):
+def _read_crop(depth, flip, mapping, slope, scale, distance, image):
     """The channels of a crop, see crops.channels, from the pixels nearest to its samples.
 
     depth: (H, W) float32, Z in metres; read as a mirror shows it where flip is true.

@@ -14,9 +14,9 @@ from torch import Tensor
 from toftrack.checks import check_number
 from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.proposals import NetworkOutput, find_hands
 from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
-from toftrack.detector.weights import load_weights
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 
@@ -139,8 +139,8 @@ NO_DETECTION = Detection(
 class HandDetector:
     """Both networks and how they are used; images are read, and answers given, on the CPU."""
 
-    pose: PoseNet
-    finder: Finder
+    pose: PoseNet | OnnxPoseNet
+    finder: Finder | OnnxFinder
     settings: DetectorSettings
 
     def to(self, device: torch.device) -> HandDetector:
@@ -246,8 +246,7 @@ def make_detector(weights: str | None = None, **settings: Any) -> HandDetector:
     weights: a file of train_detector; None = the package's.
     Raises ToftrackError when they cannot be used.
     """
-    pose, finder, _ = load_weights(weights)
-    return HandDetector(pose, finder, DetectorSettings(**settings))
+    return HandDetector(*load_networks(weights), DetectorSettings(**settings))
 
 
 def no_detector() -> None:

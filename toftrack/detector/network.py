@@ -31,6 +31,13 @@ STRIDE = 4
 """Pixels of the finder's image to a cell of its map."""
 ANGLES = 21
 JOINTS = 21
+ANCHORS = 24
+EACH = 6 + ANGLES + 1 + 3 + 2
+"""Numbers of a hypothesis: rotation, angles, size, pivot, chance, error."""
+REPORTED = ANCHORS * EACH + 2
+"""Numbers of the heads: those of all hypotheses, present, right."""
+CELLS = 16
+"""Side of the map of keypoints."""
 OFFSET_M = 0.15
 LOG_SIZE = 0.3
 JOINT_M = 0.05
@@ -123,8 +130,7 @@ class PoseNet(nn.Module):
         )
         self.register_buffer("anchors", cube_rotations())
         self.register_buffer("limits", torch.tensor(ANGLE_LIMITS))
-        count = len(cube_rotations())
-        self.heads = nn.Linear(384, count * (6 + ANGLES + 1 + 3 + 2) + 2)
+        self.heads = nn.Linear(384, REPORTED)
         self.context = nn.Linear(384, 2 * width)
         self.lateral_16 = nn.Conv2d(w2, 2 * width, 1)
         self.lateral_8 = nn.Conv2d(w3, 2 * width, 1)
@@ -135,7 +141,7 @@ class PoseNet(nn.Module):
         )
         self.keypoints = nn.Conv2d(2 * width, 5 * JOINTS, 1)
         self.painted = nn.Conv2d(2 * width, 4 * segments, 1)
-        steps = (torch.arange(16) + 0.5) / 16 - 0.5
+        steps = (torch.arange(CELLS) + 0.5) / CELLS - 0.5
         cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy")) * CROP_M
         self.register_buffer("cells", cells)  # (2, 16, 16) metres across, x then y
 
@@ -145,6 +151,11 @@ class PoseNet(nn.Module):
         stem = self.stem[0]
         assert isinstance(stem, nn.Conv2d)
         return stem.in_channels
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is."""
+        return self.anchors.device
 
     def forward(self, image: Tensor) -> Proposed:
         """See the class."""
@@ -229,6 +240,11 @@ class Finder(nn.Module):
         self.heads = nn.Conv2d(width, 8, 1)
         assert self.heads.bias is not None
         self.heads.bias.data[:2] = -5.0  # at first there are no hands anywhere
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is."""
+        return self.heads.weight.device
 
     def forward(self, image: Tensor) -> Found:
         """See the class."""

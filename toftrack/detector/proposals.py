@@ -19,6 +19,7 @@ from toftrack.compute.rotations import rotmat_to_rotvec
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.detector.crops import crop, wide
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet, Proposed
+from toftrack.detector.onnx_networks import OnnxFinder
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -76,14 +77,14 @@ def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @torch.inference_mode()
 def find_hands(
-    finder: Finder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
+    finder: Finder | OnnxFinder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
 ) -> dict[str, Places]:
     """Where hands of either side may be: at most `most` places each, at least `least` likely.
 
     depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
     """
     image, wide_k = wide(depth_m, k)
-    found = Found(*on_host(*finder(on_device(image, finder.heads.weight.device))))
+    found = Found(*on_host(*finder(on_device(image, finder.device))))
     heat = found.heat.sigmoid()
     peaks = (heat == F.max_pool2d(heat, 3, 1, 1)) & (heat >= least)
     places = {}
@@ -113,7 +114,7 @@ def run_pose_network(
     crops, crop_rotations = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
     image = torch.from_numpy(np.stack(crops)[:, : pose.inputs])
     image = image.to(memory_format=torch.channels_last)
-    p = Proposed(*on_host(*pose(on_device(image, pose.anchors.device))))
+    p = Proposed(*on_host(*pose(on_device(image, pose.device))))
     turn = torch.from_numpy(np.stack(crop_rotations)).float()  # (C, 3, 3)
     centre = torch.from_numpy(centres_m).float()
     order = p.log_probability.argsort(1, descending=True)[:, :KEPT]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -56,12 +56,23 @@ def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any
         np.savez_compressed(stream, **content)
 
 
-def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[str, Any]]:
-    """Both networks ready for use, and how they were trained; None: those of the package.
+class Weights(NamedTuple):
+    """Both networks ready for use, how they were trained, their file, its arrays' checksum."""
+
+    pose: PoseNet
+    finder: Finder
+    about: dict[str, Any]
+    path: Path
+    sha256: str
+
+
+def load_weights(path: str | Path | None = None) -> Weights:
+    """The networks of a file for torch; None: those of the package.
 
     Raises ToftrackError when the file is missing, damaged, not weights or of another version.
     """
-    arrays, metadata = _read(DEFAULT_FILE if path is None else Path(path))
+    path = DEFAULT_FILE if path is None else Path(path)
+    arrays, metadata = _read(path)
     try:
         pose = PoseNet(_width(metadata, "pose"), *_pose_channels(arrays))
         finder = Finder(_width(metadata, "finder"))
@@ -71,7 +82,7 @@ def load_weights(path: str | Path | None = None) -> tuple[PoseNet, Finder, dict[
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
     make_ready(pose)
     make_ready(finder)
-    return pose, finder, metadata.get("about", {})
+    return Weights(pose, finder, metadata.get("about", {}), path, metadata["sha256"])
 
 
 def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> None:

@@ -1,15 +1,19 @@
-"""The recording that comes with the package."""
+"""The recordings that come with the package."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from toftrack.devices.replay import Replay
-from toftrack.recordings.store import packaged_sample
+from toftrack.recordings.store import FIRST_SAMPLE, packaged_sample, sample_file
 
 
 class Sample(Replay):
-    """A right hand for 100 frames, with ground truth; arguments and errors as for `Replay`."""
+    """A recording that comes with the package, with ground truth, by its name; without one a right
+    hand for 100 frames. Other arguments and errors as for `Replay`.
+
+    Raises ToftrackError for a name that no sample has; it lists them.
+    """
 
     def __init__(
         self,
@@ -18,8 +22,10 @@ class Sample(Replay):
         realtime: bool = False,
         repeat: bool = False,
         camera_file: str | Path | None = None,
+        name: str = FIRST_SAMPLE,
     ) -> None:
-        with packaged_sample() as path:
+        with packaged_sample(name) as path:
             super().__init__(path, start, stop, realtime, repeat, camera_file)
         # Where the package happens to be installed says nothing about the result.
-        self.description |= {"device": "sample", "recording": "toftrack/data/sample.npz"}
+        recording = f"toftrack/data/{sample_file(name)}"
+        self.description |= {"device": "sample", "name": name, "recording": recording}

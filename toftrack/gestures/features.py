@@ -54,6 +54,27 @@ RANGES = np.append(np.abs(SUMS) @ np.diff(ANGLE_LIMITS)[:, 0], _DISTANCE_RANGES)
 """(13,) rad and palm lengths, from the least to the largest value within the joint limits."""
 
 
+def _joints() -> np.ndarray:
+    """(13, 21) bool: of which joints each feature speaks."""
+    asked = np.zeros((COUNT, len(JOINT_NAMES)), bool)
+    asked[[THUMB_ABDUCTION, THUMB_FLEXION], 1:5] = True
+    for finger in range(4):
+        mine = slice(5 + 4 * finger, 9 + 4 * finger)
+        asked[[FLEXION.start + finger, SPLIT.start + finger], mine] = True
+    for feature, pair in zip((REACH, GAP, APART), _DISTANCES, strict=True):
+        asked[feature, list(pair)] = True  # their unit, the palm, is rigid
+    return asked
+
+
+_JOINTS = _joints()
+
+
+def known_features(joint_ok: np.ndarray) -> np.ndarray:
+    """(13,) bool: the features all of whose joints are ok.  joint_ok: (21,) bool."""
+    known: np.ndarray = ~(_JOINTS & ~joint_ok).any(1)
+    return known
+
+
 def features(angles_rad: np.ndarray, joints_m: np.ndarray) -> np.ndarray:
     """(13,) of one hand: rad, and palm lengths.
 

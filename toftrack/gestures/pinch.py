@@ -21,6 +21,7 @@ from toftrack.hand.surface import hand_surface
 _THUMB, _INDEX = (JOINT_NAMES.index(n) for n in ("thumb_tip", "index_tip"))
 _LAST_BONES = 3, 6
 """Frames of the last bones of thumb and index finger, see hand.skeleton.HandPose."""
+_ENDS = [_THUMB - 1, _THUMB, _INDEX - 1, _INDEX]
 _MIDDLE_FINGER = [JOINT_NAMES.index("wrist"), *range(9, 13)]
 
 
@@ -82,8 +83,15 @@ def tip_gap(joints_m: np.ndarray) -> float:
     return float(np.linalg.norm(ends[0] - ends[1])) / length - sum(radii)
 
 
-def pinch_of(joints_m: np.ndarray, settings: PinchSettings) -> float:
-    """0 open .. 1 touching.  joints_m: (21, 3) metres."""
+def pinch_of(
+    joints_m: np.ndarray, settings: PinchSettings, joint_ok: np.ndarray | None = None
+) -> float:
+    """0 open .. 1 touching; NaN where a joint of the two last bones is not ok.
+
+    joints_m: (21, 3) metres.  joint_ok: (21,) bool; None: all are.
+    """
+    if joint_ok is not None and not joint_ok[_ENDS].all():
+        return math.nan
     part = (settings.open - tip_gap(joints_m)) / (settings.open - settings.touching)
     return min(max(part, 0.0), 1.0)
 
@@ -92,10 +100,12 @@ def update_pinch(
     state: PinchState, pinch: float, settings: PinchSettings, frames: float = 1.0
 ) -> PinchState:
     """One frame on: a pinch begins and ends at two thresholds, and only when it stays beyond one.
+    One that nobody knows (NaN) begins none, and ends what it outlasts.
 
     frames: how many times 1/25 s have passed since the state.
     """
-    beyond = pinch < settings.end if state.pinching else pinch >= settings.begin
+    ends = math.isnan(pinch) or pinch < settings.end
+    beyond = ends if state.pinching else pinch >= settings.begin
     if not beyond:
         return PinchState(state.pinching)
     against = state.against + frames

@@ -87,8 +87,9 @@ class Gestures:
     def probabilities(self, values: np.ndarray, score: float, off_rad: float) -> np.ndarray:
         """Of each class for one frame by itself, (C,), sum 1.
 
-        values: (13,), see features.  score: 0..1; below `doubtful_score` all classes are equally
-        probable.  off_rad: rms distance of the angles from the pose space; NaN says nothing.
+        values: (13,), see features; NaN says nothing.  score: 0..1; below `doubtful_score` all
+        classes are equally probable.  off_rad: rms distance of the angles from the pose space; NaN
+        says nothing.
         """
         cfg, (widths, most, members) = self.settings, self._tables
         # Logarithms of densities, in parts of the uniform density of "other".
@@ -104,6 +105,19 @@ class Gestures:
         log_classes *= min(max(trust, 0.0), 1.0)
         parts: np.ndarray = np.exp(log_classes - log_classes.max())
         return parts / parts.sum()
+
+    def decided(self, label: str, values: np.ndarray) -> bool:
+        """Whether all is known that makes a hand's pose this class: of its definition that suits
+        the values (13,) best every feature. Of "other" nothing needs to be known.
+        """
+        widths, most, _ = self._tables
+        mine = self.classes == self.names.index(label)
+        if label == OTHER or not mine.any():
+            return True
+        low, high = self.low[mine], self.high[mine]
+        beyond = np.maximum(np.maximum(low - values, values - high), 0.0) / widths
+        best = int(np.nansum(most[mine] - 0.5 * beyond**2, axis=1).argmax())
+        return not (np.isnan(values) & ~np.isnan(low[best])).any()
 
     @cached_property
     def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -262,7 +276,8 @@ def tell_gesture(
     """The estimate with its gesture and pinch, and with the pointing ray while it points.
 
     A hand that is lost has no gesture ("" and NaN), except one that is followed well and counts as
-    lost only because its pose is none of the pose space: this is a pose like any other.
+    lost only because its pose is none of the pose space: this is a pose like any other. Only joints
+    that are ok are asked: a gesture that others decide is not named, and so with the pinch.
     """
     if gestures is None or (estimate.lost and estimate.state_name != "tracking"):
         nowhere = np.full(3, np.nan, np.float32)
@@ -282,9 +297,12 @@ def tell_gesture(
         off = angles - space.decode(latent)[0].cpu().numpy()
         off_rad = float(np.sqrt(np.square(off).mean()))
     joints = estimate.joints_m.astype(np.float64)
-    values = features.features(angles, joints)
+    known = features.known_features(estimate.joint_ok)
+    values = np.where(known, features.features(angles, joints), np.nan)
     state, label, probability = update(state, values, estimate.score, off_rad, gestures, frames)
-    pinch = pinch_of(joints, gestures.settings.pinch)
+    if not gestures.decided(label, values):
+        label, probability = "", math.nan
+    pinch = pinch_of(joints, gestures.settings.pinch, estimate.joint_ok)
     pinched = update_pinch(state.pinch, pinch, gestures.settings.pinch, frames)
     state = replace(state, pinch=pinched)
     estimate = replace(

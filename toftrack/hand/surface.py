@@ -8,7 +8,7 @@ towards the palm.
 
 Half-breadths follow ANSUR II (see hand/shape.py). All the rest was fitted to the depth images of
 six of twelve body meshes and of another hand's mesh, begun at an adult's proportions and held near
-to them, and judged on the others and on real hands: docs/surface.md.
+to them, and judged on the others and on real hands: docs/lab/surface.md.
 """
 
 from __future__ import annotations

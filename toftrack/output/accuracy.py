@@ -7,6 +7,9 @@ does is within them, what other recordings would do is what they are about. `nev
 recording is the share of its rows that never are, of the total the sum of these shares;
 `median_first_right` is over all rows, a never counted as 999.
 
+What joint_ok flags of wrong and of right fingertips (`wrong_flagged_pct`, `right_flagged_pct`) is
+pooled over all rows, as wrong ones are rare; `tips_wrong` and `tips_right` are how many a seed has.
+
 Groups (sensor, pose, distance, length of the hand) pool the visible frames of all rows instead; the
 number of frames that is given with them is that of one seed on average.
 """
@@ -20,7 +23,13 @@ import numpy as np
 
 from toftrack.frames import Truth
 from toftrack.output.image_labels import IMAGE_MEANS, tip_figures
-from toftrack.output.measures import Measured, MeasuredRecording, gestures_right, mean_of
+from toftrack.output.measures import (
+    FLAG_COUNTS,
+    Measured,
+    MeasuredRecording,
+    gestures_right,
+    mean_of,
+)
 from toftrack.output.trust import interval
 
 Row = dict[str, Any]
@@ -48,6 +57,7 @@ MEANS = (
     "p90_ms",
 )
 """Figures whose total is the mean over recordings, with an interval."""
+_POOLED = ("seed", *FLAG_COUNTS)
 NEVER = 999
 _DISTANCES_M = (0.3, 0.4, 0.5, 0.6, 0.7)
 _LENGTHS_MM = (150, 165, 180, 195)
@@ -75,6 +85,20 @@ def row_figures(found: MeasuredRecording, compute_s: np.ndarray | None = None) -
         figures["median_ms"] = 1e3 * float(np.median(known))
         figures["p90_ms"] = 1e3 * float(np.percentile(known, 90))
     return {name: _rounded(value) for name, value in figures.items()}
+
+
+def flag_figures(rows: Sequence[Row]) -> Row:
+    """What joint_ok flags of fingertips, pooled; see the head of this module."""
+    known = [row for row in rows if row.get("tips_right") is not None]
+    seeds = len({row["seed"] for row in known})
+    found: Row = {}
+    for kind in ("wrong", "right") if known else ():
+        count, flagged = (
+            sum(row[name] for row in known) for name in (f"tips_{kind}", f"tips_{kind}_flagged")
+        )
+        found[f"tips_{kind}"] = round(count / seeds)
+        found[f"{kind}_flagged_pct"] = _rounded(100 * flagged / count) if count else None
+    return found
 
 
 def _figures_of_hand(of: Measured) -> Row:
@@ -142,13 +166,14 @@ def by_recording(rows: Sequence[Row]) -> dict[str, Row]:
             key
             for row in mine
             for key, value in row.items()
-            if key != "seed" and (value is None or isinstance(value, int | float))
+            if key not in _POOLED and (value is None or isinstance(value, int | float))
         )
         each[name] = {key: mean_of([row.get(key) for row in mine]) for key in keys}
         runs = [row["longest_silent"] for row in mine if row.get("longest_silent") is not None]
         if runs:
             each[name]["longest_silent"] = max(runs)
         each[name] = {key: _rounded(value) for key, value in each[name].items()}
+        each[name] |= flag_figures(mine)
     return each
 
 
@@ -161,7 +186,7 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
         "frames": round(sum(row.get("frames") or 0 for row in each)),
         "visible": round(sum(row.get("visible") or 0 for row in each)),
     }
-    total |= _means(each, MEANS)
+    total |= _means(each, MEANS) | flag_figures(rows)
     total["longest_silent"] = max((row.get("longest_silent") or 0 for row in each), default=0)
     total["never_right"] = _rounded(sum(row.get("never_right") or 0.0 for row in each))
     firsts = [row["first_right"] for row in rows if row.get("never_right") is not None]
@@ -198,9 +223,11 @@ def image_totals(rows: Sequence[Row]) -> dict[str, Any]:
         known = [value for value in of_seeds if value is not None]
         if known:
             total[f"{key.removesuffix('_pct')}_seeds"] = [_rounded(f(known)) for f in (min, max)]
-    return total | {
-        name: _rounded(value) for name, value in tip_figures(rows).items() if value is not None
-    }
+    return (
+        total
+        | flag_figures(rows)
+        | {name: _rounded(value) for name, value in tip_figures(rows).items() if value is not None}
+    )
 
 
 def interval_name(key: str) -> str:

@@ -145,6 +145,23 @@ def metrics_table(summary: dict[str, Any]) -> str:
     return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
 
 
+def metrics_line(summary: dict[str, Any]) -> str:
+    """The same in a line, for the jobs of a sweep."""
+    metrics = summary.get("metrics") or {}
+    trust = metrics.get("trust") or {}
+    parts = [
+        f"{summary['frames']} frames",
+        f"{summary['lost_frames']} lost",
+        f"{_figure(summary['mean_ms'])} ms a frame",
+        f"mean score {_figure(summary['mean_score'], 3)}",
+    ]
+    if trust:
+        parts.append(f"usable {_figure(trust['usable_pct'])} %")
+    if metrics:
+        parts.append(f"joint error {_figure(metrics['mean_mm'])} mm")
+    return ", ".join(parts)
+
+
 def _frames_text(summary: dict[str, Any]) -> str:
     text = f"{summary['frames']}, {summary['lost_frames']} of them lost"
     if dropped := summary.get("dropped_frames"):
@@ -178,7 +195,7 @@ def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if precision is not None or recall is not None:
         text = f"precision {_figure(precision, 2)}, recall {_figure(recall, 2)}"
         rows.append(("lost frames", text))
-    rows += _region_rows(metrics.get("coverage"))
+    rows += _region_rows(metrics.get("coverage")) + _flag_rows(metrics.get("further"))
     for event in metrics["reacquisition"]:
         delay = "never" if event["delay"] is None else f"after {event['delay']} frames"
         rows.append((f"{event['event']} at {event['frame']}", f"tracked {delay}"))
@@ -212,6 +229,17 @@ def _region_rows(coverage: dict[str, Any] | None) -> list[tuple[str, str]]:
     of_hidden = "" if hidden is None else f", {_figure(hidden)} % of the hidden ones"
     share = _figure(coverage["in_region_90_pct"])
     return [("in their 90 % region", f"{share} % of the joints{of_hidden}")]
+
+
+def _flag_rows(further: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """What joint_ok flags of visible fingertips, see measures.py; nothing where nobody knows."""
+    if further is None or "tips_right" not in further:
+        return []
+    counts = (
+        f"{further[f'tips_{kind}_flagged']} of {further[f'tips_{kind}']} {kind}"
+        for kind in ("wrong", "right")
+    )
+    return [("joint_ok flags", f"{', '.join(counts)} fingertips")]
 
 
 def _first_right(first: int | None, seen: int) -> str:

@@ -10,8 +10,10 @@ A joint is compared laterally: the distance in pixels between its projection and
 its own depth over the focal length. Of visible fingertips, which are moved 5 mm towards the joint
 before them, as the labels are: `tips_20_pct`, `tips_40_pct` are the frames in which all are within
 20 and 40 mm; `wrong_pct` those in which one is farther than 40 mm off, unflagged; `flagged_pct`
-those flagged lost; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that is not finite
-or not in front of the camera is infinitely far off, and left out of the mean).
+those flagged lost; `wrong_no_flag_pct` those not flagged lost in which a tip is so far off that
+`joint_ok` does not flag; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that
+is not finite or not in front of the camera is infinitely far off, and left out of the mean). What
+`joint_ok` flags is counted as in measures.py.
 
 **Stills**: images that have nothing to do with one another, each with what it shows. Every one has
 a fresh start and is shown so many frames, the last of which counts:
@@ -38,12 +40,15 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.json_text import read_json
+from toftrack.output.measures import FLAG_COUNTS, flag_counts
+from toftrack.output.trust import OK_MM
 
 IMAGE_MEANS = (
     "tips_20_pct",
     "tips_40_pct",
     "wrong_pct",
     "flagged_pct",
+    "wrong_no_flag_pct",
     "found_pct",
     "named_pct",
     "wrong_name_pct",
@@ -129,41 +134,62 @@ def _visible(points: Any) -> dict[int, tuple[float, float]]:
 
 
 def point_rows(
-    points: Points, joints_m: np.ndarray, lost: np.ndarray, K: np.ndarray, tips: Sequence[int]
+    points: Points,
+    joints_m: np.ndarray,
+    lost: np.ndarray,
+    joint_ok: np.ndarray,
+    K: np.ndarray,
+    tips: Sequence[int],
 ) -> dict[int, dict[str, Any]]:
     """The figures of each labelled frame that has a visible fingertip, by its number.
 
     Args:
         joints_m: (T, 21, 3) metres, camera frame.
         lost: (T,) bool.
+        joint_ok: (T, 21) bool.
         K: (3, 3), of undistorted pixels.
         tips: rows of the fingertips.
 
     Raises ToftrackError when a frame is labelled that the track has not.
+    """
+    found = {}
+    for number, off in lateral_errors_mm(points, joints_m, K, tips).items():
+        worst, flagged = max(off.values()), bool(lost[number])
+        ok = joint_ok[number][list(off)]
+        errors = np.array(list(off.values()))
+        found[number] = {
+            "tips_20_pct": 100.0 * (worst < 20),
+            "tips_40_pct": 100.0 * (worst < 40),
+            "wrong_pct": 100.0 * (worst > 40 and not flagged),
+            "flagged_pct": 100.0 * flagged,
+            "wrong_no_flag_pct": 100.0 * (not flagged and bool((ok & (errors > OK_MM)).any())),
+            **(dict.fromkeys(FLAG_COUNTS, 0) if flagged else flag_counts(errors, ~ok)),
+            "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
+        }
+    return found
+
+
+def lateral_errors_mm(
+    points: Points, joints_m: np.ndarray, K: np.ndarray, rows: Sequence[int]
+) -> dict[int, dict[int, float]]:
+    """How far off those of some joints are that are visible: by frame, if it has any, and joint.
+
+    Args and errors: as of point_rows.
     """
     if max(points.frames) >= len(joints_m):
         raise ToftrackError(
             f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
             f"{len(joints_m)} frames; give the recording that was labelled"
         )
-    found = {}
-    for number, places in points.frames.items():
-        off = {
+    found = {
+        number: {
             row: _lateral_mm(np.asarray(joints_m[number], np.float64), row, place, K)
             for row, place in places.items()
-            if row in tips
+            if row in rows
         }
-        if not off:
-            continue
-        worst, flagged = max(off.values()), bool(lost[number])
-        found[number] = {
-            "tips_20_pct": 100.0 * (worst < 20),
-            "tips_40_pct": 100.0 * (worst < 40),
-            "wrong_pct": 100.0 * (worst > 40 and not flagged),
-            "flagged_pct": 100.0 * flagged,
-            "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
-        }
-    return found
+        for number, places in points.frames.items()
+    }
+    return {number: off for number, off in found.items() if off}
 
 
 def _lateral_mm(joints: np.ndarray, row: int, place: tuple[float, float], K: np.ndarray) -> float:

@@ -26,7 +26,8 @@ _KINDS: dict[type, type] = {
     str: np.str_,
     np.ndarray: np.float32,
 }
-_EXACT = {"timestamp_s": np.float64}
+_EXACT: dict[str, type] = {"timestamp_s": np.float64, "joint_ok": np.bool_}
+"""Fields of another type than their kind's."""
 _HINTS = get_type_hints(Estimate)
 KINDS: dict[str, type] = {
     field.name: _EXACT.get(field.name, _KINDS[_HINTS[field.name]]) for field in fields(Estimate)
@@ -71,6 +72,7 @@ FROM_THE_START = (
 SHAPES: dict[str, tuple[int, ...]] = {
     "joints_m": (21, 3),
     "state": (27,),
+    "joint_ok": (21,),
     **dict.fromkeys(NUMBERS, ()),
 }
 """Of the fields of a hand whose shape does not depend on the run."""

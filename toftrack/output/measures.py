@@ -11,6 +11,9 @@ trust.py and coverage.py, of each hand, over the frames in which it is visible:
   true one; frames flagged lost say nothing.
 - `gesture_pct`: frames of a pose that has a name (`POSE_GESTURES`) in which the gesture is called
   so; a frame flagged lost calls nothing.
+- `tips_wrong`, `tips_right`: visible fingertips in frames that are not flagged lost, more than
+  40 mm off and at most; `tips_wrong_flagged`, `tips_right_flagged`: those of them that `joint_ok`
+  flags. Numbers, and none where the truth does not say which joints are visible.
 - `side_right_end`, `side_right_soon`: whether the last frame in which a side is named, and the
   tenth after the first one, names the right one.
 - `side_wrong_certain_pct`: frames in which the wrong side is named with a probability above 0.9.
@@ -29,11 +32,12 @@ import numpy as np
 from toftrack.frames import Truth
 from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import TIPS
-from toftrack.output.trust import Hand, Judged, Trust, judged, trust, trust_of_two
+from toftrack.output.trust import OK_MM, Hand, Judged, Trust, judged, trust, trust_of_two
 
 SWAP_MM = 10.0
 CERTAIN = 0.9
 SOON_FRAMES = 10
+FLAG_COUNTS = ("tips_wrong", "tips_wrong_flagged", "tips_right", "tips_right_flagged")
 POSE_GESTURES = {
     "palm": "palm",
     "spread": "palm",
@@ -65,6 +69,8 @@ class Estimates:
     """(T,) bool."""
     joint_sigma_m: np.ndarray | None = None
     """(T, 21, 3), see hand/regions.py."""
+    joint_ok: np.ndarray | None = None
+    """(T, 21) bool."""
     gesture: np.ndarray | None = None
     """(T,) text."""
     side: np.ndarray | None = None
@@ -141,11 +147,25 @@ def _of_hand(found: Trust, estimates: Estimates, truth: Truth) -> Measured:
     }
     if estimates.joint_sigma_m is not None:
         figures |= asdict(coverage(estimates.joints_m, estimates.joint_sigma_m, truth))
+    if estimates.joint_ok is not None and truth.joint_visible is not None:
+        visible = good[:, None] & truth.joint_visible[:, TIPS]
+        flagged = ~np.asarray(estimates.joint_ok, bool)[:, TIPS]
+        figures |= flag_counts(of.error_mm[:, TIPS][visible], flagged[visible])
     if estimates.gesture is not None:
         named, right = gestures_right(estimates.gesture, of, truth)
         figures["gesture_pct"] = _share_pct(right, named)
     figures |= _side_figures(estimates, of, truth)
     return Measured(found, of, figures)
+
+
+def flag_counts(off_mm: np.ndarray, flagged: np.ndarray) -> dict[str, int]:
+    """What joint_ok says of N visible fingertips, see the head of this module.
+
+    off_mm: (N,) errors.  flagged: (N,) bool.
+    """
+    wrong = np.asarray(off_mm) > OK_MM
+    counted = (wrong, wrong & flagged, ~wrong, ~wrong & flagged)
+    return {name: int(rows.sum()) for name, rows in zip(FLAG_COUNTS, counted, strict=True)}
 
 
 def gestures_right(gesture: np.ndarray, of: Judged, truth: Truth) -> tuple[np.ndarray, np.ndarray]:

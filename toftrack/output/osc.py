@@ -5,8 +5,9 @@
 | `/toftrack/frame` | i number of the frame, d its time in s; in every bundle |
 | `/toftrack/SIDE/tracked` | i 1, or 0 when the hand is lost: then nothing else comes of this hand |
 | `/toftrack/SIDE/confidence` | f 0 to 1 |
-| `/toftrack/SIDE/gesture` | s name, f probability |
-| `/toftrack/SIDE/pinch` | f 0 open to 1 touching, i 1 while pinching |
+| `/toftrack/SIDE/joint_ok` | i for each of the 21 joints: 1, or 0 for one not to be used |
+| `/toftrack/SIDE/gesture` | s name, f probability; not while a joint that decides is not ok |
+| `/toftrack/SIDE/pinch` | f 0 open, or unknown, to 1 touching, i 1 while pinching |
 | `/toftrack/SIDE/pointing` | fff origin, fff direction; only while it points |
 | `/toftrack/SIDE/joint/NAME` | fff metres, camera axes: x right, y down, z forward |
 | `/toftrack/SIDE/landmark/NAME` | fff image coordinates as MediaPipe's |
@@ -34,7 +35,7 @@ PARTS = ("joints", "landmarks", "openxr")
 """What may be sent of a hand beside the rest."""
 _FIELDS = (
     *("index", "timestamp_s", "lost", "confidence", "side", "gesture", "gesture_probability"),
-    *("pinch", "pinching", "pointing_origin_m", "pointing_direction"),
+    *("pinch", "pinching", "pointing_origin_m", "pointing_direction", "joint_ok"),
 )
 _FIELDS_OF = {
     "joints": ("joints_m",),
@@ -100,10 +101,13 @@ def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Itera
         return
     if hand["confidence"] is not None:
         yield f"{root}/confidence", [("f", hand["confidence"])]
+    yield f"{root}/joint_ok", [("i", int(ok)) for ok in hand["joint_ok"]]
     if hand["gesture"]:
         probability = hand["gesture_probability"]
         yield f"{root}/gesture", [("s", hand["gesture"]), ("f", probability)]
-        yield f"{root}/pinch", [("f", hand["pinch"]), ("i", int(hand["pinching"]))]
+    # One that a joint's doubt has ended is told, too, or a receiver would hold it for ever.
+    if hand["pinch"] is not None or not all(hand["joint_ok"]):
+        yield f"{root}/pinch", [("f", hand["pinch"] or 0.0), ("i", int(hand["pinching"]))]
     ray = [*hand["pointing_origin_m"], *hand["pointing_direction"]]
     if _finite(ray):
         yield f"{root}/pointing", _floats(ray)

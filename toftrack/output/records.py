@@ -218,7 +218,7 @@ def _vacant(hand: Mapping[str, Any]) -> dict[str, Any]:
 
     def nothing(name: str) -> Any:
         if KINDS[name] is np.bool_:
-            return name == "lost"
+            return np.full(np.shape(hand[name]), name == "lost").tolist()
         return "" if KINDS[name] is np.str_ else np.full(np.shape(hand[name]), np.nan).tolist()
 
     return {name: nothing(name) for name in HAND_FIELDS if name in hand}

@@ -253,7 +253,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
     slots behind that of the frames.
 
     A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
-    side, side_probability, the joints' regions and confidence, the pointing ray, the pinch).
+    side, side_probability, the joints' regions, confidence and joint_ok, the pointing ray, the
+    pinch).
     `dropped`, which also came later, is there nevertheless.
 
     Raises ToftrackError when the file is missing, damaged or not a result.

@@ -17,6 +17,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
+from toftrack.help_text import fields_in_help
 from toftrack.json_text import parse_json, read_json
 from toftrack.output.lines import HAND_FIELDS
 from toftrack.output.results import read_results, read_run_facts
@@ -27,7 +28,7 @@ from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import Recording
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
-from toftrack.recordings.store import open_recording, open_source
+from toftrack.recordings.store import FIRST_SAMPLE, open_recording, open_sample
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
 from toftrack.safe_files import open_to_read
@@ -38,24 +39,55 @@ FILES = ("track.npz", "track.jsonl", "summary.json", "hand_shape.json")
 _SAME_TIME_S = 0.002
 
 
+@fields_in_help
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A finished run: T frames, a row for each.
-
-    results: of `read_results`.  frames: (T,) numbers of the input frames.  summary: of
-    summary.json.  shapes: the hands at the end of the run, one a slot.
-    state_names: (T,), of a dropped frame that of the one before; of two slots that of the first.
-    """
+    """A finished run: T frames, a row for each; see `read_run`."""
 
     folder: Path
     results: dict[str, Any]
+    """Of `read_results`: the arrays of track.npz, `joint_names` and `metadata`."""
     frames: np.ndarray
+    """(T,) int64 numbers of the input frames."""
     state_names: tuple[str, ...]
+    """T texts, of a dropped frame that of the one before; of two slots that of the first."""
     summary: dict[str, Any]
+    """Of summary.json."""
     shapes: tuple[HandShape, ...]
+    """The hands at the end of the run, one a slot."""
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What was estimated, by name: the fields of Estimate, each with a row a frame, as
+        `joints_m` (T, 21, 3); with two hands (T, 2, 21, 3). docs/formats.md lists them.
+        """
+        return {
+            name: value for name, value in self.results.items() if isinstance(value, np.ndarray)
+        }
+
+    @property
+    def timestamp_s(self) -> np.ndarray:
+        """(T,) float64 seconds, the frames' times."""
+        return self.results["timestamp_s"]
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the run, whose undistorted image the joints belong to."""
+        about = self.results["metadata"].get("camera")
+        known = {field.name for field in fields(Camera)}
+        if not isinstance(about, dict) or not {"K", "width", "height"} <= about.keys():
+            raise ToftrackError(f"the run in '{self.folder}' does not say with which camera it was")
+        return Camera(**{name: value for name, value in about.items() if name in known})
+
+    def footage(self, recording: str | Path | None = None) -> Footage | None:
+        """The images that were tracked, of the recording where it is now; None of a live camera.
+
+        recording: where it is, if it was moved.  Raises ToftrackError when it is gone or changed.
+        """
+        return open_footage(self, recording)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -93,6 +125,8 @@ class Run:
             if np.ndim(value) == 0:
                 values[name] = value.item()
         values |= {"index": int(self.frames[row]), "state_name": self.state_names[row]}
+        # Older runs do not say it of the joints.
+        values.setdefault("joint_ok", np.full(21, not values["lost"]))
         return Estimate(**values)
 
     def likelihood(self) -> FMeasure:
@@ -161,7 +195,7 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """The images of a run's frames, and their truth."""
+    """The images of a run's T frames, and their truth: `depth(row)` and `amplitude(row)`."""
 
     store: FrameStore
     camera: Camera
@@ -181,7 +215,16 @@ class Footage:
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read a run's output folder; ToftrackError when it is none, or something in it is missing."""
+    """Read what a run left in its output folder.
+
+        run = toftrack.read_run("outputs/2026-01-31/12-00-00-000000")
+        run.arrays["joints_m"], run.timestamp_s, run.camera, run.summary["frames"]
+        run.estimate(30)
+
+    folder: with track.npz, track.jsonl, summary.json and hand_shape.json.
+
+    Raises ToftrackError when it is no run's, or something in it is missing or damaged.
+    """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
         raise ToftrackError(f"no folder '{folder}'; give the output folder of a run of track.py")
@@ -199,7 +242,7 @@ def read_run(folder: str | Path) -> Run:
     results = read_results(folder / "track.npz")
     rows = len(results["lost"])
     if not rows:
-        raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to draw")
+        raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to read")
     slots = 1 if results["lost"].ndim == 1 else results["lost"].shape[1]
     if {"index", "state_name"} <= results.keys():
         of_first = results["state_name"] if slots == 1 else results["state_name"][:, 0]
@@ -290,7 +333,7 @@ def open_tracked(
     if recording is None and kind == "synthetic":
         return _synthetic(device), "the synthetic frames"
     if recording is None and kind == "sample":
-        return open_source("sample"), name
+        return open_sample(about.get("name", FIRST_SAMPLE)), name
     if recording is None and name is None:
         return None
     path = Path(recording).expanduser() if recording is not None else found(str(name))

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.compose import configuration_folder, devices_of_files, setting_names
 from toftrack.programs import command_line
-from toftrack.programs.recording_argument import with_recording
+from toftrack.programs.recording_argument import options_first, with_recording
 
 
 @command_line.sweep_job
@@ -49,7 +49,7 @@ def _start(
     folder = str(configuration_folder())
     application = hydra.main(version_base="1.3", config_path=folder, config_name=config)(job)
     before = sys.argv
-    sys.argv = [f"toftrack {name}", *arguments]
+    sys.argv = [f"toftrack {name}", *options_first(arguments)]
     try:
         application()
     finally:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -33,8 +32,8 @@ from toftrack.views.pictures import write_picture
 
 _PICTURES = 12
 _LENS = "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tauX tauY".split()
-_HOPE_S = 4.0
-"""After so long without a board something is wrong."""
+_LOOKS = 24
+"""So many frames are looked at for a board before all are searched for its corners: 5 s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,24 +145,34 @@ def calibrate(
 
 
 def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> list[View]:
-    """The frames of these numbers that show the board; says so soon where none does."""
+    """The frames of these numbers that show the board. Raises ToftrackError soon where none does,
+    for searching a frame in vain takes seconds."""
+    _look_for_board(store, board, numbers)
     views: list[View] = []
-    began, reported = time.monotonic(), False
-    bar = tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5)
-    for number in bar:
-        amplitude = store.image(number)[1]
-        assert amplitude is not None  # it was made sure of that there are some
-        corners = calibration.find_corners(amplitude, board)
+    for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):
+        corners = calibration.find_corners(_amplitude(store, number), board)
         if corners is not None:
             views.append(View(int(number), corners))
-        elif not views and not reported and time.monotonic() - began > _HOPE_S:
-            reported = True
-            bar.write(
-                f"no {board[0]}x{board[1]} chequerboard seen so far, up to frame {number}; it must "
-                "be wholly in view, and --board its inner corners, columns x rows (Ctrl-C ends)",
-                file=sys.stderr,
-            )
     return views
+
+
+def _look_for_board(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> None:
+    places = np.unique(np.linspace(0, len(numbers) - 1, _LOOKS).round().astype(int))
+    # From the middle outwards: at both ends somebody still carries the board.
+    for place in sorted(places, key=lambda at: abs(at - len(numbers) / 2)):
+        if calibration.shows_board(_amplitude(store, numbers[place]), board):
+            return
+    raise ToftrackError(
+        f"no {board[0]}x{board[1]} chequerboard was seen in {len(places)} frames all over the "
+        "recording; it must be wholly in view, and --board its inner corners, columns x rows (a "
+        "board of 8x6 squares is 7x5)"
+    )
+
+
+def _amplitude(store: FrameStore, number: int) -> np.ndarray:
+    amplitude = store.image(int(number))[1]
+    assert amplitude is not None  # `calibrate` made sure that there are some
+    return amplitude
 
 
 def report_text(result: Calibration, start: Camera) -> str:

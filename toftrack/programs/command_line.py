@@ -32,7 +32,7 @@ from omegaconf import DictConfig
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
 from toftrack.json_text import read_json
-from toftrack.programs import shutdown
+from toftrack.programs import empty_folders, shutdown
 from toftrack.safe_files import write_whole
 
 
@@ -72,9 +72,11 @@ def run(main: Callable[[], object]) -> int:
     _program.running = True
     _program.tracebacks = os.environ.get(FULL_ERROR) == "1"
     _program.failed_jobs.clear()
+    empty_folders.forget()
     try:
         with shutdown.obeyed(), _hydra_raises():
             status = main()
+            empty_folders.forget()
     except KeyboardInterrupt as end:
         shutdown.say("interrupted: what was done until then is kept", sys.stderr)
         shutdown.forget_streams()
@@ -94,6 +96,7 @@ def run(main: Callable[[], object]) -> int:
         _report(error)
         return 1
     finally:
+        empty_folders.clear()
         _program.running = False
     if _program.failed_jobs:
         count = len(_program.failed_jobs)
@@ -116,11 +119,11 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
             _check(config)
             return task(config)
         except Exception as error:
-            if not _in_sweep():
+            if not in_sweep():
                 if _program.running:
                     raise _JobFailedError(error) from error
                 raise
-            _report(error)
+            _report(error, f"{job_words()}: ")
             folder = Path(HydraConfig.get().runtime.output_dir)
             note_failed_job(folder)
             _note_error(folder, sentence(error))
@@ -153,14 +156,21 @@ def _check(config: DictConfig) -> None:
     check_overrides(config, str(hydra.job.config_name), hydra.overrides.task)
 
 
-def _in_sweep() -> bool:
+def in_sweep() -> bool:
+    """Whether this is a job of a sweep, which prints one line."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def _report(error: BaseException) -> None:
+def job_words() -> str:
+    """How the line of a sweep's job begins: its number and its settings, "#0 seed=1"."""
+    hydra = HydraConfig.get()
+    return " ".join((f"#{hydra.job.num}", *hydra.overrides.task))
+
+
+def _report(error: BaseException, job: str = "") -> None:
     if _program.tracebacks:
         traceback.print_exception(error)
-    print(f"error: {sentence(error)}", file=sys.stderr, flush=True)
+    print(f"error: {job}{sentence(error)}", file=sys.stderr, flush=True)
 
 
 def _note_error(folder: Path, text: str) -> None:

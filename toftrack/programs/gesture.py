@@ -1,8 +1,8 @@
 """Your own gestures: `python -m toftrack.gesture add NAME RECORDING --from 2.0 --to 3.0`.
 
 `add` tracks that part of a recording, takes the pose that the hand holds there, and writes it into
-a file of gestures, which `gestures.file=FILE` gives to the tracker. `list` and `remove` show what
-is in the file and take a gesture out of it.
+a file of gestures, which `gestures.file=FILE` gives to the tracker. `list` names those that are
+known and those in the file; `remove` takes a gesture out of it.
 """
 
 from __future__ import annotations
@@ -146,10 +146,15 @@ def _check_name(name: str, taken: Sequence[str], replace: bool) -> None:
 
 
 def _list(path: Path, poses: Sequence[NamedPose]) -> None:
+    """A name a line, those that are known without the file first."""
     names = [pose.name for pose in poses]
+    known = (definition.name for definition in SETS[configuration().gestures.known])
+    for name in dict.fromkeys(known):
+        if name not in (OTHER, *names):  # one of yours takes its place
+            print(name)
     for name in dict.fromkeys(names):
         count = names.count(name)
-        print(name if count == 1 else f"{name} ({count} poses)")
+        print(f"{name} ({'' if count == 1 else f'{count} poses, '}yours, {path})")
     if not names:
         print(f"no gesture of yours in {path}", file=sys.stderr)
 

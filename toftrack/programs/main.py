@@ -33,6 +33,7 @@ _COMMANDS = {
     "recover": _Command("toftrack.programs.recover", "finish a run or a recording that was killed"),
 }
 _HELP = ("-h", "--help")
+_VERSION = "--version"
 
 _OVERVIEW = """toftrack follows a human hand in the depth images of a camera or a recording.
 
@@ -66,7 +67,7 @@ _TRAIN = """toftrack train learns the space of hand poses that the tracker searc
 
   toftrack train                              from the poses of the paper
   toftrack train pose_space=lle pose_space.dims=5     of another kind and size
-  toftrack train data=leap data.path=FILE     from recorded joint positions
+  toftrack train data=run data.path=RUN       from the poses of a run, outputs/DATE/TIME
 
 The model goes into the folder that is named at the end, or where hydra.run.dir=DIR says; use it
 with toftrack track pose_space=KIND pose_space.file=FILE. Settings are KEY=VALUE, or GROUP=CHOICE of
@@ -88,10 +89,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not given or given[0] in (*_HELP, "help"):
         print(overview())
         return 0
-    if given[0] == "--version":
+    name, rest = given[0], given[1:]
+    if name == _VERSION or (name in _COMMANDS and _VERSION in rest):
         print(f"toftrack {toftrack.__version__}")
         return 0
-    name, rest = given[0], given[1:]
     if name not in _COMMANDS:
         print(f"error: {_unknown(name)}", file=sys.stderr)
         return 1
@@ -123,7 +124,7 @@ def long_help(name: str) -> str:
 
 def _configuration_folder() -> Path:
     """As configuration.compose has it, which takes the time to load Hydra."""
-    inside = Path(toftrack.__file__).parent / "conf"
+    inside = Path(toftrack.__file__).resolve().parent / "conf"
     return inside if inside.is_dir() else inside.parent.parent / "conf"
 
 

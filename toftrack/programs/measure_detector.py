@@ -4,7 +4,8 @@ python -m toftrack.programs.measure_detector FOLDER_OR_FILE ... --weights FILE -
 
 Nothing is tracked and nothing searched for: the crop lies about the true middle of the palm, the
 side is told, and the keypoints are compared with the true joints, in frames in which the hand is
-visible.
+visible. The network runs as the tracker runs it: in ONNX Runtime if its file lies beside the
+weights, else in torch, which is said.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ import numpy as np
 from toftrack.checks import check_number
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector.network import PoseNet
+from toftrack.detector.onnx_networks import OnnxPoseNet, load_networks
 from toftrack.detector.proposals_numba import run_pose_network
-from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.programs import command_line
@@ -65,7 +66,7 @@ class Misses:
         return tables
 
 
-def misses(pose: PoseNet, paths: Sequence[Path], every: int) -> Misses:
+def misses(pose: PoseNet | OnnxPoseNet, paths: Sequence[Path], every: int) -> Misses:
     """Errors of a network's keypoints in every so manieth visible frame of recordings.
 
     Raises ToftrackError for a recording without truth or without a side.
@@ -98,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     weights = options.weights or [None]
     tables = {}
     for file in weights:
-        pose, *_ = load_weights(file)
+        pose, _ = load_networks(file)
         name = "the package's" if file is None else str(file)
         tables[name] = misses(pose, paths, options.every).tables()
     _print(tables)

@@ -234,7 +234,7 @@ def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:
         kinds = sorted(path.stem for path in Path(options.conf, "device").glob("*.yaml"))
         raise ToftrackError(
             f"which camera is it? Give device={', '.join(kinds)}, or one of your own with "
-            "--config-dir (docs/own_device.md)"
+            "--config-dir (docs/cameras.md)"
         )
     config = configuration(*overrides, config_dir=options.conf)
     if "keep" in config.device and not any(word.startswith("device.keep=") for word in overrides):

@@ -63,6 +63,23 @@ def with_recording(
     return [*chosen, f"device.path={quoted(name)}", *others]
 
 
+def options_first(arguments: Sequence[str]) -> list[str]:
+    """The arguments in the order that Hydra's parser wants: options, and then all overrides."""
+    options: list[str] = []
+    overrides: list[str] = []
+    words = iter(arguments)
+    for word in words:
+        if not word.startswith("-"):
+            overrides.append(word)
+        elif word in _WITH_VALUE:
+            options += (word, *(value for value in (next(words, None),) if value is not None))
+        elif word in ("--info", "-i"):  # its value may be left out, and would be an override
+            options.append("--info=all")
+        else:
+            options.append(word)
+    return [*options, *overrides]
+
+
 def _player(name: str, players: Collection[str]) -> str:
     """The device that plays a file or folder."""
     if is_bag(name):

@@ -1,4 +1,6 @@
-"""Which jobs of a sweep failed, whatever ran them: other processes tell it by their folders."""
+"""What Hydra tells of runs and sweeps: which folders they are about to make, and which jobs failed,
+whatever ran them: other processes tell it by their folders.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from toftrack.json_text import read_json
+from toftrack.programs import empty_folders
 from toftrack.programs.command_line import note_failed_job
 from toftrack.safe_files import let_links_go
 
@@ -23,11 +26,14 @@ class FailedJobs(Callback):
         self._before: dict[Path, int] = {}
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        _let_links_go(Path(config.hydra.run.dir))
+        folder = Path(config.hydra.run.dir)
+        _let_links_go(folder)
+        empty_folders.expect(folder)
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
         _let_links_go(folder)
+        empty_folders.expect(folder)
         for job in folder.iterdir() if folder.is_dir() else ():
             let_links_go(job)
             _let_links_go(job)

@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
@@ -26,12 +27,13 @@ from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.advice import Watch
-from toftrack.output.evaluation import metrics_table
+from toftrack.output.evaluation import metrics_line, metrics_table
 from toftrack.output.realtime import RealTime
 from toftrack.output.results import ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import shutdown
+from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.programs.precompile import ready_tracker
 from toftrack.programs.run_facts import ShapeFiles, configured_side, opening, run_metadata
 from toftrack.recordings.recorder import Recorder
@@ -74,7 +76,7 @@ def _track(config: DictConfig, device: Device, stream: Stream, recorder: Recorde
         return _run(config, device, parts)
     finally:  # a live run that lost the hand ends by an interruption
         for sentence in _notes(parts, configured_side(config, tracker.shapes[0].side)):
-            shutdown.say(f"note: {sentence}", sys.stderr)
+            _note(sentence)
 
 
 def _pace(configured: Pace, device: Device) -> Pace:
@@ -98,7 +100,8 @@ def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
         parts.tracker.prepare()  # a camera does not wait for what is loaded at the first frame
     with device:
         metadata = run_metadata(config, device, parts.tracker)
-        print(opening(metadata, device), file=sys.stderr)
+        if not in_sweep():
+            print(opening(metadata, device), file=sys.stderr)
         # It is the first to write into the folder, which it refuses to share with another run.
         with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
             make_view = hydra.utils.instantiate(config.view, _partial_=True)
@@ -109,21 +112,36 @@ def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
             except KeyboardInterrupt as end:
                 ended = end
     summary = results.summary or {}
-    if summary.get("frames"):
-        shutdown.say(metrics_table(summary), sys.stdout)
-        shutdown.say(_reported_files(folder), sys.stdout)
-    if parts.recorder is not None and parts.recorder.words():
-        shutdown.say(f"  {parts.recorder.words()}", sys.stdout)
+    _report(summary, folder, parts.recorder)
     said = metadata["device"].get("doubts", ())  # by the device itself
     for doubt in summary.get("doubts", ()):
         if doubt not in said:
-            shutdown.say(f"note: {doubt}", sys.stderr)
+            _note(doubt)
     if ended is not None:
         raise ended
     if not summary.get("frames"):
         raise ToftrackError("the device delivered no frame; nothing was tracked")
     error = (summary.get("metrics") or {}).get("mean_mm")
     return float(error) if error is not None else 1.0 - float(summary["mean_score"] or 0.0)
+
+
+def _report(summary: dict[str, Any], folder: Path, recorder: Recorder | None) -> None:
+    """A table and the files; of a sweep's job one line."""
+    if in_sweep():
+        line = metrics_line(summary) if summary.get("frames") else "no frames"
+        shutdown.say(f"{job_words()}: {line}; {folder}", sys.stdout)
+        return
+    if summary.get("frames"):
+        shutdown.say(metrics_table(summary), sys.stdout)
+        shutdown.say(_reported_files(folder), sys.stdout)
+    if recorder is not None and recorder.words():
+        shutdown.say(f"  {recorder.words()}", sys.stdout)
+
+
+def _note(sentence: str) -> None:
+    """What speaks against the run or its result; of a sweep summary.json tells it."""
+    if not in_sweep():
+        shutdown.say(f"note: {sentence}", sys.stderr)
 
 
 @dataclass(eq=False)
@@ -162,6 +180,8 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
     tracker, smoothing = parts.tracker, parts.smoothing
     smoothed: tuple[SmoothState | None, ...] = (None,) * len(tracker.states)
     progress = partial(tqdm, total=device.frames, unit=" frames", file=sys.stderr, mininterval=0.2)
+    if in_sweep():  # gone afterwards, and none at all where nobody looks
+        progress = partial(progress, leave=False, disable=None)
     with progress() as bar:
         for frame in device:
             began_s = time.perf_counter()

@@ -16,6 +16,7 @@ from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space, spaces_to_learn
+from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.safe_files import write_whole
 from toftrack.views.figures.poses import (
     corners_figure,
@@ -46,16 +47,17 @@ def train(config: DictConfig) -> float:
     kind, dims = settings.pop("kind"), settings.pop("dims")
     folder = Path(HydraConfig.get().runtime.output_dir)
     data: PoseData = hydra.utils.instantiate(config.data)
+    say = _nothing if in_sweep() else print
     for note in data.notes:
-        print(note)
+        say(note)
     space = fit_pose_space(kind, dims, data, **settings)
     clips = len(data.clips.unique())
-    print(f"{len(data)} training poses in {clips} clips, {kind}, {dims} dimensions")
+    say(f"{len(data)} training poses in {clips} clips, {kind}, {dims} dimensions")
     wanted = [number for number in config.compare if number < min(len(data) - 1, 22)]
     rows = _table(kind, sorted({*wanted, dims}), data, settings)
-    print(errors_table(rows))
+    say(errors_table(rows))
     if rows[0].variance is not None and [s["data"] for s in data.sources] == ["synthetic"]:
-        print(_PAPER)
+        say(_PAPER)
 
     model = folder / "pose_space.npz"
     save_pose_space(space, model, data.sources)
@@ -71,9 +73,15 @@ def train(config: DictConfig) -> float:
     error = (asked.reached or asked.training).degrees
     summary = _summary(kind, dims, data, rows)
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
-    print("\n".join(f"  {folder / name}" for name in (model.name, *figures, "summary.json")))
-    print(f"use it: toftrack track pose_space={kind} pose_space.file={model}")
+    say("\n".join(f"  {folder / name}" for name in (model.name, *figures, "summary.json")))
+    say(f"use it: toftrack track pose_space={kind} pose_space.file={model}")
+    if in_sweep():
+        print(f"{job_words()}: {len(data)} training poses, error {error:.2f} degrees; {folder}")
     return error
+
+
+def _nothing(text: str) -> None:
+    """In place of `print` in a sweep, whose jobs say one line each."""
 
 
 def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any]) -> list[Row]:
@@ -84,6 +92,7 @@ def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any])
         file=sys.stderr,
         unit=" spaces",
         delay=_SILENT_S,
+        leave=not in_sweep(),
     ) as bar:
         return [evaluate_space(kind, number, data, settings, bar.update) for number in dims]
 

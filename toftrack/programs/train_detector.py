@@ -28,7 +28,10 @@ from toftrack.views.pictures import write_picture
 )
 @command_line.sweep_job
 def main(config: DictConfig) -> float:
-    """Train, write weights and figures; returns the mean joint error of the last images, mm."""
+    """Train, write weights, their ONNX files and figures.
+
+    Returns the mean joint error of the last images, mm.
+    """
     return train(config)
 
 
@@ -37,12 +40,20 @@ def train(config: DictConfig) -> float:
     import torch
 
     from toftrack.detector.checkpoints import Checkpoints
+    from toftrack.detector.onnx_export import export_networks, missing_packages, needed
     from toftrack.detector.training import train_finder, train_poses
     from toftrack.detector.weights import save_weights
     from toftrack.errors import ToftrackError
     from toftrack.views.figures.training import course_figure, images_figure
 
     folder = Path(HydraConfig.get().runtime.output_dir)
+    path = folder / config.output
+    missing = missing_packages()
+    if missing:
+        print(
+            f"{needed(missing)}; otherwise training ends with {config.output} alone, and they are"
+            f" made later by python -m toftrack.programs.export_detector {path}"
+        )
     poses = hydra.utils.instantiate(config.poses)
     finder = hydra.utils.instantiate(config.finder)
     if not (isinstance(config.shapes, int) and config.shapes > 0):
@@ -64,8 +75,8 @@ def train(config: DictConfig) -> float:
         "torch": torch.__version__,
         "minutes": minutes,
     }
-    path = folder / config.output
     save_weights(path, pose_network, finder_network, about)
+    derived = [] if missing else [file.name for file in export_networks(path)]
     write_picture(folder / "course.png", course_figure(pose_course))
     summary = about | {"poses": pose_course, "finder": finder_course}
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
@@ -75,7 +86,7 @@ def train(config: DictConfig) -> float:
         f" {last['keypoints_mm']:.1f} mm by keypoints, {last['joints_mm']:.1f} mm by the likeliest"
         " hypothesis"
     )
-    for name in (config.output, "images.png", "course.png", "summary.json"):
+    for name in (config.output, *derived, "images.png", "course.png", "summary.json"):
         print(f"  {folder / name}")
     print(f"use it: toftrack track detector.weights={path}")
     return float(last["keypoints_mm"])

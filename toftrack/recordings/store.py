@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from contextlib import AbstractContextManager
 from importlib import resources
 from pathlib import Path
@@ -23,6 +24,9 @@ _BY_OPENNI = (
     "(docs/formats.md) and give the folder"
 )
 _BY_POINTS = "points have lost the image that they came from; give the depth images themselves"
+FIRST_SAMPLE = "right_hand"
+SAMPLES = (FIRST_SAMPLE, "left_hand", "glass")
+"""The recordings that come with the package; toftrack/data/README.md says what they show."""
 ELSEWHERE = {
     ".oni": _BY_OPENNI,
     ".xef": "export its depth frames as 16-bit PNG images or .npy, and convert those",
@@ -84,10 +88,29 @@ def open_source(name: str) -> FrameStore:
     """What a virtual camera sees: the packaged recording for `sample`, else as `open_recording`."""
     if name != "sample":
         return open_recording(name)
-    with packaged_sample() as path:
+    return open_sample()
+
+
+def open_sample(name: str = FIRST_SAMPLE) -> FrameStore:
+    """A recording that comes with the package, by its name; see `packaged_sample`."""
+    with packaged_sample(name) as path:
         return open_recording(path)
 
 
-def packaged_sample() -> AbstractContextManager[Path]:
-    """The recording that comes with the package, as a file while the context is open."""
-    return resources.as_file(resources.files("toftrack") / "data" / "sample.npz")
+def packaged_sample(name: str = FIRST_SAMPLE) -> AbstractContextManager[Path]:
+    """A recording that comes with the package, as a file while the context is open.
+
+    Raises ToftrackError when there is none of that name; it lists those that there are.
+    """
+    return resources.as_file(resources.files("toftrack") / "data" / sample_file(name))
+
+
+def sample_file(name: str) -> str:
+    """The file's name of a sample, in toftrack/data. Raises ToftrackError when there is none."""
+    if name not in SAMPLES:
+        near = difflib.get_close_matches(str(name), SAMPLES, 1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise ToftrackError(
+            f"there is no sample '{name}' (device.name); there are {', '.join(SAMPLES)}{meant}"
+        )
+    return "sample.npz" if name == FIRST_SAMPLE else f"sample_{name}.npz"

@@ -191,7 +191,8 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         believed=track.believed or not status.lost,
         nearest_m=expected.nearest_m if expected is not None and hidden else 0.0,
     )
-    estimate = replace(estimate, joint_sigma_m=sigma_m)
+    ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
+    estimate = replace(estimate, joint_sigma_m=sigma_m, joint_ok=ok)
     hand, estimate = emitted(replace(hand, track=track), image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
     state = replace(state, generator=generator.get_state(), hands=(hand,))

@@ -169,7 +169,8 @@ def conclude(
         image.k,
     )
     sigma, confidence = model.lost.joints.judge(rows)
-    estimate = replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence)
+    ok = model.lost.joint_ok.ok(confidence, status.confidence, rows) & (not status.lost)
+    estimate = replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence, joint_ok=ok)
     hand = replace(
         frame.hand,
         shape=frame.hand.shape if status.lost else learned_shape(frame, found),

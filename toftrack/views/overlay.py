@@ -82,7 +82,7 @@ def draw_panel(
     height, width = depth_m.shape
     # Even, so that a video of it can be encoded.
     size = (max(2, 2 * round(width * scale / 2)), max(2, 2 * round(height * scale / 2)))
-    grey = _depth_grey(depth_m) if amplitude is None else _amplitude_grey(amplitude)
+    grey = grey_of(depth_m, amplitude)
     smooth = cv2.INTER_NEAREST if amplitude is None else cv2.INTER_LINEAR
     left = cv2.cvtColor(cv2.resize(grey, size, interpolation=smooth), cv2.COLOR_GRAY2BGR)
     draw_hands(left, camera, estimates, (size[0] / width, size[1] / height))
@@ -91,9 +91,22 @@ def draw_panel(
     right = cv2.resize(_model_picture(surfaces), size, interpolation=cv2.INTER_NEAREST)
     if all(estimate.lost for estimate in estimates):
         for side in (left, right):
-            thick = max(2, size[0] // 130)
-            cv2.rectangle(side, (0, 0), (size[0] - 1, size[1] - 1), _RED, 2 * thick)
+            mark_lost(side)
     return np.vstack([_caption(estimates, size[0]), np.hstack([left, right])])
+
+
+def mark_lost(picture: np.ndarray) -> None:
+    """A red frame around a (h, w, 3) picture, in place."""
+    height, width = picture.shape[:2]
+    cv2.rectangle(picture, (0, 0), (width - 1, height - 1), _RED, 2 * max(2, width // 130))
+
+
+def grey_of(depth_m: np.ndarray | None, amplitude: np.ndarray | None) -> np.ndarray:
+    """(H, W) uint8 of the amplitude, where there is one, else of the depth in metres."""
+    if amplitude is not None:
+        return _amplitude_grey(amplitude)
+    assert depth_m is not None
+    return _depth_grey(depth_m)
 
 
 def draw_tracked(tracked: TrackedFrame) -> np.ndarray:

@@ -20,8 +20,8 @@ SLOT_RGB = ((0, 114, 178), (213, 94, 0))
 """Of the same palette; of the first and the second of two hands."""
 _BLACK, _WHITE = (0, 0, 0), (255, 255, 255)
 _BONE_M = 0.004
-_TRUSTED = 0.5
-"""Joints that are less likely within 40 mm are drawn hollow."""
+_DASH, _GAP = 0.5, 2.0
+"""Of the bones of joints that are not ok, in widths of the line with its outline."""
 _SUBPIXEL_BITS = 3
 _WRIST = 0
 _LABEL, _LABEL_GAP_PX = 0.5, 6
@@ -32,21 +32,21 @@ def draw_hands(
 ) -> None:
     """Draw the skeletons of the slots into the camera's image, in place, as wide as 4 mm would look
     there; of two hands the nearer over the farther, each outlined in its slot's colour and with its
-    side below the wrist. Joints that are more likely wrong than right are hollow, and of two hands
-    all of one that is lost.
+    side below the wrist. Joints that are not ok are hollow, and the bones that end there dashed;
+    of two hands all of one that is lost.
 
     scale: picture pixels per image pixel, across and down.
     """
     if len(estimates) == 1:
-        # A comparison with NaN is false: what nothing is known of is drawn as ever.
-        doubted = estimates[0].joint_confidence < _TRUSTED
+        # A single hand that is lost has a red frame already; only some of its joints may be wrong.
+        doubted = ~estimates[0].joint_ok & (not estimates[0].lost)
         _draw_skeleton(picture, camera, estimates[0].joints_m, doubted, *scale, _BLACK)
         return
     there = [pair for pair in enumerate(estimates) if not is_vacant(pair[1])]
     there.sort(key=lambda pair: -float(np.median(pair[1].joints_m[:, 2])))
     labels = []
     for slot, one in there:
-        doubted, rim = (one.joint_confidence < _TRUSTED) | one.lost, SLOT_RGB[slot][::-1]
+        doubted, rim = ~one.joint_ok | one.lost, SLOT_RGB[slot][::-1]
         wrist = _draw_skeleton(picture, camera, one.joints_m, doubted, *scale, rim)
         if wrist is not None:
             labels.append((side_words(one) or "?", wrist, rim))
@@ -102,7 +102,7 @@ def _draw_skeleton(
     """Draw (21, 3) joints into the picture, in place; returns where the wrist is, px, None where
     nothing was drawn.
 
-    doubted: (21,) joints that are drawn as rings.  rim: colour of the outline.
+    doubted: (21,) joints that are drawn as rings, their bones dashed.  rim: colour of the outline.
     """
     joints_m = np.asarray(joints_m, np.float64)
     if not np.isfinite(joints_m).all() or (joints_m[:, 2] <= 0).any():
@@ -110,7 +110,7 @@ def _draw_skeleton(
     pixels = (camera.project(joints_m) + 0.5) * (scale_x, scale_y) - 0.5
     if np.abs(pixels).max() > 1e5:  # far outside, and more than the drawing's integers hold
         return None
-    points = [tuple(map(int, p)) for p in np.round(pixels * 2**_SUBPIXEL_BITS)]
+    points = np.round(pixels * 2**_SUBPIXEL_BITS).astype(int)
     width = camera.K[0, 0] * scale_x * _BONE_M / float(np.median(joints_m[:, 2]))
     thick = int(np.clip(round(width), 1, max(1, picture.shape[1] // 40)))
     # All of the outline first, or each finger's would cross the colour of the one before.
@@ -119,20 +119,30 @@ def _draw_skeleton(
             colour = rim if outline else rgb[::-1]
             chain = (0, *range(4 * finger + 1, 4 * finger + 5))
             for a, b in zip(chain[:-1], chain[1:], strict=True):
-                cv2.line(
-                    picture,
-                    points[a],
-                    points[b],
-                    colour,
-                    thick + outline,
-                    cv2.LINE_AA,
-                    _SUBPIXEL_BITS,
-                )
+                # Alike for the outline and the colour, or the dashes would not lie on each other.
+                dash_px = (thick + 2 * max(1, thick // 3)) * float(doubted[b])
+                for ends in _strokes(points[a], points[b], dash_px * 2**_SUBPIXEL_BITS):
+                    cv2.line(picture, *ends, colour, thick + outline, cv2.LINE_AA, _SUBPIXEL_BITS)
             for joint in chain[1:]:
                 radius = (thick + outline // 2) * 2**_SUBPIXEL_BITS
-                cv2.circle(picture, points[joint], radius, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+                at = points[joint].tolist()
+                cv2.circle(picture, at, radius, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
     for joint in np.flatnonzero(doubted[1:]) + 1:
-        hole = max(1, thick // 2) * 2**_SUBPIXEL_BITS
-        cv2.circle(picture, points[joint], hole, (0, 0, 0), -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        hole, at = max(1, thick // 2) * 2**_SUBPIXEL_BITS, points[joint].tolist()
+        cv2.circle(picture, at, hole, (0, 0, 0), -1, cv2.LINE_AA, _SUBPIXEL_BITS)
     x, y = np.round(pixels[_WRIST]).astype(int).tolist()
     return x, y
+
+
+def _strokes(begin: np.ndarray, end: np.ndarray, width: float) -> list[tuple[list[int], list[int]]]:
+    """The lines from one place (2,) to another; dashes for a line of that width, one for 0."""
+    length = float(np.hypot(*(end - begin)))
+    if width == 0 or length == 0:
+        return [(begin.tolist(), end.tolist())]
+    starts = np.arange(0.5 * _GAP * width, length, (_DASH + _GAP) * width)
+    parts = ((start / length, min((start + _DASH * width) / length, 1)) for start in starts)
+    way = end - begin
+    return [
+        ((begin + low * way).astype(int).tolist(), (begin + high * way).astype(int).tolist())
+        for low, high in parts
+    ]

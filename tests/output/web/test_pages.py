@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from helpers.chromium import DRAWS_IN_3D, headless_chromium
 from helpers.hands import hand_estimate
+from helpers.pages import picture, shown
 from helpers.settings import part
 
 from toftrack.estimate import Estimate
 
 pytest.importorskip("websockets", reason="pip install '.[web]'")
-PATIENCE_S = 30
 WIDTH_M = 0.5
 
 
@@ -40,24 +38,6 @@ def page(browser: Any) -> Iterator[Any]:
     """The browser, whose console must stay empty."""
     yield browser
     assert browser.get_log("browser") == []
-
-
-def shown(browser: Any, reported: str, send: Callable[[], None]) -> Any:
-    """Send until the page says something true in JavaScript, which is returned."""
-    deadline = time.monotonic() + PATIENCE_S
-    while True:
-        send()
-        if value := browser.execute_script(f"return {reported}"):
-            return value
-        assert time.monotonic() < deadline, reported
-        time.sleep(0.02)
-
-
-def picture(browser: Any) -> np.ndarray:
-    """(H, W) bool: where something is drawn, between the page's words."""
-    data = np.frombuffer(io.BytesIO(browser.get_screenshot_as_png()).read(), np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int)[60:-60]
-    return np.ptp(image, axis=2) > 25  # skin is coloured, the ground is not
 
 
 def select(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:

@@ -66,7 +66,7 @@ class MesaTransport:
             raise ToftrackError(
                 f"the vendor's library found no camera{wanted} that it can open (SR_OpenUSB gave "
                 f"{opened}): plug the camera in and switch it on, close other programs that use "
-                "it, and check the udev rule in docs/sr3000.md"
+                "it, and check the udev rule in docs/cameras.md"
             )
         self._camera = camera
         try:

@@ -324,7 +324,7 @@ def _unopened(error: usb.core.USBError) -> ToftrackError:
     if error.errno in (errno.EACCES, errno.EPERM):
         return ToftrackError(
             "the SR3000 was found, but this user may not open it: install the udev rule of "
-            "docs/sr3000.md, then unplug the camera and plug it in again (or, to try, run as root)"
+            "docs/cameras.md, then unplug the camera and plug it in again (or, to try, run as root)"
         )
     if error.errno == errno.EBUSY:
         return ToftrackError(

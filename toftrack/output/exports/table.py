@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from toftrack.hand.skeleton import ANGLE_NAMES
+
 _PLAIN = (
     *("state_name", "lost", "dropped", "confidence", "side", "side_probability", "score"),
     *("outside_rad", "gesture", "gesture_probability", "pinch", "pinching"),
@@ -37,6 +39,9 @@ def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
     header = ["index", "timestamp_s", *(["slot"] if several else []), *plain]
     header += [f"{n}_{axis}{u}" for n, u in zip(names, units, strict=True) for axis in "xyz"]
     header += [f"{joint}_{axis}_m" for joint in results["joint_names"] for axis in "xyz"]
+    flags = [name for name in ("joint_ok",) if name in results]  # older runs have none
+    header += [f"{joint}_ok" for _ in flags for joint in results["joint_names"]]
+    header += [f"{angle}_rad" for angle in ANGLE_NAMES]
     yield header
     index = results.get("index", np.arange(len(results["lost"])))
     for row, number in enumerate(index):
@@ -46,8 +51,9 @@ def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
             cells = [number, seconds, *([slot] if several else [])]
             # A frame is dropped for all of its hands.
             cells += [np.asarray(results[name])[here[: np.ndim(results[name])]] for name in plain]
-            for name in (*points, "joints_m"):
+            for name in (*points, "joints_m", *flags):
                 cells += results[name][here].ravel().tolist()
+            cells += results["state"][here][-len(ANGLE_NAMES) :].tolist()
             yield [_cell(value) for value in cells]
 
 

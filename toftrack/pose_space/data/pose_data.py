@@ -12,7 +12,7 @@ from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.natural_poses import recorded_poses, sample_poses
 from toftrack.pose_space.data.training_poses import synthetic_training_poses
 
-_CLIP = 80
+CLIP = 80
 """Natural poses in a row that are held out together."""
 
 
@@ -67,7 +67,7 @@ def natural_data(poses: int) -> PoseData:
     for name, angles in (("recorded", recorded), ("sampled", sampled)):
         source = {"data": "natural", "part": name}
         # Neighbours in time are next to each other among the recorded ones.
-        clips = torch.arange(len(angles)) // _CLIP
+        clips = torch.arange(len(angles)) // CLIP
         parts[name] = PoseData(angles, (name,) * len(angles), clips, (source,))
     return mixed_data(parts, poses)
 

@@ -64,7 +64,7 @@ def file_data(path: str, units: str | None = None) -> PoseData:
             f" ({angles[row, column]})"
         )
     radians = _in_radians(path, angles, units or said)
-    radians, note = _within_limits(path, radians)
+    radians, note = within_limits(path, radians)
     names = list(dict.fromkeys(clips))
     source = {"data": "file", "file": Path(path).name, "poses": len(radians)}
     return PoseData(
@@ -95,8 +95,11 @@ def _in_radians(path: str, angles: np.ndarray, units: str | None) -> np.ndarray:
     return np.radians(angles) if units == "degrees" else angles
 
 
-def _within_limits(path: str, radians: np.ndarray) -> tuple[np.ndarray, str]:
-    """Clamp to the joint limits, and say how much; an error where most poses are far outside."""
+def within_limits(path: str, radians: np.ndarray) -> tuple[np.ndarray, str]:
+    """Angles (M, 21) clamped to the joint limits, and how many were, as the end of a sentence.
+
+    path: what errors call them.  Raises ToftrackError where most poses are far outside.
+    """
     low, high = np.array(ANGLE_LIMITS).T
     outside = np.maximum(low - radians, radians - high)
     far = (outside > math.radians(_SLACK_DEGREES)).any(1)
@@ -178,6 +181,8 @@ def _read_npz(path: str) -> _Content:
         content = read_archive(path)
     except ValueError as error:
         raise ToftrackError(f"{path} is not an .npz of joint angles ({error})") from None
+    if {"state", "lost"} <= content.keys():
+        raise ToftrackError(f"{path} is of a run; give data=run data.path={path}")
     if "angles" not in content:
         raise ToftrackError(f"{path} has no array 'angles' of (poses, {len(ANGLE_NAMES)})")
     angles = content["angles"]

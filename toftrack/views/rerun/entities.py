@@ -18,6 +18,8 @@ The world is the camera's frame: x right, y down, z forward, metres.
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import roma
@@ -28,7 +30,6 @@ from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
-from toftrack.hand.skeleton import FINGERS
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.model_image import cpu_surface, parted, posed_hand
 from toftrack.render.segmentation import Observation
@@ -57,6 +58,8 @@ _SEGMENTS = (
     (2, "occluder", (230, 159, 0)),
 )
 _SCORE_RGB = ((86, 180, 233), (0, 158, 115), _LOST_RGB)
+_DASHES = ((0.15, 0.3), (0.45, 0.6), (0.75, 0.9))
+"""Parts of a bone that are drawn where its joint is not ok."""
 _SKELETONS = ("world/hand/skeleton", "world/hand_2/skeleton")
 _BONE_M, _JOINT_M, _PARTICLE_M = 0.003, 0.003, 0.0012
 
@@ -186,8 +189,8 @@ class Entities:
             return
         log(f"{entity}/ellipsoids", ellipsoids(estimate, tracked.shape))
         joints = estimate.joints_m
-        strips = [joints[[0, *range(4 * f + 1, 4 * f + 5)]] for f in range(len(FINGERS))]
-        lines = rr.LineStrips3D(strips, colors=FINGER_RGB, radii=_BONE_M / 2)
+        strips, colours = bone_strips(joints, estimate.joint_ok | estimate.lost)
+        lines = rr.LineStrips3D(strips, colors=colours, radii=_BONE_M / 2)
         log(f"{entity}/skeleton", lines)
         colours = [_PALM_RGB, *(rgb for rgb in FINGER_RGB for _ in range(4))]
         log(f"{entity}/joints", rr.Points3D(joints, colors=colours, radii=_JOINT_M))
@@ -236,6 +239,24 @@ def _of_slot(entity: str, slot: int) -> str:
 
 def _plot(name: str, slot: int) -> str:
     return f"plots/{name}" if slot == 0 else f"plots/{name}/second"
+
+
+def bone_strips(
+    joints_m: np.ndarray, ok: np.ndarray
+) -> tuple[list[np.ndarray], list[tuple[int, int, int]]]:
+    """Lines (n, 3), m, and their colours: a bone each, in dashes where its joint is not ok.
+
+    joints_m: (21, 3).  ok: (21,) bool.
+    """
+    strips, colours = [], []
+    for finger, colour in enumerate(FINGER_RGB):
+        chain = (0, *range(4 * finger + 1, 4 * finger + 5))
+        for a, b in itertools.pairwise(chain):
+            begin, way = joints_m[a], joints_m[b] - joints_m[a]
+            parts = ((0.0, 1.0),) if ok[b] else _DASHES
+            strips += [np.stack((begin + low * way, begin + high * way)) for low, high in parts]
+            colours += [colour] * len(parts)
+    return strips, colours
 
 
 def ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:

@@ -1,0 +1,198 @@
+"""ONNX Runtime says what torch says; its files are those of the weights, or are not used."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from helpers.configured import detector_settings
+from helpers.detection import small_networks
+from helpers.tracking import sample
+
+from toftrack.detector import onnx_export, onnx_networks, proposals
+from toftrack.detector.crops import CROP, wide
+from toftrack.detector.hand_detector import HandDetector
+from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.onnx_networks import DIGEST, OnnxFinder, OnnxPoseNet, digest, load_networks
+from toftrack.detector.proposals_numba import run_pose_network
+from toftrack.detector.weights import DEFAULT_FILE, save_weights
+from toftrack.errors import ToftrackError
+from toftrack.programs import export_detector
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of small networks, and their files, by the program."""
+    path = tmp_path_factory.mktemp("exported") / "small.npz"
+    torch.manual_seed(1)
+    save_weights(path, PoseNet(4), Finder(8), {})
+    export_detector.main([str(path)])
+    return path
+
+
+@pytest.fixture
+def weights(exported: Path, tmp_path: Path) -> Path:
+    """A copy of them."""
+    return Path(shutil.copytree(exported.parent, tmp_path / "copy")) / exported.name
+
+
+def torch_runs(path: Path, caplog: pytest.LogCaptureFixture) -> str:
+    """What is said when torch runs the networks."""
+    onnx_networks._warn.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        pose, finder = load_networks(path)
+        load_networks(path)
+    assert isinstance(pose, PoseNet) and isinstance(finder, Finder)
+    [record] = caplog.records  # once
+    assert f"python -m toftrack.programs.export_detector {path}" in record.message
+    return record.message
+
+
+@torch.no_grad()
+def test_a_file_of_weights_is_exported_and_answers_as_torch_at_any_size(weights: Path) -> None:
+    pose, finder = load_networks(weights)
+    assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
+    draw = torch.Generator().manual_seed(0)
+    for count in (1, 4):
+        crops = torch.rand(count, pose.inputs, CROP, CROP, generator=draw)
+        expected = pose.reference.features(crops)
+        for one, two in zip(pose.outputs(crops.numpy()), expected, strict=False):
+            torch.testing.assert_close(torch.from_numpy(one), two, atol=1e-4, rtol=1e-4)
+    for size in ((1, 2, 8, 8), (2, 2, 80, 56)):
+        images = torch.rand(size, generator=draw)
+        for one, two in zip(finder(images), finder.reference(images), strict=True):
+            torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-4)
+
+
+def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand() -> None:
+    pose, finder = load_networks()
+    assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
+    scene = sample().cut(30)
+    centres = scene.joints_m[0, [0, 9]]
+    for side in ("right", "left"):
+        found = run_pose_network(pose, scene.depth_m[0], scene.k, centres, side)
+        expected = proposals.run_pose_network(
+            pose.reference, scene.depth_m[0], scene.k, centres, side
+        )
+        torch.testing.assert_close(found.keypoints_m, expected.keypoints_m, atol=1e-4, rtol=0)
+        torch.testing.assert_close(found.joints_m, expected.joints_m, atol=1e-3, rtol=0)
+    image, _ = wide(scene.depth_m[0], scene.k)
+    with torch.no_grad():
+        for one, two in zip(finder(image), finder.reference(image), strict=True):
+            torch.testing.assert_close(one, two, atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("network", ["pose", "finder"])
+def test_weights_without_a_file_are_run_by_torch_which_is_told_once(
+    network: str, weights: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    onnx_networks.onnx_file(weights, network).unlink()
+    assert f"there is no {weights.with_suffix('')}.{network}.onnx" in torch_runs(weights, caplog)
+
+
+def test_a_file_of_other_weights_is_not_used(
+    weights: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    torch.manual_seed(2)
+    save_weights(weights, PoseNet(4), Finder(8), {})
+    assert "small.pose.onnx is of other weights" in torch_runs(weights, caplog)
+
+
+def test_the_finder_s_file_is_not_taken_for_the_pose_network_s(
+    weights: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pose, finder = (onnx_networks.onnx_file(weights, name) for name in ("pose", "finder"))
+    pose.write_bytes(finder.read_bytes())
+    assert "small.pose.onnx is of other weights" in torch_runs(weights, caplog)
+
+
+def test_a_damaged_file_is_refused_in_a_sentence(weights: Path) -> None:
+    file = onnx_networks.onnx_file(weights, "pose")
+    content = file.read_bytes()
+    changed = bytearray(content)
+    changed[len(content) // 2] ^= 1
+    for broken in (b"", content[: len(content) // 3], content[:-1], bytes(changed)):
+        file.write_bytes(broken)
+        with pytest.raises(ToftrackError, match="small.pose.onnx is damaged.* make it anew with"):
+            load_networks(weights)
+    file.unlink()
+    file.mkdir()
+    with pytest.raises(ToftrackError, match="small.pose.onnx cannot be read"):
+        load_networks(weights)
+
+
+def test_what_is_no_network_is_refused_though_its_checksum_is_right(weights: Path) -> None:
+    file = onnx_networks.onnx_file(weights, "pose")
+    for text in (b"", b"no network", file.read_bytes()[: -2 * DIGEST]):
+        file.write_bytes(text + digest(text))
+        with pytest.raises(ToftrackError, match=r"ONNX Runtime refuses .*make it anew") as error:
+            load_networks(weights)
+        assert "\n" not in str(error.value)
+
+
+def test_outputs_of_another_shape_never_reach_compiled_code(weights: Path) -> None:
+    pose, _ = load_networks(weights)
+    assert isinstance(pose, OnnxPoseNet)
+
+    class Other:
+        def run(self, *given: object) -> list[np.ndarray]:
+            return [np.zeros((1, 7), np.float32), np.zeros((1, 105, 16, 16), np.float32)]
+
+    crops = np.zeros((1, pose.inputs, CROP, CROP), np.float32)
+    with pytest.raises(ToftrackError, match="is of another network"):
+        OnnxPoseNet(pose.reference, Other()).outputs(crops)
+
+
+def test_several_threads_and_batches_get_the_same_answers() -> None:
+    pose, finder = load_networks()
+    scene = sample().cut(10)
+    detector = HandDetector(pose, finder, detector_settings())
+    centres = scene.joints_m[0, [0, 9, 12]]
+    alone = [
+        detector.detect(scene.depth_m[0], scene.k, centre[None], "right")[0] for centre in centres
+    ]
+    reported: list[list] = [[], []]
+
+    def detect(into: list) -> None:
+        into += detector.detect(scene.depth_m[0], scene.k, centres, "right")
+
+    threads = [threading.Thread(target=detect, args=(into,)) for into in reported]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for found in reported:
+        for one, two in zip(found, alone, strict=True):
+            assert torch.equal(one.keypoints.points_m, two.keypoints.points_m)
+
+
+def test_on_another_device_torch_runs_them() -> None:
+    pose, finder = load_networks()
+    here = HandDetector(pose, finder, detector_settings())
+    assert here.to(torch.device("cpu")).pose is pose
+    there = here.to(torch.device("meta"))
+    assert isinstance(there.pose, PoseNet) and there.pose.device.type == "meta"
+    assert isinstance(there.finder, Finder)
+
+
+def test_without_what_an_export_needs_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onnx_export.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ToftrackError, match=r"onnx and onnxscript: pip install 'toftrack\[train\]"):
+        export_detector.main([str(DEFAULT_FILE)])
+
+
+def test_an_export_that_does_not_agree_with_torch_is_an_error(exported: Path) -> None:
+    model = onnx.load(onnx_networks.onnx_file(exported, "pose"))
+    other, _ = small_networks()
+    with pytest.raises(ToftrackError, match="away from torch's"):
+        onnx_export._compare(
+            onnx_export._Features(other), model, "crops", (other.inputs, CROP, CROP)
+        )

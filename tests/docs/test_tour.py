@@ -1,0 +1,37 @@
+"""The notebook runs as it stands, and what is kept in it is what it shows."""
+
+from __future__ import annotations
+
+import base64
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from helpers.tracking import ROOT
+
+sys.path.insert(0, str(ROOT / "docs"))
+from run_notebook import run_notebook
+
+TOUR = ROOT / "docs" / "tour.ipynb"
+
+
+def test_the_tour_runs_and_shows_a_hand_twice(tmp_path: Path) -> None:
+    done = run_notebook(TOUR, tmp_path)
+    outputs = [out for cell in done["cells"] for out in cell.get("outputs", ())]
+    pictures = [out["data"]["image/jpeg"] for out in outputs if "data" in out]
+    assert len(pictures) == 2
+    for content in pictures:
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_COLOR)
+        assert np.ptp(picture, axis=-1).max() > 100, "grey images have coloured skeletons"
+    printed = "".join(line for out in outputs for line in out.get("text", ()))
+    assert "30 frames, 0 of them lost" in printed and "joints (30, 21, 3)" in printed
+
+
+def test_the_tour_is_small_and_has_its_outputs() -> None:
+    """So that it can be read on a web page."""
+    assert TOUR.stat().st_size < 400_000
+    cells = json.loads(TOUR.read_text(encoding="utf-8"))["cells"]
+    kept = [out for cell in cells for out in cell.get("outputs", ())]
+    assert sum("image/jpeg" in out.get("data", ()) for out in kept) == 2

@@ -1,0 +1,216 @@
+"""What the pose network says of a crop, in compiled code; see PoseNet.decode and proposals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from toftrack.compute import rigid_numba
+from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rigid_numba import pose_hand, rotation_vector
+from toftrack.detector import crops, network, proposals
+from toftrack.detector.crops import CROP, CROP_M
+from toftrack.detector.network import (
+    ANGLES,
+    CELLS,
+    EACH,
+    ERROR_M,
+    JOINT_M,
+    JOINTS,
+    LEAST_ERROR_M,
+    LEAST_SIGMA_M,
+    LOG_SIZE,
+    OFFSET_M,
+    SIGMA_M,
+    cube_rotations,
+)
+from toftrack.detector.proposals import DOUBT_M, KEPT
+from toftrack.hand import overlap, overlap_numba
+from toftrack.hand.overlap_numba import add_overlaps
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
+from toftrack.hand.skeleton import ANGLE_LIMITS
+
+_SOURCES = (rigid_numba, overlap, overlap_numba, crops, network, proposals)
+_cached = entry_point(__file__, *(module.__file__ for module in _SOURCES))
+_ANCHORS = cube_rotations().double().numpy()
+_LIMITS = np.array(ANGLE_LIMITS)
+_PIVOT = np.array(PIVOT_M)
+
+
+@_cached
+def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
+    """What the network's outputs for a crop mean, see PoseNet.decode and proposals.
+
+    heads: (REPORTED,).  keypoints: (5 * JOINTS, CELLS, CELLS).  depth: (CROP, CROP), the first
+    channel.  turn, centre, mirror: as of crop_at.
+    hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
+    c, out: the row to write in the arrays of `_empty`.
+    """
+    _, _, _, log_size, _, _, _, joints, sigma, present, right = out
+    present[c], right[c] = heads[len(_ANCHORS) * EACH], heads[len(_ANCHORS) * EACH + 1]
+    _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
+    _decode_keypoints(keypoints, depth, joints[c], sigma[c])
+    for j in range(JOINTS):
+        p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
+        _into_camera(p, turn, centre, mirror, joints[c, j])
+    of_finger = np.zeros(5)
+    length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
+    add_overlaps(joints[c], length, of_finger)
+    for finger in range(5):
+        doubt = DOUBT_M * min(of_finger[finger], 1.0)
+        for joint in range(2 + 4 * finger, 5 + 4 * finger):
+            sigma[c, joint] = math.sqrt(sigma[c, joint] ** 2 + doubt * doubt)
+
+
+@compiled
+def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
+    """The likeliest hypotheses of a crop, in their order."""
+    pivot, rotvec, angles, log_size, log_probability, error, joints, _, _, _, _ = out
+    count = len(_ANCHORS)
+    chance = np.empty(count)
+    for h in range(count):
+        chance[h] = reported[h * EACH + EACH - 2]
+    first, total = _largest(chance), 0.0
+    top = chance[first]
+    for h in range(count):
+        total += math.exp(chance[h] - top)
+    matrix, state = np.empty((3, 3)), np.zeros(27)
+    frames, posed = np.empty((16, 3, 3)), np.empty((JOINTS, 3))
+    for kept in range(KEPT):
+        h = _largest(chance)
+        log_probability[c, kept] = chance[h] - top - math.log(total)
+        chance[h] = -np.inf
+        one = reported[h * EACH : (h + 1) * EACH]
+        _rotation(one, _ANCHORS[h], turn, matrix)
+        turned = rotation_vector(_quaternion(matrix))
+        sign = -1.0 if mirror else 1.0
+        for i in range(3):
+            state[3 + i] = turned[i] if i == 0 else sign * turned[i]
+            rotvec[c, kept, i] = state[3 + i]
+        for j in range(ANGLES):
+            low, high = _LIMITS[j]
+            state[6 + j] = low + (high - low) * sigmoid(one[6 + j])
+            angles[c, kept, j] = state[6 + j]
+        log_size[c, kept] = LOG_SIZE * one[6 + ANGLES]
+        p = one[7 + ANGLES : 10 + ANGLES]
+        at = (OFFSET_M * p[0], OFFSET_M * p[1], OFFSET_M * p[2])
+        _into_camera(at, turn, centre, mirror, pivot[c, kept])
+        error[c, kept] = ERROR_M * softplus(one[EACH - 1]) + LEAST_ERROR_M
+        pose_hand(state, hand[0], hand[1], hand[2], sign, frames, posed)
+        size = math.exp(log_size[c, kept])
+        for i in range(3):
+            # A mirror changes nothing on the palm's middle line.
+            middle = 0.0
+            for k in range(3):
+                middle += frames[0, i, k] * _PIVOT[k]
+            for j in range(JOINTS):
+                joints[c, kept, j, i] = pivot[c, kept, i] + size * (posed[j, i] - middle)
+
+
+@compiled
+def _largest(values):
+    found = 0
+    for i in range(len(values)):
+        if values[i] > values[found]:
+            found = i
+    return found
+
+
+@compiled
+def _rotation(reported, anchor, turn, matrix):
+    """turn G anchor, of the first two columns that are told G being made a rotation."""
+    x = (1 + 0.5 * reported[0], 0.5 * reported[1], 0.5 * reported[2])
+    y = (0.5 * reported[3], 1 + 0.5 * reported[4], 0.5 * reported[5])
+    norm = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    x = (x[0] / norm, x[1] / norm, x[2] / norm)
+    along = x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+    y = (y[0] - along * x[0], y[1] - along * x[1], y[2] - along * x[2])
+    norm = math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+    y = (y[0] / norm, y[1] / norm, y[2] / norm)
+    z = (x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0])
+    for i in range(3):
+        a = turn[i, 0] * x[0] + turn[i, 1] * x[1] + turn[i, 2] * x[2]
+        b = turn[i, 0] * y[0] + turn[i, 1] * y[1] + turn[i, 2] * y[2]
+        d = turn[i, 0] * z[0] + turn[i, 1] * z[1] + turn[i, 2] * z[2]
+        for j in range(3):
+            matrix[i, j] = a * anchor[0, j] + b * anchor[1, j] + d * anchor[2, j]
+
+
+@compiled
+def _quaternion(m):
+    """Of a rotation matrix (3, 3), from its largest component on (Shepperd, 1978)."""
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    largest = 0
+    for i in range(1, 3):
+        if m[i, i] > m[largest, largest]:
+            largest = i
+    if trace > m[largest, largest]:
+        w = math.sqrt(1 + trace) / 2
+        s = 1 / (4 * w)
+        return (m[2, 1] - m[1, 2]) * s, (m[0, 2] - m[2, 0]) * s, (m[1, 0] - m[0, 1]) * s, w
+    i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+    a = math.sqrt(max(1 + m[i, i] - m[j, j] - m[k, k], 1e-12)) / 2
+    s = 1 / (4 * a)
+    b, d, w = (m[i, j] + m[j, i]) * s, (m[i, k] + m[k, i]) * s, (m[k, j] - m[j, k]) * s
+    if i == 0:
+        return a, b, d, w
+    if i == 1:
+        return d, a, b, w
+    return b, d, a, w
+
+
+@compiled
+def _into_camera(p, turn, centre, mirror, out):
+    """A point of a crop's frame, about its centre, in the camera's, mirrored back if need be."""
+    for i in range(3):
+        value = turn[i, 0] * p[0] + turn[i, 1] * p[1] + turn[i, 2] * p[2] + centre[i]
+        out[i] = -value if mirror and i == 0 else value
+
+
+@compiled
+def _decode_keypoints(keypoints, depth, joints, sigma):
+    """Weighted means of the cells' keypoints (5 * JOINTS, 16, 16), see PoseNet._joints."""
+    # Depth is predicted about the surface that the cell sees.
+    seen, block = np.zeros((CELLS, CELLS)), CROP // CELLS
+    for row in range(CROP):
+        for column in range(CROP):
+            seen[row // block, column // block] += depth[row, column]
+    for j in range(JOINTS):
+        weights, x, y = keypoints[j], keypoints[JOINTS + j], keypoints[2 * JOINTS + j]
+        z, deviation = keypoints[3 * JOINTS + j], keypoints[4 * JOINTS + j]
+        top = weights[0, 0]
+        for row in range(CELLS):
+            for column in range(CELLS):
+                top = max(top, weights[row, column])
+        total, a, b, d, spread = 0.0, 0.0, 0.0, 0.0, 0.0
+        for row in range(CELLS):
+            for column in range(CELLS):
+                weight = math.exp(weights[row, column] - top)
+                total += weight
+                a += weight * (_cell(column) + JOINT_M * x[row, column])
+                b += weight * (_cell(row) + JOINT_M * y[row, column])
+                surface = seen[row, column] * (CROP_M / 2 / block**2)
+                d += weight * (surface + JOINT_M * z[row, column])
+                spread += weight * deviation[row, column]
+        joints[j, 0], joints[j, 1], joints[j, 2] = a / total, b / total, d / total
+        sigma[j] = SIGMA_M * softplus(spread / total) + LEAST_SIGMA_M
+
+
+@compiled
+def _cell(number):
+    """Where the middle of a cell is, metres from the crop's."""
+    return ((number + 0.5) / CELLS - 0.5) * CROP_M
+
+
+@compiled
+def sigmoid(x):
+    """Of a number."""
+    return 1 / (1 + math.exp(-x))
+
+
+@compiled
+def softplus(x):
+    """Of a number: log(1 + exp(x))."""
+    return x + math.log1p(math.exp(-x)) if x > 0 else math.log1p(math.exp(x))

@@ -1,0 +1,168 @@
+"""From weights to the files that ONNX Runtime runs, see onnx_networks; needs the extra `train`."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from toftrack.detector.crops import CROP
+from toftrack.detector.network import Found, PoseNet
+from toftrack.detector.onnx_networks import (
+    DIGEST,
+    FORMAT,
+    VERSION,
+    digest,
+    onnx_file,
+    open_session,
+)
+from toftrack.detector.weights import load_weights
+from toftrack.errors import ToftrackError
+from toftrack.safe_files import whole_file
+
+_OPSET, _IR = 18, 10
+"""Which all versions of ONNX Runtime read that the package asks for."""
+_AGREE = 1e-3
+"""How far, of the largest of an output, ONNX Runtime may be from torch."""
+
+
+def missing_packages() -> list[str]:
+    """What must be installed before anything can be exported."""
+    return [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
+
+
+def needed(missing: list[str]) -> str:
+    """How to get what is missing."""
+    return (
+        f"ONNX files need {' and '.join(missing)}: pip install 'toftrack[train]', in a checkout"
+        " pip install -e '.[train]'"
+    )
+
+
+def export_networks(weights: Path) -> list[Path]:
+    """Write the networks of a file of weights beside it; returns the files.
+
+    Raises ToftrackError when the weights cannot be used, when a package is missing, and when ONNX
+    Runtime computes something else than torch.
+    """
+    if missing := missing_packages():
+        raise ToftrackError(needed(missing))
+    loaded = load_weights(weights)
+    crops = torch.zeros(2, loaded.pose.inputs, CROP, CROP)
+    several = torch.export.Dim("n", min=1, max=1 << 16)
+    rows, columns = (torch.export.Dim(name, min=8, max=1 << 16) for name in ("h", "w"))
+    outputs = {
+        "pose": ["heads", "keypoints"],
+        "finder": list(Found._fields),
+    }
+    contents = {
+        "pose": _exported(_Features(loaded.pose), crops, "crops", outputs["pose"], {0: several}),
+        "finder": _exported(
+            loaded.finder,
+            torch.zeros(2, 2, 72, 96),
+            "images",
+            outputs["finder"],
+            {0: several, 2: rows, 3: columns},
+        ),
+    }
+    _compare(_Features(loaded.pose), contents["pose"], "crops", crops.shape[1:])
+    _compare(loaded.finder, contents["finder"], "images", (2, 56, 80))
+    files = []
+    for network, content in contents.items():
+        facts = {"format": FORMAT, "version": VERSION, "network": network}
+        file = onnx_file(weights, network)
+        with whole_file(file) as stream:
+            stream.write(_signed(content, facts | {"weights_sha256": loaded.sha256}))
+        files.append(file)
+    return files
+
+
+class _Features(nn.Module):
+    """What the tracker uses of PoseNet.features."""
+
+    def __init__(self, pose: PoseNet) -> None:
+        super().__init__()
+        self.pose = pose
+
+    def forward(self, crops: Tensor) -> tuple[Tensor, Tensor]:
+        heads, keypoints, _ = self.pose.features(crops)
+        return heads, keypoints
+
+
+def _exported(
+    network: nn.Module, example: Tensor, name: str, outputs: list[str], sizes: dict[int, Any]
+) -> Any:
+    """A network as an onnx.ModelProto; sizes: of the example, which may be others."""
+    with _quiet():
+        program = torch.onnx.export(
+            network.eval(),
+            (example,),
+            dynamo=True,
+            input_names=[name],
+            output_names=outputs,
+            dynamic_shapes=(sizes,),
+            opset_version=_OPSET,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    model.ir_version = min(model.ir_version, _IR)
+    del model.metadata_props[:]
+    for part in (
+        *model.graph.node,
+        *model.graph.input,
+        *model.graph.output,
+        *model.graph.value_info,
+    ):
+        del part.metadata_props[:]  # where in the source it stands
+    return model
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Within, nothing is said of packages that an export may use besides, and of torch's own."""
+    logger = logging.getLogger("torch.onnx")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(before)
+
+
+@torch.inference_mode()
+def _compare(network: nn.Module, model: Any, name: str, shape: tuple[int, ...]) -> None:
+    """Raises ToftrackError where ONNX Runtime says something else than torch of any images."""
+    session = open_session(model.SerializeToString())
+    generator = torch.Generator().manual_seed(0)
+    for count in (1, 3):
+        images = 2 * torch.rand(count, *shape, generator=generator) - 1
+        for one, two in zip(
+            network(images), session.run(None, {name: images.numpy()}), strict=True
+        ):
+            away = float(np.abs(one.numpy() - two).max())
+            if not away <= _AGREE * max(1.0, float(one.abs().max())):
+                raise ToftrackError(
+                    f"ONNX Runtime's {name} are {away:.2g} away from torch's; nothing was written"
+                )
+
+
+def _signed(model: Any, properties: dict[str, str]) -> bytes:
+    """A file's content, which ends with its checksum."""
+    for key, value in properties.items():
+        model.metadata_props.add(key=key, value=value)
+    # Messages that follow one another are one: the last property comes to stand at the end.
+    last = type(model)()
+    last.metadata_props.add(key="sha256", value="0" * DIGEST)
+    content = (model.SerializeToString() + last.SerializeToString())[:-DIGEST]
+    return content + digest(content)

@@ -1,0 +1,185 @@
+"""The detector's networks on the CPU by ONNX Runtime, from the files that export_detector derives.
+
+Beside the weights NAME.npz lie NAME.pose.onnx and NAME.finder.onnx. Each says of which weights it
+was made, and ends with its own checksum. Weights without them, or with those of other weights, are
+for torch, which is the reference, and slower on the CPU.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.detector.network import CELLS, JOINTS, REPORTED, Finder, Found, PoseNet
+from toftrack.detector.weights import load_weights
+from toftrack.errors import ToftrackError
+from toftrack.safe_files import open_to_read
+
+FORMAT = "toftrack-detector-network"
+VERSION = "1"
+"""Of the inputs and outputs of such files; one of another version is made anew."""
+DIGEST = 64
+"""Last bytes of such a file, the SHA-256 in hexadecimal of all before: a property's value."""
+COMMAND = "python -m toftrack.programs.export_detector"
+_LARGEST_BYTES = 1 << 28
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class OnnxPoseNet:
+    """A PoseNet for the CPU; reference: the one that it was made of."""
+
+    reference: PoseNet
+    session: Any
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is."""
+        return torch.device("cpu")
+
+    @property
+    def inputs(self) -> int:
+        """Channels of a crop that it sees."""
+        return self.reference.inputs
+
+    def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of crops (N, inputs, 64, 64): PoseNet.features' heads and keypoints; without the lock.
+
+        Raises ToftrackError for a file of a network with other outputs.
+        """
+        heads, keypoints = self.session.run(("heads", "keypoints"), {"crops": crops})
+        n = len(crops)
+        # Compiled code reads them, and believes their shapes.
+        if (heads.shape, heads.dtype, keypoints.shape, keypoints.dtype) != (
+            *((n, REPORTED), np.float32),
+            *((n, 5 * JOINTS, CELLS, CELLS), np.float32),
+        ):
+            raise ToftrackError("the detector's pose.onnx is of another network; " + _anew())
+        return heads, keypoints
+
+    def to(self, device: torch.device) -> PoseNet | OnnxPoseNet:
+        """Itself on the CPU, elsewhere the reference."""
+        return self if device.type == "cpu" else self.reference.to(device)
+
+
+@dataclass(frozen=True, eq=False)
+class OnnxFinder:
+    """A Finder for the CPU; reference: the one that it was made of."""
+
+    reference: Finder
+    session: Any
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is."""
+        return torch.device("cpu")
+
+    def __call__(self, images: Tensor) -> Found:
+        """See network.Finder."""
+        found = self.session.run(Found._fields, {"images": images.numpy()})
+        return Found(*map(torch.from_numpy, found))
+
+    def to(self, device: torch.device) -> Finder | OnnxFinder:
+        """Itself on the CPU, elsewhere the reference."""
+        return self if device.type == "cpu" else self.reference.to(device)
+
+
+def load_networks(
+    path: str | Path | None = None,
+) -> tuple[PoseNet | OnnxPoseNet, Finder | OnnxFinder]:
+    """Both networks as they are used: by ONNX Runtime, or by torch, which is told.
+
+    path: of the weights; None: those of the package.
+    Raises ToftrackError when a file is damaged, or the weights are missing.
+    """
+    weights = load_weights(path)
+    sessions = []
+    for network in ("pose", "finder"):
+        file = onnx_file(weights.path, network)
+        session = _session(file, weights.path)
+        known = session is not None
+        if not known or _made_of(session) != (FORMAT, VERSION, network, weights.sha256):
+            why = f"{file} is of other weights" if known else f"there is no {file}"
+            _warn(f"{why}: torch runs the detector's networks, slower; {_make(weights.path)}")
+            return weights.pose, weights.finder
+        sessions.append(session)
+    pose, finder = sessions
+    return OnnxPoseNet(weights.pose, pose), OnnxFinder(weights.finder, finder)
+
+
+def onnx_file(weights: Path, network: str) -> Path:
+    """Where the file of a network, "pose" or "finder", is that is derived from weights."""
+    return weights.with_suffix(f".{network}.onnx")
+
+
+def digest(content: bytes) -> bytes:
+    """What a file ends with, of all that stands before it."""
+    return hashlib.sha256(content).hexdigest().encode()
+
+
+def _session(file: Path, weights: Path) -> Any:
+    """An ONNX Runtime session of a file that is whole; None: there is no such file."""
+    try:
+        with open_to_read(file) as stream:
+            content = stream.read(_LARGEST_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ToftrackError(f"{file} cannot be read ({error}); {_anew(weights)}") from None
+    if len(content) > _LARGEST_BYTES or content[-DIGEST:] != digest(content[:-DIGEST]):
+        raise ToftrackError(f"{file} is damaged, its checksum is wrong; {_anew(weights)}")
+    try:
+        return open_session(content)
+    except Exception as error:  # ONNX Runtime's have no class of their own
+        reason = str(error).partition("\n")[0]
+        raise ToftrackError(f"ONNX Runtime refuses {file} ({reason}); {_anew(weights)}") from None
+
+
+def open_session(content: bytes) -> Any:
+    """A session that computes in the thread that asks and nowhere else, also after a fork."""
+    runtime = _runtime()
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.graph_optimization_level = runtime.GraphOptimizationLevel.ORT_ENABLE_ALL
+    options.log_severity_level = 4  # what goes wrong is raised as well
+    return runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+@functools.cache
+def _runtime() -> Any:
+    import onnxruntime
+
+    onnxruntime.set_default_logger_severity(4)
+    onnxruntime.disable_telemetry_events()
+    return onnxruntime
+
+
+def _made_of(session: Any) -> tuple[str | None, ...]:
+    """Format, version and name of a file's network, and the checksum of its weights."""
+    properties = session.get_modelmeta().custom_metadata_map
+    return tuple(
+        properties.get(name) for name in ("format", "version", "network", "weights_sha256")
+    )
+
+
+@functools.cache
+def _warn(message: str) -> None:
+    """Once in a process."""
+    _log.warning(message)
+
+
+def _make(weights: Path) -> str:
+    return f"make it with {COMMAND} {weights}"
+
+
+def _anew(weights: Path | None = None) -> str:
+    return f"make it anew with {COMMAND} {weights or 'FILE'}"

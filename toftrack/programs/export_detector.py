@@ -1,0 +1,42 @@
+"""Derive from the detector's weights the files that ONNX Runtime runs, beside them:
+
+python -m toftrack.programs.export_detector FILE
+
+train_detector does so at its end. Without FILE: those of the package. It needs `pip install
+'toftrack[train]'`; tracking does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from toftrack.programs import command_line
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line, write NAME.pose.onnx and NAME.finder.onnx. Raises ToftrackError."""
+    options = _parser().parse_args(arguments)
+
+    from toftrack.detector.onnx_export import export_networks
+    from toftrack.detector.weights import DEFAULT_FILE
+
+    for file in export_networks(options.weights or DEFAULT_FILE):
+        print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m toftrack.programs.export_detector",
+        description="Make of the detector's weights the files that ONNX Runtime runs, beside them.",
+    )
+    parser.add_argument(
+        "weights", nargs="?", type=Path, metavar="FILE", help="of train_detector (the package's)"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(command_line.run(main))
