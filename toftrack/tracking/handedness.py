@@ -20,6 +20,8 @@ _BODY_COMPARISONS = 20
 """Comparisons over which the body's place is averaged."""
 _FIRST_COMPARISONS = 5
 """Whatever a given side is taken for, a new hand is compared so often before it is sure."""
+_NOT_AGAINST = 0.86
+"""With the user's word alone it is a little more probable that it is of the side."""
 _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
@@ -97,6 +99,11 @@ class HandednessEstimate:
         """Probability that what is followed is of a side, also where the side was given."""
         log_odds = self.log_odds if side == "right" else -self.log_odds
         return 1 / (1 + math.exp(-log_odds))
+
+    def doubtful(self, side: str) -> bool:
+        """Whether the first comparisons of a new hand speak against the side that was given."""
+        new = self.given and self.comparisons < _FIRST_COMPARISONS
+        return new and self.seems(side) < _NOT_AGAINST
 
     def contradicted(self, side: str, settings: HandednessSettings) -> bool:
         """Whether what is followed is surely the other hand than the one that was given."""

@@ -46,6 +46,7 @@ class OtherHand:
     certain: its last estimate was not flagged, so that pixels are its own.
     pixels: (H, W) bool of the reduced image, those that it explains better.
     beside: (H, W) bool, those of them that cannot hide this hand.
+    watched: nobody asked for it.
     """
 
     joints_m: Tensor
@@ -54,6 +55,7 @@ class OtherHand:
     certain: bool
     pixels: np.ndarray
     beside: np.ndarray
+    watched: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,9 @@ def others_of(
     ]
     return [
         tuple(
-            _other_hand(hands[slot].track, theirs, mine, depth_m)
+            replace(
+                _other_hand(hands[slot].track, theirs, mine, depth_m), watched=hands[slot].watched
+            )
             for slot, theirs in enumerate(there)
             if theirs is not None and slot != own and own in slots
         )

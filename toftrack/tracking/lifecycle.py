@@ -289,10 +289,13 @@ def close(
 ) -> tuple[Status, Track, LastSeen]:
     """What is thought of a frame's estimate, the track as of the frame, and the hand last seen."""
     model, track = frame.model, frame.track
-    whose, second = frame.hand.handedness, any(other.believed for other in frame.others)
-    again = frame.hand.seen.ever and not (second and frame.slot)
-    new = model.lost.again if again else model.lost.second if second else model.lost.believe
+    whose = frame.hand.handedness
+    second = any(other.believed and not other.watched for other in frame.others)
+    first = model.lost.again if frame.hand.seen.ever else model.lost.believe
+    new = model.lost.second if second else first
     seems = whose.seems(frame.hand.side) if whose.given else 1.0
+    if whose.doubtful(frame.hand.side):
+        new = math.inf
     side = whose.probability(frame.hand.side)
     status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
     if seems < OTHER_HAND and not status.lost:

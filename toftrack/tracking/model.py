@@ -206,7 +206,7 @@ class TrackerModel(FilterModel):
         if hands == 2:
             return state
         first, other = state.hands
-        watched = self.first_hand(other.side, side_given=False)
+        watched = replace(self.first_hand(other.side, side_given=False), watched=True)
         return replace(state, hands=(first, watched), watched=True, second_s=_LONG_S)
 
     @property

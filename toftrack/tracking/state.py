@@ -93,6 +93,7 @@ class HandState:
     gesture: smoothed probabilities of the gestures, None where there are none.
     last: the last estimate that there was; lost and NaN before any.
     searched_s: how long ago the whole image was searched for this hand.
+    watched: nobody asked for it.
     beside: it was believed while the first hand was, too, so that it is another one.
     """
 
@@ -104,6 +105,7 @@ class HandState:
     track: Track | None = None
     gesture: GestureState | None = None
     searched_s: float = math.inf
+    watched: bool = False
     beside: bool = False
 
     @property

@@ -253,8 +253,8 @@ def restarted(state: TrackerState, model: FilterModel, side: str | None = None) 
     first = model.configured.shape.of_side(side).side if side is not None else first
     sides = (first, OTHER_SIDE[first])
     hands = tuple(
-        model.first_hand(sides[slot], given and not (slot and state.watched))
-        for slot in range(len(state.hands))
+        replace(model.first_hand(sides[slot], given and not hand.watched), watched=hand.watched)
+        for slot, hand in enumerate(state.hands)
     )
     return replace(fresh, hands=hands, generator=state.generator, next_index=state.next_index)
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from toftrack.estimate import Estimate
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.handedness import OTHER_SIDE, HandednessSettings
@@ -20,8 +22,8 @@ _GONE_S = 2.0
 """The first hand that has been away so long makes way for the other; not one of a given side."""
 _BACK = 0.9
 """A hand that turns out to be of the given side after all is the first one again."""
-_RATHER = 0.7
-"""Likewise while what is taken for the first one does not seem to be of that side."""
+_RATHER, _UNSURE = 0.7, 0.6
+"""Likewise with so much, while what is taken for the first one is less probably of that side."""
 OTHER_HAND = 0.4
 """Where it is less probable than this that what is followed is of the given side, the frame is
 flagged."""
@@ -67,7 +69,8 @@ def told_apart(estimate: Estimate, state: TrackerState) -> Estimate:
     first, other = state.hands
     if first.track is not None or not (other.believed or state.second_s == math.inf):
         return estimate
-    return replace(estimate, lost=True, state_name="other hand")
+    none = np.zeros_like(estimate.joint_ok)
+    return replace(estimate, lost=True, state_name="other hand", joint_ok=none)
 
 
 def _other_after_all(state: TrackerState, track: Track) -> TrackerState:
@@ -98,7 +101,7 @@ def _is_first(first: HandState, other: HandState) -> bool:
         return first.track is None and other.believed and not first.seen.age_s < _GONE_S
     probable = other.handedness.probability(first.side) if other.side == first.side else 0.0
     if first.track is not None:
-        return probable > _RATHER and first.handedness.seems(first.side) < OTHER_HAND
+        return probable > _RATHER and first.handedness.seems(first.side) < _UNSURE
     return probable > _BACK and not other.beside
 
 
