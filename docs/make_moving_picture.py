@@ -32,7 +32,7 @@ NEAR_M, FAR_M = 0.35, 1.2
 
 
 def coloured(depth_m: np.ndarray) -> np.ndarray:
-    """(h, w, 3) uint8 BGR; nothing read is black. Noise is smoothed, which the eye does not miss."""
+    """(h, w, 3) uint8 BGR; nothing read is black. Noise is smoothed: it would fill the file."""
     share = np.clip((FAR_M - depth_m) / (FAR_M - NEAR_M), 0, 1)
     grey = cv2.medianBlur(np.rint(255 * share).astype(np.uint8), 5)
     picture = cv2.applyColorMap(grey, cv2.COLORMAP_TURBO)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 _TO_CAMERA = np.array([0.1, -0.1, -0.1])
 """From MakeHuman's decimetres, y up, z to the front, to a person who faces the camera."""
 _FINGERS = (2, 3, 4, 5)
-_THUMB_TURNS = 5
+_THUMB_ANGLES = 5
 _WRIST_BENDS = 0.9
 """Radians at most."""
 
@@ -92,9 +92,9 @@ class RightHand:
         across /= np.linalg.norm(across)
         return np.stack((across, np.cross(along, across), along), 1)
 
-    def _turns(self, pose: Pose, thumb: np.ndarray) -> dict[str, np.ndarray]:
+    def _rotations(self, pose: Pose, thumb: np.ndarray) -> dict[str, np.ndarray]:
         """(4, 4) of each bone from where it rests, the hand itself at rest."""
-        turns = {"lowerarm": np.eye(4), "wrist": np.eye(4)}
+        rotations = {"lowerarm": np.eye(4), "wrist": np.eye(4)}
         across, back, _ = self.frame.T
         for finger, flexion in zip(_FINGERS, pose.flexion, strict=True):
             first = self.rest[f"{finger}-2"] - self.rest[f"{finger}-1"]
@@ -105,29 +105,29 @@ class RightHand:
                 along = self.rest[f"{finger}-{bone + 1}"] - self.rest[f"{finger}-{bone}"]
                 has = np.arctan2(np.cross(before, along) @ axis, before @ along)
                 way = way @ _about(self.rest[f"{finger}-{bone}"], (np.radians(wanted) - has) * axis)
-                turns[f"{finger}-{bone}"], before = way, along
+                rotations[f"{finger}-{bone}"], before = way, along
         bend = np.cross(self.rest["1-2"] - self.rest["1-1"], self.rest["1-4"] - self.rest["1-3"])
         bend /= np.linalg.norm(bend)
         way = np.eye(4)
         for bone, vector in ((1, thumb[:3]), (2, thumb[3] * bend), (3, thumb[4] * bend)):
             way = way @ _about(self.rest[f"1-{bone}"], vector)
-            turns[f"1-{bone}"] = way
-        return turns
+            rotations[f"1-{bone}"] = way
+        return rotations
 
-    def _tips(self, turns: dict[str, np.ndarray]) -> np.ndarray:
+    def _tips(self, rotations: dict[str, np.ndarray]) -> np.ndarray:
         """(21, 3) joints in toftrack's order, the hand itself at rest."""
         found = [self.wrist]
         for finger in (1, *_FINGERS):
             for bone in (1, 2, 3, 4):
-                turn = turns[f"{finger}-{min(bone, 3)}"]
+                turn = rotations[f"{finger}-{min(bone, 3)}"]
                 found.append(turn[:3, :3] @ self.rest[f"{finger}-{bone}"] + turn[:3, 3])
         return np.array(found)
 
     def _thumb(self, pose: Pose) -> np.ndarray:
-        """The thumb's turns (5,): its tip beside the index finger's, or on the middle finger."""
+        """The thumb angles (5,): its tip beside the index finger's, or on the middle finger."""
 
         def off(turn: np.ndarray) -> np.ndarray:
-            joints = self._tips(self._turns(pose, turn))
+            joints = self._tips(self._rotations(pose, turn))
             tip = joints[4]
             last = joints[7] - joints[8]
             pad = np.cross(last, self.frame[:, 0])
@@ -137,12 +137,12 @@ class RightHand:
             return np.concatenate((100 * (tip - wanted), 0.25 * turn))
 
         if pose not in self._thumbs:
-            self._thumbs[pose] = least_squares(off, np.zeros(_THUMB_TURNS)).x
+            self._thumbs[pose] = least_squares(off, np.zeros(_THUMB_ANGLES)).x
         return self._thumbs[pose]
 
     def joints(self, pose: Pose) -> np.ndarray:
         """(21, 3) the joints in the hand's own frame, the index finger's base at 0."""
-        joints = self._tips(self._turns(pose, self._thumb(pose)))
+        joints = self._tips(self._rotations(pose, self._thumb(pose)))
         return (joints - joints[5]) @ self.frame
 
     def posed(
@@ -154,17 +154,17 @@ class RightHand:
         place: of the index finger's base.
         elbow: (3,) the direction in which it is wanted; the wrist bends as far as it can.
         """
-        turns = self._turns(pose, self._thumb(pose))
+        rotations = self._rotations(pose, self._thumb(pose))
         arm = self._elbow - self.wrist
         axis = np.cross(arm, self.frame @ turn.T @ elbow)
         bent = np.arctan2(np.linalg.norm(axis), arm @ (self.frame @ turn.T @ elbow))
         axis *= min(bent, _WRIST_BENDS) / np.linalg.norm(axis)
-        turns["lowerarm"] = _about(self.wrist, axis)
+        rotations["lowerarm"] = _about(self.wrist, axis)
         moved = np.zeros_like(self.points)
         for bone, weight in zip(self.bones, self.weights, strict=True):
-            at = turns[bone]
+            at = rotations[bone]
             moved += weight[:, None] * (self.points @ at[:3, :3].T + at[:3, 3])
-        joints = self._tips(turns)
+        joints = self._tips(rotations)
         base, way = joints[5], turn @ self.frame.T
         return (
             Solid((moved - base) @ way.T + place, self.faces, 0.6),

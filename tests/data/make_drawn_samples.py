@@ -6,16 +6,13 @@
 
 The folder is that of make_empty.py, whose camera draws these, too. Writes
 toftrack/data/sample_point_and_pinch.npz and sample_two_hands.npz. The same seed draws the same.
-
-Who points sees the cursor and corrects where it is off: the first drawing is tracked, and the
-second one aims beside each target by what the tracker's ray was beside it.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,9 +21,9 @@ from drawn_hands import Pose, RightHand
 from make_empty import F_PX, HEIGHT, WIDTH, Solid, drawn, sensed
 from make_guards import write
 from make_samples import LICENCE, ORIGIN, PACKAGED
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
-
-import toftrack
 
 FPS = 25.0
 SEED = 5
@@ -41,10 +38,17 @@ POINTING = Pose((_STRAIGHT, _CURLED, _CURLED, _CURLED))
 PINCHING = Pose(((42.0, 45.0, 25.0), _CURLED, _CURLED, _CURLED), pinch=1.0)
 VICTORY = Pose((_STRAIGHT, _STRAIGHT, _CURLED, _CURLED))
 
-# The game of toftrack/output/web/point.html with ?seed=1.
-TARGETS, GAME_SEED, SCREEN_M = 12, 1, 0.5
+# The game of toftrack/output/web/point.html with the address of GAME; this seed's targets lie where
+# an arm need not reach far, and near each other.
+TARGETS, GAME_SEED, SCREEN_M, REACH = 12, 15411478, 1.0, 0.5
+GAME = f"point?seed={GAME_SEED}&width={SCREEN_M:g}&reach={REACH:g}"
+_LOWER = np.array([0.0, 0.01])
+"""Metres. The cursor lies about that much above where the finger points; who sees it aims lower."""
 _FIELD, _RADIUS = 0.45, 0.07
-_FIRST, _MOVE, _REST, _CLOSE, _HOLD, _OPEN = 15, 10, 7, 4, 5, 4
+_FIRST, _MOVE, _REST, _CLOSE, _HOLD, _OPEN = 22, 10, 9, 3, 5, 4
+_SHOWN, _CHANGE, _SWAY = 25, 10, 60
+_UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+"""From the hand's own frame: fingers up, the palm to the camera."""
 _ELBOW = np.array([-0.1, 0.5, 0.8])
 """Direction from the wrist."""
 _ROUND = _MOVE + _REST + _CLOSE + _HOLD + _OPEN
@@ -63,11 +67,13 @@ def game_targets() -> np.ndarray:
         return ((t ^ (t >> 14)) & 0xFFFFFFFF) / 2**32
 
     while len(found) < TARGETS:
-        there = np.array([0.12 + 0.76 * chance(), _FIELD * (0.18 + 0.6 * chance())])
+        across, down = chance(), chance()
+        across, down = 0.12 + 0.76 * across - 0.5, 0.18 + 0.6 * down - 0.5
+        there = np.array([REACH * across, _FIELD * (0.5 + REACH * down)])
         if not found or np.linalg.norm(there - found[-1]) >= 3 * _RADIUS * _FIELD:
             found.append(there)
     # The camera is in the middle of the upper edge, and its right is the person's left.
-    return SCREEN_M * (np.array(found) * [-1, 1] + [0.5, 0])
+    return SCREEN_M * (np.array(found) * [-1, 1])
 
 
 def smooth(share: float) -> float:
@@ -103,7 +109,7 @@ def game_moments(aims: np.ndarray) -> list[Moment]:
 
 def pointing_at(hand: RightHand, moment: Moment) -> tuple[Solid, np.ndarray]:
     """The hand of a moment, and its joints: the ray from the index finger's base meets the aim."""
-    base = np.array([0.4 * moment.aim[0] - 0.01, 0.03 + 0.15 * moment.aim[1], 0.4])
+    base = np.array([0.4 * moment.aim[0] - 0.01, 0.12 * moment.aim[1] - 0.01, 0.4])
     way = np.append(moment.aim, 0.0) - base
     joints = hand.joints(POINTING)
     own = basis(joints[8] - joints[5], np.array([0.0, 1.0, 0.0]))
@@ -139,11 +145,47 @@ def draw_game(hand: RightHand, aims: np.ndarray) -> dict[str, np.ndarray]:
     return recording(frames, {"joints_m": truth}, "right")
 
 
-def behind(hand: RightHand, shoulders: np.ndarray) -> Solid:
-    """The body, without the arm, whose shoulders' middle is there."""
-    points = hand.body.points
+def behind(hand: RightHand, shoulders: np.ndarray, left: bool = True) -> Solid:
+    """The body, without the right arm below the elbow, whose shoulders' middle is there.
+
+    left: whether it has its left arm below the elbow.
+    """
+    points, faces = hand.body.points, hand.body.faces
     neck = points[:, 1].min() + 0.3
-    return Solid(points - [0, neck, 0] + shoulders, hand.body.faces, hand.body.albedo)
+    if not left:  # the mesh is the same on both sides
+        near = cKDTree(hand.points * [-1, 1, 1]).query(points)[0] < 0.002
+        faces = faces[~near[faces].all(1)]
+    return Solid(points - [0, neck, 0] + shoulders, faces, hand.body.albedo)
+
+
+def shown_pose(shows: Sequence[Pose], t: int) -> Pose:
+    """The poses one after the other, each for _SHOWN frames, with what is between them."""
+    number, since = divmod(t, _SHOWN)
+    before = shows[max(number - 1, 0) % len(shows)]
+    return before.towards(shows[number % len(shows)], smooth(since / _CHANGE))
+
+
+def draw_both(hand: RightHand) -> dict[str, np.ndarray]:
+    """The recording of two hands side by side, palms to the camera, that show different poses."""
+    rng = np.random.default_rng(SEED)
+    body = drawn([behind(hand, np.array([0.0, 0.1, 0.85]), left=False)])
+    frames, truth = [], {"joints_m": [], "joints2_m": []}
+    for t in tqdm(range(4 * _SHOWN), "two hands"):
+        solids = []
+        for key, shows, side, late in (
+            ("joints_m", (PALM, FIST, POINTING, PALM), 1, 0.0),
+            ("joints2_m", (PALM, VICTORY, PALM, FIST), -1, 1.5),
+        ):
+            sway = 2 * np.pi * t / _SWAY + late
+            turn = Rotation.from_euler("yz", [0.35 * np.sin(sway), 0.2 * np.cos(sway)]).as_matrix()
+            place = np.array([-0.1, -0.02, 0.5]) + 0.02 * np.sin([sway, 2 * sway, sway])
+            elbow = np.array([0.0, 0.9, 0.4])
+            solid, joints = hand.posed(shown_pose(shows, t), turn @ _UPRIGHT, place, elbow)
+            mirrored = [side, 1, 1]
+            solids.append(Solid(solid.points * mirrored, solid.faces, solid.albedo))
+            truth[key].append(joints * mirrored)
+        frames.append(seen(drawn(solids, body), rng))
+    return recording(frames, truth, "right")
 
 
 def recording(
@@ -162,23 +204,6 @@ def recording(
     return arrays | {"metadata": np.array(json.dumps(metadata))}
 
 
-def cursor(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """(T, 2) metres on the screen: where the tracked hand points, NaN where it does not."""
-    tracker, found = toftrack.make_tracker("seed=0"), []
-    for index, depth in enumerate(tqdm(arrays["depth_m"], "tracking")):
-        depth = depth.astype(np.float32)
-        estimate = tracker.step(depth, arrays["K"], index, index / FPS)
-        base, way = estimate.pointing_origin_m, estimate.pointing_direction
-        found.append((base - base[2] / way[2] * way)[:2])
-    return np.array(found)
-
-
-def at_rest(there: np.ndarray) -> np.ndarray:
-    """(12, 2) where the cursor rests at each target: the median of the frames of rest."""
-    starts = _FIRST + _ROUND * np.arange(TARGETS) + _MOVE
-    return np.array([np.nanmedian(there[start : start + _REST], axis=0) for start in starts])
-
-
 def save(name: str, arrays: dict[str, np.ndarray]) -> None:
     path = PACKAGED / f"sample_{name}.npz"
     write(path, arrays)
@@ -190,13 +215,8 @@ def main() -> None:
     if not (folder / "3dobjs" / "base.obj").is_file():
         raise SystemExit(__doc__)
     player, targets = RightHand(folder, PLAYER), game_targets()
-    first = draw_game(player, targets)
-    beside = at_rest(cursor(first)) - targets
-    print("cm beside the targets:", np.round(100 * np.linalg.norm(beside, axis=1), 1))
-    second = draw_game(player, targets - beside)
-    beside = at_rest(cursor(second)) - targets
-    print("corrected:", np.round(100 * np.linalg.norm(beside, axis=1), 1))
-    save("point_and_pinch", second)
+    save("two_hands", draw_both(RightHand(folder, BOTH)))
+    save("point_and_pinch", draw_game(player, targets + _LOWER))
 
 
 if __name__ == "__main__":

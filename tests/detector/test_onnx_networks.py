@@ -91,7 +91,7 @@ def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand
 
 
 @pytest.mark.parametrize("network", ["pose", "finder"])
-def test_weights_without_a_file_are_run_by_torch_which_is_told_once(
+def test_weights_without_a_file_are_run_by_torch_which_is_said_once(
     network: str, weights: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     onnx_networks.onnx_file(weights, network).unlink()

@@ -102,11 +102,13 @@ def shown_again_and_again(view: BrowserView) -> Iterator[list[str]]:
         while not stop.is_set():
             taken.extend(view.commands())
             moment, count = moments()[count // 5 % 2], count + 1
-            side = next((c for c in reversed(taken) if c != "restart"), "right")
+            told = next((c for c in reversed(taken) if c != "restart"), "right")
+            side = "right" if told == "auto" else told
             hand = moment.hands[0]
             shape = hand.shape.of_side(side) if side != hand.shape.side else hand.shape
             estimate = replace(hand.estimate, index=count)
-            view.show(with_hand(moment, estimate=estimate, shape=shape))
+            shown = with_hand(moment, estimate=estimate, shape=shape)
+            view.show(replace(shown, side_given=told != "auto"))
             stop.wait(0.02)
 
     thread = threading.Thread(target=run)

@@ -18,7 +18,8 @@ from helpers.tracking import run
 from toftrack.camera import Camera
 from toftrack.configuration.compose import configuration, configuration_folder
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.weights import _checksum, load_weights, save_weights
+from toftrack.detector.onnx_networks import onnx_file, read_session
+from toftrack.detector.weights import DEFAULT_FILE, _checksum, load_weights, save_weights
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
@@ -206,6 +207,7 @@ def _small_files(folder: Path) -> list[Reader]:
     for parameter in (one for network in networks for one in network.parameters()):
         parameter.data.zero_()  # takes hardly any room
     save_weights(small / "weights.npz", *networks, {"steps": 1})
+    shutil.copy(onnx_file(DEFAULT_FILE, "finder"), small / "weights.finder.onnx")
     readers: dict[str, Callable[[Path], object]] = {
         "gestures.json": read_poses,
         "gestures.csv": read_poses,
@@ -216,6 +218,7 @@ def _small_files(folder: Path) -> list[Reader]:
         "camera.json": Camera.load,
         "leap.npz": lambda path: leap_data(str(path), None, 1e3),
         "weights.npz": read_weights,
+        "weights.finder.onnx": lambda path: read_session(path, path.with_name("weights.npz")),
     }
     return [_alone(name, small / name, read) for name, read in readers.items()]
 

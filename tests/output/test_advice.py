@@ -95,6 +95,19 @@ def test_a_frames_facts_are_read_off_its_image() -> None:
     assert "0 % of the pixels had readings." in watch.advice("right")[0]
 
 
+def test_who_watches_is_told_of_what_is_recent() -> None:
+    lost, nothing = no_estimate(0, 0.0, "lost", 4, 0.01), np.zeros((6, 8), np.float32)
+    watch = Watch(REACH_M)
+    for count in range(1, 61):
+        watch.see((lost,), nothing, (None,))
+        assert bool(watch.advice(None, recent=True)) == (count >= 20), "not of the first frames"
+    for _ in range(60):
+        assert watch.advice(None, recent=True)[0].startswith("60 of 60 frames were lost")
+        watch.see((replace(lost, lost=False),), nothing, (None,))
+    assert watch.advice(None, recent=True) == ()
+    assert watch.facts[0].lost == 60, "the run's are all"
+
+
 def test_words_for_people() -> None:
     lost = no_estimate(0, 0.0, "out of view", 4, 0.01)
 

@@ -110,7 +110,14 @@ def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> Non
         "dropped": ((6,), "?"),
     }
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
-        texts = {"gesture", "state_name", "side", "joint_names", "openxr_joint_names"}
+        texts = {
+            "gesture",
+            "state_name",
+            "side",
+            "joint_names",
+            "openxr_joint_names",
+            "angle_names",
+        }
         assert set(archive.files) == {*promised, *texts, "readme", "metadata"}
         for name, (shape, kind) in promised.items():
             assert archive[name].shape == shape, name
@@ -224,6 +231,7 @@ def test_files_of_older_versions_are_results_as_well(tmp_path: Path) -> None:
     later = {"confidence", "outside_rad", "side", "side_probability", "index", "state_name"}
     with np.load(tmp_path / "track.npz") as archive:
         facts = {"readme", "joint_parents", "openxr_joint_names", "openxr_joint_parents"}
+        facts |= {"angle_names"}
         kept = {n: archive[n] for n in archive.files if n not in later | facts}
     np.savez(tmp_path / "old.npz", **kept)
     assert read_results(tmp_path / "old.npz").keys() == kept.keys()

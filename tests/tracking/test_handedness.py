@@ -65,6 +65,15 @@ def test_a_side_that_is_reported_at_a_restart_stays_reported() -> None:
         tracker.restart()
 
 
+def test_a_restart_may_detect_the_side_of_a_hand_that_was_told() -> None:
+    scene, tracker = first(2), make_tracker("hand.side=left", *SMALL)
+    tracker.restart("auto")
+    estimate = tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
+    assert estimate.side_probability < 1.0
+    tracker.restart()
+    assert tracker.step(scene.depth_m[1], scene.k, 1, 0.04).side_probability < 1.0, "it stays so"
+
+
 def test_the_evidence_of_comparisons_is_summed_up_and_bounded() -> None:
     fit, belief = (
         handedness_settings(weight=1.0, largest=2.0, most=3.0, shoulder=0.0),

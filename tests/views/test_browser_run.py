@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -186,6 +187,9 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
         press("Left hand")
         eventually(lambda: taken == ["restart", "left"])
         eventually(lambda: pressed() == ["Left hand"])
+        press("Either hand")
+        eventually(lambda: taken[2:] == ["auto"] and pressed() == ["Either hand"])
+        assert text("latency").endswith(" ms")
 
         for width in (1200, 500):
             chromium.set_window_size(width, 900)
@@ -202,8 +206,10 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
         left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
         assert right["y"] > left["y"] + left["height"] and left["width"] > 400
     lost = no_estimate(9, 0.36, "lost", 4, 0.01)
-    view.show(with_hand(moments()[0], estimate=lost, insight=None))
+    hint = ("Nothing was within reach: hold the hand nearer.",)
+    view.show(replace(with_hand(moments()[0], estimate=lost, insight=None), advice=hint))
     eventually(lambda: text("state") == "LOST" and text("phase") == "lost: no hand found")
+    assert text("advice") == hint[0]
 
     def of_slots(name: str) -> list[str]:
         script = f"return [...document.querySelectorAll('.hand .{name}')].map(e => e.textContent)"

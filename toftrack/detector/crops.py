@@ -6,6 +6,8 @@ points of a grid; nothing is interpolated over depth edges.
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import torch
@@ -27,12 +29,14 @@ WIDE_RANGE_M = 1.6
 
 def crop_rotation(centre_m: np.ndarray) -> np.ndarray:
     """(3, 3) from the crop's frame, whose z axis points at the centre (3,), to the camera's."""
-    ray = np.asarray(centre_m, np.float64)
-    ray = ray / np.linalg.norm(ray)
-    axis = np.array([-ray[1], ray[0], 0.0])  # z cross ray
-    sine, cosine = np.linalg.norm(axis), ray[2]
-    rotation, _ = cv2.Rodrigues(axis / max(sine, 1e-12) * np.arctan2(sine, cosine))
-    return rotation
+    x, y, z = map(float, centre_m)
+    distance = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    x, y, z = x / distance, y / distance, z / distance
+    # The shortest one; straight back there is none.
+    part = 1 / max(1 + z, 1e-12)
+    return np.array(
+        [[1 - x * x * part, -x * y * part, x], [-x * y * part, 1 - y * y * part, y], [-x, -y, z]]
+    )
 
 
 def crop(depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,6 +39,10 @@ BETWEEN_TIPS = {
 }
 """How often each thing is held between tips that leave room of up to 5, 15 and 30 mm, and more."""
 PARTS_OF_A_THING = 2
+WRITING_SHARE = 0.25
+"""Of the precision grasps, those of a pen as one writes with it."""
+_THUMB_ANYWHERE = ((-30.0, 42.0), (-20.0, 30.0), (-20.0, 15.0), (-12.0, 20.0), (-8.0, 20.0))
+"""Degrees of the thumb's five angles before it closes on a thing in the palm."""
 _PHONE_M = ((0.055, 0.095), (0.115, 0.185), (0.0, 0.016))
 """Width, length and thickness of what could be a phone."""
 
@@ -156,6 +160,10 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     fingers[..., 0] += spread
     thumb = torch.tensor([10.0, -12.0, 0.0, -5.0, 0.0])
     thumb = thumb + torch.tensor([14.0, 8.0, 8.0, 5.0, 8.0]) * dice.normal(n, 5)
+    # Or anywhere: beside the index finger, along the thing, around it from the other side.
+    low, high = torch.tensor(_THUMB_ANYWHERE).unbind(1)
+    anywhere = low + (high - low) * dice.uniform(n, 5)
+    thumb = torch.where(dice.chance(0.55, n, 1), anywhere, thumb)
     angles = torch.cat((thumb, fingers.flatten(1)), 1)
     return within_limits(torch.deg2rad(angles)), _chosen([things[name] for name in IN_PALM], which)
 
@@ -165,12 +173,13 @@ def things_between_tips(
 ) -> tuple[Tensor, Tensor]:
     """Hands (N, 21) whose thumb and index finger hold things (N, Q, PART) between their pads."""
     n = len(bare)
-    thumbs, fingers = _opposed_pairs()
-    # Sorted by the room between the tips; the narrow ones oftener.
-    row = (dice.uniform(n).square() * len(thumbs)).long()
+    writing = dice.chance(WRITING_SHARE, n)
     angles = bare.clone()
-    angles[:, :5], angles[:, 5:9] = thumbs[row], fingers[row]
-    closing = dice.chance(0.5, n, 1)
+    for some, (thumbs, fingers) in ((~writing, _opposed_pairs()), (writing, _writing_pairs())):
+        # Sorted by the room between the tips; the narrow ones oftener.
+        row = (dice.uniform(n).square() * len(thumbs)).long()[some]
+        angles[some, :5], angles[some, 5:9] = thumbs[row], fingers[row]
+    closing = dice.chance(0.5, n, 1) | writing[:, None]
     reaching = torch.deg2rad(torch.tensor([0.0, 15.0, 20.0, 10.0]).repeat(3))
     reaching = reaching + math.radians(6.0) * dice.normal(n, 12)
     angles[:, 9:] = torch.where(closing, reaching, angles[:, 9:])
@@ -245,6 +254,7 @@ def things_between_tips(
     chances = torch.tensor(list(BETWEEN_TIPS.values())).T
     thickness = torch.bucketize(thick, torch.tensor([0.005, 0.015, 0.03]))
     which = torch.multinomial(chances[thickness], 1, generator=dice.generator)[:, 0]
+    which = torch.where(writing, list(BETWEEN_TIPS).index("pen"), which)
     parts = _chosen([plate, disc, pens, cubes, ball, cylinder, cup], which)
     return angles, _thing(parts)
 
@@ -273,9 +283,19 @@ def _pads(
     return pads[0], pads[1]
 
 
-@functools.cache
 def _opposed_pairs() -> tuple[Tensor, Tensor]:
     """Thumbs (P, 5) and index fingers (P, 4) whose pads face each other, the nearest first."""
+    return _pairs(facing=0.7, widest_m=0.085, parallel=-1.0)
+
+
+def _writing_pairs() -> tuple[Tensor, Tensor]:
+    """Likewise, as they hold a pen: beside each other, and pointing where it points."""
+    return _pairs(facing=0.25, widest_m=0.033, parallel=0.6)
+
+
+@functools.cache
+def _pairs(facing: float, widest_m: float, parallel: float) -> tuple[Tensor, Tensor]:
+    """Thumbs and index fingers by the least cosines of pads that face each other and of tips."""
     generator = torch.Generator().manual_seed(0)
     n = 200_000
     low, high = torch.tensor(ANGLE_LIMITS)[:5].unbind(1)
@@ -286,11 +306,14 @@ def _opposed_pairs() -> tuple[Tensor, Tensor]:
     state = torch.cat((torch.zeros(n, 6), thumb, finger, torch.zeros(n, 12)), 1)
     radii = torch.full((n, 5, 3), 0.0075)
     radii[:, 0] = 0.009
-    (a, facing_a), (b, facing_b) = _pads(state, default_hand_shape(), radii, 0.1 * radii)
+    shape = default_hand_shape()
+    (a, facing_a), (b, facing_b) = _pads(state, shape, radii, 0.1 * radii)
     across = b - a
     gap = across.norm(dim=1)
     u = across / gap[:, None]
-    faced = ((facing_a * u).sum(1) > 0.7) & (-(facing_b * u).sum(1) > 0.7)
-    rows = (faced & (gap > 0.017) & (gap < 0.085)).nonzero()[:, 0]
+    faced = ((facing_a * u).sum(1) > facing) & (-(facing_b * u).sum(1) > facing)
+    frames = forward_kinematics(state, shape).frames
+    alike = (frames[:, 3, :, 1] * frames[:, 6, :, 1]).sum(1) > parallel
+    rows = (faced & alike & (gap > 0.017) & (gap < widest_m)).nonzero()[:, 0]
     rows = rows[gap[rows].argsort()]
     return thumb[rows], finger[rows]

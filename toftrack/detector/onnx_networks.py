@@ -45,7 +45,7 @@ class OnnxPoseNet:
         """Where it is."""
         return torch.device("cpu")
 
-    @property
+    @functools.cached_property
     def inputs(self) -> int:
         """Channels of a crop that it sees."""
         return self.reference.inputs
@@ -104,7 +104,7 @@ def load_networks(
     sessions = []
     for network in ("pose", "finder"):
         file = onnx_file(weights.path, network)
-        session = _session(file, weights.path)
+        session = read_session(file, weights.path)
         known = session is not None
         if not known or _made_of(session) != (FORMAT, VERSION, network, weights.sha256):
             why = f"{file} is of other weights" if known else f"there is no {file}"
@@ -125,8 +125,11 @@ def digest(content: bytes) -> bytes:
     return hashlib.sha256(content).hexdigest().encode()
 
 
-def _session(file: Path, weights: Path) -> Any:
-    """An ONNX Runtime session of a file that is whole; None: there is no such file."""
+def read_session(file: Path, weights: Path) -> Any:
+    """An ONNX Runtime session of a file of some weights; None: there is no such file.
+
+    Raises ToftrackError for one that is damaged.
+    """
     try:
         with open_to_read(file) as stream:
             content = stream.read(_LARGEST_BYTES + 1)

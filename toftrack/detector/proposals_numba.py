@@ -22,7 +22,7 @@ from toftrack.detector.network import ANGLES, JOINTS, PoseNet
 from toftrack.detector.onnx_networks import OnnxPoseNet
 from toftrack.detector.proposals import KEPT, MIRROR, NetworkOutput, mean_hand
 
-_COMPILING = "detector: compiling its numba kernels (once, about 3 s)"
+_COMPILING = "detector: compiling its numba kernels (once, about 4 s)"
 
 
 def run_pose_network(
@@ -47,14 +47,20 @@ def start_pose_network(
     centres_m: np.ndarray,
     side: str,
 ) -> Callable[[], NetworkOutput]:
-    """The same, begun in another thread if there may be one; what is returned waits for it."""
-    if not _may_be_shared(pose):
+    """The same, begun in another thread if there may be one; what is returned waits for it.
+
+    That thread has nothing to do but the network, so that it hardly needs the interpreter's lock.
+    centres_m: one, (1, 3).
+    """
+    if isinstance(pose, PoseNet) or not _may_be_shared(pose):
         return functools.partial(run_pose_network, pose, depth_m, k, centres_m, side)
     task, out = _prepared(pose, depth_m, k, centres_m, side)
-    wait = beside(task)
+    _, depth, left, k, centres, hand, written, _ = task.args
+    turn, image = _crop(pose, depth, left, k, centres[0])
+    wait = beside(functools.partial(pose.outputs, image))
 
     def reported() -> NetworkOutput:
-        wait()
+        _decode(wait(), image, turn, centres[0], left, hand, written, 0)
         return _reported(out)
 
     return reported
@@ -112,13 +118,34 @@ def _propose(
 
     Each by itself: a batch takes as long, and what is said of a crop would depend on the others.
     """
-    image = np.empty((1, pose.inputs, CROP, CROP), np.float32)
     for row in rows:
-        turn = crop_rotation(centres[row])
-        called(crop_at, _COMPILING, depth, left, k, centres[row], turn, image[0])
-        heads, keypoints = _outputs(pose, image)
-        given = heads[0], keypoints[0], image[0, 0], turn, centres[row], left, hand, row, out
-        called(decode_at, _COMPILING, *given)
+        turn, image = _crop(pose, depth, left, k, centres[row])
+        _decode(_outputs(pose, image), image, turn, centres[row], left, hand, out, row)
+
+
+def _crop(
+    pose: PoseNet | OnnxPoseNet, depth: np.ndarray, left: bool, k: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A crop's rotation (3, 3) and its image (1, inputs, CROP, CROP)."""
+    turn, image = crop_rotation(centre), np.empty((1, pose.inputs, CROP, CROP), np.float32)
+    called(crop_at, _COMPILING, depth, left, k, centre, turn, image[0])
+    return turn, image
+
+
+def _decode(
+    outputs: tuple[np.ndarray, np.ndarray],
+    image: np.ndarray,
+    turn: np.ndarray,
+    centre: np.ndarray,
+    left: bool,
+    hand: tuple[np.ndarray, ...],
+    out: tuple[np.ndarray, ...],
+    row: int,
+) -> None:
+    """Into a row of the arrays that are written."""
+    heads, keypoints = outputs
+    given = heads[0], keypoints[0], image[0, 0], turn, centre, left, hand, row, out
+    called(decode_at, _COMPILING, *given)
 
 
 def _outputs(pose: PoseNet | OnnxPoseNet, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,6 +30,10 @@ _NO_CAMERA_M = 0.1
 """No depth camera sees only what is nearer."""
 _NO_HAND_M = 4.0
 """Nobody has a hand tracked from farther away."""
+_STRETCH = 60
+"""So many frames are what is recent: long enough that advice does not flicker."""
+_FEWEST_FRAMES = 20
+"""Of a run that is shorter."""
 
 
 @dataclass(frozen=True)
@@ -160,15 +164,27 @@ def _apparent_m(insight: StepInfo | None) -> float | None:
     return None if detection is None or detection.present < _PRESENT else detection.length_m
 
 
+@dataclass(frozen=True)
+class _Tracked:
+    """A frame that was not lost; other_side as in LostFrame."""
+
+    other_side: bool | None
+
+
+_Frame = LostFrame | _Tracked
+
+
 class Watch:
     """Gathers the facts of a run, of each slot apart.
 
     reach_m: nothing beyond is a hand.  facts: of the slots.
+    recent: likewise, of the newest whole stretch of frames, for who watches a run.
     """
 
     def __init__(self, reach_m: float, slots: int = 1) -> None:
         self.reach_m = reach_m
-        self.facts = (RunFacts(),) * slots
+        self.facts = self.recent = self._stretch = (RunFacts(),) * slots
+        self._seen = 0
 
     def see(
         self,
@@ -181,33 +197,50 @@ class Watch:
         """
         vacant = [is_vacant(estimate) for estimate in estimates]
         missed = [slot > 0 or not all(vacant) for slot in range(len(estimates))]
-        self.facts = tuple(
-            facts if gone and idle else self._with(facts, estimate, depth_m, insight)
-            for facts, gone, idle, estimate, insight in zip(
-                self.facts, vacant, missed, estimates, insights, strict=True
+        frames = [
+            None if gone and idle else self._frame(estimate, depth_m, insight)
+            for gone, idle, estimate, insight in zip(
+                vacant, missed, estimates, insights, strict=True
             )
-        )
+        ]
+        self.facts, self._stretch = _with(self.facts, frames), _with(self._stretch, frames)
+        self._seen += 1
+        if _FEWEST_FRAMES <= self._seen < _STRETCH:
+            self.recent = self._stretch
+        elif self._seen % _STRETCH == 0:
+            self.recent, self._stretch = self._stretch, (RunFacts(),) * len(frames)
 
-    def _with(
-        self, facts: RunFacts, estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None
-    ) -> RunFacts:
+    def _frame(self, estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None) -> _Frame:
         if estimate.lost:
-            return facts.with_lost(lost_frame(estimate, depth_m, insight, self.reach_m))
-        return facts.tracked(_other_side(insight))
+            return lost_frame(estimate, depth_m, insight, self.reach_m)
+        return _Tracked(_other_side(insight))
 
     def apparent_m(self) -> tuple[float | None, ...]:
         """Of RunFacts.mean_looked_m, for each slot."""
         return tuple(facts.mean_apparent_m() for facts in self.facts)
 
-    def advice(self, side: str | None) -> tuple[str, ...]:
-        """Of the function of that name, for each slot."""
-        if len(self.facts) == 1:
-            return advice(self.facts[0], side, self.reach_m)
+    def advice(self, side: str | None, recent: bool = False) -> tuple[str, ...]:
+        """Of the function of that name, for each slot; of the run, or of what is recent."""
+        every = self.recent if recent else self.facts
+        if len(every) == 1:
+            return advice(every[0], side, self.reach_m)
         return tuple(
             f"Slot {slot}: {sentence}"
-            for slot, facts in enumerate(self.facts)
+            for slot, facts in enumerate(every)
             for sentence in advice(facts, side, self.reach_m)
         )
+
+
+def _with(every: tuple[RunFacts, ...], frames: Sequence[_Frame | None]) -> tuple[RunFacts, ...]:
+    """Each slot's facts with its frame, None where it missed none."""
+    return tuple(
+        facts.with_lost(frame)
+        if isinstance(frame, LostFrame)
+        else facts
+        if frame is None
+        else facts.tracked(frame.other_side)
+        for facts, frame in zip(every, frames, strict=True)
+    )
 
 
 def advice(facts: RunFacts, side: str | None, reach_m: float) -> tuple[str, ...]:
@@ -272,7 +305,7 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     if not found:
         which = "a bare hand" if side is None else f"a {side} hand (hand.side)"
         found.append(
-            f"If a hand was in view, check overlay.png (view=video): it must be {which}, upright "
+            f"If a hand was in view, check the picture (overlay.png): it must be {which}, upright "
             "and not mirrored (x right, y down), with nothing else nearer to "
             "the camera, and depth_m must have the order frames, rows, columns."
         )

@@ -1,5 +1,5 @@
-"""Choose when a joint may be used, `joint_ok`, on half of some recordings, and show what it does on
-the other half:
+"""Choose from which confidence on a joint may be used, `joint_ok`, on half of some recordings, and
+show what it does on the other half:
 
 python -m toftrack.programs.fit_joint_flags FOLDER... [--labels FILE]
 """
@@ -14,12 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import expit
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
-from toftrack.benchmark.runs import Source, sources
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
@@ -27,10 +24,7 @@ from toftrack.output.evaluation import TIPS
 from toftrack.output.image_labels import Points, lateral_errors_mm, read_labels
 from toftrack.output.trust import OK_MM
 from toftrack.programs import command_line
-from toftrack.tracking.confidence import JointFlags, flag_columns
 
-_SHRINK = 20.0
-"""Prior precision of weights of columns in standard deviations, in fingertips."""
 _RATES = (1, 2, 3, 4, 5, 7, 10, 15, 20)
 """Per cent of the right fingertips that are flagged, in the table."""
 
@@ -39,18 +33,18 @@ _RATES = (1, 2, 3, 4, 5, 7, 10, 15, 20)
 class Tips:
     """N visible fingertips in frames that are not flagged lost.
 
-    columns: (N, 3), see flag_columns.  wrong: (N,) more than 40 mm off.
+    confidence: (N,) of each.  wrong: (N,) more than 40 mm off.
     shown: (N,) of a recording on which nothing is chosen.
     """
 
-    columns: np.ndarray
+    confidence: np.ndarray
     wrong: np.ndarray
     shown: np.ndarray
 
     def half(self, shown: bool) -> Tips:
         """Those on which the flags are chosen, or those on which they are shown."""
         rows = self.shown == shown
-        return Tips(self.columns[rows], self.wrong[rows], self.shown[rows])
+        return Tips(self.confidence[rows], self.wrong[rows], self.shown[rows])
 
 
 def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
@@ -78,58 +72,75 @@ def main(arguments: list[str] | None = None) -> None:
     asked = read_arguments(arguments)
     if not 0 < asked.right < 100:
         raise ToftrackError(f"--right {asked.right:g} is no share; give per cent, as 4")
-    found = sources(asked.recordings, asked.labels)
-    todo = [(one, seed) for one in found for seed in range(1, asked.seeds + 1)]
+    labels = [read_points(path) for path in asked.labels]
+    found = recordings(asked.recordings)
+    todo = [(path, seed) for path in found for seed in range(1, asked.seeds + 1)]
     parts = [
-        observed(one, seed, is_shown(one, found), asked.settings)
-        for one, seed in tqdm(todo, unit=" recordings", file=sys.stderr)
+        observed(path, labels, seed, is_shown(path, found), asked.settings)
+        for path, seed in tqdm(todo, unit=" recordings", file=sys.stderr)
     ]
     tips = joined(parts)
-    flags = chosen(tips.half(False), asked.right)
+    least = chosen(tips.half(False), asked.right)
     report = {
-        "joint_ok": vars(flags),
-        "chosen_on": rates(tips.half(False), flags),
-        "shown_on": rates(tips.half(True), flags),
-        "curve": curve(tips.half(True), flags),
+        "joint_ok": least,
+        "chosen_on": rates(tips.half(False), least),
+        "shown_on": rates(tips.half(True), least),
+        "curve": curve(tips.half(True)),
     }
     if asked.output is not None:
         asked.output.write_text(json.dumps(report, indent=1) + "\n")
     print("\n".join(lines(report)))
 
 
-def is_shown(one: Source, found: list[Source]) -> bool:
+def recordings(paths: list[str]) -> list[Path]:
+    """The .npz files that are named, and those of folders in the order of their names."""
+    found: list[Path] = []
+    for path in (Path(name).expanduser() for name in paths):
+        mine = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+        if not mine:
+            raise ToftrackError(f"the folder '{path}' has no .npz; give one with recordings")
+        found += mine
+    return found
+
+
+def read_points(path: str) -> Points:
+    """Labels of points; ToftrackError for others."""
+    labels = read_labels(path)
+    if not isinstance(labels, Points):
+        raise ToftrackError(f"'{path}' labels no points; give labels of fingertips")
+    return labels
+
+
+def is_shown(path: Path, found: list[Path]) -> bool:
     """Whether nothing is chosen on a recording: every second one of its folder."""
-    return [source for source in found if source.path.parent == one.path.parent].index(one) % 2 == 1
+    return [one for one in found if one.parent == path.parent].index(path) % 2 == 1
 
 
-def observed(one: Source, seed: int, shown: bool, settings: list[str]) -> Tips:
-    """The fingertips of a recording.  shown: as in Tips."""
-    labels = None if one.labels is None else read_labels(one.labels)
-    if labels is not None and not isinstance(labels, Points):
-        raise ToftrackError(f"'{one.labels}' labels no points; give labels of fingertips")
-    with Replay(one.path) as device:
-        truth, k = device.truth, device.camera.K
-        side = labels.side if labels is not None else truth.side if truth else ""
-        if side not in ("right", "left"):
-            raise ToftrackError(f"'{one.path}' does not say whose hand it shows; leave it out")
+def observed(path: Path, labels: list[Points], seed: int, shown: bool, settings: list[str]) -> Tips:
+    """The fingertips of a recording with truth, or else with labels of images of its size.
+
+    shown: as in Tips.
+    """
+    with Replay(path) as device:
+        k, size = device.camera.K, (device.camera.width, device.camera.height)
+        known = device.truth or next((one for one in labels if one.size == size), None)
+        if known is None:
+            raise ToftrackError(
+                f"'{path}' has no truth, and no labels fit it; give --labels, or leave it out"
+            )
+        if known.side not in ("right", "left"):
+            raise ToftrackError(f"'{path}' does not say whose hand it shows; leave it out")
+        side = known.side
         tracker = make_tracker(f"hand.side={side}", f"seed={seed}", *settings)
-        joints, columns = [], []
+        joints, sure = [], []
         for frame in device:
             depth = device.camera.rectify(frame.depth, frame.radial)
             estimate = tracker.step(depth, k, frame.index, frame.timestamp_s)
-            info = tracker.info
-            nothing = info is None or info.joint_features is None or estimate.lost
             joints.append(estimate.joints_m)
-            columns.append(
-                np.full((21, 3), np.nan)
-                if nothing
-                else flag_columns(
-                    estimate.joint_confidence, estimate.confidence, info.joint_features
-                )
-            )
-    off = _tips_off_mm(np.array(joints), truth if labels is None else labels, k)
-    of_tips = np.array(columns)[:, TIPS]
-    used = np.isfinite(off) & np.isfinite(of_tips).all(2)
+            sure.append(np.where(estimate.lost, np.nan, estimate.joint_confidence))
+    off = _tips_off_mm(np.array(joints), known, k)
+    of_tips = np.array(sure)[:, TIPS]
+    used = np.isfinite(off) & np.isfinite(of_tips)
     return Tips(of_tips[used], off[used] > OK_MM, np.full(used.sum(), shown))
 
 
@@ -150,51 +161,22 @@ def _tips_off_mm(joints_m: np.ndarray, known: Truth | Points, k: np.ndarray) -> 
 
 def joined(parts: list[Tips]) -> Tips:
     """All of them."""
-    columns, wrong, shown = zip(*((p.columns, p.wrong, p.shown) for p in parts), strict=True)
-    return Tips(np.concatenate(columns), np.concatenate(wrong), np.concatenate(shown))
+    sure, wrong, shown = zip(*((p.confidence, p.wrong, p.shown) for p in parts), strict=True)
+    return Tips(np.concatenate(sure), np.concatenate(wrong), np.concatenate(shown))
 
 
-def chosen(tips: Tips, right_pct: float) -> JointFlags:
-    """Weights by a logistic model of what is wrong; the least such that so many right tips fall
-    below it.
-
-    Nothing may make a joint surer but its own confidence and the estimate's, and nothing but what
-    covers it less sure: three numbers, for a half of few recordings.
-    """
-    if not tips.wrong.any() or tips.wrong.all():
+def chosen(tips: Tips, right_pct: float) -> float:
+    """The confidence below which so many per cent of the right tips are."""
+    if tips.wrong.all():
         raise ToftrackError(
-            "no fingertip of the half on which is chosen is wrong, or none is right: give more "
-            "recordings, or other ones"
+            "no fingertip of the half on which is chosen is right: give more recordings, or others"
         )
-    signed = tips.columns * (1, 1, -1)
-    mean, spread = signed.mean(0), signed.std(0) + 1e-9
-    z, right = (signed - mean) / spread, 1.0 - tips.wrong
-
-    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        odds = z @ parameters[1:] + parameters[0]
-        off = expit(odds) - right
-        slope = np.concatenate(([off.sum()], z.T @ off + _SHRINK * parameters[1:]))
-        square = 0.5 * _SHRINK * np.square(parameters[1:]).sum()
-        return float((np.logaddexp(0, odds) - right * odds).sum() + square), slope
-
-    # The joint's own weight is never 0, for the others are given in units of it.
-    bounds = [(None, None), (0.05, None), (0, None), (0, None)]
-    start = np.array([0.0, 1.0, 0.0, 0.0])
-    found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x[1:] / spread
-    whole, behind = (round(float(weight / found[0]), 2) for weight in found[1:])
-    score = signed @ (1, whole, behind)
-    least = round(float(np.percentile(score[~tips.wrong], right_pct)), 2)
-    return JointFlags(least, whole, behind)
+    return float(np.percentile(tips.confidence[~tips.wrong], right_pct).round(4))
 
 
-def _score(tips: Tips, flags: JointFlags) -> np.ndarray:
-    score: np.ndarray = tips.columns @ (1, flags.whole, -flags.behind)
-    return score
-
-
-def rates(tips: Tips, flags: JointFlags) -> dict[str, Any]:
+def rates(tips: Tips, least: float) -> dict[str, Any]:
     """Of the wrong and of the right tips: how many there are, and per cent that are flagged."""
-    flagged = _score(tips, flags) < flags.least
+    flagged = tips.confidence < least
     found: dict[str, Any] = {}
     for name, rows in (("wrong", tips.wrong), ("right", ~tips.wrong)):
         found[name] = int(rows.sum())
@@ -204,21 +186,22 @@ def rates(tips: Tips, flags: JointFlags) -> dict[str, Any]:
     return found
 
 
-def curve(tips: Tips, flags: JointFlags) -> list[tuple[float, float]]:
+def curve(tips: Tips) -> list[tuple[float, float]]:
     """Per cent of the right tips that other thresholds flag, and of the wrong ones."""
-    score = _score(tips, flags)
     if not tips.wrong.any() or tips.wrong.all():
         return []
     points = []
     for right in _RATES:
-        least = np.percentile(score[~tips.wrong], right)
-        points.append((float(right), round(100 * float((score[tips.wrong] < least).mean()), 1)))
+        least = np.percentile(tips.confidence[~tips.wrong], right)
+        points.append(
+            (float(right), round(100 * float((tips.confidence[tips.wrong] < least).mean()), 1))
+        )
     return points
 
 
 def lines(report: dict[str, Any]) -> list[str]:
-    """For people; what is indented goes into conf/lost/calibrated.yaml."""
-    said = [f"  {name}: {value:g}" for name, value in report["joint_ok"].items()]
+    """For people; the first goes into conf/lost/calibrated.yaml."""
+    said = [f"joint_ok: {report['joint_ok']:g}"]
     for where, words in (("chosen_on", "chosen on"), ("shown_on", "the other half")):
         of = report[where]
         said.append(
@@ -226,7 +209,7 @@ def lines(report: dict[str, Any]) -> list[str]:
             f" {of['right_flagged_pct']} % of {of['right']} right ones"
         )
     pairs = ", ".join(f"{wrong:g} at {right:g}" for right, wrong in report["curve"])
-    return ["joint_ok:", *said, f"other thresholds there, wrong at right flagged, %: {pairs}"]
+    return [*said, f"other thresholds there, wrong at right flagged, %: {pairs}"]
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.programs.precompile import ready_tracker
-from toftrack.programs.run_facts import ShapeFiles, configured_side, opening, run_metadata
+from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata
 from toftrack.recordings.recorder import Recorder
 from toftrack.tracking.tracker import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
@@ -75,7 +75,7 @@ def _track(config: DictConfig, device: Device, stream: Stream, recorder: Recorde
     try:
         return _run(config, device, parts)
     finally:  # a live run that lost the hand ends by an interruption
-        for sentence in _notes(parts, configured_side(config, tracker.shapes[0].side)):
+        for sentence in _notes(parts):
             _note(sentence)
 
 
@@ -86,11 +86,19 @@ def _pace(configured: Pace, device: Device) -> Pace:
     return Pace(1 / device.fps) if configured.budget_s is None else configured
 
 
-def _notes(parts: _Parts, side: str | None) -> tuple[str, ...]:
+def _notes(parts: _Parts) -> tuple[str, ...]:
     """What is to be said of a run at its end."""
     dropped = tuple(filter(None, (parts.realtime.words(),)))
     # Hands are lost, too, where most frames are dropped.
-    return dropped if parts.realtime.too_slow else dropped + parts.watch.advice(side)
+    if parts.realtime.too_slow:
+        return dropped
+    return dropped + parts.watch.advice(_told_side(parts.tracker))
+
+
+def _told_side(tracker: HandsTracker) -> str | None:
+    """Of the only hand, by the configuration or in a view; None where it is detected."""
+    one = tracker.states[0]
+    return one.side if len(tracker.states) == 1 and one.handedness.given else None
 
 
 def _run(config: DictConfig, device: Device, parts: _Parts) -> float:
@@ -210,7 +218,11 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 parts.shapes.save()
                 parts.stream.send(calm)
                 hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
-                view.show(TrackedFrame(frame, depth, device.camera, hands))
+                told = _told_side(tracker)
+                advice = parts.watch.advice(told, recent=True)
+                view.show(
+                    TrackedFrame(frame, depth, device.camera, hands, told is not None, advice)
+                )
                 bar.update()
                 if device.live:
                     took_s, reduced = tracker.time.took_s(), tracker.time.reduced

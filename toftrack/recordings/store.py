@@ -25,7 +25,7 @@ _BY_OPENNI = (
 )
 _BY_POINTS = "points have lost the image that they came from; give the depth images themselves"
 FIRST_SAMPLE = "right_hand"
-SAMPLES = (FIRST_SAMPLE, "left_hand", "glass")
+SAMPLES = (FIRST_SAMPLE, "left_hand", "two_hands", "point_and_pinch", "glass")
 """The recordings that come with the package; toftrack/data/README.md says what they show."""
 ELSEWHERE = {
     ".oni": _BY_OPENNI,

@@ -164,7 +164,6 @@ misfit: minus the log of the image's score.
 pixel: log of a pixel's width there, in millimetres.
 doubt: log(1 + exp(-x)) of the log odds x that the whole estimate is right.
 """
-_BEHIND = JOINT_FEATURES.index("behind")
 KINDS = (
     *("wrist", "thumb_cmc", "thumb_mcp", "thumb_ip", "thumb_tip"),
     *("mcp", "pip", "dip", "tip"),
@@ -234,41 +233,6 @@ class JointConfidence:
         ) / 100
         odds = (predicted[:, 3] + self.odds).clip(-30.0, 30.0)
         return sigma.astype(np.float32), (1 / (1 + np.exp(-odds))).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class JointFlags:
-    """When a joint of an estimate may be used; see conf/lost/calibrated.yaml.
-
-    least: log odds that it needs.  whole, behind: weights of what they are formed from beside those
-        of the joint itself: the log odds of the whole estimate, and the joint's feature `behind`.
-    """
-
-    least: float
-    whole: float
-    behind: float
-
-    def __post_init__(self) -> None:
-        for name in ("least", "whole", "behind"):
-            value = getattr(self, name)
-            check_number(f"lost.joint_ok.{name}", value, *(() if name == "least" else (0,)))
-
-    def ok(self, confidence: np.ndarray, whole: float, features: np.ndarray) -> np.ndarray:
-        """(21,) bool; arguments as of flag_columns."""
-        weights = np.array([1.0, self.whole, -self.behind])
-        found: np.ndarray = flag_columns(confidence, whole, features) @ weights >= self.least
-        return found
-
-
-def flag_columns(confidence: np.ndarray, whole: float, features: np.ndarray) -> np.ndarray:
-    """(21, 3) of joints: their own log odds, the whole estimate's, and how far behind they are.
-
-    confidence, whole: probabilities (21,) of the joints, and of the estimate.  features: (21, J).
-    """
-    sure = np.append(confidence, whole).astype(np.float64).clip(_LEAST, 1 - _LEAST)
-    odds = np.log(sure / (1 - sure))
-    columns = (odds[:-1], np.full(len(confidence), odds[-1]), features[:, _BEHIND])
-    return np.stack(columns, 1)
 
 
 def joint_features(
@@ -358,7 +322,7 @@ class ConfidenceModel:
         believed before.  second: or while another hand is believed.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
-    joint_ok: when a joint of an estimate may be used.
+    joint_ok: joints of an estimate that are near with a lower probability are not ok.
     probation: frames after a start during which the hand is not remembered as seen.
     intercept, weights: of the features, by name.
     joints: of each joint.
@@ -371,14 +335,14 @@ class ConfidenceModel:
     give_up: float
     patience: int
     memory: float
-    joint_ok: JointFlags
+    joint_ok: float
     probation: int
     intercept: float
     weights: Mapping[str, float]
     joints: JointConfidence
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "again", "second", "give_up"):
+        for name in ("confidence", "believe", "again", "second", "give_up", "joint_ok"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
         for name in ("patience", "probation"):

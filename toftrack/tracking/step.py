@@ -169,7 +169,7 @@ def conclude(
         image.k,
     )
     sigma, confidence = model.lost.joints.judge(rows)
-    ok = model.lost.joint_ok.ok(confidence, status.confidence, rows) & (not status.lost)
+    ok = (confidence >= model.lost.joint_ok) & (not status.lost)
     estimate = replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence, joint_ok=ok)
     hand = replace(
         frame.hand,

@@ -27,6 +27,7 @@ from toftrack.tracking.paper import PaperModel, paper_step
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.step import Stepped, step
 
+AUTO = "auto"
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
 
@@ -98,6 +99,8 @@ class HandsTracker:
 
     def restart(self, side: str | None = None) -> None:
         """Forget the hands, also their size, and search for them anew; a side is the first hand's.
+
+        side: right or left, which it is told to be; auto, to detect it; None, as it was.
 
         Only random numbers and frame numbers go on. Raises ToftrackError for an unknown side.
         """
@@ -243,14 +246,16 @@ def _stepped(state: TrackerState, image: DepthImage, model: FilterModel) -> Step
 
 def restarted(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
     """A state that has seen nothing, but for its random and frame numbers; of a side if one is
-    given, which is certain from then on.
+    given, which is certain from then on, with auto of either. The paper's tracker detects none.
 
     Raises ToftrackError for an unknown side.
     """
     fresh = model.first_state(0, len(state.reported))
-    given = side is not None or state.hands[0].handedness.given
+    told = None if side == AUTO else side
+    keeps = side is None or isinstance(model, PaperModel)
+    given = told is not None or (keeps and state.hands[0].handedness.given)
     first = state.hands[0].side if given else fresh.hands[0].side
-    first = model.configured.shape.of_side(side).side if side is not None else first
+    first = model.configured.shape.of_side(told).side if told is not None else first
     sides = (first, OTHER_SIDE[first])
     hands = tuple(
         replace(model.first_hand(sides[slot], given and not hand.watched), watched=hand.watched)

@@ -14,8 +14,9 @@ from toftrack.frames import Frame
 from toftrack.hand.shape import HandShape
 from toftrack.tracking.state import StepInfo
 
-COMMANDS = ("restart", "right", "left")
-"""What a view may ask: a new start, or another hand (which starts anew)."""
+COMMANDS = ("restart", "auto", "right", "left")
+"""What a view may ask: a new start, or another hand, which starts anew: of either side, a right or
+a left one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,10 @@ class TrackedFrame:
     camera: Camera
     hands: tuple[TrackedHand, ...]
     """One for each slot, of which there are one or two."""
+    side_given: bool = False
+    """The first hand's side is told, and not detected."""
+    advice: tuple[str, ...] = ()
+    """What to try, where the frames before this one hardly showed a hand, or the other one."""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

@@ -25,7 +25,10 @@ from toftrack.output.exports.motion import motions_of
 from toftrack.output.exports.table import csv_of
 
 NAMES = ("index", "timestamp_s", "state_name", "lost", "side", "joints_m", "state", "gesture")
-MORE = ("confidence", "pinching", "pointing_origin_m", "pointing_direction", "openxr_position_m")
+MORE = (
+    *("confidence", "joint_ok", "pinching", "pointing_origin_m", "pointing_direction"),
+    "openxr_position_m",
+)
 
 
 def results_of(estimates: list[Estimate]) -> dict[str, Any]:
@@ -183,6 +186,7 @@ def test_a_csv_has_a_row_a_frame_and_a_column_a_number() -> None:
         for number, name in enumerate(JOINT_NAMES):
             place = [float(row[f"{name}_{axis}_m"]) for axis in "xyz"]
             assert place == pytest.approx(estimate.joints_m[number].tolist(), abs=1e-5)
+            assert row[f"{name}_ok"] == str(int(estimate.joint_ok[number]))
         assert row["pointing_origin_x_m"] == ""
 
 

@@ -167,6 +167,7 @@ class LivePicture:
         self._phase, self._version = "starting", 0
         self._jpeg, self._jpeg_version, self._facts = b"", 0, dict[str, Any]()
         self._waiting, self._asked_s = 0, -math.inf
+        self._newest_s = self._arrived_s = time.monotonic()  # when the device gave the frame
         self._commands: deque[str] = deque(maxlen=_MOST_COMMANDS)
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._draw_all, name="browser-drawing", daemon=True)
@@ -183,7 +184,9 @@ class LivePicture:
             if self._error is not None:
                 raise self._error
             self._tracked, self._undrawn, self._phase = tracked, True, "live"
-            self._times_s.append(time.monotonic())
+            now_s, took_s = time.monotonic(), tracked.hands[0].estimate.compute_s
+            self._newest_s = now_s - (took_s if math.isfinite(took_s) else 0.0)
+            self._times_s.append(now_s)
             self._work.notify()
 
     def set_phase(self, phase: str) -> None:
@@ -206,7 +209,8 @@ class LivePicture:
                 self._waiting -= 1
                 self._asked_s = time.monotonic()
             jpeg = self._jpeg if self._jpeg_version > version else None
-            return News(self._version, jpeg, {"phase": self._phase} | self._facts)
+            age = {"age_ms": round(1e3 * (time.monotonic() - self._arrived_s), 1)}
+            return News(self._version, jpeg, {"phase": self._phase} | self._facts | age)
 
     def ask(self, command: str) -> None:
         """Keep a visitor's command; the oldest are forgotten when nobody fetches them."""
@@ -231,14 +235,14 @@ class LivePicture:
     def _draw_all(self) -> None:
         with small_operations():
             while (tracked := self._next()) is not None:
-                began = time.monotonic()
+                began, arrived_s = time.monotonic(), self._newest_s
                 try:
                     jpeg = _encode(tracked, self._quality)
                 except Exception as error:  # the tracker's thread raises it
                     with self._lock:
                         self._error = error
                     return
-                self._publish(tracked, jpeg)
+                self._publish(tracked, jpeg, arrived_s)
                 with self._lock:
                     rest = began + self._least_s - time.monotonic()
                     self._work.wait_for(lambda: self._closed, max(0.0, rest))
@@ -255,8 +259,9 @@ class LivePicture:
             self._undrawn = False
             return None if self._closed else self._tracked
 
-    def _publish(self, tracked: TrackedFrame, jpeg: bytes) -> None:
+    def _publish(self, tracked: TrackedFrame, jpeg: bytes, arrived_s: float) -> None:
         with self._lock:
+            self._arrived_s = arrived_s
             self._version += 1
             self._jpeg, self._jpeg_version = jpeg, self._version
             self._facts = _facts(tracked) | {"fps": _rate(self._times_s)}
@@ -282,9 +287,14 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
     Of two hands the frame is lost when neither can be used, and its state is the first slot's.
     """
     first = tracked.hands[0]
-    of_frame = {"index": int(first.estimate.index), "ms": _number(1e3 * first.estimate.compute_s)}
+    of_frame = {
+        "index": int(first.estimate.index),
+        "ms": _number(1e3 * first.estimate.compute_s),
+        "advice": list(tracked.advice),
+    }
     if len(tracked.hands) == 1:
-        return of_frame | _hand_facts(first) | {"side": first.shape.side}
+        side = {"side": first.shape.side, "side_given": tracked.side_given}
+        return of_frame | _hand_facts(first) | side
     return of_frame | {
         "state": state_words(first.estimate),
         "lost": all(estimate.lost for estimate in tracked.estimates),
