@@ -16,7 +16,7 @@ from toftrack.estimate import Estimate
 from toftrack.tracking.handedness import HandednessEstimate
 from toftrack.tracking.lifecycle import taking_part
 from toftrack.tracking.state import TrackerState
-from toftrack.tracking.watching import told_apart, watched_over
+from toftrack.tracking.watching import first_estimate, watched_over
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -31,7 +31,7 @@ def watching(first: bool, other: bool, **changes: object) -> TrackerState:
         replace(hand, track=track_of(here, model) if followed else None)
         for hand, followed in zip(state.hands, (first, other), strict=True)
     ]
-    hands[0] = replace(hands[0], handedness=HandednessEstimate(given=True, told=2.0))
+    hands[0] = replace(hands[0], handedness=HandednessEstimate(given=True, prior=2.0))
     return replace(state, hands=tuple(hands), **changes)
 
 
@@ -76,7 +76,7 @@ def test_what_is_surely_of_the_other_side_is_followed_as_the_other_hand() -> Non
     first, other = after.hands
     assert first.track is None and first.side == "right" and first.handedness.given
     assert other.side == "left" and not other.handedness.given
-    reported = told_apart(first.last, after)
+    reported = first_estimate(first.last, after)
     assert reported.lost and reported.state_name == "other hand"
 
 

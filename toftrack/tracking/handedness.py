@@ -43,8 +43,8 @@ class HandednessSettings:
     sure: float
     interval_unsure_s: float
     interval_sure_s: float
-    told: float
-    interval_told_s: float
+    given: float
+    interval_given_s: float
     other: float
     watch_s: float
 
@@ -60,7 +60,7 @@ class HandednessEstimate:
     """Which hand it is; all but the body's place are log odds of a right hand.
 
     given: the user gave the side, which is certain; what is followed may be the other hand.
-    told: by the user's word, where it was given.
+    prior: by the user's word, where it was given.
     fits: by how much better a right hand explains the image than a left one, summed up.
     shoulder: by where the body is.  partner: by which hand the other one is that is tracked.
     body_m: how far the body is to the image's right of the hand, on average.
@@ -68,7 +68,7 @@ class HandednessEstimate:
     """
 
     given: bool = False
-    told: float = 0.0
+    prior: float = 0.0
     fits: float = 0.0
     shoulder: float = 0.0
     partner: float = 0.0
@@ -79,7 +79,7 @@ class HandednessEstimate:
     @property
     def log_odds(self) -> float:
         """That it is a right hand, by all this."""
-        return self.told + self.fits + self.shoulder + self.partner
+        return self.prior + self.fits + self.shoulder + self.partner
 
     def probability(self, side: str) -> float:
         """That the hand is of a side; 1 where it was given."""
@@ -92,7 +92,7 @@ class HandednessEstimate:
         interval = settings.interval_unsure_s
         new = self.given and self.comparisons < _FIRST_COMPARISONS
         if abs(self.log_odds) > math.log(settings.sure / (1 - settings.sure)) and not new:
-            interval = settings.interval_told_s if self.given else settings.interval_sure_s
+            interval = settings.interval_given_s if self.given else settings.interval_sure_s
         return self.age_s + dt_s >= interval
 
     def seems(self, side: str) -> float:
@@ -136,7 +136,7 @@ class HandednessEstimate:
 
     def beside(self, other: HandednessEstimate, settings: HandednessSettings) -> HandednessEstimate:
         """The same where another hand is tracked: a person's two hands are not of one side."""
-        surely = math.tanh(0.5 * (other.told + other.fits + other.shoulder))
+        surely = math.tanh(0.5 * (other.prior + other.fits + other.shoulder))
         return self if self.given else replace(self, partner=-settings.partner * surely)
 
 

@@ -103,8 +103,8 @@ class FilterModel:
 
     def first_hand(self, side: str, side_given: bool) -> HandState:
         """A slot before any frame."""
-        told = self.configured.handedness.told * (1 if side == "right" else -1)
-        handedness = HandednessEstimate(side_given, told if side_given else 0.0)
+        prior = self.configured.handedness.given * (1 if side == "right" else -1)
+        handedness = HandednessEstimate(side_given, prior if side_given else 0.0)
         seen = LastSeen(torch.zeros(1, 6 + self.space.dims), math.inf)
         nothing = no_estimate(-1, math.nan, "lost", self.space.dims, math.nan)
         return HandState(side, handedness, first_shape(), seen, nothing)

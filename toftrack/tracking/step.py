@@ -40,7 +40,7 @@ from toftrack.tracking.lifecycle import (
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
 from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
-from toftrack.tracking.watching import told_apart, watched_over
+from toftrack.tracking.watching import first_estimate, watched_over
 
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state, and for each slot what was seen, None where nobody asked, and the estimate."""
@@ -221,7 +221,7 @@ def reconciled(
     after, exchanged = reconcile(before, after, partial(_found_hand, model), dt_s)
     if before.watched:
         after = watched_over(after, model.configured.handedness)
-        first = told_apart(estimates[0], after)
+        first = first_estimate(estimates[0], after)
         return after, tuple(infos[:1]), (first,)
     if exchanged:
         infos, estimates = infos[::-1], estimates[::-1]

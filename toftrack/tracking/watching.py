@@ -64,7 +64,7 @@ def watched_over(state: TrackerState, settings: HandednessSettings) -> TrackerSt
     return state
 
 
-def told_apart(estimate: Estimate, state: TrackerState) -> Estimate:
+def first_estimate(estimate: Estimate, state: TrackerState) -> Estimate:
     """The first hand's estimate, where only the other hand is followed."""
     first, other = state.hands
     if first.track is not None or not (other.believed or state.second_s == math.inf):
@@ -87,7 +87,7 @@ def _passed_on(first: HandState, other: HandState, track: Track) -> HandState:
     return replace(
         other,
         side=OTHER_SIDE[first.side],
-        handedness=replace(first.handedness, given=False, told=0.0),
+        handedness=replace(first.handedness, given=False, prior=0.0),
         shape=first_shape(),
         seen=LastSeen(track.mean, 0.0),
         track=None,
