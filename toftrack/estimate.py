@@ -17,6 +17,7 @@ STATES = {
     "initialising": "starting",
     "lost": "no hand found",
     "recovering": "trying to recover",
+    "other hand": "only the other hand is seen",
     "dropped": "the frame came too late",
 }
 """What the tracker does, Estimate.state_name, and how it is said to people."""

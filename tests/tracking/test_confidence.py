@@ -94,7 +94,7 @@ def test_log_odds_rise_and_fall_with_a_feature_as_its_weight_says(name: str) -> 
 
 @pytest.mark.parametrize("log_odds", [-1e9, -40.0, -2.0, 0.1, 3.0, 1e9])
 def test_the_confidence_is_the_probability_of_the_log_odds(log_odds: float) -> None:
-    found = judge(followed(), with_odds(log_odds), FRAME_S, 1.0, False, model_of())
+    found = judge(followed(), with_odds(log_odds), FRAME_S, 1.0, 0.0, model_of())
     assert found.confidence == pytest.approx(1 / (1 + math.exp(-max(min(log_odds, 50), -50))))
     assert 0 <= found.confidence <= 1
     assert found.lost == (found.confidence < 0.5)

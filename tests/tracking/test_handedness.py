@@ -45,7 +45,7 @@ def test_a_wrong_side_is_changed_in_one_frame_and_the_fingers_with_it() -> None:
         if i == 0:
             wrong = HandednessEstimate(fits=-1.0)
             hand = replace(tracker.state.hands[0], side="left", handedness=wrong)
-            tracker.state = replace(tracker.state, hands=(hand,))
+            tracker.state = replace(tracker.state, hands=(hand, *tracker.state.hands[1:]))
         estimates.append(tracker.step(scene.depth_m[i], scene.k, i, i / 25))
     for i in range(4, FRAMES):
         estimates.append(tracker.step(scene.depth_m[i], scene.k, i, i / 25))

@@ -60,7 +60,8 @@ def judged(
 ) -> Status:
     log_odds = math.log(probability / (1 - probability))
     features = replace(NO_FEATURES, log_score=log_odds, **features)
-    return judge(track, features, dt_s, side, second, replace(PLAIN, patience=patience))
+    new = PLAIN.second if second else PLAIN.believe
+    return judge(track, features, dt_s, side, new, replace(PLAIN, patience=patience))
 
 
 def frames_until_end(patience: int, dt_s: float = FRAME_S, **features: float) -> int | None:
@@ -143,7 +144,7 @@ def test_the_log_odds_are_smoothed_over_time_but_in_a_first_frame() -> None:
     features = replace(NO_FEATURES, log_score=2.0)
     older, new = track_of(HERE, log_odds=-2.0), track_of(HERE, age=Duration(), log_odds=-2.0)
     found = [
-        judge(track, features, dt_s, 1.0, False, model).log_odds
+        judge(track, features, dt_s, 1.0, 0.0, model).log_odds
         for track, dt_s in ((older, FRAME_S), (older, 2 * FRAME_S), (new, FRAME_S))
     ]
     assert found == pytest.approx([0.0, 1.0, 2.0])

@@ -109,7 +109,7 @@ def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() 
     fresh = tracker.state
     tracked(tracker, scene, range(9))
     before = tracker.state
-    (hand,) = before.hands
+    hand = before.hands[0]
     assert hand.track is not None and hand.seen.ever and hand.gesture is not None
     assert hand.shape.frames > 0 and np.isfinite(hand.last.joints_m).all()
     tracker.restart()

@@ -318,8 +318,8 @@ class ConfidenceModel:
     """When an estimate is not to be used, and when its track is given up; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time.  second: or while another hand
-        is believed.
+    believe: likewise, until a track was believed for the first time.  again: or of a hand that was
+        believed before.  second: or while another hand is believed.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
     joint_ok: joints of an estimate that are near with a lower probability are not ok.
@@ -330,6 +330,7 @@ class ConfidenceModel:
 
     confidence: float
     believe: float
+    again: float
     second: float
     give_up: float
     patience: int
@@ -341,7 +342,7 @@ class ConfidenceModel:
     joints: JointConfidence
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "second", "give_up", "joint_ok"):
+        for name in ("confidence", "believe", "again", "second", "give_up", "joint_ok"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
         for name in ("patience", "probation"):

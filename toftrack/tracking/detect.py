@@ -56,7 +56,8 @@ def search(
     likely = partial(_reachable, hand, others)
     found = detector.search(image.depth_m, image.k, side, likely)
     undecided = not hand.handedness.given
-    if not found and hand.track is None and undecided:
+    beside = any(other.believed for other in others)
+    if not found and hand.track is None and undecided and not beside:
         # A hand of the other side may be too unlike one of this to be found as such.
         found = detector.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
         again = np.array([one.centre_m.numpy() for one in found[:1]]).reshape(-1, 3)

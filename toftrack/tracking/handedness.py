@@ -18,6 +18,10 @@ from toftrack.frames import DepthImage
 
 _BODY_COMPARISONS = 20
 """Comparisons over which the body's place is averaged."""
+_FIRST_COMPARISONS = 5
+"""Whatever a given side is taken for, a new hand is compared so often before it is sure."""
+_NOT_AGAINST = 0.86
+"""With the user's word alone it is a little more probable that it is of the side."""
 _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
@@ -39,10 +43,15 @@ class HandednessSettings:
     sure: float
     interval_unsure_s: float
     interval_sure_s: float
+    given: float
+    interval_given_s: float
+    other: float
+    watch_s: float
 
     def __post_init__(self) -> None:
+        limits = {"sure": (0.5, 0.999), "other": (0, 0.5)}
         for entry in fields(self):
-            least, most = (0.5, 0.999) if entry.name == "sure" else (0, math.inf)
+            least, most = limits.get(entry.name, (0, math.inf))
             check_number(f"hand.sides.{entry.name}", getattr(self, entry.name), least, most)
 
 
@@ -50,7 +59,8 @@ class HandednessSettings:
 class HandednessEstimate:
     """Which hand it is; all but the body's place are log odds of a right hand.
 
-    given: the user gave the side, which is certain.
+    given: the user gave the side, which is certain; what is followed may be the other hand.
+    prior: by the user's word, where it was given.
     fits: by how much better a right hand explains the image than a left one, summed up.
     shoulder: by where the body is.  partner: by which hand the other one is that is tracked.
     body_m: how far the body is to the image's right of the hand, on average.
@@ -58,6 +68,7 @@ class HandednessEstimate:
     """
 
     given: bool = False
+    prior: float = 0.0
     fits: float = 0.0
     shoulder: float = 0.0
     partner: float = 0.0
@@ -68,22 +79,35 @@ class HandednessEstimate:
     @property
     def log_odds(self) -> float:
         """That it is a right hand, by all this."""
-        return self.fits + self.shoulder + self.partner
+        return self.prior + self.fits + self.shoulder + self.partner
 
     def probability(self, side: str) -> float:
         """That the hand is of a side; 1 where it was given."""
-        if self.given:
-            return 1.0
-        log_odds = self.log_odds if side == "right" else -self.log_odds
-        return 1 / (1 + math.exp(-log_odds))
+        return 1.0 if self.given else self.seems(side)
 
     def comparison_due(self, settings: HandednessSettings, tracked: bool, dt_s: float) -> bool:
         """Whether both sides are to be compared in a frame, dt_s after the last."""
-        if self.given or not tracked:
-            return not self.given
-        sure = max(self.probability(side) for side in OTHER_SIDE) > settings.sure
-        interval = settings.interval_sure_s if sure else settings.interval_unsure_s
+        if not tracked:
+            return True
+        interval = settings.interval_unsure_s
+        new = self.given and self.comparisons < _FIRST_COMPARISONS
+        if abs(self.log_odds) > math.log(settings.sure / (1 - settings.sure)) and not new:
+            interval = settings.interval_given_s if self.given else settings.interval_sure_s
         return self.age_s + dt_s >= interval
+
+    def seems(self, side: str) -> float:
+        """Probability that what is followed is of a side, also where the side was given."""
+        log_odds = self.log_odds if side == "right" else -self.log_odds
+        return 1 / (1 + math.exp(-log_odds))
+
+    def doubtful(self, side: str) -> bool:
+        """Whether the first comparisons of a new hand speak against the side that was given."""
+        new = self.given and self.comparisons < _FIRST_COMPARISONS
+        return new and self.seems(side) < _NOT_AGAINST
+
+    def contradicted(self, side: str, settings: HandednessSettings) -> bool:
+        """Whether what is followed is surely the other hand than the one that was given."""
+        return self.given and self.seems(side) < settings.other
 
     def waited(self, dt_s: float) -> HandednessEstimate:
         """After a frame without a comparison."""
@@ -98,18 +122,21 @@ class HandednessEstimate:
         fits = min(max(fits, -settings.most), settings.most)
         body_m = self.body_m + (body_m - self.body_m) / min(comparisons, _BODY_COMPARISONS)
         most = settings.shoulder_most
-        shoulder = min(max(settings.shoulder * body_m, -most), most)
-        return HandednessEstimate(False, fits, shoulder, self.partner, body_m, comparisons)
+        shoulder = 0.0 if self.given else min(max(settings.shoulder * body_m, -most), most)
+        return replace(
+            self, fits=fits, shoulder=shoulder, body_m=body_m, comparisons=comparisons, age_s=0.0
+        )
 
     def left(self, settings: HandednessSettings) -> HandednessEstimate:
         """After the hand has left: the next one is likely, but not surely, the same."""
         before = self.fits + self.shoulder
         kept = min(max(before, -settings.kept), settings.kept)
-        return HandednessEstimate(fits=kept, partner=self.partner, age_s=self.age_s)
+        kept = 0.0 if self.given else kept  # which hand it was says nothing of which one it is
+        return replace(self, fits=kept, shoulder=0.0, body_m=0.0, comparisons=0)
 
     def beside(self, other: HandednessEstimate, settings: HandednessSettings) -> HandednessEstimate:
         """The same where another hand is tracked: a person's two hands are not of one side."""
-        surely = math.tanh(0.5 * (other.fits + other.shoulder))
+        surely = math.tanh(0.5 * (other.prior + other.fits + other.shoulder))
         return self if self.given else replace(self, partner=-settings.partner * surely)
 
 

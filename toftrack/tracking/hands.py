@@ -46,6 +46,7 @@ class OtherHand:
     certain: its last estimate was not flagged, so that pixels are its own.
     pixels: (H, W) bool of the reduced image, those that it explains better.
     beside: (H, W) bool, those of them that cannot hide this hand.
+    watched: nobody asked for it.
     """
 
     joints_m: Tensor
@@ -54,6 +55,7 @@ class OtherHand:
     certain: bool
     pixels: np.ndarray
     beside: np.ndarray
+    watched: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +105,15 @@ def placed(
 
 
 def others_of(
-    hands: Sequence[HandState], image: DepthImage, model: TrackerModel, dt_s: float
+    hands: Sequence[HandState],
+    slots: Sequence[int],
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
 ) -> list[tuple[OtherHand, ...]]:
-    """For each slot, the other hands as they are predicted in a frame."""
-    if len(hands) == 1:
-        return [()]
+    """For each of the slots that take part, the other hands as they are predicted in a frame."""
+    if not any(hands[own - 1].track is not None for own in slots):
+        return [() for _ in hands]
     depth_m, k = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
     size = (depth_m.shape[0], depth_m.shape[1])
     there = [
@@ -116,9 +122,11 @@ def others_of(
     ]
     return [
         tuple(
-            _other_hand(hands[slot].track, theirs, mine, depth_m)
+            replace(
+                _other_hand(hands[slot].track, theirs, mine, depth_m), watched=hands[slot].watched
+            )
             for slot, theirs in enumerate(there)
-            if theirs is not None and slot != own
+            if theirs is not None and slot != own and own in slots
         )
         for own, mine in enumerate(there)
     ]
@@ -177,8 +185,6 @@ def without(image: DepthImage, others: Sequence[OtherHand]) -> DepthImage:
 
 def partnered(hands: Sequence[HandState], model: TrackerModel) -> list[HandState]:
     """The hands, with what the other hand's side says of each one's."""
-    if len(hands) == 1:
-        return list(hands)
     settings = model.configured.handedness
     return [
         replace(hand, handedness=hand.handedness.beside(other.handedness, settings))

@@ -65,6 +65,7 @@ from toftrack.tracking.hands import (
 )
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
+from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S, watched_slots
 
 _HIDDEN = 0.3
 """Share of the joints behind something from which on a hand is hidden."""
@@ -204,10 +205,8 @@ def _compared(
     When the other side has become the likelier one, a track of it begins in this frame.
     """
     settings, before = model.configured.handedness, hand.handedness
-    if before.given:
-        return hand, detection
     due = before.comparison_due(settings, hand.track is not None, dt_s)
-    if hand.track is None and hand.seen.age_s > _GONE_S:
+    if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
         before = before.left(settings)  # what comes may be the other hand
     handedness = before.waited(dt_s)
     if detection.present < _LEAST_PRESENT or not due:
@@ -219,7 +218,7 @@ def _compared(
     gain = gain if hand.side == "right" else -gain
     handedness = handedness.compared(gain, body_offset_m(image, centre), settings)
     hand = replace(hand, handedness=handedness)
-    if handedness.probability(hand.side) >= _SWITCHED:
+    if handedness.probability(hand.side) >= _SWITCHED:  # 1 where the side was given
         return hand, detection
     return replace(hand, side=other, shape=first_shape(), gesture=None, track=None), mirrored
 
@@ -290,9 +289,17 @@ def close(
 ) -> tuple[Status, Track, LastSeen]:
     """What is thought of a frame's estimate, the track as of the frame, and the hand last seen."""
     model, track = frame.model, frame.track
-    side = frame.hand.handedness.probability(frame.hand.side)
-    second = any(other.believed for other in frame.others)
-    status = judge(track, features, dt_s, side, second, model.lost)
+    whose = frame.hand.handedness
+    second = any(other.believed and not other.watched for other in frame.others)
+    first = model.lost.again if frame.hand.seen.ever else model.lost.believe
+    new = model.lost.second if second else first
+    seems = whose.seems(frame.hand.side) if whose.given else 1.0
+    if whose.doubtful(frame.hand.side):
+        new = math.inf
+    side = whose.probability(frame.hand.side)
+    status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
+    if seems < OTHER_HAND and not status.lost:
+        status = replace(status, lost=True, state_name="other hand")
     # Without refinement the particles stay where they are.
     followed = drawn_to(found, model) if model.refinement.iterations else found.filtered
     carried = model.refinement.carry * found.offset if model.refinement.iterations else track.offset
@@ -324,13 +331,13 @@ def judge(
     features: ConfidenceFeatures,
     dt_s: float,
     side: float,
-    second: bool,
+    new: float,
     model: ConfidenceModel,
 ) -> Status:
     """What is thought of an estimate, dt_s after the last, and whether its track goes on.
 
     side: probability that it is of the right side; of the other one every finger is wrong.
-    second: another hand is believed already.
+    new: confidence that a track needs which was not believed yet.
     """
     now, kept = model.log_odds(features), model.memory ** (dt_s / FRAME_S)
     smooth = kept * track.log_odds + (1 - kept) * now if track.age.begun else now
@@ -341,8 +348,7 @@ def judge(
     patience = model.patience * (_PATIENT if features.hidden > _HIDDEN else 1)
     ends = patience > 0 and doubtful.begun and doubtful.reached(patience)
     # Whether it is a hand at all does not depend on whose it is.
-    new = 0.0 if track.believed else model.second if second else model.believe
-    lost = confidence < new or side * confidence < model.confidence
+    lost = (confidence < new and not track.believed) or side * confidence < model.confidence
     name = _state_name(features) if lost else "tracking"
     return Status(name, lost, ends, side * confidence, smooth, doubtful)
 
@@ -354,12 +360,23 @@ def _state_name(features: ConfidenceFeatures) -> str:
     return "hidden" if features.hidden > _HIDDEN else "searching"
 
 
-def taking_part(state: TrackerState) -> list[int]:
-    """The slots that a frame is about, the surest first; one without a hand now and then."""
+def taking_part(state: TrackerState, watch_s: float) -> list[int]:
+    """The slots that a frame is about, the surest first; one without a hand now and then.
+
+    watch_s: see HandednessSettings.
+    """
+    if state.watched:
+        return watched_slots(state, watch_s)
     vacant = [hand.track is None for hand in state.hands]
     sought = all(vacant) or state.second_s >= _SECOND_S
     slots = [slot for slot in range(len(vacant)) if sought or not vacant[slot]]
     return sorted(slots, key=lambda slot: -sureness(state.hands[slot]))
+
+
+def since_search(before: TrackerState, slots: Sequence[int]) -> float:
+    """Seconds since a slot without a hand was searched for, after a frame about these slots."""
+    sought = len(slots) == 2 and any(hand.track is None for hand in before.hands)
+    return 0.0 if sought else before.second_s
 
 
 def reconcile(
@@ -374,8 +391,7 @@ def reconcile(
     Returns the state, and whether the slots were exchanged.
     """
     hands = list(after.hands)
-    sought = len(taking_part(before)) == 2 and any(hand.track is None for hand in before.hands)
-    second_s = 0.0 if sought else before.second_s
+    second_s = after.second_s
     places = [place(hand, hand.track) for hand in hands if hand.track is not None]
     one = len(places) == 2 and on_one_hand(*places)
     merged = before.merged.extended(dt_s) if one else Duration()
@@ -387,9 +403,9 @@ def reconcile(
         track = hand.track
         if track is None or track.believed or not hands[1 - slot].believed:
             continue
-        if track.age.seconds > _TRIED_S:
+        if track.age.seconds > (WATCHED_TRIED_S if after.watched and slot else _TRIED_S):
             second_s = 0.0 if known_side(hand) else -_AGAIN_S
             hands[slot] = replace(hand, track=None)
-    wrong = in_wrong_slot(before.hands, hands)
+    wrong = not after.watched and in_wrong_slot(before.hands, hands)
     hands = exchanged(before.hands, hands) if wrong else hands
     return replace(after, hands=tuple(hands), second_s=second_s, merged=merged), wrong

@@ -35,6 +35,8 @@ from toftrack.tracking.state import HandState, LastSeen, TrackerState
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
+_LONG_S = 1e3
+"""Another hand was looked for so long ago before any frame: it is as soon as there is a first."""
 _HANDS = 32
 """Hands of some side and shape that are kept made."""
 
@@ -101,7 +103,8 @@ class FilterModel:
 
     def first_hand(self, side: str, side_given: bool) -> HandState:
         """A slot before any frame."""
-        handedness = HandednessEstimate(given=side_given)
+        prior = self.configured.handedness.given * (1 if side == "right" else -1)
+        handedness = HandednessEstimate(side_given, prior if side_given else 0.0)
         seen = LastSeen(torch.zeros(1, 6 + self.space.dims), math.inf)
         nothing = no_estimate(-1, math.nan, "lost", self.space.dims, math.nan)
         return HandState(side, handedness, first_shape(), seen, nothing)
@@ -196,6 +199,15 @@ class TrackerModel(FilterModel):
     @cached_property
     def _at_quality(self) -> Callable[[Quality], TrackerModel]:
         return lru_cache(partial(_at_quality, self))
+
+    def first_state(self, seed: int, hands: int = 1) -> TrackerState:
+        """See FilterModel. Beside one hand that is asked for, the other one is watched."""
+        state = super().first_state(seed, 2)
+        if hands == 2:
+            return state
+        first, other = state.hands
+        watched = replace(self.first_hand(other.side, side_given=False), watched=True)
+        return replace(state, hands=(first, watched), watched=True, second_s=_LONG_S)
 
     @property
     def fit(self) -> ShapeFit:

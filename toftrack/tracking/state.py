@@ -93,6 +93,8 @@ class HandState:
     gesture: smoothed probabilities of the gestures, None where there are none.
     last: the last estimate that there was; lost and NaN before any.
     searched_s: how long ago the whole image was searched for this hand.
+    watched: nobody asked for it.
+    beside: it was believed while the first hand was, too, so that it is another one.
     """
 
     side: str
@@ -103,6 +105,8 @@ class HandState:
     track: Track | None = None
     gesture: GestureState | None = None
     searched_s: float = math.inf
+    watched: bool = False
+    beside: bool = False
 
     @property
     def believed(self) -> bool:
@@ -121,6 +125,8 @@ class TrackerState:
 
     generator: the state of the random generator, as torch.Generator.get_state() gives it.
     hands: one or two, each in its slot.
+    watched: nobody asked for the second hand: it is followed so that it is not taken for the first
+        one, and not reported.
     second_s: how long ago a second hand was searched for; below 0 while none is.
     merged: how long two tracks have seemed to be on one hand.
     next_index: number of the next frame that comes without one.
@@ -129,10 +135,16 @@ class TrackerState:
 
     generator: Tensor
     hands: tuple[HandState, ...]
+    watched: bool = False
     second_s: float = math.inf
     merged: Duration = Duration()
     next_index: int = 0
     timestamp_s: float | None = None
+
+    @property
+    def reported(self) -> tuple[HandState, ...]:
+        """The hands that were asked for."""
+        return self.hands[:1] if self.watched else self.hands
 
     def elapsed_s(self, image: DepthImage) -> float:
         """Seconds from the last frame to an image, as motions are reckoned with."""

@@ -34,11 +34,13 @@ from toftrack.tracking.lifecycle import (
     observed_shape,
     open_hand,
     reconcile,
+    since_search,
     taking_part,
 )
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
 from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
+from toftrack.tracking.watching import first_estimate, watched_over
 
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state, and for each slot what was seen, None where nobody asked, and the estimate."""
@@ -89,13 +91,14 @@ def open_hands(
 ) -> list[HandFrame | Absence]:
     """The hands that a frame is about, the surest first; each knows where the others are."""
     hands, opened = partnered(state.hands, model), list[HandFrame | Absence]()
-    others = others_of(hands, image, model, dt_s)
-    for slot in taking_part(state):
+    slots = taking_part(state, model.configured.handedness.watch_s)
+    others = others_of(hands, slots, image, model, dt_s)
+    for slot in slots:
         opened.append(open_hand(slot, hands[slot], others[slot], image, model, dt_s))
         track = opened[-1].track
         if track is not hands[slot].track:  # it began or ended: the next one must know
             hands[slot] = replace(opened[-1].hand, track=track)
-            others = others_of(hands, image, model, dt_s)
+            others = others_of(hands, slots, image, model, dt_s)
     return opened
 
 
@@ -209,14 +212,17 @@ def reconciled(
     """What a step returns; of two hands each in its slot, and vacant where none is followed."""
     hands = list(before.hands)
     infos: list[StepInfo | None] = [None] * len(hands)
-    estimates = [vacant(image, model) for _ in hands]
+    estimates = [unseen(hand, before.watched, image, model) for hand in hands]
     for slot, hand, info, estimate in found:
         hands[slot], estimates[slot] = hand, estimate
         infos[slot] = replace(info, seconds=spans.seconds())
-    after = replace(before, hands=tuple(hands))
-    if len(hands) == 1:
-        return after, tuple(infos), tuple(estimates)
+    second_s = since_search(before, [slot for slot, _, _, _ in found])
+    after = replace(before, hands=tuple(hands), second_s=second_s)
     after, exchanged = reconcile(before, after, partial(_found_hand, model), dt_s)
+    if before.watched:
+        after = watched_over(after, model.configured.handedness)
+        first = first_estimate(estimates[0], after)
+        return after, tuple(infos[:1]), (first,)
     if exchanged:
         infos, estimates = infos[::-1], estimates[::-1]
     both = zip(after.hands, estimates, strict=True)
@@ -294,6 +300,14 @@ def no_hand(absence: Absence, image: DepthImage, model: FilterModel) -> Conclude
     none = torch.zeros(0, 6 + model.space.dims, device=model.device)
     info = StepInfo(absence.observation, none, none[:, 0], {})
     return absence.slot, replace(hand, gesture=gesture), info, _sided(estimate, hand)
+
+
+def unseen(hand: HandState, watched: bool, image: DepthImage, model: FilterModel) -> Estimate:
+    """The estimate of a slot that takes no part in a frame."""
+    if not watched:
+        return vacant(image, model)
+    estimate = lost_estimate(hand.last, image.index, image.timestamp_s, math.nan)
+    return _sided(tell_gesture(model.gestures, None, estimate, model.space)[1], hand)
 
 
 def vacant(image: DepthImage, model: FilterModel) -> Estimate:

@@ -110,17 +110,17 @@ class HandsTracker:
     @property
     def states(self) -> tuple[HandState, ...]:
         """Of the slots."""
-        return self.state.hands
+        return self.state.reported
 
     @property
     def shapes(self) -> tuple[HandShape, ...]:
         """The hand of each slot that the next frame is compared with."""
-        return tuple(self.model.hand(hand.side, hand.shape).shape for hand in self.state.hands)
+        return tuple(self.model.hand(hand.side, hand.shape).shape for hand in self.states)
 
     @property
     def fitted(self) -> tuple[HandShape, ...]:
         """The same hands, with how sure the fit is of them."""
-        return tuple(self.model.fitted(hand) for hand in self.state.hands)
+        return tuple(self.model.fitted(hand) for hand in self.states)
 
     @property
     def scorer(self) -> Scorer:
@@ -250,14 +250,17 @@ def restarted(state: TrackerState, model: FilterModel, side: str | None = None) 
 
     Raises ToftrackError for an unknown side.
     """
-    fresh = model.first_state(0, len(state.hands))
+    fresh = model.first_state(0, len(state.reported))
     wanted = None if side == AUTO else side
     keeps = side is None or isinstance(model, PaperModel)
     given = wanted is not None or (keeps and state.hands[0].handedness.given)
     first = state.hands[0].side if given else fresh.hands[0].side
     first = model.configured.shape.of_side(wanted).side if wanted is not None else first
     sides = (first, OTHER_SIDE[first])
-    hands = tuple(model.first_hand(sides[slot], given) for slot in range(len(state.hands)))
+    hands = tuple(
+        replace(model.first_hand(sides[slot], given and not hand.watched), watched=hand.watched)
+        for slot, hand in enumerate(state.hands)
+    )
     return replace(fresh, hands=hands, generator=state.generator, next_index=state.next_index)
 
 

@@ -1,0 +1,107 @@
+"""One hand is asked for: a second one in view is known, and never taken for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.configured import handedness_settings
+from helpers.rendered import hand_at, right_hand_model, track_of
+from helpers.tracking import configuration, sample
+from helpers.two_hands import beside_its_mirror
+
+from toftrack.api import build_hands_tracker
+from toftrack.estimate import Estimate
+from toftrack.tracking.handedness import HandednessEstimate
+from toftrack.tracking.lifecycle import taking_part
+from toftrack.tracking.state import TrackerState
+from toftrack.tracking.watching import first_estimate, watched_over
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SMALL = ("filter.particles=80", "hysteresis.exchanged=16")
+
+
+def watching(first: bool, other: bool, **changes: object) -> TrackerState:
+    """One hand that is asked for and one that is watched, each followed or not."""
+    model, here = right_hand_model(), hand_at()
+    state = model.first_state(0)
+    hands = [
+        replace(hand, track=track_of(here, model) if followed else None)
+        for hand, followed in zip(state.hands, (first, other), strict=True)
+    ]
+    hands[0] = replace(hands[0], handedness=HandednessEstimate(given=True, prior=2.0))
+    return replace(state, hands=tuple(hands), **changes)
+
+
+@pytest.mark.parametrize(
+    ("first", "other", "second_s", "slots"),
+    [
+        (False, False, 9.0, [0]),
+        (False, False, np.inf, [1, 0]),
+        (True, False, 0.4, [0]),
+        (True, False, 0.6, [0, 1]),
+        (False, True, 0.04, [1]),
+        (False, True, 0.08, [1, 0]),
+        (True, True, 0.0, [0, 1]),
+    ],
+    ids=[
+        "nobody: the one that was asked for is searched for",
+        "what has just turned out to be the other hand is found as such",
+        "another one is not looked for at once",
+        "but now and then",
+        "and the one that was asked for",
+        "more often",
+        "both",
+    ],
+)
+def test_a_frame_is_about_these_hands(
+    first: bool, other: bool, second_s: float, slots: list[int]
+) -> None:
+    assert taking_part(watching(first, other, second_s=second_s), 0.5) == slots
+
+
+def with_evidence(state: TrackerState, slot: int, **changes: object) -> TrackerState:
+    hands = list(state.hands)
+    hands[slot] = replace(hands[slot], handedness=replace(hands[slot].handedness, **changes))
+    return replace(state, hands=tuple(hands))
+
+
+def test_what_is_surely_of_the_other_side_is_followed_as_the_other_hand() -> None:
+    settings = handedness_settings()
+    unsure = watched_over(with_evidence(watching(True, False), 0, fits=-2.5), settings)
+    assert unsure.hands[0].track is not None
+    after = watched_over(with_evidence(watching(True, False), 0, fits=-6.0), settings)
+    first, other = after.hands
+    assert first.track is None and first.side == "right" and first.handedness.given
+    assert other.side == "left" and not other.handedness.given
+    reported = first_estimate(first.last, after)
+    assert reported.lost and reported.state_name == "other hand"
+
+
+def test_only_a_hand_that_was_never_beside_the_first_one_can_be_it_after_all() -> None:
+    state = with_evidence(watching(False, True), 1, fits=5.0)
+    known = replace(state.hands[1], side="right")
+    after = watched_over(replace(state, hands=(state.hands[0], known)), handedness_settings())
+    assert after.hands[0].track is not None and after.hands[1].track is None
+    beside = replace(known, beside=True)
+    after = watched_over(replace(state, hands=(state.hands[0], beside)), handedness_settings())
+    assert after.hands[0].track is None and after.hands[1].track is not None
+
+
+def follow(depth_m: np.ndarray, k: np.ndarray, *overrides: str) -> list[Estimate]:
+    tracker = build_hands_tracker(configuration(*SMALL, *overrides))
+    return [tracker.step(depth, k, i, i / 25)[0] for i, depth in enumerate(depth_m)]
+
+
+def test_the_other_hand_is_not_taken_for_one_that_has_left() -> None:
+    rows, watch = range(14, 32), "hand.sides.watch_s=0.1"
+    both = beside_its_mirror(sample().cut(*rows), 30)
+    alone = np.where(both.depth_m == sample().cut(*rows).depth_m, 1.5, both.depth_m)
+    depth = np.concatenate((both.depth_m[:8], alone[8:]))
+    found = follow(depth.astype(np.float32), both.k, "hand.side=right", watch)
+    off = [np.linalg.norm(found[i].joints_m - both.joints_m[0, i], axis=1).mean() for i in range(8)]
+    assert not any(e.lost for e in found[3:8]) and max(off[3:8]) < 0.03
+    assert all(e.lost for e in found[12:])
+    assert found[-1].state_name == "other hand" and {e.side for e in found} == {"right"}
