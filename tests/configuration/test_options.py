@@ -54,6 +54,8 @@ def given_for(folder: Path) -> dict[tuple[str, str], list[str]]:
     joints = forward_kinematics(state, default_hand_shape()).joints_m[:, 1:].unflatten(1, (5, 4))
     clip = {"seq_name": ["one"], "seq_len": [len(joints)], "is_left": np.zeros(len(joints), bool)}
     np.savez(folder / "leap.npz", joints_mm=1e3 * joints.numpy(), **clip)
+    run = {"state": np.zeros((3, 27), np.float32), "lost": np.zeros(3, bool)}
+    np.savez(folder / "track.npz", confidence=np.ones(3), **run)
     images = folder / "images"
     images.mkdir()
     cv2.imwrite(str(images / "0.png"), np.full((30, 40), 600, np.uint16))
@@ -67,6 +69,7 @@ def given_for(folder: Path) -> dict[tuple[str, str], list[str]]:
         ("device", "sr3000"): ["device.transport=emulated"],  # there is no camera here
         ("data", "file"): [f"data.path={folder / 'poses.csv'}"],
         ("data", "leap"): [f"data.path={folder / 'leap.npz'}"],
+        ("data", "run"): [f"data.path={folder}"],
         ("data", "mixture"): [f"data.parts.leap.path={folder / 'leap.npz'}"],
     }
 
@@ -116,6 +119,7 @@ def test_every_option_composes_and_can_be_made(
         ("device", "folder", "device.path"),
         ("data", "leap", "data.path"),
         ("data", "file", "data.path"),
+        ("data", "run", "data.path"),
         ("data", "mixture", "data.parts.leap.path"),
     ],
 )
