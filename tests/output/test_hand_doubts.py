@@ -85,7 +85,7 @@ def test_a_focal_length_that_makes_the_hand_small_is_reported_at_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with packaged_sample() as path:
-        words = [str(path), "device.intrinsics=[300,300,88,72]", "device.stop=24"]
+        words = [str(path), "device.intrinsics=[340,340,88,72]", "device.stop=24"]
         summary, said = tracked(tmp_path, capsys, *words)
     (doubt,) = summary["doubts"]
     assert "as only small children's are" in doubt and f"note: {doubt}" in said
