@@ -43,6 +43,8 @@ def _remembering(resolve: Callable) -> Callable:
     def resolve_function_type(self: BaseContext, func: Any, args: tuple, kws: Any) -> Any:
         # A function that an extension was added to since is another one.
         function = self._lookup_global(func) or func
+        if isinstance(function, types.Dispatcher):
+            return resolve(self, func, _without_literals(args), kws)
         if kws or not isinstance(function, types.Function) or not _are_plain(args):
             return resolve(self, func, args, kws)
         key = (id(self), function, *args)
@@ -54,6 +56,13 @@ def _remembering(resolve: Callable) -> Callable:
         return found
 
     return resolve_function_type
+
+
+def _without_literals(args: tuple) -> tuple:
+    """A kernel's own function is compiled once for 0, 1 and all other whole numbers."""
+    return tuple(
+        types.unliteral(arg) if isinstance(arg, types.IntegerLiteral) else arg for arg in args
+    )
 
 
 def _are_plain(args: tuple) -> bool:

@@ -1,7 +1,8 @@
 """Before the first frame: kernels that were never compiled here are, by two processes at once.
 
 numba compiles one kernel after the other in a process, and keeps the code on the disk for all. The
-second process compiles the refinement's, and what else takes a second.
+second process compiles the refinement's, and what has most in common with it. What only some
+recordings need (the median of large images, handedness) is compiled when they do.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
         if helper is not None:
             _compile_here(tracker.model)
             helper.join()
+            _load(tracker.model)
     finally:
         if helper is not None:
             helper.kill()
@@ -45,8 +47,19 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
 
 
 def _compile_here(model: FilterModel) -> None:
-    """The large kernels but for the one that the second process compiles."""
+    """What the second process leaves, the largest kernel first."""
+    from toftrack.detector.proposals_numba import compile_crops
+    from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
+
     model.backend.make_scorer(model.configured.shape)
+    compile_crops()
+    pixel, hand = np.ones((1, 1), np.float32), np.ones((1, 1), bool)
+    smooth_points(pixel, hand, (0, 0), np.eye(3, dtype=np.float32), 1.0, 1.0)
+    nearest_of_labels(np.ones((1, 1), np.int32), hand, (0, 0))
+
+
+def _load(model: FilterModel) -> None:
+    """The networks, and what the second process compiled."""
     if isinstance(model, TrackerModel):
         nothing = np.zeros((72, 88), np.float32)
         k = np.array([[110.0, 0, 44], [0, 110.0, 36], [0, 0, 1]])
@@ -61,12 +74,15 @@ def _helper(config: DictConfig) -> BaseProcess | None:
     alone = getattr(sys, "frozen", False) or multiprocessing.current_process().daemon
     if (cores or 1) < 2 or not numba or alone:
         return None
+    from numba.core.registry import cpu_target
+
     from toftrack.compute.compiling import must_be_compiled
     from toftrack.refinement.gauss_newton_numba import refine_hands
 
     if not must_be_compiled(refine_hands):
         return None
     _log.info("compiling kernels (once on a machine, about 10 s)")
+    cpu_target.target_context.refresh()  # what numba loads at its first compilation, for both
     # A copy of this process has imported everything already; elsewhere libraries forbid copies.
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
     helper: BaseProcess = context.Process(target=_compile_beside, daemon=True)  # type: ignore
@@ -86,23 +102,19 @@ def _compile_beside() -> None:
     for standard in (1, 2):
         os.dup2(nowhere, standard)
     with small_operations():
-        compile_small_and_refinement()
+        compile_refinement_and_decoding()
 
 
-def compile_small_and_refinement() -> None:
-    """The kernels of the refinement and the small ones; the order is that of their size."""
+def compile_refinement_and_decoding() -> None:
+    """Kernels that have functions in common, which are compiled once in a process."""
+    from toftrack.detector.proposals_numba import compile_decoding
     from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.refinement.penalty_numba import joints_penalty
-    from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
-    from toftrack.render.numba.median import thinned
 
     shape = default_hand_shape()
     CompiledRefiner(shape)
-    pixel, hand = np.ones((1, 1), np.float32), np.ones((1, 1), bool)
-    smooth_points(pixel, hand, (0, 0), np.eye(3, dtype=np.float32), 1.0, 1.0)
-    nearest_of_labels(np.ones((1, 1), np.int32), hand, (0, 0))
     joints = forward_kinematics(torch.zeros(1, 27), shape).joints_m
     joints_penalty(joints, shape.hand_length_m, 1.0, None, 0.0)
+    compile_decoding()
     openxr_hand_compiled(joints[0].numpy(), np.zeros(27), openxr_rig(shape))
-    thinned(np.zeros((3, 3), np.float32), 3, 1)  # of images that are reduced
