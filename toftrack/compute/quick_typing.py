@@ -30,11 +30,11 @@ def quick_typing() -> Iterator[None]:
     with global_compiler_lock:
         resolve, collects = BaseContext.resolve_function_type, gc.isenabled()
         gc.disable()
-        BaseContext.resolve_function_type = _remembering(resolve)
+        BaseContext.resolve_function_type = _remembering(resolve)  # type: ignore[method-assign]
         try:
             yield
         finally:
-            BaseContext.resolve_function_type = resolve
+            BaseContext.resolve_function_type = resolve  # type: ignore[method-assign]
             if collects:
                 gc.enable()
 
