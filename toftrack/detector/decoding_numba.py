@@ -53,15 +53,11 @@ def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
     _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
     _decode_keypoints(keypoints, depth, joints[c], sigma[c])
     for j in range(JOINTS):
-        p = np.float64(joints[c, j, 0]), np.float64(joints[c, j, 1]), np.float64(joints[c, j, 2])
+        p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
         _into_camera(p, turn, centre, mirror, joints[c, j])
-    # As float64, for which the refinement's penalty has it compiled, too.
-    posed, of_finger = np.empty((JOINTS, 3)), np.zeros(5)
-    for j in range(JOINTS):
-        for i in range(3):
-            posed[j, i] = joints[c, j, i]
+    of_finger = np.zeros(5)
     length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
-    add_overlaps(posed, length, of_finger)
+    add_overlaps(joints[c], length, of_finger)
     for finger in range(5):
         doubt = DOUBT_M * min(of_finger[finger], 1.0)
         for joint in range(2 + 4 * finger, 5 + 4 * finger):
