@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import pytest
 from helpers.tracking import configuration
 
@@ -15,21 +13,25 @@ def test_the_second_process_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> No
     done: list[str] = []
 
     class Process:
-        def __init__(self, command: list[str], **options: object) -> None:
-            assert command[1:] == ["-m", "toftrack.programs.precompile"]
+        def start(self) -> None:
+            done.append("begun")
 
-        def wait(self) -> int:
+        def join(self) -> None:
             done.append("waited")
-            return 0
 
         def kill(self) -> None:
             done.append("ended")
 
-    monkeypatch.setattr(subprocess, "Popen", Process)
+    class Context:
+        def Process(self, target: object, daemon: bool) -> Process:  # noqa: N802
+            assert target is precompile._compile_beside and daemon
+            return Process()
+
+    monkeypatch.setattr(precompile.multiprocessing, "get_context", lambda method: Context())
     monkeypatch.setattr(precompile.os, "sched_getaffinity", lambda process: {0, 1}, raising=False)
     monkeypatch.setattr(compiling, "must_be_compiled", lambda kernel: True)
     assert precompile.ready_tracker(configuration()).model.backend.name == "numba"
-    assert done == ["waited", "ended", "waited"]
+    assert done == ["begun", "waited", "ended", "waited"]
 
 
 def test_without_compiled_kernels_there_is_no_second_process(

@@ -18,6 +18,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
 from toftrack.compute.kernel_cache import KernelCache, can_be_kept
+from toftrack.compute.quick_typing import quick_typing
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +44,7 @@ def entry_point(*sources: str | Path | None) -> Callable:
         function.__qualname__ += f"_{checksum:08x}"
         kernel = numba.njit(**OPTIONS)(function)
         kernel._cache = KernelCache(f"{function.__module__}.{function.__qualname__}")
+        kernel._compiler.compile = quick_typing()(kernel._compiler.compile)
         kernel.sources = frozenset(str(Path(file).resolve()) for file in files)
         return kernel
 

@@ -226,7 +226,9 @@ def main_axis(symmetric):
 
     Golub and Van Loan, "Matrix computations", section 8.5.
     """
-    axes = np.eye(4)
+    axes = np.zeros((4, 4))
+    for i in range(4):
+        axes[i, i] = 1.0
     for _ in range(_SWEEPS):
         for p in range(3):
             for q in range(p + 1, 4):

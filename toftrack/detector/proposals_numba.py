@@ -18,7 +18,7 @@ from toftrack.detector import proposals
 from toftrack.detector.crops import CROP, crop_rotation
 from toftrack.detector.crops_numba import crop_at
 from toftrack.detector.decoding_numba import decode_at
-from toftrack.detector.network import ANGLES, JOINTS, PoseNet
+from toftrack.detector.network import ANGLES, CELLS, JOINTS, REPORTED, PoseNet
 from toftrack.detector.onnx_networks import OnnxPoseNet
 from toftrack.detector.proposals import KEPT, MIRROR, NetworkOutput, mean_hand
 
@@ -146,6 +146,24 @@ def _decode(
     heads, keypoints = outputs
     given = heads[0], keypoints[0], image[0, 0], turn, centre, left, hand, row, out
     called(decode_at, _COMPILING, *given)
+
+
+def compile_crops() -> None:
+    """What reads crops, compiled now; without a network."""
+    centre, image = np.array([0.0, 0.0, 0.5]), np.empty((3, CROP, CROP), np.float32)
+    depth, turn = np.zeros((2, 2), np.float32), crop_rotation(centre)
+    called(crop_at, _COMPILING, depth, False, np.eye(3), centre, turn, image)
+
+
+def compile_decoding() -> None:
+    """What reads a network's outputs, compiled now; without a network."""
+    centre, image = np.array([0.0, 0.0, 0.5]), np.zeros((1, 1, CROP, CROP), np.float32)
+    outputs = (
+        np.zeros((1, REPORTED), np.float32),
+        np.zeros((1, 5 * JOINTS, CELLS, CELLS), np.float32),
+    )
+    out, turn = tuple(_empty(1).values()), crop_rotation(centre)
+    _decode(outputs, image, turn, centre, False, _mean_hand("right"), out, 0)
 
 
 def _outputs(pose: PoseNet | OnnxPoseNet, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -62,4 +62,7 @@ def penalise(joints, hand_length_m, overlap_weight, points, sigma, keypoints_wei
             # Of a sigma that is infinite nothing is known.
             away += off / (1 + off / FAR_SIGMAS**2) / 21
         # Every finger's overlap with all others holds each pair twice.
-        out[n] = 0.5 * overlap_weight * of_finger.sum() + keypoints_weight * away
+        overlap_m = 0.0
+        for finger in range(5):
+            overlap_m += of_finger[finger]
+        out[n] = 0.5 * overlap_weight * overlap_m + keypoints_weight * away

@@ -246,7 +246,9 @@ def score_hands(
     steps: of disc_steps.  slots .. surface: see NumbaScorer.
     counter: (1,) int64 tasks taken.  out: (4, N) correct, false, missed, residual.
     """
-    reach, parts = steps[:, 1].max(), hand.shape[0] - 1
+    reach, parts = 0, hand.shape[0] - 1
+    for i in range(steps.shape[0]):
+        reach = max(reach, steps[i, 1])
     whole = max(states.shape[0] // LANES - 2, 0)
     x = np.empty(27 * LANES, np.float32)
     frames = np.empty((16, 12 * LANES), np.float32)
