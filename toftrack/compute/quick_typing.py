@@ -26,7 +26,13 @@ def quick_typing() -> Iterator[None]:
     """Within, what numba compiles is typed faster, and no garbage is looked for.
 
     numba keeps nearly all that it makes, which the collector would look through again and again.
+    With a numba that has other insides, kernels are typed as ever.
     """
+    if not (
+        hasattr(BaseContext, "_lookup_global") and hasattr(BaseContext, "resolve_function_type")
+    ):
+        yield
+        return
     with global_compiler_lock:
         resolve, collects = BaseContext.resolve_function_type, gc.isenabled()
         gc.disable()
