@@ -19,7 +19,7 @@ export interface Frame {
 /** What is said of a hand. */
 export interface Hand {
   /** What the tracker does: tracking, or why not. */
-  state_name: "tracking" | "searching" | "hidden" | "out of view" | "initialising" | "lost" | "recovering";
+  state_name: "tracking" | "searching" | "other hand" | "hidden" | "out of view" | "initialising" | "lost" | "recovering";
   /** Not to be used: no hand, or a joint that is likely off by more than 40 mm. */
   lost: boolean;
   /** Probability that every joint is within 40 mm. */

@@ -48,6 +48,7 @@ class GestureSettings:
     sure_score: float
     smoothing: float
     margin: float
+    joint: float
     pinch: PinchSettings
 
     def __post_init__(self) -> None:
@@ -56,6 +57,8 @@ class GestureSettings:
             widths.append(self.off_rad)
         if not all(0 < width < math.inf for width in widths):
             raise ToftrackError("gestures: the *_rad and *_palms widths and other must be above 0")
+        if not 0 <= self.joint <= 1:
+            raise ToftrackError("gestures.joint must be within 0 .. 1, a probability")
         if not self.doubtful_score < self.sure_score:
             raise ToftrackError("gestures.doubtful_score must be below gestures.sure_score")
         if not (0 <= self.smoothing < 1 and 0 <= self.margin < 1):
@@ -297,12 +300,14 @@ def tell_gesture(
         off = angles - space.decode(latent)[0].cpu().numpy()
         off_rad = float(np.sqrt(np.square(off).mean()))
     joints = estimate.joints_m.astype(np.float64)
-    known = features.known_features(estimate.joint_ok)
+    # Which fingers are straight is told by joints that are less exact than who uses a joint wants.
+    asked = estimate.joint_ok | (estimate.joint_confidence >= gestures.settings.joint)
+    known = features.known_features(asked)
     values = np.where(known, features.features(angles, joints), np.nan)
     state, label, probability = update(state, values, estimate.score, off_rad, gestures, frames)
     if not gestures.decided(label, values):
         label, probability = "", math.nan
-    pinch = pinch_of(joints, gestures.settings.pinch, estimate.joint_ok)
+    pinch = pinch_of(joints, gestures.settings.pinch, asked)
     pinched = update_pinch(state.pinch, pinch, gestures.settings.pinch, frames)
     state = replace(state, pinch=pinched)
     estimate = replace(
