@@ -137,8 +137,8 @@ return game;
 
 
 def test_the_sample_of_pointing_and_pinching_plays_the_game(stream: Any, page: Any) -> None:
-    """Half of the targets and more; a round in which a target was missed is followed by another one, as in a live run,
-    where the sample is repeated."""
+    """Half of the targets and more; a round in which a target was missed is followed by another
+    one, as in a live run, where the sample is repeated."""
     tracker, device = make_tracker(), Sample(name="point_and_pinch", repeat=True)
     rounds, lines = len(Sample(name="point_and_pinch").truth), []
     page.get(f"{stream.url}{GAME}")
