@@ -95,7 +95,7 @@ def _readme(rows: Rows) -> list[str]:
         f"| ... frames that are wrong and not flagged | {both(bare, 'silent_pct', '%', 1)} |",
         "| ... mean joint error, all frames in which the hand is visible |"
         f" {both(bare, 'mean_all_mm', 'mm', 1)} |",
-        f"| ... time for a frame | {both(bare, 'median_ms', 'ms')} |",
+        f"| time for a frame of the packaged sample | {both('sample', 'median_ms', 'ms')} |",
         "| **4 more, three of whom hold things**: frames in which every joint is within 40 mm |"
         f" {both(others, 'usable_pct', '%')} |",
         "| **a real Kinect V2 recording**, 27 labelled frames: those with all visible fingertips"
