@@ -28,6 +28,8 @@ VERSION = "1"
 """Of the inputs and outputs of such files; one of another version is made anew."""
 DIGEST = 64
 """Last bytes of such a file, the SHA-256 in hexadecimal of all before: a property's value."""
+FLOAT, WHOLE = "float32", "int8"
+"""Precisions that such a file says it is in; one that says nothing is of before there were two."""
 COMMAND = "python -m toftrack.programs.export_detector"
 _LARGEST_BYTES = 1 << 28
 _log = logging.getLogger(__name__)
@@ -49,6 +51,11 @@ class OnnxPoseNet:
     def inputs(self) -> int:
         """Channels of a crop that it sees."""
         return self.reference.inputs
+
+    @functools.cached_property
+    def precision(self) -> str:
+        """FLOAT or WHOLE."""
+        return str(_properties(self.session).get("precision", FLOAT))
 
     def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of crops (N, inputs, 64, 64): PoseNet.features' heads and keypoints; without the lock.
@@ -168,10 +175,15 @@ def _runtime() -> Any:
 
 def _made_of(session: Any) -> tuple[str | None, ...]:
     """Format, version and name of a file's network, and the checksum of its weights."""
-    properties = session.get_modelmeta().custom_metadata_map
+    properties = _properties(session)
     return tuple(
         properties.get(name) for name in ("format", "version", "network", "weights_sha256")
     )
+
+
+def _properties(session: Any) -> dict[str, str]:
+    properties: dict[str, str] = session.get_modelmeta().custom_metadata_map
+    return properties
 
 
 @functools.cache
