@@ -8,6 +8,7 @@ detector propose; then the best of these with single fingers of other poses.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,6 +38,9 @@ from toftrack.tracking.posterior import (
 from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import HandState, Track
 
+_NO_HAND = tuple(int(c) for c in os.environ.get("NOHAND", "4"))
+_LEAST_PARTS = 4
+"""Parts of a crop, of 9 mm, that a thing in the hand has at least."""
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
 _COVERED = 0.6
@@ -135,6 +139,24 @@ class FilteredFrame:
         """Hands (N, 27) brought onto the seen points and the keypoints."""
         cfg, refiner = self.frame.model.refinement, self.frame.fitted.refiner
         return refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
+
+
+def without_things(observation: Observation, detection: Detection) -> Observation:
+    """The same without the pixels of a thing in the hand, as the pose network tells them.
+
+    Else the best pose is one whose fingers explain the thing.
+    """
+    kind = detection.parts.kind
+    if observation.empty or not np.isin(kind, _NO_HAND).sum() >= _LEAST_PARTS:
+        return observation
+    row, column = np.nonzero(observation.hand.cpu().numpy())
+    k, z = observation.k.cpu().numpy(), observation.depth_m.cpu().numpy()[row, column]
+    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
+    held = np.isin(detection.parts.at(np.stack((x, y, z), 1)), _NO_HAND)
+    thing = np.zeros(observation.hand.shape, bool)
+    thing[row[held], column[held]] = True
+    mask = torch.from_numpy(thing).to(observation.hand.device)
+    return replace(observation, hand=observation.hand & ~mask, thing=mask)
 
 
 def image_term(
