@@ -23,6 +23,20 @@ from toftrack.detector.onnx_networks import OnnxPoseNet
 from toftrack.detector.parts import Parts, likeliest_parts
 from toftrack.detector.proposals import KEPT, MIRROR, NetworkOutput, mean_hand
 
+_SHAPES = {
+    "pivot_m": (KEPT, 3),
+    "rotvec": (KEPT, 3),
+    "angles": (KEPT, ANGLES),
+    "log_size": (KEPT,),
+    "log_probability": (KEPT,),
+    "error_m": (KEPT,),
+    "joints_m": (KEPT, JOINTS, 3),
+    "keypoints_m": (JOINTS, 3),
+    "sigma_m": (JOINTS,),
+    "present": (),
+    "right": (),
+}
+"""Of a crop: the numbers of a NetworkOutput, as the compiled code writes them."""
 _COMPILING = "detector: compiling its numba kernels (once, about 4 s)"
 
 
@@ -78,7 +92,8 @@ def _reported(task: functools.partial[None]) -> NetworkOutput:
     """What a task of _prepared has written."""
     _, _, left, _, centres, turns, _, (*out, kinds), _ = task.args
     parts = tuple(Parts(*one, left) for one in zip(kinds, turns, centres, strict=True))
-    return NetworkOutput(*(torch.from_numpy(array) for array in out), parts)
+    numbers = zip(_SHAPES, map(torch.from_numpy, out), strict=True)
+    return NetworkOutput(**dict(numbers), parts=parts)
 
 
 def _prepared(
@@ -206,19 +221,6 @@ def _mean_hand(side: str) -> tuple[np.ndarray, ...]:
 
 
 def _empty(count: int) -> tuple[np.ndarray, ...]:
-    """Arrays of NetworkOutput's fields, in their order; of the parts their kinds."""
-    shapes = {
-        "pivot_m": (KEPT, 3),
-        "rotvec": (KEPT, 3),
-        "angles": (KEPT, ANGLES),
-        "log_size": (KEPT,),
-        "log_probability": (KEPT,),
-        "error_m": (KEPT,),
-        "joints_m": (KEPT, JOINTS, 3),
-        "keypoints_m": (JOINTS, 3),
-        "sigma_m": (JOINTS,),
-        "present": (),
-        "right": (),
-    }
-    numbers = (np.empty((count, *shape), np.float32) for shape in shapes.values())
+    """The arrays of _SHAPES, and the parts' kinds (count, PARTS, PARTS)."""
+    numbers = (np.empty((count, *shape), np.float32) for shape in _SHAPES.values())
     return *numbers, np.empty((count, PARTS, PARTS), np.uint8)

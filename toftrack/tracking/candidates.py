@@ -8,7 +8,6 @@ detector propose; then the best of these with single fingers of other poses.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.parts import THING_PART
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.proposals import exchange_fingers, swap_fingers
@@ -38,7 +38,6 @@ from toftrack.tracking.posterior import (
 from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import HandState, Track
 
-_NO_HAND = tuple(int(c) for c in os.environ.get("NOHAND", "4"))
 _LEAST_PARTS = 4
 """Parts of a crop, of 9 mm, that a thing in the hand has at least."""
 _HIDDEN = 0.03
@@ -147,12 +146,12 @@ def without_things(observation: Observation, detection: Detection) -> Observatio
     Else the best pose is one whose fingers explain the thing.
     """
     kind = detection.parts.kind
-    if observation.empty or not np.isin(kind, _NO_HAND).sum() >= _LEAST_PARTS:
+    if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
         return observation
     row, column = np.nonzero(observation.hand.cpu().numpy())
     k, z = observation.k.cpu().numpy(), observation.depth_m.cpu().numpy()[row, column]
     x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
-    held = np.isin(detection.parts.at(np.stack((x, y, z), 1)), _NO_HAND)
+    held = detection.parts.at(np.stack((x, y, z), 1)) == THING_PART
     thing = np.zeros(observation.hand.shape, bool)
     thing[row[held], column[held]] = True
     mask = torch.from_numpy(thing).to(observation.hand.device)
