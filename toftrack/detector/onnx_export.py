@@ -64,7 +64,7 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     several = torch.export.Dim("n", min=1, max=1 << 16)
     rows, columns = (torch.export.Dim(name, min=8, max=1 << 16) for name in ("h", "w"))
     outputs = {
-        "pose": ["heads", "keypoints"],
+        "pose": ["heads", "keypoints", "parts"],
         "finder": list(Found._fields),
     }
     contents = {
@@ -97,15 +97,14 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
 
 
 class _Features(nn.Module):
-    """What the tracker uses of PoseNet.features."""
+    """PoseNet.features."""
 
     def __init__(self, pose: PoseNet) -> None:
         super().__init__()
         self.pose = pose
 
-    def forward(self, crops: Tensor) -> tuple[Tensor, Tensor]:
-        heads, keypoints, _ = self.pose.features(crops)
-        return heads, keypoints
+    def forward(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.pose.features(crops)
 
 
 def _exported(

@@ -73,7 +73,8 @@ def quantised(model: Any, crops: np.ndarray) -> Any:
 def compare(pose: PoseNet, model: Any, crops: np.ndarray) -> None:
     """Raises ToftrackError where a quantised network is too far from torch's on (N, ...) crops."""
     session = open_session(model.SerializeToString())
-    each = [session.run(("heads", "keypoints"), {"crops": one[None]}) for one in crops]
+    names = ("heads", "keypoints")
+    each = [session.run(names, {"crops": one[None]}) for one in crops]
     heads, keypoints = (torch.from_numpy(np.concatenate(part)) for part in zip(*each, strict=True))
     image = torch.from_numpy(crops)
     with torch.inference_mode():
