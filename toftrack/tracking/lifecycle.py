@@ -43,6 +43,7 @@ from toftrack.tracking.detect import (
     search,
     search_due,
     start_detection,
+    was_beside,
 )
 from toftrack.tracking.filter import (
     Found,
@@ -187,9 +188,22 @@ def _detected(
         return hand, best
     if not detection_due(track, model.detector.settings, dt_s):
         return hand, NO_DETECTION
-    if is_elsewhere(best, track, model, dt_s):
-        return replace(hand, track=None), best
+    if is_elsewhere(best, track, model, dt_s) and not _stays_watched(hand, others):
+        return _left_behind(hand, model), best
     return hand, detect(hand, track, image, model, dt_s)
+
+
+def _stays_watched(hand: HandState, others: Sequence[OtherHand]) -> bool:
+    """Whether a hand is watched while the first one is away, which it is that is seen elsewhere."""
+    return hand.watched and not any(other.believed for other in others)
+
+
+def _left_behind(hand: HandState, model: TrackerModel) -> HandState:
+    """The hand before a track of it begins elsewhere; what was watched may be another hand now."""
+    if not hand.watched:
+        return replace(hand, track=None)
+    handedness = hand.handedness.left(model.configured.handedness)
+    return replace(hand, track=None, beside=False, handedness=handedness)
 
 
 def _compared(
@@ -208,6 +222,8 @@ def _compared(
     due = before.comparison_due(settings, hand.track is not None, dt_s)
     if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
         before = before.left(settings)  # what comes may be the other hand
+        if before.given and was_beside(detection, hand.seen):
+            before = before.stranger(hand.side)
     handedness = before.waited(dt_s)
     if detection.present < _LEAST_PRESENT or not due:
         return replace(hand, handedness=handedness), detection
@@ -298,7 +314,7 @@ def close(
         new = math.inf
     side = whose.probability(frame.hand.side)
     status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
-    if seems < OTHER_HAND and not status.lost:
+    if seems < OTHER_HAND and status.confidence >= model.lost.confidence:
         status = replace(status, lost=True, state_name="other hand")
     # Without refinement the particles stay where they are.
     followed = drawn_to(found, model) if model.refinement.iterations else found.filtered
@@ -322,7 +338,7 @@ def close(
         nearest_m=frame.expected_m if frame.hidden else 0.0,
     )
     remembered = not status.lost and track.age.reached(model.lost.probation + 1)
-    seen = LastSeen(track.mean, 0.0) if remembered else frame.hand.seen
+    seen = LastSeen(track.mean, 0.0, frame.observation) if remembered else frame.hand.seen
     return status, track, seen
 
 

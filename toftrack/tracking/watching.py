@@ -57,10 +57,10 @@ def watched_over(state: TrackerState, settings: HandednessSettings) -> TrackerSt
     elif first.believed and other.believed:
         other = replace(other, beside=True)
     state = replace(state, hands=(first, other))
-    if first.track is not None and first.handedness.contradicted(first.side, settings):
-        return _other_after_all(state, first.track)
     if other.track is not None and _is_first(first, other):
         return _first_after_all(state, other.track)
+    if first.track is not None and first.handedness.contradicted(first.side, settings):
+        return _other_after_all(state, first.track)
     return state
 
 
@@ -87,7 +87,7 @@ def _passed_on(first: HandState, other: HandState, track: Track) -> HandState:
     return replace(
         other,
         side=OTHER_SIDE[first.side],
-        handedness=replace(first.handedness, given=False, prior=0.0),
+        handedness=replace(first.handedness, given=False, prior=0.0, beside_it=0.0),
         shape=first_shape(),
         seen=LastSeen(track.mean, 0.0),
         track=None,
