@@ -228,7 +228,8 @@ def _compared(
     if detection.present < _LEAST_PRESENT or not due:
         return replace(hand, handedness=handedness), detection
     other, centre = OTHER_SIDE[hand.side], detection.centre_m.numpy()
-    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other)[0]
+    up = detection.up[None]
+    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other, up)[0]
     gain = _best_log_posterior(hand, detection, hand.side, others, image, model)
     gain -= _best_log_posterior(hand, mirrored, other, others, image, model)
     gain = gain if hand.side == "right" else -gain
