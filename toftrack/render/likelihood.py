@@ -74,6 +74,8 @@ class FMeasure:
         if observation.other is not None:
             front = torch.where(observation.other & (depth > 0), depth.reciprocal(), front)
         front = front.masked_fill_(observation.occluder, torch.inf)
+        if observation.thing is not None:
+            front = front.masked_fill_(observation.thing, torch.inf)
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
         return Evidence(low, high, front, hand, observation.k, radius)
 

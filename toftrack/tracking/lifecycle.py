@@ -33,6 +33,7 @@ from toftrack.tracking.candidates import (
     best_start,
     image_term,
     posterior_of,
+    without_things,
 )
 from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
 from toftrack.tracking.detect import (
@@ -282,7 +283,7 @@ def _best_start(
     model: TrackerModel,
 ) -> tuple[Tensor, float]:
     """The best of the detector's poses of a hand, and its log posterior."""
-    fitted = model.hand(hand.side, hand.shape)
+    fitted, observation = model.hand(hand.side, hand.shape), without_things(observation, detection)
     # Very different poses are compared: what explains more of the image counts in full.
     image = image_term(observation, fitted, model, coverage=1.0)
     posterior = posterior_of(observation, fitted, detection, others, model, image)

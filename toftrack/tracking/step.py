@@ -23,7 +23,14 @@ from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.candidates import FilteredFrame, HandFrame, keypoints_of, propose
+from toftrack.tracking.candidates import (
+    FilteredFrame,
+    HandFrame,
+    image_term,
+    keypoints_of,
+    propose,
+    without_things,
+)
 from toftrack.tracking.confidence import confidence_features, joint_features
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
 from toftrack.tracking.hands import PlacedHand, others_of, partnered
@@ -113,12 +120,15 @@ def filtered_frame(
 
 
 def waited_for(frame: HandFrame) -> HandFrame:
-    """The frame with its detection, if that ran beside the filter."""
+    """The frame with its detection, if that ran beside the filter, and without what it holds."""
     detection = frame.pending()
-    if detection.empty:
+    if not detection.empty:
+        hand = observed_shape(frame.hand, detection, frame.model)
+        frame = replace(frame, hand=hand, detection=detection)
+    seen = without_things(frame.observation, frame.detection)
+    if seen is frame.observation:
         return frame
-    hand = observed_shape(frame.hand, detection, frame.model)
-    return replace(frame, hand=hand, detection=detection)
+    return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
 
 
 def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
