@@ -248,5 +248,6 @@ def test_what_hides_a_hand_is_no_place_that_it_has_come_to() -> None:
     likely = likely_for(slot_of(hidden))
     assert likely(np.array([0.0, 0.0, 0.40])) == -math.inf
     assert likely(np.array([0.0, 0.0, 0.46])) == 0
+    assert np.isfinite(likely_for(slot_of(replace(hidden, believed=False)))(np.array([0, 0, 0.3])))
     free = likely_for(slot_of(replace(hidden, nearest_m=0.0)))
     assert free(np.array([0.0, 0.0, 0.40])) == 0

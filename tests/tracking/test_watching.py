@@ -107,6 +107,33 @@ def test_of_two_hands_the_one_that_rather_is_of_the_given_side_is_the_first() ->
     assert watched_over(as_told, settings).hands[0].track is followed
 
 
+@pytest.mark.parametrize(
+    ("believed", "beside", "fits", "exchanged"),
+    [
+        (False, False, 1.1, True),
+        (False, False, 0.7, False),
+        (True, False, 1.1, False),
+        (False, True, 1.1, False),
+    ],
+    ids=[
+        "what nobody believed makes way",
+        "not for one that is as doubtful",
+        "what was believed stays",
+        "not for what is known to be the other hand",
+    ],
+)
+def test_a_first_hand_that_nobody_believed_makes_way_for_one_that_rather_is_it(
+    believed: bool, beside: bool, fits: float, exchanged: bool
+) -> None:
+    state = with_evidence(with_evidence(watching(True, True), 0, fits=-0.2), 1, fits=fits)
+    told, other = state.hands
+    assert told.track is not None and other.track is not None
+    told = replace(told, track=replace(told.track, believed=believed))
+    other = replace(other, side="right", beside=beside, track=replace(other.track, believed=beside))
+    after = watched_over(replace(state, hands=(told, other)), handedness_settings())
+    assert (after.hands[0].track is other.track) is exchanged
+
+
 def follow(depth_m: np.ndarray, k: np.ndarray, *overrides: str) -> list[Estimate]:
     tracker = build_hands_tracker(configuration(*SMALL, *overrides))
     return [tracker.step(depth, k, i, i / 25)[0] for i, depth in enumerate(depth_m)]

@@ -152,7 +152,9 @@ def _reachable(hand: HandState, others: Sequence[OtherHand], centre_m: np.ndarra
     """
     if any(np.linalg.norm(other.centre_m - centre_m) < SAME_PLACE_M for other in others):
         return -np.inf
-    if hand.track is not None and centre_m[2] < hand.track.nearest_m - _IN_FRONT_M:
+    # What was never believed may be a thing, and what is nearer the hand.
+    believed = hand.track if hand.believed else None
+    if believed is not None and centre_m[2] < believed.nearest_m - _IN_FRONT_M:
         return -np.inf
     if hand.seen.age_s >= _FORGOTTEN_S:
         return 0.0
