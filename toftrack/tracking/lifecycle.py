@@ -11,7 +11,7 @@
 | a pose at another place was better for a while | ends, and one begins with it (select.py) |
 | doubtful for longer than `lost.patience` | ends |
 | two tracks on one hand for a while | the less sure one ends |
-| a second hand that was never believed | ends after a while |
+| a second hand that was never believed | ends after a while; not the one that is asked for |
 """
 
 from __future__ import annotations
@@ -421,7 +421,9 @@ def reconcile(
         track = hand.track
         if track is None or track.believed or not hands[1 - slot].believed:
             continue
-        if track.age.seconds > (WATCHED_TRIED_S if after.watched and slot else _TRIED_S):
+        if after.watched and not slot:
+            continue  # the hand that is asked for: a better one is searched for meanwhile
+        if track.age.seconds > (WATCHED_TRIED_S if after.watched else _TRIED_S):
             second_s = 0.0 if known_side(hand) else -_AGAIN_S
             hands[slot] = replace(hand, track=None)
     wrong = not after.watched and in_wrong_slot(before.hands, hands)
