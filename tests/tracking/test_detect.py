@@ -29,6 +29,7 @@ from toftrack.tracking.detect import (
     search,
     search_due,
     start_detection,
+    was_beside,
 )
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
@@ -63,6 +64,33 @@ def likely_for(hand: HandState, *others: OtherHand):
     search(hand, IMAGE, others, model_with(detector))
     assert detector.likely is not None
     return detector.likely
+
+
+# What was there before.
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "there", "beside"),
+    [
+        ((0.16, 0.0), True, True),
+        ((0.16, 0.0), False, False),
+        ((0.0, 0.0), True, False),
+        ((0.0, 0.11), True, False),
+    ],
+    ids=["it was there", "nothing was there", "where the hand was", "where its arm was"],
+)
+def test_a_hand_that_was_beside_the_one_that_left_is_told_from_one_that_comes(
+    moved_m: tuple[float, float], there: bool, beside: bool
+) -> None:
+    model, here = right_hand_model(), hand_at()
+    other = here.clone()
+    other[0, :2] += torch.tensor(moved_m)
+    image = image_of(here, other) if there else image_of(here)
+    scene = model.segmentation(image.depth_m, image.k, None, None)
+    seen = seen_at(here, 0.4)
+    assert was_beside(detection_of(other), replace(seen, scene=scene)) is beside
+    assert not was_beside(detection_of(other), seen), "nobody says what was there"
+    assert not was_beside(NO_DETECTION, replace(seen, scene=scene))
 
 
 # When it is asked.
@@ -220,5 +248,6 @@ def test_what_hides_a_hand_is_no_place_that_it_has_come_to() -> None:
     likely = likely_for(slot_of(hidden))
     assert likely(np.array([0.0, 0.0, 0.40])) == -math.inf
     assert likely(np.array([0.0, 0.0, 0.46])) == 0
+    assert np.isfinite(likely_for(slot_of(replace(hidden, believed=False)))(np.array([0, 0, 0.3])))
     free = likely_for(slot_of(replace(hidden, nearest_m=0.0)))
     assert free(np.array([0.0, 0.0, 0.40])) == 0

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
+import numpy as np
 import pytest
 from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import (
@@ -25,6 +26,7 @@ from toftrack.frames import DepthImage
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.candidates import HandFrame
 from toftrack.tracking.handedness import HandednessEstimate
+from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.lifecycle import (
     Absence,
     open_hand,
@@ -82,12 +84,13 @@ def opened(
     found: Sequence[Detection],
     image: str = "both",
     model: TrackerModel | None = None,
+    others: tuple[OtherHand, ...] = (),
     **changes: object,
 ) -> Opened:
     detector = FixedDetector(found)
     model = replace(model or right_hand_model(), detector=detector)
     hand = slot_of(track, model, **changes)
-    return Opened(open_hand(0, hand, (), images()[image], model, FRAME_S), track, detector)
+    return Opened(open_hand(0, hand, others, images()[image], model, FRAME_S), track, detector)
 
 
 FOUND_HERE, FOUND_THERE = detection_of(HERE), detection_of(THERE)
@@ -138,6 +141,20 @@ def test_in_a_frame_a_track_begins_goes_on_or_ends(
     if x is not None:
         assert after.x == pytest.approx(x, abs=0.02)
     assert bool(after.detector.searched) == (track != "believed"), "the whole image"
+
+
+def test_a_watched_hand_gives_way_to_one_elsewhere_only_while_the_first_one_is_followed() -> None:
+    none, doubted = np.zeros((144, 176), bool), tracks()["doubted"]
+    first = OtherHand(FOUND_HERE.joints_m[0] + 0.3, np.full(3, 0.3), True, False, none, none)
+    known = HandednessEstimate(fits=-5.0)
+    stayed, went = (
+        opened(doubted, [FOUND_THERE], others=others, watched=True, beside=True, handedness=known)
+        for others in ((), (first,))
+    )
+    assert stayed.outcome == "went on" and stayed.result.hand.beside
+    assert went.outcome == "began" and went.x == pytest.approx(ELSEWHERE, abs=0.02)
+    assert not went.result.hand.beside, "it may be another hand now"
+    assert abs(went.result.hand.handedness.fits) < 2.0 < -stayed.result.hand.handedness.fits
 
 
 def test_the_detector_runs_beside_the_filter_for_a_believed_hand_only() -> None:

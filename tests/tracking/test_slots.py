@@ -126,6 +126,17 @@ def test_a_second_hand_that_was_never_believed_ends(
     assert (after.second_s < 0) == (not expected), "and is not searched for at once"
 
 
+@pytest.mark.parametrize(("watched", "ends"), [(True, False), (False, True)])
+def test_the_hand_that_is_asked_for_need_not_be_believed_beside_the_watched_one(
+    watched: bool, ends: bool
+) -> None:
+    state = two("apart", "sure", second_s=0.0, watched=watched)
+    track = replace(known_tracks()["apart"], believed=False, age=Duration(2.0))
+    state = replace(state, hands=(replace(state.hands[0], track=track), state.hands[1]))
+    after, _ = afterwards(state)
+    assert (after.hands[0].track is None) is ends and after.hands[1].track is not None
+
+
 @pytest.mark.parametrize(
     ("tracks", "second_s", "slots"),
     [

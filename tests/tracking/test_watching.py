@@ -14,6 +14,7 @@ from helpers.two_hands import beside_its_mirror
 from toftrack.api import build_hands_tracker
 from toftrack.estimate import Estimate
 from toftrack.tracking.handedness import HandednessEstimate
+from toftrack.tracking.hands import partnered
 from toftrack.tracking.lifecycle import taking_part
 from toftrack.tracking.state import TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
@@ -88,6 +89,49 @@ def test_only_a_hand_that_was_never_beside_the_first_one_can_be_it_after_all() -
     beside = replace(known, beside=True)
     after = watched_over(replace(state, hands=(state.hands[0], beside)), handedness_settings())
     assert after.hands[0].track is None and after.hands[1].track is not None
+
+
+def test_of_two_hands_the_one_that_rather_is_of_the_given_side_is_the_first() -> None:
+    settings = handedness_settings()
+    state = with_evidence(with_evidence(watching(True, True), 0, fits=-0.6), 1, fits=0.6)
+    told, other = partnered(
+        (state.hands[0], replace(state.hands[1], side="right")), right_hand_model()
+    )
+    assert told.track is not None and other.track is not None
+    followed = replace(told.track, pose=told.track.pose + 0.01)
+    state = replace(state, hands=(replace(told, track=followed), other))
+    after = watched_over(state, settings)
+    assert after.hands[0].track is other.track and after.hands[1].track is None
+    assert after.hands[0].handedness.given and after.second_s == np.inf
+    as_told = with_evidence(with_evidence(state, 0, fits=0.6, partner=0.6), 1, fits=-0.6)
+    assert watched_over(as_told, settings).hands[0].track is followed
+
+
+@pytest.mark.parametrize(
+    ("believed", "beside", "fits", "exchanged"),
+    [
+        (False, False, 1.1, True),
+        (False, False, 0.7, False),
+        (True, False, 1.1, False),
+        (False, True, 1.1, False),
+    ],
+    ids=[
+        "what nobody believed makes way",
+        "not for one that is as doubtful",
+        "what was believed stays",
+        "not for what is known to be the other hand",
+    ],
+)
+def test_a_first_hand_that_nobody_believed_makes_way_for_one_that_rather_is_it(
+    believed: bool, beside: bool, fits: float, exchanged: bool
+) -> None:
+    state = with_evidence(with_evidence(watching(True, True), 0, fits=-0.2), 1, fits=fits)
+    told, other = state.hands
+    assert told.track is not None and other.track is not None
+    told = replace(told, track=replace(told.track, believed=believed))
+    other = replace(other, side="right", beside=beside, track=replace(other.track, believed=beside))
+    after = watched_over(replace(state, hands=(told, other)), handedness_settings())
+    assert (after.hands[0].track is other.track) is exchanged
 
 
 def follow(depth_m: np.ndarray, k: np.ndarray, *overrides: str) -> list[Estimate]:

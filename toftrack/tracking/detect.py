@@ -22,7 +22,7 @@ from toftrack.tracking.filter import predicted_palm
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.state import HandState, Track
+from toftrack.tracking.state import HandState, LastSeen, Track
 
 _AS_WELL = 1.3
 """Hands are seen about as well when their expected errors differ by less than this factor."""
@@ -31,6 +31,13 @@ _IN_FRONT_M = 0.03
 _STEP_M, _SPEED_M_S = 0.04, 0.25
 """How far a hand has moved since it was last believed: at once, and a second."""
 _FORGOTTEN_S = 1.0
+_OTHER_PLACE_M = 0.1
+"""A hand that is so far from where the one that was believed was seen last may be another one."""
+_NEAR_M, _DEPTH_M, _MOST = 0.03, 0.05, 0.5
+"""It was there already where so many of its joints had a surface so near to them, across the view
+and along it: hands move a little meanwhile."""
+_ARM_M, _BENT = 0.05, 0.6
+"""Half of a forearm's breadth, and the tangent of how far a wrist bends: the arm is the hand's."""
 
 
 def search_due(hand: HandState, model: TrackerModel) -> bool:
@@ -92,6 +99,33 @@ def is_elsewhere(detection: Detection, track: Track, model: TrackerModel, dt_s: 
     return bool(np.linalg.norm(detection.centre_m.numpy() - centre) > SAME_PLACE_M)
 
 
+def was_beside(detection: Detection, seen: LastSeen) -> bool:
+    """Whether what is detected was beside a hand and its arm already when that was seen last."""
+    if detection.empty or seen.scene is None:
+        return False
+    particle, centre = seen.particle.numpy(), detection.centre_m.numpy()
+    palm = pivot_offset(particle[:, 3:6])[0]
+    off, arm = centre - particle[0, :3], -palm / np.linalg.norm(palm)
+    along = max(0.0, float(off @ arm))
+    if np.linalg.norm(off - palm) < _OTHER_PLACE_M:
+        return False
+    if np.linalg.norm(off - along * arm) < _ARM_M + _BENT * along:
+        return False
+    depth, k = seen.scene.depth_m.cpu().numpy(), seen.scene.k.cpu().numpy()
+    joints = detection.joints_m[0].double().numpy()
+    return sum(_had_surface(joint, depth, k) for joint in joints) > _MOST * len(joints)
+
+
+def _had_surface(point_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> bool:
+    """Whether an image (H, W) has a surface near a point (3,)."""
+    u, v = k[:2, :2].diagonal() * point_m[:2] / point_m[2] + k[:2, 2]
+    reach_px = _NEAR_M * k[0, 0] / point_m[2]
+    rows, columns = (
+        slice(max(0, round(c - reach_px)), max(0, round(c + reach_px) + 1)) for c in (v, u)
+    )
+    return bool((np.abs(depth_m[rows, columns] - point_m[2]) < _DEPTH_M).any())
+
+
 def expected_of(detection: Detection) -> Expected:
     """Where a hand is to be segmented that is not tracked yet."""
     joints = detection.joints_m[0]
@@ -118,7 +152,9 @@ def _reachable(hand: HandState, others: Sequence[OtherHand], centre_m: np.ndarra
     """
     if any(np.linalg.norm(other.centre_m - centre_m) < SAME_PLACE_M for other in others):
         return -np.inf
-    if hand.track is not None and centre_m[2] < hand.track.nearest_m - _IN_FRONT_M:
+    # What was never believed may be a thing, and what is nearer the hand.
+    believed = hand.track if hand.believed else None
+    if believed is not None and centre_m[2] < believed.nearest_m - _IN_FRONT_M:
         return -np.inf
     if hand.seen.age_s >= _FORGOTTEN_S:
         return 0.0

@@ -20,12 +20,17 @@ _BODY_COMPARISONS = 20
 """Comparisons over which the body's place is averaged."""
 _FIRST_COMPARISONS = 5
 """Whatever a given side is taken for, a new hand is compared so often before it is sure."""
-_NOT_AGAINST = 0.86
-"""With the user's word alone it is a little more probable that it is of the side."""
+_AGAINST = -0.2
+"""Log odds from which on they speak against the given side."""
+_OF_EITHER = 0.25
+"""So much of the user's word is left where two hands are seen: it does not say which one it is of.
+"""
 _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
 """Its least area that is seen, and rows of the image that it is searched in."""
+_STRANGER = 4.0
+"""Log odds that a thing which was seen beside the hand is not the hand."""
 OTHER_SIDE = {"right": "left", "left": "right"}
 
 
@@ -63,6 +68,7 @@ class HandednessEstimate:
     prior: by the user's word, where it was given.
     fits: by how much better a right hand explains the image than a left one, summed up.
     shoulder: by where the body is.  partner: by which hand the other one is that is tracked.
+    beside_it: by whether what is followed was seen beside the hand before that left.
     body_m: how far the body is to the image's right of the hand, on average.
     comparisons: how many there were.  age_s: how long ago the last one was.
     """
@@ -72,6 +78,7 @@ class HandednessEstimate:
     fits: float = 0.0
     shoulder: float = 0.0
     partner: float = 0.0
+    beside_it: float = 0.0
     body_m: float = 0.0
     comparisons: int = 0
     age_s: float = 0.0
@@ -79,7 +86,7 @@ class HandednessEstimate:
     @property
     def log_odds(self) -> float:
         """That it is a right hand, by all this."""
-        return self.prior + self.fits + self.shoulder + self.partner
+        return self.prior + self.fits + self.shoulder + self.partner + self.beside_it
 
     def probability(self, side: str) -> float:
         """That the hand is of a side; 1 where it was given."""
@@ -103,7 +110,8 @@ class HandednessEstimate:
     def doubtful(self, side: str) -> bool:
         """Whether the first comparisons of a new hand speak against the side that was given."""
         new = self.given and self.comparisons < _FIRST_COMPARISONS
-        return new and self.seems(side) < _NOT_AGAINST
+        compared = self.fits + self.partner
+        return new and (compared if side == "right" else -compared) < _AGAINST
 
     def contradicted(self, side: str, settings: HandednessSettings) -> bool:
         """Whether what is followed is surely the other hand than the one that was given."""
@@ -132,12 +140,32 @@ class HandednessEstimate:
         before = self.fits + self.shoulder
         kept = min(max(before, -settings.kept), settings.kept)
         kept = 0.0 if self.given else kept  # which hand it was says nothing of which one it is
-        return replace(self, fits=kept, shoulder=0.0, body_m=0.0, comparisons=0)
+        fresh = HandednessEstimate(self.given, self.prior, partner=self.partner, age_s=self.age_s)
+        return replace(fresh, fits=kept)
+
+    def stranger(self, side: str) -> HandednessEstimate:
+        """Where what comes was there already when the hand of a side was seen last."""
+        return replace(self, beside_it=-_STRANGER if side == "right" else _STRANGER)
+
+    def alone(self, settings: HandednessSettings) -> HandednessEstimate:
+        """The same where no other hand is tracked."""
+        prior = math.copysign(settings.given, self.prior) if self.given else 0.0
+        return replace(self, prior=prior, partner=0.0)
 
     def beside(self, other: HandednessEstimate, settings: HandednessSettings) -> HandednessEstimate:
-        """The same where another hand is tracked: a person's two hands are not of one side."""
-        surely = math.tanh(0.5 * (other.prior + other.fits + other.shoulder))
-        return self if self.given else replace(self, partner=-settings.partner * surely)
+        """The same where another hand is tracked: a person's two hands are not of one side.
+
+        Where one hand is asked for, the given side is that of either of the two, and what is seen
+        of both says of which.
+        """
+        if self.given and other.given:
+            return self
+        if self.given:
+            prior = math.copysign(_OF_EITHER * settings.given, self.prior)
+            most = settings.partner
+            return replace(self, prior=prior, partner=-min(max(other.fits, -most), most))
+        surely = math.tanh(0.5 * (other.fits + other.shoulder))
+        return replace(self, partner=-settings.partner * surely)
 
 
 def body_offset_m(image: DepthImage, centre_m: np.ndarray) -> float:

@@ -189,7 +189,7 @@ def partnered(hands: Sequence[HandState], model: TrackerModel) -> list[HandState
     return [
         replace(hand, handedness=hand.handedness.beside(other.handedness, settings))
         if other.believed
-        else replace(hand, handedness=replace(hand.handedness, partner=0.0))
+        else replace(hand, handedness=hand.handedness.alone(settings))
         for hand, other in zip(hands, reversed(hands), strict=True)
     ]
 

@@ -11,7 +11,7 @@
 | a pose at another place was better for a while | ends, and one begins with it (select.py) |
 | doubtful for longer than `lost.patience` | ends |
 | two tracks on one hand for a while | the less sure one ends |
-| a second hand that was never believed | ends after a while |
+| a second hand that was never believed | ends after a while; not the one that is asked for |
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from toftrack.tracking.detect import (
     search,
     search_due,
     start_detection,
+    was_beside,
 )
 from toftrack.tracking.filter import (
     Found,
@@ -188,9 +189,22 @@ def _detected(
         return hand, best
     if not detection_due(track, model.detector.settings, dt_s):
         return hand, NO_DETECTION
-    if is_elsewhere(best, track, model, dt_s):
-        return replace(hand, track=None), best
+    if is_elsewhere(best, track, model, dt_s) and not _stays_watched(hand, others):
+        return _left_behind(hand, model), best
     return hand, detect(hand, track, image, model, dt_s)
+
+
+def _stays_watched(hand: HandState, others: Sequence[OtherHand]) -> bool:
+    """Whether a hand is watched while the first one is away, which it is that is seen elsewhere."""
+    return hand.watched and not any(other.believed for other in others)
+
+
+def _left_behind(hand: HandState, model: TrackerModel) -> HandState:
+    """The hand before a track of it begins elsewhere; what was watched may be another hand now."""
+    if not hand.watched:
+        return replace(hand, track=None)
+    handedness = hand.handedness.left(model.configured.handedness)
+    return replace(hand, track=None, beside=False, handedness=handedness)
 
 
 def _compared(
@@ -209,6 +223,8 @@ def _compared(
     due = before.comparison_due(settings, hand.track is not None, dt_s)
     if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
         before = before.left(settings)  # what comes may be the other hand
+        if before.given and was_beside(detection, hand.seen):
+            before = before.stranger(hand.side)
     handedness = before.waited(dt_s)
     if detection.present < _LEAST_PRESENT or not due:
         return replace(hand, handedness=handedness), detection
@@ -300,7 +316,7 @@ def close(
         new = math.inf
     side = whose.probability(frame.hand.side)
     status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
-    if seems < OTHER_HAND and not status.lost:
+    if seems < OTHER_HAND and status.confidence >= model.lost.confidence:
         status = replace(status, lost=True, state_name="other hand")
     # Without refinement the particles stay where they are.
     followed = drawn_to(found, model) if model.refinement.iterations else found.filtered
@@ -324,7 +340,7 @@ def close(
         nearest_m=frame.expected_m if frame.hidden else 0.0,
     )
     remembered = not status.lost and track.age.reached(model.lost.probation + 1)
-    seen = LastSeen(track.mean, 0.0) if remembered else frame.hand.seen
+    seen = LastSeen(track.mean, 0.0, frame.observation) if remembered else frame.hand.seen
     return status, track, seen
 
 
@@ -405,7 +421,9 @@ def reconcile(
         track = hand.track
         if track is None or track.believed or not hands[1 - slot].believed:
             continue
-        if track.age.seconds > (WATCHED_TRIED_S if after.watched and slot else _TRIED_S):
+        if after.watched and not slot:
+            continue  # the hand that is asked for: a better one is searched for meanwhile
+        if track.age.seconds > (WATCHED_TRIED_S if after.watched else _TRIED_S):
             second_s = 0.0 if known_side(hand) else -_AGAIN_S
             hands[slot] = replace(hand, track=None)
     wrong = not after.watched and in_wrong_slot(before.hands, hands)

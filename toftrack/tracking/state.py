@@ -71,10 +71,12 @@ class LastSeen:
     """A hand as it was last believed.
 
     particle: (1, 6 + d).  age_s: how long ago; inf = it never was.
+    scene: what was seen then; None where nobody says.
     """
 
     particle: Tensor
     age_s: float
+    scene: Observation | None = None
 
     @property
     def ever(self) -> bool:

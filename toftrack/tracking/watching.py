@@ -24,6 +24,9 @@ _BACK = 0.9
 """A hand that turns out to be of the given side after all is the first one again."""
 _RATHER, _UNSURE = 0.7, 0.6
 """Likewise with so much, while what is taken for the first one is less probably of that side."""
+_MORE = 1.2
+"""Or with as much, and when by such log odds more speaks for its side, while what is taken for the
+first one was never believed."""
 OTHER_HAND = 0.4
 """Where it is less probable than this that what is followed is of the given side, the frame is
 flagged."""
@@ -57,10 +60,10 @@ def watched_over(state: TrackerState, settings: HandednessSettings) -> TrackerSt
     elif first.believed and other.believed:
         other = replace(other, beside=True)
     state = replace(state, hands=(first, other))
-    if first.track is not None and first.handedness.contradicted(first.side, settings):
-        return _other_after_all(state, first.track)
     if other.track is not None and _is_first(first, other):
         return _first_after_all(state, other.track)
+    if first.track is not None and first.handedness.contradicted(first.side, settings):
+        return _other_after_all(state, first.track)
     return state
 
 
@@ -87,7 +90,7 @@ def _passed_on(first: HandState, other: HandState, track: Track) -> HandState:
     return replace(
         other,
         side=OTHER_SIDE[first.side],
-        handedness=replace(first.handedness, given=False, prior=0.0),
+        handedness=replace(first.handedness, given=False, prior=0.0, beside_it=0.0),
         shape=first_shape(),
         seen=LastSeen(track.mean, 0.0),
         track=None,
@@ -99,10 +102,15 @@ def _is_first(first: HandState, other: HandState) -> bool:
     """Whether the hand that is watched is the one that was asked for."""
     if not first.handedness.given:
         return first.track is None and other.believed and not first.seen.age_s < _GONE_S
-    probable = other.handedness.probability(first.side) if other.side == first.side else 0.0
-    if first.track is not None:
+    if other.side != first.side:
+        return False
+    probable = other.handedness.probability(first.side)
+    if first.track is None:
+        return probable > _BACK and not other.beside
+    if first.believed or other.beside:
         return probable > _RATHER and first.handedness.seems(first.side) < _UNSURE
-    return probable > _BACK and not other.beside
+    more = other.handedness.fits - first.handedness.fits
+    return probable > _RATHER and (more if first.side == "right" else -more) > _MORE
 
 
 def _first_after_all(state: TrackerState, track: Track) -> TrackerState:
