@@ -66,6 +66,7 @@ class HandFrame:
     expected_m: the depth at which its nearest joint was expected; 0 where the track begins.
     detection: what the detector says of it, and `pending` waits for it where it is still computed.
     others: hands that are tracked as well.  image: the likelihood of the image.
+    mirrored: where the sides are to be compared, waits for what the detector says of the other one.
     """
 
     slot: int
@@ -79,6 +80,7 @@ class HandFrame:
     others: tuple[OtherHand, ...]
     image: ImageTerm
     model: TrackerModel
+    mirrored: Callable[[], Detection] | None = None
 
     @property
     def hidden(self) -> bool:
@@ -297,7 +299,8 @@ def _second_round(
     frame, none = filtered.frame, table.rows(slice(0))
     standing = table.of_source(Source.PREVIOUS, Source.DYNAMICS)
     due = schedule(frame.track, frame.hidden, frame.model.hysteresis.alternate)[1]
-    if not (frame.model.refinement.iterations and len(standing) and due):
+    busy = frame.mirrored is not None  # one expensive thing a frame
+    if busy or not (frame.model.refinement.iterations and len(standing) and due):
         return none
     best, exchanged = standing.best, frame.model.hysteresis.exchanged
     poses = torch.cat(

@@ -20,20 +20,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from torch import Tensor
-
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.frames import DepthImage
-from toftrack.refinement import shape_fit
-from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.candidates import (
-    HandFrame,
-    best_start,
-    image_term,
-    posterior_of,
-)
+from toftrack.tracking.candidates import HandFrame, image_term
+from toftrack.tracking.comparing import begun, compared, observed_shape
 from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
 from toftrack.tracking.detect import (
     detect,
@@ -44,14 +36,8 @@ from toftrack.tracking.detect import (
     search_due,
     start_detection,
 )
-from toftrack.tracking.filter import (
-    Found,
-    drawn_to,
-    new_track,
-    predicted_depths,
-    velocity_after,
-)
-from toftrack.tracking.handedness import OTHER_SIDE, body_offset_m
+from toftrack.tracking.filter import Found, drawn_to, predicted_depths, velocity_after
+from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import (
     OtherHand,
     PlacedHand,
@@ -73,12 +59,6 @@ _OUT_OF_VIEW = 0.4
 """Share of the joints outside of the image from which on a hand is out of view."""
 _PATIENT = 10
 """Times as long is waited for a hidden hand."""
-_GONE_S = 1.0
-"""A hand that was believed so long ago may have made way for another one."""
-_SWITCHED = 0.4
-"""The side is changed when it has become less probable than this, so that it does not flicker."""
-_LEAST_PRESENT = 0.5
-"""Where a hand is less probable than this, its sides are not compared."""
 _SECOND_S = 0.12
 """How often a second hand is searched for."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
@@ -124,19 +104,22 @@ def open_hand(
 ) -> HandFrame | Absence:
     """A slot's hand as it goes into a frame: detected, its side compared, segmented, begun.
 
-    Where a track is believed, and its side need not be compared, the detector runs beside the
-    filter; else it is waited for, as everything depends on it.
+    Where a track is believed the detector runs beside the filter, of both sides where they are to
+    be compared (see settled); else it is waited for, as everything depends on it.
     """
-    alone, settings, track = without(image, others), model.configured.handedness, hand.track
-    compared = hand.handedness.comparison_due(settings, track is not None, dt_s)
-    if track is not None and not track.doubted and not compared:
-        asked = detection_due(track, model.detector.settings, dt_s)
+    alone, track, mirrored = without(image, others), hand.track, None
+    if track is not None and not track.doubted:
+        due = hand.handedness.comparison_due(model.configured.handedness, True, dt_s)
+        asked = due or detection_due(track, model.detector.settings, dt_s)
         pending = start_detection(hand, track, alone, model, dt_s) if asked else _nothing
+        if due:
+            other = replace(hand, side=OTHER_SIDE[hand.side])
+            mirrored = start_detection(other, track, alone, model, dt_s)
         hand = replace(hand, handedness=hand.handedness.waited(dt_s))
         detection = NO_DETECTION
     else:
         hand, detection = _detected(hand, others, alone, model, dt_s)
-        hand, detection = _compared(hand, detection, others, alone, model, dt_s)
+        hand, detection = compared(hand, detection, others, alone, model, dt_s)
         hand = observed_shape(hand, detection, model)
         pending, track = _nothing, hand.track
     fitted = model.hand(hand.side, hand.shape)
@@ -148,7 +131,7 @@ def open_hand(
         hand = observed_shape(hand, pending(), model)
         return Absence(slot, replace(hand, track=None), observation)
     if track is None:
-        track = _begun(hand, detection, observation, others, model)
+        track = begun(hand, detection, observation, others, model)
     return HandFrame(
         slot,
         hand,
@@ -161,6 +144,7 @@ def open_hand(
         others,
         image_term(observation, fitted, model),
         model,
+        mirrored,
     )
 
 
@@ -190,98 +174,6 @@ def _detected(
     if is_elsewhere(best, track, model, dt_s):
         return replace(hand, track=None), best
     return hand, detect(hand, track, image, model, dt_s)
-
-
-def _compared(
-    hand: HandState,
-    detection: Detection,
-    others: tuple[OtherHand, ...],
-    image: DepthImage,
-    model: TrackerModel,
-    dt_s: float,
-) -> tuple[HandState, Detection]:
-    """The hand after its side was compared, where that is due.
-
-    When the other side has become the likelier one, a track of it begins in this frame.
-    """
-    settings, before = model.configured.handedness, hand.handedness
-    due = before.comparison_due(settings, hand.track is not None, dt_s)
-    if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
-        before = before.left(settings)  # what comes may be the other hand
-    handedness = before.waited(dt_s)
-    if detection.present < _LEAST_PRESENT or not due:
-        return replace(hand, handedness=handedness), detection
-    other, centre = OTHER_SIDE[hand.side], detection.centre_m.numpy()
-    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other)[0]
-    gain = _best_log_posterior(hand, detection, hand.side, others, image, model)
-    gain -= _best_log_posterior(hand, mirrored, other, others, image, model)
-    gain = gain if hand.side == "right" else -gain
-    handedness = handedness.compared(gain, body_offset_m(image, centre), settings)
-    hand = replace(hand, handedness=handedness)
-    if handedness.probability(hand.side) >= _SWITCHED:  # 1 where the side was given
-        return hand, detection
-    return replace(hand, side=other, shape=first_shape(), gesture=None, track=None), mirrored
-
-
-def _best_log_posterior(
-    hand: HandState,
-    detection: Detection,
-    side: str,
-    others: tuple[OtherHand, ...],
-    image: DepthImage,
-    model: TrackerModel,
-) -> float:
-    """Of the best pose that the detector has for a side; -inf where nothing can be a hand."""
-    observation = model.segmentation(
-        image.depth_m, image.k, expected_of(detection), pixels_of(others)
-    )
-    if observation.empty:
-        return -math.inf
-    shape = hand.shape
-    if hand.track is None:
-        first = model.configured.shape
-        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
-    hand = replace(hand, side=side, shape=shape)
-    return _best_start(hand, detection, observation, others, model)[1]
-
-
-def _begun(
-    hand: HandState,
-    detection: Detection,
-    observation: Observation,
-    others: tuple[OtherHand, ...],
-    model: TrackerModel,
-) -> Track:
-    """A track that begins with the best of the detector's poses."""
-    pose, _ = _best_start(hand, detection, observation, others, model)
-    return new_track(pose, model, model.refinement.carry)
-
-
-def _best_start(
-    hand: HandState,
-    detection: Detection,
-    observation: Observation,
-    others: tuple[OtherHand, ...],
-    model: TrackerModel,
-) -> tuple[Tensor, float]:
-    """The best of the detector's poses of a hand, and its log posterior."""
-    fitted = model.hand(hand.side, hand.shape)
-    # Very different poses are compared: what explains more of the image counts in full.
-    image = image_term(observation, fitted, model, coverage=1.0)
-    posterior = posterior_of(observation, fitted, detection, others, model, image)
-    return best_start(detection, observation, fitted, posterior, model)
-
-
-def observed_shape(hand: HandState, detection: Detection, model: TrackerModel) -> HandState:
-    """The hand with what a detection says of its shape: the length to begin a track with, and
-    whether it still is the hand that was fitted.
-    """
-    if detection.empty:
-        return hand
-    shape, first = hand.shape, model.configured.shape
-    if hand.track is None:
-        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
-    return replace(hand, shape=shape_fit.contradicted(shape, detection, model.fit, first))
 
 
 def close(

@@ -24,6 +24,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.candidates import FilteredFrame, HandFrame, keypoints_of, propose
+from toftrack.tracking.comparing import observed_shape, settled
 from toftrack.tracking.confidence import confidence_features, joint_features
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
 from toftrack.tracking.hands import PlacedHand, others_of, partnered
@@ -31,7 +32,6 @@ from toftrack.tracking.lifecycle import (
     Absence,
     Status,
     close,
-    observed_shape,
     open_hand,
     reconcile,
     since_search,
@@ -74,7 +74,15 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
     with spans("filter: rest"):
         filtered = [filtered_frame(frame, dt_s, generator, spans) for frame in frames]
     with spans("detector"):
-        frames = [waited_for(frame) for frame in frames]
+        waited = [waited_for(frame, image) for frame in frames]
+    again = [new.track is not old.track for new, old in zip(waited, frames, strict=True)]
+    frames = waited
+    if any(again):  # the side has changed
+        with spans("filter: rest"):
+            filtered = [
+                filtered_frame(frame, dt_s, generator, spans) if anew else found
+                for frame, found, anew in zip(frames, filtered, again, strict=True)
+            ]
     with spans("refinement"):
         pairs = list(zip(frames, filtered, strict=True))
         candidates = [FilteredFrame.of(frame, found.mean) for frame, found in pairs]
@@ -112,13 +120,16 @@ def filtered_frame(
     return run_filter(track, dt_s, frame.image, model, generator, spans, width)
 
 
-def waited_for(frame: HandFrame) -> HandFrame:
-    """The frame with its detection, if that ran beside the filter."""
+def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
+    """The frame with its detection, if that ran beside the filter, and with both sides compared, if
+    that is due.
+    """
     detection = frame.pending()
     if detection.empty:
         return frame
     hand = observed_shape(frame.hand, detection, frame.model)
-    return replace(frame, hand=hand, detection=detection)
+    frame = replace(frame, hand=hand, detection=detection)
+    return frame if frame.mirrored is None else settled(frame, frame.mirrored(), image)
 
 
 def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
