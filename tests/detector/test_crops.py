@@ -44,6 +44,23 @@ def test_a_crop_faces_along_the_ray_to_its_centre(centre: tuple[float, float, fl
     assert rotation[:, 2] == pytest.approx(np.array(centre) / np.linalg.norm(centre))
 
 
+@pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.3, 0.2, 0.4)])
+@pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (-0.5, 0.7, 0.4), (0.0, -1.0, 0.0)])
+def test_what_is_said_to_be_up_is_up_in_a_crop(
+    centre: tuple[float, float, float], up: tuple[float, float, float]
+) -> None:
+    rotation = crop_rotation(np.array(centre), np.array(up))
+    assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert rotation[:, 2] == pytest.approx(np.array(centre) / np.linalg.norm(centre))
+    across, down, _ = np.array(up) @ rotation
+    assert across == pytest.approx(0, abs=1e-12) and down < 0
+
+
+def test_a_direction_along_the_axis_leaves_a_crop_as_it_is() -> None:
+    centre = np.array([0.0, 0.0, 0.5])
+    assert crop_rotation(centre, centre) == pytest.approx(crop_rotation(centre))
+
+
 def test_a_crop_shows_depths_about_its_centre() -> None:
     """A plate across the crop's axis, aside of the camera's: as far everywhere, but not in Z."""
     centre = np.array([0.12, -0.05, 0.5])
@@ -128,8 +145,9 @@ def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int
     centres = scene.joints_m[0, [0, 9]]
     flip = np.array([-1.0, 1.0, 1.0])
     depth, k = mirrored(scene.depth_m[0], scene.k)
-    right = numbers(run_pose_network(pose, scene.depth_m[0], scene.k, centres, "right"))
-    left = numbers(run_pose_network(pose, depth, k, centres * flip, "left"))
+    up = np.array([[0.3, -0.8, 0.2], [-0.5, 0.1, 0.6]])
+    right = numbers(run_pose_network(pose, scene.depth_m[0], scene.k, centres, "right", up))
+    left = numbers(run_pose_network(pose, depth, k, centres * flip, "left", up * flip))
     turn = torch.tensor([1.0, -1.0, -1.0])
     for name, value in right.items():
         reported = left[name]
@@ -152,8 +170,9 @@ def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> 
     for frame in (0, 30, 60):
         scene = sample().cut(frame)
         centres = np.concatenate((scene.joints_m[0, [0, 9]], [[0.2, 0.0, 0.45], [2.0, 0.1, 0.3]]))
-        reported = run_pose_network(pose, scene.depth_m[0], scene.k, centres, side)
-        expected = proposals.run_pose_network(pose, scene.depth_m[0], scene.k, centres, side)
+        up = np.random.default_rng(frame).normal(size=(4, 3)) if frame else None
+        reported = run_pose_network(pose, scene.depth_m[0], scene.k, centres, side, up)
+        expected = proposals.run_pose_network(pose, scene.depth_m[0], scene.k, centres, side, up)
         for name, value in numbers(expected).items():
             # The file's weights hold the limits of the angles and the cells' places in half
             # precision, which only the reference uses.

@@ -92,9 +92,9 @@ def searched(monkeypatch: pytest.MonkeyPatch, found: dict[str, Places], **change
     monkeypatch.setattr(module, "find_hands", lambda *given: found)
     plain = module.run_pose_network
 
-    def run_pose_network(pose, depth_m, k, centres_m, side):
+    def run_pose_network(pose, depth_m, k, centres_m, side, up=None):
         inspected.append(np.array(centres_m))
-        return plain(pose, depth_m, k, centres_m, side)
+        return plain(pose, depth_m, k, centres_m, side, up)
 
     monkeypatch.setattr(module, "run_pose_network", run_pose_network)
     return here.search(sample().depth_m[0], sample().k, "right"), inspected

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 
 import numpy as np
@@ -11,6 +12,7 @@ from helpers.detection import small_bank
 
 from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M, channels
 from toftrack.detector.images import (
+    NEW_HANDS,
     WIDE_SIZE,
     Crops,
     WideImages,
@@ -116,8 +118,8 @@ def test_crops_are_read_as_the_reference_reads_them() -> None:
     border = np.tile(np.array([1.0, 0.0, 9.0], np.float32), (n, 2, 1))
     border[2:, 0] = (0.0, 1.0, 0.1)
     border[3:, 1] = (-1.0, 0.0, 0.25)
-    sides = np.full(n, side, np.int32)
-    image, parts = read_pictures(depth, labels, sides, distance, border)
+    sides = np.full((n, 2), side, np.int32)
+    image, parts = read_pictures(depth, labels, sides, distance, np.zeros(n), border)
     steps = (np.arange(side) + 0.5) / side - 0.5
     inside = np.ones(depth.shape, bool)
     inside[2:] &= (steps < 0.1)[:, None]
@@ -128,6 +130,28 @@ def test_crops_are_read_as_the_reference_reads_them() -> None:
     seen = labels[:, step // 2 :: step, step // 2 :: step]
     known = inside[:, step // 2 :: step, step // 2 :: step]
     assert np.array_equal(parts[known], seen[known]) and (parts[~known] == -1).all()
+
+
+def test_a_quarter_turn_of_a_crop_turns_what_is_read_and_not_where_the_image_ends() -> None:
+    generator = np.random.default_rng(0)
+    side = 2 * CROP
+    depth = generator.uniform(0.3, 0.7, (1, side, side)).astype(np.float32)
+    labels = generator.integers(0, 5, depth.shape).astype(np.int8)
+    border = np.array([[[1.0, 0.0, 0.2], [1.0, 0.0, 9.0]]], np.float32)
+    sides, distance = np.full((1, 2), side, np.int32), np.full(1, 0.5, np.float32)
+    held, _ = read_pictures(depth, labels, sides, distance, np.zeros(1), border)
+    turned, _ = read_pictures(depth, labels, sides, distance, np.full(1, math.pi / 2), border)
+    # What was to the right is up: upright_angle of (1, 0).
+    np.testing.assert_allclose(turned[0, :4], np.rot90(held[0, :4], 1, (1, 2)), atol=1e-5)
+    assert held[0, 3, :, -5:].min() == 1 and turned[0, 3, :5].min() == 1
+
+
+def test_fingers_point_up_in_crops_of_hands_that_are_followed(crops: Crops) -> None:
+    fingers = crops.joints_m[:, 9] - crops.joints_m[:, 0]
+    across = fingers[:, :2].norm(dim=1) > 0.07
+    up = -fingers[:, 1] / fingers[:, :2].norm(dim=1)
+    upright = (up[across] > 0.8).float().mean()
+    assert 1 - NEW_HANDS < float(upright) + 0.1 and (up < 0).any()
 
 
 @pytest.mark.parametrize("make", [crop_images, wide_images])

@@ -135,7 +135,7 @@ class FixedDetector:
         self.likely = likely
         return self.found
 
-    def detect(self, depth_m, k, centres_m, side) -> list[Detection]:
+    def detect(self, depth_m, k, centres_m, side, up=None) -> list[Detection]:
         """An open palm whose middle is at each place."""
         self.centres_m.append(np.array(centres_m))
         states = torch.zeros(len(centres_m), 27)
@@ -143,6 +143,6 @@ class FixedDetector:
         states[:, :3] -= rotated_pivot(states[:, 3:6])
         return [detection_of(state[None], side=side) for state in states]
 
-    def start(self, depth_m, k, centre_m, side) -> Callable[[], Detection]:
+    def start(self, depth_m, k, centre_m, side, up) -> Callable[[], Detection]:
         found = self.detect(depth_m, k, np.asarray(centre_m)[None], side)[0]
         return lambda: found

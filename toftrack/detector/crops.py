@@ -27,8 +27,26 @@ WIDE_RANGE_M = 1.6
 """Farther away, all is the same to the finder."""
 
 
-def crop_rotation(centre_m: np.ndarray) -> np.ndarray:
-    """(3, 3) from the crop's frame, whose z axis points at the centre (3,), to the camera's."""
+def crop_rotation(centre_m: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
+    """(3, 3) from the crop's frame, whose z axis points at the centre (3,), to the camera's.
+
+    up: (3,) what is up in the crop (-y), as far as it lies across; None: as the camera has it.
+    """
+    upright = _shortest_rotation(centre_m)
+    if up is None:
+        return upright
+    across, down, _ = up @ upright
+    angle = upright_angle(float(across), float(down))
+    c, s = math.cos(angle), math.sin(angle)
+    return upright @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def upright_angle(across: float, down: float) -> float:
+    """By how much a crop is turned about its z axis so that a direction in it, x and y, is up."""
+    return math.atan2(across, -down) if across or down else 0.0
+
+
+def _shortest_rotation(centre_m: np.ndarray) -> np.ndarray:
     x, y, z = map(float, centre_m)
     distance = max(math.sqrt(x * x + y * y + z * z), 1e-12)
     x, y, z = x / distance, y / distance, z / distance
@@ -39,13 +57,16 @@ def crop_rotation(centre_m: np.ndarray) -> np.ndarray:
     )
 
 
-def crop(depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def crop(
+    depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, up: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """What is in the cube about a point.
 
     depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).  centre_m: (3,) in the camera frame.
+    up: see crop_rotation.
     Returns (CROP_CHANNELS, CROP, CROP) float32, see `channels`, and the crop's rotation (3, 3).
     """
-    rotation = crop_rotation(centre_m)
+    rotation = crop_rotation(centre_m, up)
     distance = float(np.linalg.norm(centre_m))
     samples = 2 * CROP
     # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.

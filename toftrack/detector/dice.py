@@ -20,8 +20,8 @@ class Dice:
         """Mean 0, standard deviation 1."""
         return torch.randn(*size, generator=self.generator)
 
-    def chance(self, p: float, *size: int) -> Tensor:
-        """True with probability p."""
+    def chance(self, p: float | Tensor, *size: int) -> Tensor:
+        """True with probability p, one for all or of a shape like the size."""
         return torch.rand(*size, generator=self.generator) < p
 
     def rows(self, count: int, n: int) -> Tensor:

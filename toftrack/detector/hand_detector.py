@@ -103,6 +103,12 @@ class Detection:
         """(3,) middle of the palm of the likeliest hypothesis."""
         return self.pivot_m[0]
 
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) where its fingers point: from the wrist to the middle finger's knuckle."""
+        wrist, knuckle = self.keypoints.points_m[[0, 9]].numpy()
+        return np.asarray(knuckle - wrist)
+
     def first(self, count: int) -> Detection:
         """With only so many hypotheses."""
         kept = slice(None, count)
@@ -148,22 +154,28 @@ class HandDetector:
         return replace(self, pose=self.pose.to(device), finder=self.finder.to(device))
 
     def detect(
-        self, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        centres_m: np.ndarray,
+        side: str,
+        up: np.ndarray | None = None,
     ) -> list[Detection]:
         """What a hand of a side is like at each of C places (C, 3), in their order.
 
         depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).
+        up: (C, 3) where its fingers point, see proposals.run_pose_network; None = unknown.
         """
         if len(centres_m) == 0:
             return []
-        seen = run_pose_network(self.pose, depth_m, k, centres_m, side)
+        seen = run_pose_network(self.pose, depth_m, k, centres_m, side, up)
         return [_detection(seen, row) for row in range(len(seen.present))]
 
     def start(
-        self, depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, side: str
+        self, depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, side: str, up: np.ndarray
     ) -> Callable[[], Detection]:
-        """The same at one place (3,), begun beside whatever does not need it; see looking."""
-        wait = start_pose_network(self.pose, depth_m, k, centre_m[None], side)
+        """The same at one place (3,), begun beside whatever does not need it."""
+        wait = start_pose_network(self.pose, depth_m, k, centre_m[None], side, up[None])
         return lambda: _detection(wait(), 0)
 
     def search(
@@ -177,8 +189,9 @@ class HandDetector:
 
         likely: what is known of places (3,) besides the image, log scale.
 
-        At the best places poses are proposed twice, the second time about the palm that was found:
-        they are the more exact the nearer the crop's centre is to the middle of the palm.
+        At the best places poses are proposed twice, the second time about the palm that was found
+        with its fingers upright: they are the more exact the nearer the crop's centre is to the
+        middle of the palm.
         """
         cfg = self.settings
         found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)
@@ -198,7 +211,8 @@ class HandDetector:
         first = merits()
         good = [row for row in range(len(first)) if first[row] > first.max() - _AGAIN]
         again = np.array([detections[row].centre_m.numpy() for row in good]).reshape(-1, 3)
-        for row, detection in zip(good, self.detect(depth_m, k, again, side), strict=True):
+        up = np.array([detections[row].up for row in good]).reshape(-1, 3)
+        for row, detection in zip(good, self.detect(depth_m, k, again, side, up), strict=True):
             detections[row] = detection
         second = merits()
         order = np.argsort(-second, kind="stable")

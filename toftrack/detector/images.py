@@ -22,6 +22,7 @@ from toftrack.detector.hands import (
     Hands,
     posed_hands,
     random_views,
+    turn,
 )
 from toftrack.detector.images_numba import read_pictures
 from toftrack.detector.network import SEGMENTS, STRIDE
@@ -37,6 +38,12 @@ from toftrack.detector.scenes import (
 from toftrack.detector.shapes import ShapeBank
 
 _SAMPLES = 2 * CROP
+_WHOLE = math.ceil(_SAMPLES * 2**0.5) + 1
+"""Pixels of a picture of which a turned crop is read."""
+NEW_HANDS = 0.25
+"""How many crops are as of new hands: as the camera is held, and less well centred."""
+_DIRECTION = 0.25
+"""By how much it is uncertain where the fingers of a hand point that is followed, of 1 m."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
 _HAND_M2 = 0.0105
@@ -85,7 +92,9 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     dice = Dice(generator)
     distance = dice.uniform(n, low=math.log(0.27), high=math.log(1.1)).exp()
     centre = torch.stack((torch.zeros(n), torch.zeros(n), distance), 1)
-    near = torch.where(dice.chance(0.3, n), 0.040, 0.016)[:, None] * dice.normal(n, 3)
+    known = ~dice.chance(NEW_HANDS, n)
+    far = dice.chance(torch.where(known, 0.15, 0.5), n)
+    near = torch.where(far, 0.036, 0.014)[:, None] * dice.normal(n, 3)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.13, high=0.30)
     present = ~dice.chance(0.16, n)
@@ -101,29 +110,46 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12, views=views)
     scenes = moved(scenes, torch.where(gone[:, None], _onto_something(scenes, centre, dice), 0.0))
 
+    turned = torch.where(known, _upright_angles(hands, dice), 0.0)
     pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
     side = pixels.round().clamp(36, _SAMPLES)
-    middle = (side - 1) / 2
-    lens = Lens(side * distance / CROP_M, middle, middle, side, side)
-    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_SAMPLES, _SAMPLES), dice)
+    whole = (side * (turned.cos().abs() + turned.sin().abs())).ceil()
+    middle = (whole - 1) / 2
+    lens = Lens(side * distance / CROP_M, middle, middle, whole, whole)
+    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_WHOLE, _WHOLE), dice)
     image, seen_parts = read_pictures(
-        depth, which, side.int().numpy(), distance.numpy(), _borders(n, dice).numpy()
+        depth,
+        which,
+        torch.stack((whole, side), 1).int().numpy(),
+        distance.numpy(),
+        turned.numpy(),
+        _borders(n, dice).numpy(),
     )
     parts = torch.from_numpy(seen_parts).long()
     parts[parts == OTHER_HAND] = OTHER_FOREARM
     parts[parts == THING] = SEGMENTS - 1
     visible = (parts == HAND).sum((1, 2)) >= 12
+    back = turn(turned, 2)  # from the crop's frame
     return Crops(
         image=torch.from_numpy(image),
         parts=parts,
         present=present & visible,
         right=~left,
-        pivot_m=pivot - centre,
-        rotation=hands.rotation,
+        pivot_m=((pivot - centre)[:, None] @ back)[:, 0],
+        rotation=back.mT @ hands.rotation,
         angles=hands.angles,
         log_size=hands.log_size,
-        joints_m=hands.joints_m - centre[:, None],
+        joints_m=(hands.joints_m - centre[:, None]) @ back,
     )
+
+
+def _upright_angles(hands: Hands, dice: Dice) -> Tensor:
+    """(N,) turns of crops in which the fingers point up, as far as a tracker knows where they do:
+    well where they lie across, hardly where they point at the camera or away.
+    """
+    up = hands.joints_m[:, 9] - hands.joints_m[:, 0]
+    up = torch.nn.functional.normalize(up, dim=1) + _DIRECTION * dice.normal(len(up), 3)
+    return torch.atan2(up[:, 0], -up[:, 1])
 
 
 def _onto_something(scenes: Scenes, centre_m: Tensor, dice: Dice) -> Tensor:

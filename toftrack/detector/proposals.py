@@ -104,14 +104,28 @@ def find_hands(
 
 @torch.inference_mode()
 def run_pose_network(
-    pose: PoseNet, depth_m: np.ndarray, k: np.ndarray, centres_m: np.ndarray, side: str
+    pose: PoseNet,
+    depth_m: np.ndarray,
+    k: np.ndarray,
+    centres_m: np.ndarray,
+    side: str,
+    up: np.ndarray | None = None,
 ) -> NetworkOutput:
-    """Hypotheses of a hand of one side about each of C centres (C, 3); C is at least 1."""
+    """Hypotheses of a hand of one side about each of C centres (C, 3); C is at least 1.
+
+    up: (C, 3) where the fingers point, as far as that is known, which is up in the crops, see
+    crops.crop_rotation; None: crops as the camera is held. A network that learns hands that are
+    upright, more or less, knows them better.
+    """
     centres_m = np.asarray(centres_m, np.float64).reshape(-1, 3)
+    ups = [None] * len(centres_m) if up is None else list(np.asarray(up, np.float64))
     if side == "left":
         depth_m, k = mirrored(depth_m, k)
         centres_m = centres_m * MIRROR.numpy()
-    crops, crop_rotations = zip(*(crop(depth_m, k, centre) for centre in centres_m), strict=True)
+        ups = [None if one is None else one * MIRROR.numpy() for one in ups]
+    crops, crop_rotations = zip(
+        *(crop(depth_m, k, *at) for at in zip(centres_m, ups, strict=True)), strict=True
+    )
     image = torch.from_numpy(np.stack(crops)[:, : pose.inputs])
     image = image.to(memory_format=torch.channels_last)
     p = Proposed(*on_host(*pose(on_device(image, pose.device))))

@@ -7,7 +7,7 @@ microseconds that every operation costs on a few numbers.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -31,11 +31,12 @@ def run_pose_network(
     k: np.ndarray,
     centres_m: np.ndarray,
     side: str,
+    up: np.ndarray | None = None,
 ) -> NetworkOutput:
     """See proposals.run_pose_network, which it is where the network is on another device."""
     if isinstance(pose, PoseNet) and pose.device.type != "cpu":
-        return proposals.run_pose_network(pose, depth_m, k, centres_m, side)
-    task, out = _prepared(pose, depth_m, k, centres_m, side)
+        return proposals.run_pose_network(pose, depth_m, k, centres_m, side, up)
+    task, out = _prepared(pose, depth_m, k, centres_m, side, up)
     run_shared(task, len(centres_m) if _may_be_shared(pose) else 1)
     return _reported(out)
 
@@ -46,17 +47,18 @@ def start_pose_network(
     k: np.ndarray,
     centres_m: np.ndarray,
     side: str,
+    up: np.ndarray | None = None,
 ) -> Callable[[], NetworkOutput]:
     """The same, begun in another thread if there may be one; what is returned waits for it.
 
     That thread has nothing to do but the network, so that it hardly needs the interpreter's lock.
-    centres_m: one, (1, 3).
+    centres_m, up: one, (1, 3).
     """
     if isinstance(pose, PoseNet) or not _may_be_shared(pose):
-        return functools.partial(run_pose_network, pose, depth_m, k, centres_m, side)
-    task, out = _prepared(pose, depth_m, k, centres_m, side)
-    _, depth, left, k, centres, hand, written, _ = task.args
-    turn, image = _crop(pose, depth, left, k, centres[0])
+        return functools.partial(run_pose_network, pose, depth_m, k, centres_m, side, up)
+    task, out = _prepared(pose, depth_m, k, centres_m, side, up)
+    _, depth, left, k, centres, turns, hand, written, _ = task.args
+    turn, image = turns[0], _crop(pose, depth, left, k, centres[0], turns[0])
     wait = beside(functools.partial(pose.outputs, image))
 
     def reported() -> NetworkOutput:
@@ -81,6 +83,7 @@ def _prepared(
     k: np.ndarray,
     centres_m: np.ndarray,
     side: str,
+    up: np.ndarray | None = None,
 ) -> tuple[functools.partial[None], dict[str, np.ndarray]]:
     """What does it, for threads that share the crops, and the arrays that it writes."""
     # Copies: numba compiles once more for arrays that must not be written to.
@@ -89,6 +92,10 @@ def _prepared(
     if left:
         k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
         centres = centres * MIRROR.numpy()
+    ups = [None] * len(centres) if up is None else list(np.asarray(up, np.float64))
+    if left:
+        ups = [None if one is None else one * MIRROR.numpy() for one in ups]
+    turns = [crop_rotation(*at) for at in zip(centres, ups, strict=True)]
     out = _empty(len(centres))
     task = functools.partial(
         _propose,
@@ -97,6 +104,7 @@ def _prepared(
         left,
         k,
         centres,
+        turns,
         _mean_hand(side),
         tuple(out.values()),
         iter(range(len(centres))),
@@ -110,6 +118,7 @@ def _propose(
     left: bool,
     k: np.ndarray,
     centres: np.ndarray,
+    turns: Sequence[np.ndarray],
     hand: tuple[np.ndarray, ...],
     out: tuple[np.ndarray, ...],
     rows: Iterator[int],
@@ -119,17 +128,22 @@ def _propose(
     Each by itself: a batch takes as long, and what is said of a crop would depend on the others.
     """
     for row in rows:
-        turn, image = _crop(pose, depth, left, k, centres[row])
-        _decode(_outputs(pose, image), image, turn, centres[row], left, hand, out, row)
+        image = _crop(pose, depth, left, k, centres[row], turns[row])
+        _decode(_outputs(pose, image), image, turns[row], centres[row], left, hand, out, row)
 
 
 def _crop(
-    pose: PoseNet | OnnxPoseNet, depth: np.ndarray, left: bool, k: np.ndarray, centre: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """A crop's rotation (3, 3) and its image (1, inputs, CROP, CROP)."""
-    turn, image = crop_rotation(centre), np.empty((1, pose.inputs, CROP, CROP), np.float32)
+    pose: PoseNet | OnnxPoseNet,
+    depth: np.ndarray,
+    left: bool,
+    k: np.ndarray,
+    centre: np.ndarray,
+    turn: np.ndarray,
+) -> np.ndarray:
+    """A crop's image (1, inputs, CROP, CROP)."""
+    image = np.empty((1, pose.inputs, CROP, CROP), np.float32)
     called(crop_at, _COMPILING, depth, left, k, centre, turn, image[0])
-    return turn, image
+    return image
 
 
 def _decode(

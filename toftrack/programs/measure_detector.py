@@ -3,9 +3,9 @@
 python -m toftrack.programs.measure_detector FOLDER_OR_FILE ... --weights FILE --weights OTHER
 
 Nothing is tracked and nothing searched for: the crop lies about the true middle of the palm, the
-side is told, and the keypoints are compared with the true joints, in frames in which the hand is
-visible. The network runs as the tracker runs it: in ONNX Runtime if its file lies beside the
-weights, else in torch, which is said.
+fingers point up in it (unless --as-held is given), the side is told, and the keypoints are compared
+with the true joints, in frames in which the hand is visible. The network runs as the tracker runs
+it: in ONNX Runtime if its file lies beside the weights, else in torch, which is said.
 """
 
 from __future__ import annotations
@@ -66,9 +66,12 @@ class Misses:
         return tables
 
 
-def misses(pose: PoseNet | OnnxPoseNet, paths: Sequence[Path], every: int) -> Misses:
+def misses(
+    pose: PoseNet | OnnxPoseNet, paths: Sequence[Path], every: int, as_held: bool = False
+) -> Misses:
     """Errors of a network's keypoints in every so manieth visible frame of recordings.
 
+    as_held: crops as the camera is held, and not turned so that the fingers point up.
     Raises ToftrackError for a recording without truth or without a side.
     """
     errors, recordings, poses = [], [], []
@@ -84,7 +87,8 @@ def misses(pose: PoseNet | OnnxPoseNet, paths: Sequence[Path], every: int) -> Mi
             centre = joints[0] + _MIDDLE * (joints[9] - joints[0])
             depth, _ = recording.image(int(frame))
             k = recording.camera.K
-            seen = run_pose_network(pose, depth, k, centre[None], truth.side)
+            up = None if as_held else (joints[9] - joints[0])[None]
+            seen = run_pose_network(pose, depth, k, centre[None], truth.side, up)
             errors.append(np.linalg.norm(seen.keypoints_m[0].numpy() - joints, axis=1))
             recordings.append(path.stem)
             poses.append("" if truth.pose_name is None else str(truth.pose_name[frame]))
@@ -101,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for file in weights:
         pose, _ = load_networks(file)
         name = "the package's" if file is None else str(file)
-        tables[name] = misses(pose, paths, options.every).tables()
+        tables[name] = misses(pose, paths, options.every, options.as_held).tables()
     _print(tables)
     if options.json is not None:
         write_whole(options.json, json.dumps(tables, indent=1) + "\n")
@@ -139,6 +143,11 @@ def _parser() -> argparse.ArgumentParser:
         "--weights", action="append", metavar="FILE", help="of train_detector; several are compared"
     )
     parser.add_argument("--every", type=int, default=1, help="every so manieth frame (1)")
+    parser.add_argument(
+        "--as-held",
+        action="store_true",
+        help="look as at a new hand: crops as the camera is held, not turned upright",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
     return parser
 

@@ -50,7 +50,8 @@ def compared(
     if detection.present < _LEAST_PRESENT or not due:
         return hand, detection
     other, centre = OTHER_SIDE[hand.side], detection.centre_m.numpy()
-    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other)[0]
+    up = detection.up[None]
+    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other, up)[0]
     gain = _best_log_posterior(hand, detection, hand.side, others, image, model)
     gain -= _best_log_posterior(hand, mirrored, other, others, image, model)
     hand = _after(replace(hand, handedness=before), gain, detection, image, model)

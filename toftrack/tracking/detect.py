@@ -18,7 +18,7 @@ from toftrack.detector.hand_detector import (
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.confidence import log_odds
-from toftrack.tracking.filter import predicted_centre
+from toftrack.tracking.filter import predicted_palm
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
@@ -61,7 +61,8 @@ def search(
         # A hand of the other side may be too unlike one of this to be found as such.
         found = detector.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
         again = np.array([one.centre_m.numpy() for one in found[:1]]).reshape(-1, 3)
-        found = detector.detect(image.depth_m, image.k, again, side)
+        up = np.array([one.up for one in found[:1]]).reshape(-1, 3)
+        found = detector.detect(image.depth_m, image.k, again, side, up)
     elif undecided and not hand.seen.ever:
         found = _held_out(found)
     return found[0] if found else NO_DETECTION
@@ -71,23 +72,23 @@ def detect(
     hand: HandState, track: Track, image: DepthImage, model: TrackerModel, dt_s: float
 ) -> Detection:
     """What the pose network says where a hand is predicted."""
-    centre = predicted_centre(track, dt_s, model)
-    return model.detector.detect(image.depth_m, image.k, centre, hand.side)[0]
+    centre, up = predicted_palm(track, dt_s, model)
+    return model.detector.detect(image.depth_m, image.k, centre, hand.side, up)[0]
 
 
 def start_detection(
     hand: HandState, track: Track, image: DepthImage, model: TrackerModel, dt_s: float
 ) -> Callable[[], Detection]:
     """The same, begun beside whatever does not need it; what is returned waits for it."""
-    centre = predicted_centre(track, dt_s, model)
-    return model.detector.start(image.depth_m, image.k, centre[0], hand.side)
+    centre, up = predicted_palm(track, dt_s, model)
+    return model.detector.start(image.depth_m, image.k, centre[0], hand.side, up[0])
 
 
 def is_elsewhere(detection: Detection, track: Track, model: TrackerModel, dt_s: float) -> bool:
     """Whether a hand was detected at another place than where a track is predicted."""
     if detection.empty:
         return False
-    centre = predicted_centre(track, dt_s, model)[0]
+    centre = predicted_palm(track, dt_s, model)[0][0]
     return bool(np.linalg.norm(detection.centre_m.numpy() - centre) > SAME_PLACE_M)
 
 

@@ -40,13 +40,14 @@ def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Ten
     return track.velocity * (settings.velocity * reach_s)
 
 
-def predicted_centre(track: Track, dt_s: float, model: FilterModel) -> np.ndarray:
-    """(1, 3) middle of the palm, dt_s after the last frame, camera frame."""
+def predicted_palm(track: Track, dt_s: float, model: FilterModel) -> tuple[np.ndarray, np.ndarray]:
+    """(1, 3) middle of the palm, dt_s after the last frame, and (1, 3) where its fingers point."""
     moved = predicted_motion(track, dt_s, model.filter)[None]
     particle = model.backend.motions.compose(track.mean, moved).numpy()
-    centre: np.ndarray = particle[:, :3] + pivot_offset(particle[:, 3:6])
+    up = pivot_offset(particle[:, 3:6])
+    centre: np.ndarray = particle[:, :3] + up
     centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
-    return centre
+    return centre, up
 
 
 def predicted_depths(track: Track, dt_s: float, hand: FittedHand, model: FilterModel) -> Expected:
