@@ -50,8 +50,9 @@ from toftrack.tracking.hands import (
     without,
 )
 from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.seeking import look_again
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
-from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S, watched_slots
+from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S
 
 _HIDDEN = 0.3
 """Share of the joints behind something from which on a hand is hidden."""
@@ -59,8 +60,6 @@ _OUT_OF_VIEW = 0.4
 """Share of the joints outside of the image from which on a hand is out of view."""
 _PATIENT = 10
 """Times as long is waited for a hidden hand."""
-_SECOND_S = 0.12
-"""How often a second hand is searched for."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track ends when it was not believed for so long, and is searched for so much later."""
 _ONE_FRAMES = 4
@@ -164,7 +163,10 @@ def _detected(
     A track that is doubted gives way to a hand that is detected elsewhere.
     """
     track, best = hand.track, NO_DETECTION
-    if search_due(hand, model):
+    if hand.seeking is not None:
+        best = look_again(hand, hand.seeking, image, others, model)
+        hand = replace(hand, seeking=None)
+    elif search_due(hand, model):
         best = search(hand, image, others, model)
         hand = replace(hand, searched_s=0.0)
     if track is None:
@@ -252,25 +254,6 @@ def _state_name(features: ConfidenceFeatures) -> str:
     return "hidden" if features.hidden > _HIDDEN else "searching"
 
 
-def taking_part(state: TrackerState, watch_s: float) -> list[int]:
-    """The slots that a frame is about, the surest first; one without a hand now and then.
-
-    watch_s: see HandednessSettings.
-    """
-    if state.watched:
-        return watched_slots(state, watch_s)
-    vacant = [hand.track is None for hand in state.hands]
-    sought = all(vacant) or state.second_s >= _SECOND_S
-    slots = [slot for slot in range(len(vacant)) if sought or not vacant[slot]]
-    return sorted(slots, key=lambda slot: -sureness(state.hands[slot]))
-
-
-def since_search(before: TrackerState, slots: Sequence[int]) -> float:
-    """Seconds since a slot without a hand was searched for, after a frame about these slots."""
-    sought = len(slots) == 2 and any(hand.track is None for hand in before.hands)
-    return 0.0 if sought else before.second_s
-
-
 def reconcile(
     before: TrackerState,
     after: TrackerState,
@@ -297,7 +280,7 @@ def reconcile(
             continue
         if track.age.seconds > (WATCHED_TRIED_S if after.watched and slot else _TRIED_S):
             second_s = 0.0 if known_side(hand) else -_AGAIN_S
-            hands[slot] = replace(hand, track=None)
+            hands[slot] = replace(hand, track=None, tried=LastSeen(track.mean, 0.0))
     wrong = not after.watched and in_wrong_slot(before.hands, hands)
     hands = exchanged(before.hands, hands) if wrong else hands
     return replace(after, hands=tuple(hands), second_s=second_s, merged=merged), wrong

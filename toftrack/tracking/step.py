@@ -34,10 +34,9 @@ from toftrack.tracking.lifecycle import (
     close,
     open_hand,
     reconcile,
-    since_search,
-    taking_part,
 )
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.seeking import since_search, sought, start_seeking, taking_part
 from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
@@ -69,6 +68,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
     spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     before = state.at(image)
     with spans("detector"):
+        before, seeking = start_seeking(before, image, model, dt_s)
         opened = open_hands(before, image, model, dt_s)
     frames = [one for one in opened if isinstance(one, HandFrame)]
     with spans("filter: rest"):
@@ -90,6 +90,8 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
         choices = [choose(row, one, table, dt_s) for row, one in enumerate(candidates)]
     found = [conclude(*pair, one, image, dt_s) for pair, one in zip(pairs, choices, strict=True)]
     found += [no_hand(one, image, model) for one in opened if isinstance(one, Absence)]
+    with spans("detector"):
+        before = sought(before, seeking, model)
     before = replace(before, generator=generator.get_state())
     return reconciled(before, found, image, model, dt_s, spans)
 
