@@ -188,8 +188,11 @@ def mix_columns(frame, column, angle):
 
 
 @_cached
-def joints_of(states, base_frames, base, lengths, mirror, joints):
-    """The joints of N hands alone, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32."""
+def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
+    """The joints of N hands, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32.
+
+    frames_out: (N, 16, 3, 3) float32 for their frames, or (0, 16, 3, 3).
+    """
     frames, posed, state = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty(27)
     for i in range(len(states)):
         for j in range(27):
@@ -198,6 +201,8 @@ def joints_of(states, base_frames, base, lengths, mirror, joints):
         for j in range(21):
             for k in range(3):
                 joints[i, j, k] = posed[j, k]
+        if i < len(frames_out):
+            frames_out[i] = frames
 
 
 @_cached

@@ -67,6 +67,7 @@ class HandFrame:
     detection: what the detector says of it, and `pending` waits for it where it is still computed.
     others: hands that are tracked as well.  image: the likelihood of the image.
     mirrored: where the sides are to be compared, waits for what the detector says of the other one.
+    turn: odd or even; in one frame it is another one for each of two hands.
     """
 
     slot: int
@@ -81,6 +82,12 @@ class HandFrame:
     image: ImageTerm
     model: TrackerModel
     mirrored: Callable[[], Detection] | None = None
+    turn: int = 0
+
+    @property
+    def in_turn(self) -> int | None:
+        """The turn, where another hand is followed as well; None where nothing else takes time."""
+        return self.turn if any(other.believed for other in self.others) else None
 
     @property
     def hidden(self) -> bool:
@@ -283,7 +290,7 @@ def _first_round(number: int, filtered: FilteredFrame) -> tuple[Hypotheses, Tens
         Hypotheses.of(state, number, Source.DYNAMICS),
         Hypotheses.of(_with_fingers(state, track.contender), number, Source.CONTENDER),
     ]
-    if schedule(track, frame.hidden, model.hysteresis.alternate)[0]:
+    if schedule(track, frame.hidden, model.hysteresis.alternate, frame.in_turn)[0]:
         tables.append(Hypotheses.of(detected, number, Source.DETECTOR))
     return Hypotheses.joined(tables), detected[:_DONORS, 6:]
 
@@ -298,7 +305,8 @@ def _second_round(
     """The best pose with single fingers of other poses, as they are and refined, scored."""
     frame, none = filtered.frame, table.rows(slice(0))
     standing = table.of_source(Source.PREVIOUS, Source.DYNAMICS)
-    due = schedule(frame.track, frame.hidden, frame.model.hysteresis.alternate)[1]
+    alternate = frame.model.hysteresis.alternate
+    due = schedule(frame.track, frame.hidden, alternate, frame.in_turn)[1]
     busy = frame.mirrored is not None  # one expensive thing a frame
     if busy or not (frame.model.refinement.iterations and len(standing) and due):
         return none
@@ -332,13 +340,19 @@ def _refined(table: Hypotheses, frames: Sequence[FilteredFrame]) -> Hypotheses:
     return Hypotheses.joined(tables)
 
 
-def schedule(track: Track, hidden: bool, alternate: float) -> tuple[bool, bool]:
+def schedule(
+    track: Track, hidden: bool, alternate: float, turn: int | None = None
+) -> tuple[bool, bool]:
     """Whether the detector's poses are candidates in a frame, and whether fingers are exchanged.
 
-    Both; but in turn where the last estimate was surely right and nothing challenges it.
+    Both; but in turn where the last estimate was surely right and nothing challenges it, and of two
+    hands also where it was not.
 
     alternate: probability from which on it was; 1 = never.
+    turn: of one of two hands that are followed; odd for one and even for the other.
     """
+    if turn is not None and alternate < 1 and not track.challenged.begun:
+        return turn % 2 == 0, turn % 2 == 1
     sure = alternate < 1 and track.log_odds >= log_odds(alternate)
     if hidden or track.challenged.begun or not sure:
         return True, True

@@ -50,7 +50,7 @@ from toftrack.tracking.hands import (
     without,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.seeking import look_again
+from toftrack.tracking.seeking import look_again, search_is_over
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
 from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S
 
@@ -103,11 +103,11 @@ def open_hand(
 ) -> HandFrame | Absence:
     """A slot's hand as it goes into a frame: detected, its side compared, segmented, begun.
 
-    Where a track is believed the detector runs beside the filter, of both sides where they are to
-    be compared (see settled); else it is waited for, as everything depends on it.
+    Where a track is believed, or the other hand's is, the detector runs beside the filter, of both
+    sides where they are to be compared (see settled); else everything depends on it, and waits.
     """
     alone, track, mirrored = without(image, others), hand.track, None
-    if track is not None and not track.doubted:
+    if track is not None and not (track.doubted and _waits(hand, others)):
         due = hand.handedness.comparison_due(model.configured.handedness, True, dt_s)
         asked = due or detection_due(track, model.detector.settings, dt_s)
         pending = start_detection(hand, track, alone, model, dt_s) if asked else _nothing
@@ -144,7 +144,15 @@ def open_hand(
         image_term(observation, fitted, model),
         model,
         mirrored,
+        slot + image.index,
     )
+
+
+def _waits(hand: HandState, others: Sequence[OtherHand]) -> bool:
+    """Whether a doubted track waits for the detector: where nothing is surely followed, or a search
+    beside the other hand has found something elsewhere.
+    """
+    return hand.seeking is not None and search_is_over(hand) or not any(o.certain for o in others)
 
 
 def _nothing() -> Detection:

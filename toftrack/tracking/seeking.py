@@ -18,7 +18,7 @@ from toftrack.tracking.detect import held_out, reachable, search_due
 from toftrack.tracking.filter import predicted_palm
 from toftrack.tracking.hands import OtherHand, sureness
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.state import HandState, Seeking, TrackerState
+from toftrack.tracking.state import HandState, LastSeen, Seeking, TrackerState
 from toftrack.tracking.watching import watched_slots
 
 _SECOND_S = 0.12
@@ -35,11 +35,11 @@ def taking_part(state: TrackerState, watch_s: float) -> list[int]:
 
     watch_s: see HandednessSettings.
     """
-    slots, vacant = due_slots(state, watch_s), _beside(state)
-    if vacant is None:
+    slots, sought = due_slots(state, watch_s), searched_beside(state)
+    if sought is None or state.hands[sought].track is not None:
         return slots
-    slots = [slot for slot in slots if slot != vacant]
-    return [*slots, vacant] if _over(state.hands[vacant]) else slots
+    slots = [slot for slot in slots if slot != sought]
+    return [*slots, sought] if search_is_over(state.hands[sought]) else slots
 
 
 def due_slots(state: TrackerState, watch_s: float) -> list[int]:
@@ -58,18 +58,19 @@ def since_search(before: TrackerState, slots: Sequence[int]) -> float:
     return 0.0 if sought else before.second_s
 
 
-def _beside(state: TrackerState) -> int | None:
-    """The slot whose hand is searched for beside the other one; None where a search may wait for
-    nothing, or knows where to look.
+def searched_beside(state: TrackerState) -> int | None:
+    """The slot whose hand is searched for beside the other one, as it is not there or doubted; None
+    where nothing else is followed, or it is known where to look.
     """
-    vacant = [slot for slot, hand in enumerate(state.hands) if hand.track is None]
-    if len(state.hands) < 2 or len(vacant) != 1 or state.second_s == math.inf:
+    tracks = [hand.track for hand in state.hands]
+    sure = [track is not None and track.believed and not track.doubted for track in tracks]
+    if len(sure) < 2 or sum(sure) != 1 or state.second_s == math.inf:
         return None
-    other = state.hands[1 - vacant[0]].track
-    return vacant[0] if other is not None and other.believed and not other.doubted else None
+    return sure.index(False)
 
 
-def _over(hand: HandState) -> bool:
+def search_is_over(hand: HandState) -> bool:
+    """Whether all places have been looked at, and something was found."""
     return hand.seeking is not None and not len(hand.seeking.centres_m)
 
 
@@ -80,7 +81,7 @@ def start_seeking(
 
     Returns the state, where a search that began is noted, and what waits for that part.
     """
-    slot, watch_s = _beside(state), model.configured.handedness.watch_s
+    slot, watch_s = searched_beside(state), model.configured.handedness.watch_s
     if slot is None:
         hands = [replace(hand, seeking=None) if hand.seeking else hand for hand in state.hands]
         return replace(state, hands=tuple(hands)), None
@@ -89,17 +90,19 @@ def start_seeking(
     assert other is not None
     likely = partial(reachable, hand, [predicted_palm(other, dt_s, model)[0][0]])
     if hand.seeking is not None:
-        if _over(hand):
+        if search_is_over(hand):
             return state, None
         at = hand.seeking.centres_m[:_LOOKS]
         looks = [detector.start(image.depth_m, image.k, one, hand.side) for one in at]
         return state, partial(_looked, hand.seeking, looks)
-    if slot not in due_slots(state, watch_s) or not search_due(hand, model):
+    due = hand.track is not None or slot in due_slots(state, watch_s)
+    if not due or not search_due(hand, model):
         return state, None
     wait = detector.start_search(image.depth_m, image.k, hand.side)
     hands = list(state.hands)
     hands[slot] = replace(hand, searched_s=0.0)
-    return replace(state, hands=tuple(hands), second_s=0.0), partial(_found, wait, likely)
+    second_s = 0.0 if hand.track is None else state.second_s
+    return replace(state, hands=tuple(hands), second_s=second_s), partial(_found, wait, likely)
 
 
 def _found(wait: Callable[[], tuple], likely: Callable[..., float]) -> Seeking:
@@ -120,7 +123,8 @@ def sought(state: TrackerState, wait: Sought | None, model: TrackerModel) -> Tra
     """The state with what a frame's part of a search has found."""
     if wait is None:
         return state
-    slot = next(slot for slot, hand in enumerate(state.hands) if hand.track is None)
+    slot = searched_beside(state)
+    assert slot is not None
     hand, seeking = state.hands[slot], wait()
     over = not len(seeking.centres_m)
     hands = list(state.hands)
@@ -131,7 +135,9 @@ def sought(state: TrackerState, wait: Sought | None, model: TrackerModel) -> Tra
 def _best(hand: HandState, seeking: Seeking, model: TrackerModel) -> Seeking | None:
     """A search that is over with the hand that is meant alone; None where there is none."""
     least = model.detector.settings.merit - _NEARLY
-    likely = partial(reachable, hand, [])
+    # Where its track is nothing new is found.
+    known = [] if hand.track is None else [LastSeen(hand.track.mean, 0.0).centre_m]
+    likely = partial(reachable, hand, known)
     merits = [merit(seen, heat) + likely(seen.centre_m.numpy()) for seen, heat in seeking.seen]
     rows = sorted(range(len(merits)), key=lambda row: -merits[row])
     found = [seeking.seen[row] for row in rows if merits[row] > least]
