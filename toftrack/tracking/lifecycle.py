@@ -62,6 +62,8 @@ _PATIENT = 10
 """Times as long is waited for a hidden hand."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track ends when it was not believed for so long, and is searched for so much later."""
+_COMPARED_EVERY = 4
+"""The sides of one of two hands are compared in every so many frames at most, never both's."""
 _ONE_FRAMES = 4
 """Two tracks that were believed may be on one hand for so many frames."""
 
@@ -109,6 +111,8 @@ def open_hand(
     alone, track, mirrored = without(image, others), hand.track, None
     if track is not None and not (track.doubted and _waits(hand, others)):
         due = hand.handedness.comparison_due(model.configured.handedness, True, dt_s)
+        if any(other.believed for other in others):  # one hand in a frame, and not in each
+            due = due and (slot + image.index) % _COMPARED_EVERY == 0
         asked = due or detection_due(track, model.detector.settings, dt_s)
         pending = start_detection(hand, track, alone, model, dt_s) if asked else _nothing
         if due:
