@@ -115,5 +115,6 @@ class FMeasure:
 
 def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     # On the CPU each of torch's operations takes longer than its arithmetic.
-    correct, false, missed, residual = (count.float().numpy() for count in counts)
+    given = (np.asarray(count.numpy(), np.float32) for count in counts)
+    correct, false, missed, residual = given
     return correct, false, missed, residual

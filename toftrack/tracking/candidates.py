@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -89,11 +90,11 @@ class HandFrame:
         """The turn, where another hand is followed as well; None where nothing else takes time."""
         return self.turn if any(other.believed for other in self.others) else None
 
-    @property
+    @cached_property
     def hidden(self) -> bool:
         """Whether something hides part of the hand."""
-        hand, occluder = self.observation.hand, self.observation.occluder
-        return int(occluder.sum()) > _HIDDEN * int(hand.sum())
+        hand, occluder = self.observation.hand.numpy(), self.observation.occluder.numpy()
+        return int(np.count_nonzero(occluder)) > _HIDDEN * int(np.count_nonzero(hand))
 
     def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
         """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""

@@ -86,6 +86,6 @@ def read_around(joints, nearest_m, step_m, depth, k, found):
                     at -= 1
                 read[at] = value
                 count += 1
-        found[joint, 0] = 1 - inside / _AROUND
+        found[joint, 0] = (_AROUND - inside) / _AROUND
         found[joint, 1] = (inside - count) / _AROUND
         found[joint, 2] = read[(count - 1) // 2] if count > 0 else np.nan

@@ -213,6 +213,7 @@ def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
         keypoints_of(frame.detection, model),
         model.fit,
         fitted.first,
+        fitted.refiner.pose,
     )
 
 
