@@ -15,7 +15,7 @@ from helpers.configured import detector_settings
 from helpers.detection import small_networks
 from helpers.tracking import sample
 
-from toftrack.detector import onnx_export, onnx_networks, proposals
+from toftrack.detector import onnx_export, onnx_networks, proposals, quantisation
 from toftrack.detector.crops import CROP, wide
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import Finder, PoseNet
@@ -34,7 +34,9 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("exported") / "small.npz"
     torch.manual_seed(1)
     save_weights(path, PoseNet(4), Finder(8), {})
-    export_detector.main([str(path)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quantisation, "CALIBRATION", 32)
+        export_detector.main([str(path)])
     return path
 
 
@@ -57,7 +59,7 @@ def torch_runs(path: Path, caplog: pytest.LogCaptureFixture) -> str:
 
 
 @torch.no_grad()
-def test_a_file_of_weights_is_exported_and_answers_as_torch_at_any_size(weights: Path) -> None:
+def test_a_file_of_weights_is_exported_and_answers_like_torch_at_any_size(weights: Path) -> None:
     pose, finder = load_networks(weights)
     assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
     draw = torch.Generator().manual_seed(0)
@@ -65,7 +67,8 @@ def test_a_file_of_weights_is_exported_and_answers_as_torch_at_any_size(weights:
         crops = torch.rand(count, pose.inputs, CROP, CROP, generator=draw)
         expected = pose.reference.features(crops)
         for one, two in zip(pose.outputs(crops.numpy()), expected, strict=False):
-            torch.testing.assert_close(torch.from_numpy(one), two, atol=1e-4, rtol=1e-4)
+            away = torch.from_numpy(one) - two
+            assert 0 < away.square().mean().sqrt() < 0.1 * two.std()
     for size in ((1, 2, 8, 8), (2, 2, 80, 56)):
         images = torch.rand(size, generator=draw)
         for one, two in zip(finder(images), finder.reference(images), strict=True):
@@ -82,12 +85,42 @@ def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand
         expected = proposals.run_pose_network(
             pose.reference, scene.depth_m[0], scene.k, centres, side
         )
-        torch.testing.assert_close(found.keypoints_m, expected.keypoints_m, atol=1e-4, rtol=0)
-        torch.testing.assert_close(found.joints_m, expected.joints_m, atol=1e-3, rtol=0)
+        if pose.precision == onnx_networks.WHOLE:
+            away = (found.keypoints_m - expected.keypoints_m).norm(dim=-1).mean()
+            assert float(away) < (0.003 if side == "right" else 0.010), (
+                "of the other side it guesses"
+            )
+            continue
+        for one, two, away in (
+            (found.keypoints_m, expected.keypoints_m, 1e-4),
+            (found.joints_m[:, 0], expected.joints_m[:, 0], 1e-3),
+        ):
+            torch.testing.assert_close(one, two, atol=away, rtol=0)
     image, _ = wide(scene.depth_m[0], scene.k)
     with torch.no_grad():
         for one, two in zip(finder(image), finder.reference(image), strict=True):
             torch.testing.assert_close(one, two, atol=1e-3, rtol=1e-4)
+
+
+def test_the_file_is_in_8_bits_and_says_so_and_bad_ones_are_refused(exported: Path) -> None:
+    pose, _ = load_networks(exported)
+    assert isinstance(pose, OnnxPoseNet) and pose.precision == "int8"
+    model = onnx.load(onnx_networks.onnx_file(exported, "pose"))
+    kinds = [part.data_type for part in model.graph.initializer if len(part.dims) == 4]
+    assert kinds.count(onnx.TensorProto.INT8) == len(kinds) - 3, "all but the first and the last"
+    crops = quantisation.example_crops(pose.inputs)[:4]
+    quantisation.compare(pose.reference, model, crops)
+    other, _ = small_networks()
+    with pytest.raises(ToftrackError, match=r"mm away .* give --float"):
+        quantisation.compare(other, model, crops)
+
+
+def test_floating_point_is_an_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(onnx_export, "export_networks", lambda *given: asked.append(given) or [])
+    for option in ([], ["--float"]):
+        export_detector.main(["a.npz", *option])
+    assert asked == [(Path("a.npz"), True), (Path("a.npz"), False)]
 
 
 @pytest.mark.parametrize("network", ["pose", "finder"])
@@ -144,7 +177,8 @@ def test_outputs_of_another_shape_never_reach_compiled_code(weights: Path) -> No
 
     class Other:
         def run(self, *given: object) -> list[np.ndarray]:
-            return [np.zeros((1, 7), np.float32), np.zeros((1, 105, 16, 16), np.float32)]
+            maps = (np.zeros((1, count, 16, 16), np.float32) for count in (105, 20))
+            return [np.zeros((1, 7), np.float32), *maps]
 
     crops = np.zeros((1, pose.inputs, CROP, CROP), np.float32)
     with pytest.raises(ToftrackError, match="is of another network"):

@@ -14,8 +14,13 @@ from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
 
 from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.detector.crops import crop_rotation
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.network import PARTS
+from toftrack.detector.parts import HAND_PART, THING_PART, Parts
 from toftrack.refinement.proposals import FINGER_OF_ANGLE
+from toftrack.refinement.shape_fit import first_shape
+from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import (
     FilteredFrame,
     best_start,
@@ -24,6 +29,7 @@ from toftrack.tracking.candidates import (
     posterior_of,
     propose,
     schedule,
+    without_things,
 )
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.select import Hypotheses, Source
@@ -250,3 +256,42 @@ def test_a_hand_of_another_size_is_proposed_with_the_same_palm() -> None:
     )
     palms = [points[[0, 5, 9, 13, 17]].mean(0) for points in joints]
     assert float((palms[0] - palms[1]).norm()) < 0.01
+
+
+def seen_with(parts: np.ndarray) -> tuple[Observation, Observation, np.ndarray]:
+    """A hand's image as it is, and without what is said to be a thing; (P, 3) its hand's pixels.
+
+    parts: (PARTS, PARTS) of a crop about the hand's middle finger.
+    """
+    truth = hand_at()
+    detection = detection_of(truth)
+    centre = detection.keypoints.points_m[9].double().numpy()
+    detection = replace(detection, parts=Parts(parts, crop_rotation(centre), centre, False))
+    observation = frame_of(image_of(truth), track_of(truth), detection).observation
+    return observation, without_things(observation, detection), centre
+
+
+def test_a_thing_in_the_hand_is_neither_hand_nor_background() -> None:
+    parts = np.full((PARTS, PARTS), HAND_PART, np.uint8)
+    parts[: PARTS // 2] = THING_PART
+    whole, rest, centre = seen_with(parts)
+    assert rest.thing is not None
+    assert torch.equal(rest.hand | rest.thing, whole.hand) and not (rest.hand & rest.thing).any()
+    middle = float(whole.k[1, 1]) * centre[1] / centre[2] + float(whole.k[1, 2])
+    rows = rest.thing.nonzero()[:, 0], rest.hand.nonzero()[:, 0]
+    assert rows[0].max() < middle + 2 and rows[1].min() > middle - 2
+    # A finger that is behind it, or not, is neither false nor missed.
+    likelihood, fitted = model_with().likelihood, model_with().hand("right", first_shape())
+    poses = torch.cat((hand_at(), bent(hand_at(), 3, 0.8)))
+    counts = fitted.scorer(poses, likelihood.evidence(rest))
+    before = fitted.scorer(poses, likelihood.evidence(whole))
+    assert (counts.correct < before.correct).all() and (counts.missed <= before.missed).all()
+    assert counts.missed[1] + counts.false[1] < before.missed[1] + before.false[1]
+
+
+def test_without_a_thing_all_stays_as_it_is() -> None:
+    parts = np.full((PARTS, PARTS), HAND_PART, np.uint8)
+    whole, rest, _ = seen_with(parts)
+    assert rest is whole
+    parts[0, :3] = THING_PART
+    assert seen_with(parts)[1].thing is None, "too little for a thing"

@@ -15,6 +15,7 @@ from toftrack.checks import check_number
 from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
+from toftrack.detector.parts import ALL_HAND, Parts
 from toftrack.detector.proposals import NetworkOutput, Places, find_hands, start_finding
 from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
@@ -67,6 +68,7 @@ class Detection:
     log_probability, error_m: (H,).
     keypoints: the joints, each with its standard deviation.
     present, right_side: probabilities that there is a hand, and that it is of the side looked for.
+    parts: which of the pixels are the hand, and which a thing's that it holds.
     """
 
     pivot_m: Tensor
@@ -79,6 +81,7 @@ class Detection:
     keypoints: Keypoints
     present: float
     right_side: float
+    parts: Parts = ALL_HAND
 
     def states(self, ratio: float) -> Tensor:
         """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
@@ -123,6 +126,7 @@ class Detection:
             self.keypoints,
             self.present,
             self.right_side,
+            self.parts,
         )
 
 
@@ -270,6 +274,7 @@ def _detection(seen: NetworkOutput, row: int) -> Detection:
         keypoints=Keypoints(seen.keypoints_m[row], seen.sigma_m[row]),
         present=float(seen.present[row].sigmoid()),
         right_side=float(seen.right[row].sigmoid()),
+        parts=seen.parts[row],
     )
 
 

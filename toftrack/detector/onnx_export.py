@@ -18,12 +18,15 @@ from toftrack.detector.crops import CROP
 from toftrack.detector.network import Found, PoseNet
 from toftrack.detector.onnx_networks import (
     DIGEST,
+    FLOAT,
     FORMAT,
     VERSION,
+    WHOLE,
     digest,
     onnx_file,
     open_session,
 )
+from toftrack.detector.quantisation import COMPARED, compare, example_crops, quantised
 from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
 from toftrack.safe_files import whole_file
@@ -47,9 +50,10 @@ def needed(missing: list[str]) -> str:
     )
 
 
-def export_networks(weights: Path) -> list[Path]:
+def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     """Write the networks of a file of weights beside it; returns the files.
 
+    whole_numbers: the pose network in 8 bits, else in floating point, as the finder is.
     Raises ToftrackError when the weights cannot be used, when a package is missing, and when ONNX
     Runtime computes something else than torch.
     """
@@ -60,7 +64,7 @@ def export_networks(weights: Path) -> list[Path]:
     several = torch.export.Dim("n", min=1, max=1 << 16)
     rows, columns = (torch.export.Dim(name, min=8, max=1 << 16) for name in ("h", "w"))
     outputs = {
-        "pose": ["heads", "keypoints"],
+        "pose": ["heads", "keypoints", "parts"],
         "finder": list(Found._fields),
     }
     contents = {
@@ -75,9 +79,16 @@ def export_networks(weights: Path) -> list[Path]:
     }
     _compare(_Features(loaded.pose), contents["pose"], "crops", crops.shape[1:])
     _compare(loaded.finder, contents["finder"], "images", (2, 56, 80))
+    precision = dict.fromkeys(contents, FLOAT)
+    if whole_numbers:
+        examples = example_crops(loaded.pose.inputs)
+        contents["pose"] = quantised(contents["pose"], examples[:-COMPARED])
+        compare(loaded.pose, contents["pose"], examples[-COMPARED:])
+        precision["pose"] = WHOLE
     files = []
     for network, content in contents.items():
         facts = {"format": FORMAT, "version": VERSION, "network": network}
+        facts["precision"] = precision[network]
         file = onnx_file(weights, network)
         with whole_file(file) as stream:
             stream.write(_signed(content, facts | {"weights_sha256": loaded.sha256}))
@@ -86,15 +97,14 @@ def export_networks(weights: Path) -> list[Path]:
 
 
 class _Features(nn.Module):
-    """What the tracker uses of PoseNet.features."""
+    """PoseNet.features."""
 
     def __init__(self, pose: PoseNet) -> None:
         super().__init__()
         self.pose = pose
 
-    def forward(self, crops: Tensor) -> tuple[Tensor, Tensor]:
-        heads, keypoints, _ = self.pose.features(crops)
-        return heads, keypoints
+    def forward(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.pose.features(crops)
 
 
 def _exported(
@@ -115,7 +125,6 @@ def _exported(
     assert program is not None
     model = program.model_proto
     model.ir_version = min(model.ir_version, _IR)
-    del model.metadata_props[:]
     for part in (
         *model.graph.node,
         *model.graph.input,
@@ -159,6 +168,7 @@ def _compare(network: nn.Module, model: Any, name: str, shape: tuple[int, ...]) 
 
 def _signed(model: Any, properties: dict[str, str]) -> bytes:
     """A file's content, which ends with its checksum."""
+    del model.metadata_props[:]
     for key, value in properties.items():
         model.metadata_props.add(key=key, value=value)
     # Messages that follow one another are one: the last property comes to stand at the end.

@@ -24,10 +24,12 @@ from toftrack.errors import ToftrackError
 from toftrack.safe_files import open_to_read
 
 FORMAT = "toftrack-detector-network"
-VERSION = "1"
+VERSION = "2"
 """Of the inputs and outputs of such files; one of another version is made anew."""
 DIGEST = 64
 """Last bytes of such a file, the SHA-256 in hexadecimal of all before: a property's value."""
+FLOAT, WHOLE = "float32", "int8"
+"""Precisions that such a file says it is in; one that says nothing is of before there were two."""
 COMMAND = "python -m toftrack.programs.export_detector"
 _LARGEST_BYTES = 1 << 28
 _log = logging.getLogger(__name__)
@@ -50,20 +52,26 @@ class OnnxPoseNet:
         """Channels of a crop that it sees."""
         return self.reference.inputs
 
-    def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of crops (N, inputs, 64, 64): PoseNet.features' heads and keypoints; without the lock.
+    @functools.cached_property
+    def precision(self) -> str:
+        """FLOAT or WHOLE."""
+        return str(_properties(self.session).get("precision", FLOAT))
+
+    def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of crops (N, inputs, 64, 64): what PoseNet.features returns; without the lock.
 
         Raises ToftrackError for a file of a network with other outputs.
         """
-        heads, keypoints = self.session.run(("heads", "keypoints"), {"crops": crops})
+        outputs = self.session.run(("heads", "keypoints", "parts"), {"crops": crops})
+        heads, keypoints, parts = outputs
         n = len(crops)
         # Compiled code reads them, and believes their shapes.
-        if (heads.shape, heads.dtype, keypoints.shape, keypoints.dtype) != (
-            *((n, REPORTED), np.float32),
-            *((n, 5 * JOINTS, CELLS, CELLS), np.float32),
+        shapes = (n, REPORTED), (n, 5 * JOINTS, CELLS, CELLS), (n, *parts.shape[1:2], CELLS, CELLS)
+        if any(one.dtype != np.float32 for one in outputs) or shapes != tuple(
+            one.shape for one in outputs
         ):
             raise ToftrackError("the detector's pose.onnx is of another network; " + _anew())
-        return heads, keypoints
+        return heads, keypoints, parts
 
     def to(self, device: torch.device) -> PoseNet | OnnxPoseNet:
         """Itself on the CPU, elsewhere the reference."""
@@ -168,10 +176,15 @@ def _runtime() -> Any:
 
 def _made_of(session: Any) -> tuple[str | None, ...]:
     """Format, version and name of a file's network, and the checksum of its weights."""
-    properties = session.get_modelmeta().custom_metadata_map
+    properties = _properties(session)
     return tuple(
         properties.get(name) for name in ("format", "version", "network", "weights_sha256")
     )
+
+
+def _properties(session: Any) -> dict[str, str]:
+    properties: dict[str, str] = session.get_modelmeta().custom_metadata_map
+    return properties
 
 
 @functools.cache

@@ -22,6 +22,7 @@ from toftrack.compute.transfer import on_device, on_host
 from toftrack.detector.crops import crop, wide
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet, Proposed
 from toftrack.detector.onnx_networks import OnnxFinder
+from toftrack.detector.parts import Parts
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -55,6 +56,7 @@ class NetworkOutput:
     joints_m: (C, H, 21, 3) of mean hands of these sizes.
     keypoints_m: (C, 21, 3) joints by the cells' means.  sigma_m: (C, 21) their deviations.
     present, right: (C,) logits; `right` is of the side that was searched for.
+    parts: what it says of the pixels, of each crop.
     """
 
     pivot_m: Tensor
@@ -68,6 +70,7 @@ class NetworkOutput:
     sigma_m: Tensor
     present: Tensor
     right: Tensor
+    parts: tuple[Parts, ...]
 
 
 def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -173,6 +176,12 @@ def run_pose_network(
         sigma_m=_sigma_m(keypoints, p.sigma_m, log_size[:, 0]),
         present=p.present,
         right=p.right,
+        parts=tuple(
+            Parts(kind, rotation, centre_m, side == "left")
+            for kind, rotation, centre_m in zip(
+                p.parts.argmax(1).byte().numpy(), crop_rotations, centres_m, strict=True
+            )
+        ),
     )
 
 

@@ -18,10 +18,25 @@ from toftrack.detector import proposals
 from toftrack.detector.crops import CROP, crop_rotation
 from toftrack.detector.crops_numba import crop_at
 from toftrack.detector.decoding_numba import decode_at
-from toftrack.detector.network import ANGLES, CELLS, JOINTS, REPORTED, PoseNet
+from toftrack.detector.network import ANGLES, CELLS, JOINTS, PARTS, REPORTED, PoseNet
 from toftrack.detector.onnx_networks import OnnxPoseNet
+from toftrack.detector.parts import Parts, likeliest_parts
 from toftrack.detector.proposals import KEPT, MIRROR, NetworkOutput, mean_hand
 
+_SHAPES = {
+    "pivot_m": (KEPT, 3),
+    "rotvec": (KEPT, 3),
+    "angles": (KEPT, ANGLES),
+    "log_size": (KEPT,),
+    "log_probability": (KEPT,),
+    "error_m": (KEPT,),
+    "joints_m": (KEPT, JOINTS, 3),
+    "keypoints_m": (JOINTS, 3),
+    "sigma_m": (JOINTS,),
+    "present": (),
+    "right": (),
+}
+"""Of a crop: the numbers of a NetworkOutput, as the compiled code writes them."""
 _COMPILING = "detector: compiling its numba kernels (once, about 4 s)"
 
 
@@ -36,9 +51,9 @@ def run_pose_network(
     """See proposals.run_pose_network, which it is where the network is on another device."""
     if isinstance(pose, PoseNet) and pose.device.type != "cpu":
         return proposals.run_pose_network(pose, depth_m, k, centres_m, side, up)
-    task, out = _prepared(pose, depth_m, k, centres_m, side, up)
+    task = _prepared(pose, depth_m, k, centres_m, side, up)
     run_shared(task, len(centres_m) if _may_be_shared(pose) else 1)
-    return _reported(out)
+    return _reported(task)
 
 
 def start_pose_network(
@@ -56,14 +71,14 @@ def start_pose_network(
     """
     if isinstance(pose, PoseNet) or not _may_be_shared(pose):
         return functools.partial(run_pose_network, pose, depth_m, k, centres_m, side, up)
-    task, out = _prepared(pose, depth_m, k, centres_m, side, up)
-    _, depth, left, k, centres, turns, hand, written, _ = task.args
+    task = _prepared(pose, depth_m, k, centres_m, side, up)
+    _, depth, left, k, centres, turns, hand, out, _ = task.args
     turn, image = turns[0], _crop(pose, depth, left, k, centres[0], turns[0])
     wait = beside(functools.partial(pose.outputs, image))
 
     def reported() -> NetworkOutput:
-        _decode(wait(), image, turn, centres[0], left, hand, written, 0)
-        return _reported(out)
+        _decode(wait(), image, turn, centres[0], left, hand, out, 0)
+        return _reported(task)
 
     return reported
 
@@ -73,8 +88,12 @@ def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
     return isinstance(pose, OnnxPoseNet) and bool(decode_at.signatures)
 
 
-def _reported(out: dict[str, np.ndarray]) -> NetworkOutput:
-    return NetworkOutput(**{name: torch.from_numpy(array) for name, array in out.items()})
+def _reported(task: functools.partial[None]) -> NetworkOutput:
+    """What a task of _prepared has written."""
+    _, _, left, _, centres, turns, _, (*out, kinds), _ = task.args
+    parts = tuple(Parts(*one, left) for one in zip(kinds, turns, centres, strict=True))
+    numbers = zip(_SHAPES, map(torch.from_numpy, out), strict=True)
+    return NetworkOutput(**dict(numbers), parts=parts)
 
 
 def _prepared(
@@ -84,8 +103,8 @@ def _prepared(
     centres_m: np.ndarray,
     side: str,
     up: np.ndarray | None = None,
-) -> tuple[functools.partial[None], dict[str, np.ndarray]]:
-    """What does it, for threads that share the crops, and the arrays that it writes."""
+) -> functools.partial[None]:
+    """What does it, for threads that share the crops."""
     # Copies: numba compiles once more for arrays that must not be written to.
     centres, k = np.array(centres_m, np.float64).reshape(-1, 3), np.array(k, np.float64)
     left = side == "left"
@@ -96,8 +115,7 @@ def _prepared(
     if left:
         ups = [None if one is None else one * MIRROR.numpy() for one in ups]
     turns = [crop_rotation(*at) for at in zip(centres, ups, strict=True)]
-    out = _empty(len(centres))
-    task = functools.partial(
+    return functools.partial(
         _propose,
         pose,
         np.ascontiguousarray(depth_m, np.float32),
@@ -106,10 +124,9 @@ def _prepared(
         centres,
         turns,
         _mean_hand(side),
-        tuple(out.values()),
+        _empty(len(centres)),
         iter(range(len(centres))),
     )
-    return task, out
 
 
 def _propose(
@@ -147,7 +164,7 @@ def _crop(
 
 
 def _decode(
-    outputs: tuple[np.ndarray, np.ndarray],
+    outputs: tuple[np.ndarray, np.ndarray, np.ndarray],
     image: np.ndarray,
     turn: np.ndarray,
     centre: np.ndarray,
@@ -157,9 +174,11 @@ def _decode(
     row: int,
 ) -> None:
     """Into a row of the arrays that are written."""
-    heads, keypoints = outputs
-    given = heads[0], keypoints[0], image[0, 0], turn, centre, left, hand, row, out
+    heads, keypoints, painted = outputs
+    *numbers, kinds = out
+    given = heads[0], keypoints[0], image[0, 0], turn, centre, left, hand, row, tuple(numbers)
     called(decode_at, _COMPILING, *given)
+    kinds[row] = likeliest_parts(painted[0])
 
 
 def compile_crops() -> None:
@@ -175,19 +194,23 @@ def compile_decoding() -> None:
     outputs = (
         np.zeros((1, REPORTED), np.float32),
         np.zeros((1, 5 * JOINTS, CELLS, CELLS), np.float32),
+        np.zeros((1, 4, CELLS, CELLS), np.float32),
     )
-    out, turn = tuple(_empty(1).values()), crop_rotation(centre)
+    out, turn = _empty(1), crop_rotation(centre)
     _decode(outputs, image, turn, centre, False, _mean_hand("right"), out, 0)
 
 
-def _outputs(pose: PoseNet | OnnxPoseNet, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _outputs(
+    pose: PoseNet | OnnxPoseNet, crops: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """See OnnxPoseNet.outputs."""
     if isinstance(pose, OnnxPoseNet):
         return pose.outputs(crops)
     with torch.inference_mode():
         image = torch.from_numpy(crops).to(memory_format=torch.channels_last)
-        heads, keypoints, _ = pose.features(image)
-    return heads.numpy(), keypoints.contiguous().numpy()
+        heads, *maps = pose.features(image)
+    keypoints, parts = (one.contiguous().numpy() for one in maps)
+    return heads.numpy(), keypoints, parts
 
 
 @functools.lru_cache
@@ -197,19 +220,7 @@ def _mean_hand(side: str) -> tuple[np.ndarray, ...]:
     return tuple(part.double().numpy() for part in parts)
 
 
-def _empty(count: int) -> dict[str, np.ndarray]:
-    """Arrays of NetworkOutput's fields, in their order."""
-    shapes = {
-        "pivot_m": (KEPT, 3),
-        "rotvec": (KEPT, 3),
-        "angles": (KEPT, ANGLES),
-        "log_size": (KEPT,),
-        "log_probability": (KEPT,),
-        "error_m": (KEPT,),
-        "joints_m": (KEPT, JOINTS, 3),
-        "keypoints_m": (JOINTS, 3),
-        "sigma_m": (JOINTS,),
-        "present": (),
-        "right": (),
-    }
-    return {name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()}
+def _empty(count: int) -> tuple[np.ndarray, ...]:
+    """The arrays of _SHAPES, and the parts' kinds (count, PARTS, PARTS)."""
+    numbers = (np.empty((count, *shape), np.float32) for shape in _SHAPES.values())
+    return *numbers, np.empty((count, PARTS, PARTS), np.uint8)

@@ -2,8 +2,9 @@
 
 python -m toftrack.programs.export_detector FILE
 
-train_detector does so at its end. Without FILE: those of the package. It needs `pip install
-'toftrack[train]'`; tracking does not.
+train_detector does so at its end. The pose network computes in whole numbers of 8 bits, or, with
+--float, in floating point, which is slower. Without FILE: those of the package. It needs
+`pip install 'toftrack[train]'`; tracking does not.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from toftrack.detector.onnx_export import export_networks
     from toftrack.detector.weights import DEFAULT_FILE
 
-    for file in export_networks(options.weights or DEFAULT_FILE):
+    for file in export_networks(options.weights or DEFAULT_FILE, not options.float):
         print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
 
 
@@ -34,6 +35,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "weights", nargs="?", type=Path, metavar="FILE", help="of train_detector (the package's)"
+    )
+    parser.add_argument(
+        "--float", action="store_true", help="the pose network in floating point, not in 8 bits"
     )
     return parser
 

@@ -76,10 +76,10 @@ def train(config: DictConfig) -> float:
         "minutes": minutes,
     }
     save_weights(path, pose_network, finder_network, about)
-    derived = [] if missing else [file.name for file in export_networks(path)]
     write_picture(folder / "course.png", course_figure(pose_course))
     summary = about | {"poses": pose_course, "finder": finder_course}
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
+    derived = [] if missing else [file.name for file in export_networks(path)]
     last = pose_course[-1]
     print(
         f"trained in {minutes} minutes; on the last training images: joints"

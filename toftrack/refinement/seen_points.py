@@ -70,8 +70,9 @@ def seen_points(observation: Observation) -> SeenPoints:
     # Whatever is not behind the hand may hide it or be it.
     hand = observation.hand.cpu().numpy()
     solid = hand | observation.occluder.cpu().numpy()
-    if observation.other is not None:
-        solid |= observation.other.cpu().numpy()
+    for mask in (observation.other, observation.thing):
+        if mask is not None:
+            solid |= mask.cpu().numpy()
     left, top, wide, high = cv2.boundingRect(solid.view(np.uint8))
     left, right = max(0, left - _MARGIN_PX), min(solid.shape[1], left + wide + _MARGIN_PX)
     top, bottom = max(0, top - _MARGIN_PX), min(solid.shape[0], top + high + _MARGIN_PX)

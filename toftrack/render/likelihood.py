@@ -68,6 +68,8 @@ class FMeasure:
         other = None if observation.other is None else observation.other.cpu().numpy()
         given = observation.depth_m, observation.hand, observation.occluder
         depth, hand, occluder = (one.cpu().numpy() for one in given)
+        if observation.thing is not None:
+            occluder = occluder | observation.thing.cpu().numpy()
         images = evidence_images(depth, hand, occluder, other, self.tolerance_m)
         device = observation.depth_m.device
         low, high, front = (torch.from_numpy(image).to(device) for image in images)

@@ -29,6 +29,8 @@ class Observation:
     nearest_m: depth of the nearest surface, `inf` when nothing is in range.
     other: (H, W) bool, pixels of another hand that is tracked as well; None where there is none. It
         hides what is behind it.
+    thing: (H, W) bool, pixels of a thing in the hand; None where there is none. Fingers may be
+        behind it, so that these pixels say nothing.
     """
 
     depth_m: Tensor
@@ -37,6 +39,7 @@ class Observation:
     k: Tensor
     nearest_m: float
     other: Tensor | None = None
+    thing: Tensor | None = None
 
     @property
     def empty(self) -> bool:
@@ -52,6 +55,7 @@ class Observation:
             occluder=self.occluder.to(device),
             k=self.k.to(device),
             other=None if self.other is None else self.other.to(device),
+            thing=None if self.thing is None else self.thing.to(device),
         )
 
 

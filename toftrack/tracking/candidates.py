@@ -18,6 +18,7 @@ from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.parts import THING_PART
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.proposals import exchange_fingers, swap_fingers
@@ -38,6 +39,8 @@ from toftrack.tracking.posterior import (
 from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import HandState, Track
 
+_LEAST_PARTS = 4
+"""Parts of a crop, of 9 mm, that a thing in the hand has at least."""
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
 _COVERED = 0.6
@@ -145,6 +148,24 @@ class FilteredFrame:
         """Hands (N, 27) brought onto the seen points and the keypoints."""
         cfg, refiner = self.frame.model.refinement, self.frame.fitted.refiner
         return refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
+
+
+def without_things(observation: Observation, detection: Detection) -> Observation:
+    """The same without the pixels of a thing in the hand, as the pose network tells them.
+
+    Else the best pose is one whose fingers explain the thing.
+    """
+    kind = detection.parts.kind
+    if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
+        return observation
+    row, column = np.nonzero(observation.hand.cpu().numpy())
+    k, z = observation.k.cpu().numpy(), observation.depth_m.cpu().numpy()[row, column]
+    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
+    held = detection.parts.at(np.stack((x, y, z), 1)) == THING_PART
+    thing = np.zeros(observation.hand.shape, bool)
+    thing[row[held], column[held]] = True
+    mask = torch.from_numpy(thing).to(observation.hand.device)
+    return replace(observation, hand=observation.hand & ~mask, thing=mask)
 
 
 def image_term(

@@ -13,7 +13,13 @@ from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.candidates import HandFrame, best_start, image_term, posterior_of
+from toftrack.tracking.candidates import (
+    HandFrame,
+    best_start,
+    image_term,
+    posterior_of,
+    without_things,
+)
 from toftrack.tracking.detect import expected_of
 from toftrack.tracking.filter import new_track
 from toftrack.tracking.handedness import OTHER_SIDE, body_offset_m
@@ -162,11 +168,12 @@ def _best_start(
 
     image: the likelihood of that image, if it was made already.
     """
-    fitted = model.hand(hand.side, hand.shape)
-    # Very different poses are compared: what explains more of the image counts in full.
-    image = image or image_term(observation, fitted, model, coverage=1.0)
-    posterior = posterior_of(observation, fitted, detection, others, model, image)
-    return best_start(detection, observation, fitted, posterior, model)
+    fitted, seen = model.hand(hand.side, hand.shape), without_things(observation, detection)
+    if image is None or seen is not observation:
+        # Very different poses are compared: what explains more of the image counts in full.
+        image = image_term(seen, fitted, model, coverage=1.0)
+    posterior = posterior_of(seen, fitted, detection, others, model, image)
+    return best_start(detection, seen, fitted, posterior, model)
 
 
 def observed_shape(hand: HandState, detection: Detection, model: TrackerModel) -> HandState:

@@ -23,7 +23,14 @@ from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.candidates import FilteredFrame, HandFrame, keypoints_of, propose
+from toftrack.tracking.candidates import (
+    FilteredFrame,
+    HandFrame,
+    image_term,
+    keypoints_of,
+    propose,
+    without_things,
+)
 from toftrack.tracking.comparing import observed_shape, settled
 from toftrack.tracking.confidence import confidence_features, joint_features
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
@@ -123,15 +130,19 @@ def filtered_frame(
 
 
 def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
-    """The frame with its detection, if that ran beside the filter, and with both sides compared, if
-    that is due.
+    """The frame with its detection, if that ran beside the filter, without what the hand holds, and
+    with both sides compared, if that is due.
     """
     detection = frame.pending()
-    if detection.empty:
+    if not detection.empty:
+        hand = observed_shape(frame.hand, detection, frame.model)
+        frame = replace(frame, hand=hand, detection=detection)
+        if frame.mirrored is not None:
+            frame = settled(frame, frame.mirrored(), image)
+    seen = without_things(frame.observation, frame.detection)
+    if seen is frame.observation:
         return frame
-    hand = observed_shape(frame.hand, detection, frame.model)
-    frame = replace(frame, hand=hand, detection=detection)
-    return frame if frame.mirrored is None else settled(frame, frame.mirrored(), image)
+    return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
 
 
 def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
