@@ -329,7 +329,8 @@ def _second_round(
     standing = table.of_source(Source.PREVIOUS, Source.DYNAMICS)
     alternate = frame.model.hysteresis.alternate
     due = schedule(frame.track, frame.hidden, alternate, frame.in_turn)[1]
-    busy = frame.mirrored is not None  # one expensive thing a frame
+    # One expensive thing a frame, where nothing is at stake.
+    busy = frame.mirrored is not None and _sure(frame.track, alternate)
     if busy or not (frame.model.refinement.iterations and len(standing) and due):
         return none
     best, exchanged = standing.best, frame.model.hysteresis.exchanged
@@ -375,11 +376,15 @@ def schedule(
     """
     if turn is not None and alternate < 1 and not track.challenged.begun:
         return turn % 2 == 0, turn % 2 == 1
-    sure = alternate < 1 and track.log_odds >= log_odds(alternate)
-    if hidden or track.challenged.begun or not sure:
+    if hidden or track.challenged.begun or not _sure(track, alternate):
         return True, True
     even = round(track.age.seconds / FRAME_S) % 2 == 0
     return even, not even
+
+
+def _sure(track: Track, alternate: float) -> bool:
+    """Whether the last estimate was right with so much probability; 1 = never."""
+    return alternate < 1 and track.log_odds >= log_odds(alternate)
 
 
 def _with_fingers(state: Tensor, poses: Tensor) -> Tensor:

@@ -211,8 +211,7 @@ def conclude(
 def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
     """The estimate of the hand's shape after a believed estimate of its pose."""
     shape, fitted, model = frame.hand.shape, frame.fitted, frame.model
-    # One expensive thing a frame.
-    busy = frame.mirrored is not None or (frame.in_turn or 0) % 2 == 1
+    busy = (frame.in_turn or 0) % 2 == 1  # of two hands one learns in a frame
     if busy or frame.detection.empty or frame.hidden or shape.applied != fitted.applied:
         return shape  # of a hand that was given up in this very frame nothing is learned
     return shape_fit.learned(
