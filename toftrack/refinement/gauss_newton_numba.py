@@ -189,10 +189,10 @@ class CompiledRefiner:
 
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
-        joints = torch.empty(len(states), 21, 3)
+        joints = np.empty((len(states), 21, 3), np.float32)
         states_read = np.ascontiguousarray(states.numpy(), np.float32)
-        joints_of(states_read, *self._shape, joints.numpy(), _NO_FRAMES)
-        return joints
+        joints_of(states_read, *self._shape, joints, _NO_FRAMES)
+        return torch.from_numpy(joints)
 
     def pose(self, states: Tensor) -> HandPose:
         """See gauss_newton.Refiner."""
