@@ -15,7 +15,7 @@ from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import SAME_PLACE_M
 from toftrack.tracking.detect import reachable
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.seeking import look_again, sought, start_seeking, taking_part
+from toftrack.tracking.seeking import detect_again, sought, start_seeking, taking_part
 from toftrack.tracking.state import LastSeen, Track, TrackerState
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -49,11 +49,11 @@ def centres(model: TrackerModel) -> np.ndarray:
     return np.array(model.detector.centres_m).reshape(-1, 3)
 
 
-def test_a_search_takes_a_frame_for_its_places_and_one_for_looking_at_two() -> None:
+def test_a_search_takes_a_frame_for_its_places_and_one_for_detecting_at_two() -> None:
     model = searching(HERE, THERE, hand_at(-0.2), hand_at(-0.4))
-    found, looked, over = frames(followed(track_of(HERE), None), model, 3)
+    found, asked, over = frames(followed(track_of(HERE), None), model, 3)
     assert found.second_s == 0
-    assert [len(state.hands[1].seeking.centres_m) for state in (found, looked, over)] == [3, 1, 0]
+    assert [len(state.hands[1].seeking.centres_m) for state in (found, asked, over)] == [3, 1, 0]
     assert len(centres(model)) == 3
     away = np.linalg.norm(centres(model) - detection_of(HERE).centre_m.numpy(), axis=1)
     assert (away > SAME_PLACE_M).all(), "where the first hand is there is no other one"
@@ -66,11 +66,11 @@ def test_a_slot_takes_part_when_its_hand_is_found_and_not_before() -> None:
     assert parts == [[0], [0], [0, 1]]
 
 
-def test_what_was_found_is_looked_at_again_where_it_is_now() -> None:
+def test_what_was_found_is_detected_again_where_it_is_now() -> None:
     model = searching(THERE)
     hand = frames(followed(track_of(HERE), None), model, 2)[-1].hands[1]
     assert hand.seeking is not None
-    again = look_again(hand, hand.seeking, IMAGE, (), model)
+    again = detect_again(hand, hand.seeking, IMAGE, (), model)
     expected = detection_of(THERE).centre_m.numpy()
     np.testing.assert_allclose(again.centre_m.numpy(), expected, atol=1e-3)
 

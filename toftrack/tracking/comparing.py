@@ -64,7 +64,7 @@ def compared(
     return hand, detection if hand.side != other else mirrored
 
 
-def settled(frame: HandFrame, mirrored: Detection, image: DepthImage) -> HandFrame:
+def compared_beside(frame: HandFrame, mirrored: Detection, image: DepthImage) -> HandFrame:
     """The frame of a track after its sides were compared in the image that it has segmented.
 
     mirrored: what the detector says of the other side, where it says anything of this one.

@@ -50,7 +50,7 @@ from toftrack.tracking.hands import (
     without,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.seeking import look_again, search_is_over
+from toftrack.tracking.seeking import detect_again, search_is_over
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
 from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S
 
@@ -106,7 +106,7 @@ def open_hand(
     """A slot's hand as it goes into a frame: detected, its side compared, segmented, begun.
 
     Where a track is believed, or the other hand's is, the detector runs beside the filter, of both
-    sides where they are to be compared (see settled); else everything depends on it, and waits.
+    sides where they are to be compared (see compared_beside); else everything depends on it, and waits.
     """
     alone, track, mirrored = without(image, others), hand.track, None
     if track is not None and not (track.doubted and _waits(hand, others)):
@@ -176,7 +176,7 @@ def _detected(
     """
     track, best = hand.track, NO_DETECTION
     if hand.seeking is not None:
-        best = look_again(hand, hand.seeking, image, others, model)
+        best = detect_again(hand, hand.seeking, image, others, model)
         hand = replace(hand, seeking=None)
     elif search_due(hand, model):
         best = search(hand, image, others, model)

@@ -23,7 +23,7 @@ from toftrack.tracking.watching import watched_slots
 
 _SECOND_S = 0.12
 """How often a second hand is searched for."""
-_LOOKS = 2
+_AT_ONCE = 2
 """Places that are looked at in a frame."""
 _NEARLY = 1.0
 """The first look may be so much worse than what a hand needs: the second one is more exact."""
@@ -92,9 +92,9 @@ def start_seeking(
     if hand.seeking is not None:
         if search_is_over(hand):
             return state, None
-        at = hand.seeking.centres_m[:_LOOKS]
-        looks = [detector.start(image.depth_m, image.k, one, hand.side) for one in at]
-        return state, partial(_looked, hand.seeking, looks)
+        at = hand.seeking.centres_m[:_AT_ONCE]
+        pending = [detector.start(image.depth_m, image.k, one, hand.side) for one in at]
+        return state, partial(_after_detecting, hand.seeking, pending)
     due = hand.track is not None or slot in due_slots(state, watch_s)
     if not due or not search_due(hand, model):
         return state, None
@@ -112,10 +112,10 @@ def _found(wait: Callable[[], tuple], likely: Callable[..., float]) -> Seeking:
     return Seeking(centres[possible], heat[possible])
 
 
-def _looked(seeking: Seeking, looks: Sequence[Callable[[], Detection]]) -> Seeking:
-    """A search after so many looks more."""
-    seen = [(look(), float(heat)) for look, heat in zip(looks, seeking.heat, strict=False)]
-    rest = slice(len(looks), None)
+def _after_detecting(seeking: Seeking, pending: Sequence[Callable[[], Detection]]) -> Seeking:
+    """A search after the pose network was asked about some places more."""
+    seen = [(wait(), float(heat)) for wait, heat in zip(pending, seeking.heat, strict=False)]
+    rest = slice(len(pending), None)
     return Seeking(seeking.centres_m[rest], seeking.heat[rest], (*seeking.seen, *seen))
 
 
@@ -147,7 +147,7 @@ def _best(hand: HandState, seeking: Seeking, model: TrackerModel) -> Seeking | N
     return replace(seeking, seen=tuple(found[:1])) if found else None
 
 
-def look_again(
+def detect_again(
     hand: HandState,
     seeking: Seeking,
     image: DepthImage,

@@ -31,7 +31,7 @@ from toftrack.tracking.candidates import (
     propose,
     without_things,
 )
-from toftrack.tracking.comparing import observed_shape, settled
+from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
 from toftrack.tracking.hands import PlacedHand, others_of, partnered
@@ -138,7 +138,7 @@ def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
         hand = observed_shape(frame.hand, detection, frame.model)
         frame = replace(frame, hand=hand, detection=detection)
         if frame.mirrored is not None:
-            frame = settled(frame, frame.mirrored(), image)
+            frame = compared_beside(frame, frame.mirrored(), image)
     seen = without_things(frame.observation, frame.detection)
     if seen is frame.observation:
         return frame
