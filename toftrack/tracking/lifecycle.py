@@ -106,7 +106,7 @@ def open_hand(
     """A slot's hand as it goes into a frame: detected, its side compared, segmented, begun.
 
     Where a track is believed, or the other hand's is, the detector runs beside the filter, of both
-    sides where they are to be compared (see compared_beside); else everything depends on it, and waits.
+    sides where they are to be compared (compared_beside); else everything depends on it, and waits.
     """
     alone, track, mirrored = without(image, others), hand.track, None
     if track is not None and not (track.doubted and _waits(hand, others)):
