@@ -132,9 +132,10 @@ def test_the_compiled_hand_is_that_of_the_reference(side: str) -> None:
         -1.0 if side == "left" else 1.0,
     )
     expected = forward_kinematics(rows, shape)
-    joints = np.empty((30, 21, 3))
-    rigid_numba.joints_of(rows.numpy(), *hand, joints)
+    joints, all_frames = np.empty((30, 21, 3)), np.empty((30, 16, 3, 3))
+    rigid_numba.joints_of(rows.numpy(), *hand, joints, all_frames)
     np.testing.assert_allclose(joints, expected.joints_m.numpy(), atol=1e-7)  # metres
+    np.testing.assert_allclose(all_frames, expected.frames.numpy(), atol=1e-7)
     frames, one = np.empty((16, 3, 3)), np.empty((21, 3))
     for i in (0, 7, 29):
         _pose(rows[i].numpy(), *hand, frames, one)
@@ -147,7 +148,7 @@ def test_a_hand_that_is_no_number_is_none() -> None:
     rows[1, 3], rows[2, 0] = math.nan, math.inf
     hand = (shape.base_frames.numpy(), shape.base_m.numpy(), shape.bone_lengths_m.numpy(), 1.0)
     joints = np.empty((3, 21, 3))
-    rigid_numba.joints_of(rows.numpy(), *hand, joints)
+    rigid_numba.joints_of(rows.numpy(), *hand, joints, np.empty((0, 16, 3, 3)))
     assert np.isfinite(joints[0]).all()
     assert not np.isfinite(joints[1:]).all((1, 2)).any()
 

@@ -135,6 +135,11 @@ class FixedDetector:
         self.likely = likely
         return self.found
 
+    def start_search(self, depth_m, k, side) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+        self.searched.append(side)
+        centres = np.array([one.centre_m.numpy() for one in self.found]).reshape(-1, 3)
+        return lambda: (centres, np.full(len(centres), 0.9, np.float32))
+
     def detect(self, depth_m, k, centres_m, side, up=None) -> list[Detection]:
         """An open palm whose middle is at each place."""
         self.centres_m.append(np.array(centres_m))
@@ -143,6 +148,6 @@ class FixedDetector:
         states[:, :3] -= rotated_pivot(states[:, 3:6])
         return [detection_of(state[None], side=side) for state in states]
 
-    def start(self, depth_m, k, centre_m, side, up) -> Callable[[], Detection]:
+    def start(self, depth_m, k, centre_m, side, up=None) -> Callable[[], Detection]:
         found = self.detect(depth_m, k, np.asarray(centre_m)[None], side)[0]
         return lambda: found

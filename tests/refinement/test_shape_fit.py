@@ -87,7 +87,8 @@ def test_keypoints_say_by_how_much_a_hand_is_another(side: str) -> None:
     none = torch.zeros(6)
     joints = forward_kinematics(state, shaped(first, 0.2 * BETWEEN_FINGERS)).joints_m[0]
     keypoints = Keypoints(joints, torch.full((21,), 0.002))
-    information, vector = keypoints_system(state, first, shape_derivatives(first, none), keypoints)
+    pose = forward_kinematics(state, first)
+    information, vector = keypoints_system(pose, first, shape_derivatives(first, none), keypoints)
     # Thickness moves no joint.
     assert information[3].abs().max() < 1e-3 * information.diagonal().max()
     assert torch.linalg.eigvalsh(information).min() > -1e-3 * information.diagonal().max()

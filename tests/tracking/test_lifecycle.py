@@ -33,6 +33,7 @@ from toftrack.tracking.lifecycle import (
 )
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
+from toftrack.tracking.step import waited_for
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -194,12 +195,18 @@ def test_a_track_begins_with_the_length_that_was_detected_and_keeps_it() -> None
 UNSURE = HandednessEstimate(age_s=10.0)
 
 
+def compared(after: Opened, image: str) -> Opened:
+    """After what ran beside the filter was waited for."""
+    assert isinstance(after.result, HandFrame)
+    return replace(after, result=waited_for(after.result, images()[image]))
+
+
 @pytest.mark.parametrize("tracked", [False, True])
 def test_a_hand_that_has_become_more_likely_of_the_other_side_begins_anew(tracked: bool) -> None:
     model = any_hand_model()
     track = track_of(HERE, model) if tracked else None
     found = [detection_of(HERE)]
-    after = opened(track, found, "left", model, handedness=UNSURE)
+    after = compared(opened(track, found, "left", model, handedness=UNSURE), "left")
     assert isinstance(after.result, HandFrame)
     hand = after.result.hand
     assert after.outcome == "began" and hand.side == "left"
@@ -211,7 +218,7 @@ def test_a_hand_that_has_become_more_likely_of_the_other_side_begins_anew(tracke
 def test_a_hand_of_the_likelier_side_keeps_it(tracked: bool) -> None:
     model = any_hand_model()
     track = track_of(HERE, model) if tracked else None
-    after = opened(track, [detection_of(HERE)], "both", model, handedness=UNSURE)
+    after = compared(opened(track, [detection_of(HERE)], "both", model, handedness=UNSURE), "both")
     assert after.result.hand.side == "right"
     assert after.result.hand.handedness.probability("right") > 0.6
     assert after.outcome == ("went on" if tracked else "began")

@@ -16,11 +16,8 @@ from helpers.rendered import (
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.tracking.handedness import HandednessEstimate
 from toftrack.tracking.hands import PlacedHand
-from toftrack.tracking.lifecycle import (
-    reconcile,
-    since_search,
-    taking_part,
-)
+from toftrack.tracking.lifecycle import reconcile
+from toftrack.tracking.seeking import due_slots, since_search
 from toftrack.tracking.state import HandState, Track, TrackerState
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -153,13 +150,13 @@ def test_the_hand_that_is_asked_for_need_not_be_believed_beside_the_watched_one(
 def test_the_surest_hand_comes_first_and_a_second_one_is_searched_for_now_and_then(
     tracks: tuple[str | None, str | None], second_s: float, slots: list[int]
 ) -> None:
-    assert taking_part(two(*tracks, second_s=second_s), 0.5) == slots
+    assert due_slots(two(*tracks, second_s=second_s), 0.5) == slots
 
 
 def test_a_search_for_a_second_hand_is_the_last_one_for_a_while() -> None:
     for second_s, expected in ((0.13, 0.0), (0.05, 0.05)):
         state = two("sure", None, second_s=second_s)
-        assert since_search(state, taking_part(state, 0.5)) == expected
+        assert since_search(state, due_slots(state, 0.5)) == expected
 
 
 @pytest.mark.parametrize(

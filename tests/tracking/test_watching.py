@@ -15,7 +15,7 @@ from toftrack.api import build_hands_tracker
 from toftrack.estimate import Estimate
 from toftrack.tracking.handedness import HandednessEstimate
 from toftrack.tracking.hands import partnered
-from toftrack.tracking.lifecycle import taking_part
+from toftrack.tracking.seeking import due_slots
 from toftrack.tracking.state import TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
 
@@ -60,7 +60,7 @@ def watching(first: bool, other: bool, **changes: object) -> TrackerState:
 def test_a_frame_is_about_these_hands(
     first: bool, other: bool, second_s: float, slots: list[int]
 ) -> None:
-    assert taking_part(watching(first, other, second_s=second_s), 0.5) == slots
+    assert due_slots(watching(first, other, second_s=second_s), 0.5) == slots
 
 
 def with_evidence(state: TrackerState, slot: int, **changes: object) -> TrackerState:

@@ -188,8 +188,11 @@ def mix_columns(frame, column, angle):
 
 
 @_cached
-def joints_of(states, base_frames, base, lengths, mirror, joints):
-    """The joints of N hands alone, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32."""
+def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
+    """The joints of N hands, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32.
+
+    frames_out: (N, 16, 3, 3) float32 for their frames, or (0, 16, 3, 3).
+    """
     frames, posed, state = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty(27)
     for i in range(len(states)):
         for j in range(27):
@@ -198,6 +201,8 @@ def joints_of(states, base_frames, base, lengths, mirror, joints):
         for j in range(21):
             for k in range(3):
                 joints[i, j, k] = posed[j, k]
+        if i < len(frames_out):
+            frames_out[i] = frames
 
 
 @_cached
@@ -257,16 +262,16 @@ def main_axis(symmetric):
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """See rigid.compose; on the CPU, in float32."""
     left, right = np.broadcast_arrays(_rows(reference), _rows(tangent))
-    out = torch.empty(left.shape)
-    compose_rows(np.ascontiguousarray(left), np.ascontiguousarray(right), _PIVOT, out.numpy())
-    return out
+    out = np.empty(left.shape, np.float32)
+    compose_rows(np.ascontiguousarray(left), np.ascontiguousarray(right), _PIVOT, out)
+    return torch.from_numpy(out)
 
 
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
     """See rigid.difference; on the CPU, in float32."""
-    out = torch.empty(particles.shape)
-    difference_rows(_rows(particles), _rows(reference), _PIVOT, out.numpy())
-    return out
+    out = np.empty(particles.shape, np.float32)
+    difference_rows(_rows(particles), _rows(reference), _PIVOT, out)
+    return torch.from_numpy(out)
 
 
 def redraw(
@@ -279,7 +284,7 @@ def redraw(
     mode: str,
 ) -> Tensor:
     """See redraw.redraw_with; on the CPU, in float32."""
-    out = torch.empty(tangents.shape)
+    out = np.empty(tangents.shape, np.float32)
     redraw_rows(
         _rows(particles),
         np.ascontiguousarray(weights.numpy(), np.float64),
@@ -289,16 +294,16 @@ def redraw(
         _rows(upper),
         mode == "reflect",
         _PIVOT,
-        out.numpy(),
+        out,
     )
-    return out
+    return torch.from_numpy(out)
 
 
 def mean(particles: Tensor, weights: Tensor) -> Tensor:
     """See rigid.mean; on the CPU, in float32."""
-    out = torch.empty(1, particles.shape[1])
-    mean_of_rows(_rows(particles), np.ascontiguousarray(weights.numpy(), np.float64), out.numpy())
-    return out
+    out = np.empty((1, particles.shape[1]), np.float32)
+    mean_of_rows(_rows(particles), np.ascontiguousarray(weights.numpy(), np.float64), out)
+    return torch.from_numpy(out)
 
 
 def _rows(tensor: Tensor) -> np.ndarray:

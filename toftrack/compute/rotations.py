@@ -7,7 +7,9 @@ bits: roma itself loads torch's compiler, which takes longer than everything els
 from __future__ import annotations
 
 import functools
+import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -121,3 +123,12 @@ def _rotmat_to_unitquat(matrix: Tensor) -> Tensor:
     row = largest[..., None, None].expand(*largest.shape, 1, 4)
     chosen = torch.gather(found, -2, row)[..., 0, :]
     return chosen / torch.norm(chosen, dim=-1, keepdim=True)
+
+
+def rotation_matrix(rotvec: np.ndarray) -> np.ndarray:
+    """(3, 3) of one rotation vector (3,), radians; the same as rotvec_to_rotmat."""
+    angle = float(np.sqrt(np.square(rotvec).sum()))
+    x, y, z = np.asarray(rotvec, np.float64) / max(angle, 1e-12)
+    turn = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0)))
+    matrix: np.ndarray = np.eye(3) + math.sin(angle) * turn + (1 - math.cos(angle)) * turn @ turn
+    return matrix

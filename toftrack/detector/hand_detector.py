@@ -16,7 +16,7 @@ from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.parts import ALL_HAND, Parts
-from toftrack.detector.proposals import NetworkOutput, find_hands
+from toftrack.detector.proposals import NetworkOutput, Places, find_hands, start_finding
 from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
@@ -176,10 +176,16 @@ class HandDetector:
         return [_detection(seen, row) for row in range(len(seen.present))]
 
     def start(
-        self, depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, side: str, up: np.ndarray
+        self,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        centre_m: np.ndarray,
+        side: str,
+        up: np.ndarray | None = None,
     ) -> Callable[[], Detection]:
         """The same at one place (3,), begun beside whatever does not need it."""
-        wait = start_pose_network(self.pose, depth_m, k, centre_m[None], side, up[None])
+        up = None if up is None else up[None]
+        wait = start_pose_network(self.pose, depth_m, k, centre_m[None], side, up)
         return lambda: _detection(wait(), 0)
 
     def search(
@@ -199,13 +205,7 @@ class HandDetector:
         """
         cfg = self.settings
         found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)
-        # The finder knows sides only roughly: places of the other side may be this one's as well.
-        other = "left" if side == "right" else "right"
-        centres = np.concatenate((found[side].centre_m, found[other].centre_m))
-        heat = np.concatenate((found[side].probability, 0.3 * found[other].probability))
-        order = np.argsort(-heat, kind="stable")
-        order = order[_apart(centres[order])][: cfg.places]
-        centres, heat = centres[order], heat[order]
+        centres, heat = self._places(found, side)
         detections = self.detect(depth_m, k, centres, side)
 
         def merits() -> np.ndarray:
@@ -221,6 +221,25 @@ class HandDetector:
         second = merits()
         order = np.argsort(-second, kind="stable")
         return [detections[row] for row in order if second[row] > cfg.merit]
+
+    def start_search(
+        self, depth_m: np.ndarray, k: np.ndarray, side: str
+    ) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+        """The first part of a search, begun beside whatever does not need it: the places (P, 3)
+        where a hand of a side may be, the likeliest first, and their probabilities (P,).
+        """
+        cfg = self.settings
+        wait = start_finding(self.finder, depth_m, k, cfg.places, cfg.least)
+        return lambda: self._places(wait(), side)
+
+    def _places(self, found: dict[str, Places], side: str) -> tuple[np.ndarray, np.ndarray]:
+        # The finder knows sides only roughly: places of the other side may be this one's as well.
+        other = "left" if side == "right" else "right"
+        centres = np.concatenate((found[side].centre_m, found[other].centre_m))
+        heat = np.concatenate((found[side].probability, 0.3 * found[other].probability))
+        order = np.argsort(-heat, kind="stable")
+        order = order[_apart(centres[order])][: self.settings.places]
+        return centres[order], heat[order]
 
 
 def merit(detection: Detection, heat: float) -> float:

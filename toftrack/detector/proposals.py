@@ -6,8 +6,9 @@ mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rotations import rotmat_to_rotvec
+from toftrack.compute.threads import beside
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.detector.crops import crop, wide
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet, Proposed
@@ -88,6 +90,23 @@ def find_hands(
     """
     image, wide_k = wide(depth_m, k)
     found = Found(*on_host(*finder(on_device(image, finder.device))))
+    return _places(found, wide_k, most, least)
+
+
+def start_finding(
+    finder: Finder | OnnxFinder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
+) -> Callable[[], dict[str, Places]]:
+    """The same, begun in another thread if there may be one; what is returned waits for it."""
+    if not isinstance(finder, OnnxFinder):
+        return partial(find_hands, finder, depth_m, k, most, least)
+    image, wide_k = wide(depth_m, k)
+    wait = beside(partial(finder, image))
+    return lambda: _places(wait(), wide_k, most, least)
+
+
+@torch.inference_mode()
+def _places(found: Found, wide_k: np.ndarray, most: int, least: float) -> dict[str, Places]:
+    """See find_hands; wide_k: (3, 3) of the image that the finder has seen."""
     heat = found.heat.sigmoid()
     peaks = (heat == F.max_pool2d(heat, 3, 1, 1)) & (heat >= least)
     places = {}

@@ -14,8 +14,10 @@ to them, and judged on the others and on real hands: docs/lab/surface.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -109,6 +111,25 @@ _WRIST_MM = (0.0, 45.0, 0.0)
 _WRIST_AXES_MM = (50.0, 45.0, 45.0)
 
 _REFERENCE_LENGTH_M = 0.190
+_KEPT = 8
+"""Shapes whose surface is kept: scorer, refiner and OpenXR's joints each want it."""
+_BONES = np.array([_THUMB_BONES, *[_FINGER_BONES] * 4]).transpose(2, 0, 1)
+"""(4, 5, 3) depth, palmward, before and beyond of each finger's bones."""
+_KNUCKLES = np.array([_THUMB_KNUCKLE, *[_FINGER_KNUCKLE] * 4]).T
+"""(4, 5) breadth, along, depth and palmward of each finger's knuckle."""
+_PAD_ENDS = tuple(
+    (
+        [
+            5 if getattr(pad, f"{end}_root") is None else getattr(pad, f"{end}_root")
+            for pad in _PALM
+        ],
+        np.array([getattr(pad, end) for pad in _PALM]),
+    )
+    for end in ("start", "end")
+)
+"""Of both ends of each pad: the root, 5 the wrist, and (P, 3) where it is from there."""
+_PAD_SIZES = np.array([(pad.wide, pad.deep, pad.beyond) for pad in _PALM]).T
+_BONE_FRAMES = [1 + 3 * finger + bone for finger in range(5) for bone in (0, 1, 2, 0)]
 
 
 class Ellipsoids(NamedTuple):
@@ -158,55 +179,59 @@ class HandSurface:
         return Ellipsoids(pose.origins_m[:, self.frame_index] + centres, frames @ self.axes_m)
 
 
+@lru_cache(maxsize=_KEPT)
 def hand_surface(shape: HandShape) -> HandSurface:
     """Flesh out a skeleton of the given sizes; on the shape's device and of its dtype."""
-    base = shape.base_m
+    # In numpy, all bones at once: torch's operations on a few numbers take milliseconds together.
+    base, lengths = shape.base_m.cpu().numpy(), shape.bone_lengths_m.cpu().numpy()
     unit = shape.hand_length_m / _REFERENCE_LENGTH_M / 1000
     thick = unit * shape.thickness
-    radii = base.new_tensor(BONE_RADII_MM) * thick
-    parts = [part for finger in range(5) for part in _finger(finger, shape, radii[finger])]
-    parts += [(0, *_pad(pad, base, unit, thick)) for pad in _PALM]
-    wrist = torch.diag(base.new_tensor(_WRIST_AXES_MM) * thick)
-    parts.append((0, base.new_tensor(_WRIST_MM) * unit, wrist))
-    frames, centres, axes = zip(*parts, strict=True)
+    wrist = np.array([_WRIST_MM]) * unit, np.diag(_WRIST_AXES_MM)[None] * thick
+    bones = _bones(lengths, np.array(BONE_RADII_MM, base.dtype) * thick)
+    each = zip(bones, _pads(base, unit, thick), wrist, strict=True)
+    centres, axes = (np.concatenate(parts).astype(base.dtype) for parts in each)
+    frames = [*_BONE_FRAMES, *[0] * (len(_PALM) + 1)]
+    device = shape.base_m.device
     return HandSurface(
-        torch.tensor(frames, device=base.device), torch.stack(centres), torch.stack(axes)
+        torch.tensor(frames, device=device),
+        torch.from_numpy(centres).to(device),
+        torch.from_numpy(axes).to(device),
     )
 
 
-def _finger(finger: int, shape: HandShape, radii: Tensor) -> list[tuple[int, Tensor, Tensor]]:
-    """Frame, centre and axes of a finger's four ellipsoids; radii: (3,) its half-breadths, m."""
-    bones, knuckle = (
-        (_THUMB_BONES, _THUMB_KNUCKLE) if finger == 0 else (_FINGER_BONES, _FINGER_KNUCKLE)
-    )
-    parts = []
-    for number, bone in enumerate(bones):
-        breadth = radii[number]
-        start = -bone.before * breadth
-        end = shape.bone_lengths_m[finger, number] + bone.beyond * breadth
-        centre = torch.stack((0 * start, -(start + end) / 2, -bone.palmward * breadth))
-        axes = torch.stack((breadth, (end - start) / 2, bone.depth * breadth))
-        parts.append((1 + 3 * finger + number, centre, torch.diag(axes)))
-    breadth = knuckle.breadth * radii[:2].mean()
-    length = shape.bone_lengths_m[finger, 0]
-    centre = torch.stack((0 * length, -length, -knuckle.palmward * breadth))
-    axes = breadth * radii.new_tensor((1.0, knuckle.along, knuckle.depth))
-    return [*parts, (1 + 3 * finger, centre, torch.diag(axes))]
+def _bones(lengths: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (20, 3) and axes (20, 3, 3) of the fingers' ellipsoids, in their bones' frames.
+
+    lengths, radii: (5, 3) of the bones and their half-breadths, m.
+    """
+    depth, palmward, before, beyond = _BONES  # (5, 3) each
+    start, end = -before * radii, lengths + beyond * radii
+    none = np.zeros((5, 1))
+    breadth = _KNUCKLES[0] * radii[:, :2].mean(1)
+    across = np.concatenate((radii, breadth[:, None]), 1)
+    along = np.concatenate(((end - start) / 2, (_KNUCKLES[1] * breadth)[:, None]), 1)
+    deep = np.concatenate((depth * radii, (_KNUCKLES[2] * breadth)[:, None]), 1)
+    axes = np.stack((across, along, deep), -1)[..., None] * np.eye(3)
+    y = np.concatenate((-(start + end) / 2, -lengths[:, :1]), 1)
+    z = -np.concatenate((palmward * radii, (_KNUCKLES[3] * breadth)[:, None]), 1)
+    centres = np.stack((np.broadcast_to(none, y.shape), y, z), -1)
+    return centres.reshape(-1, 3), axes.reshape(-1, 3, 3)
 
 
-def _pad(pad: _Pad, base: Tensor, unit: float, thick: float) -> tuple[Tensor, Tensor]:
-    """Centre and axes of a pad in the hand frame; unit, thick: metres of a millimetre."""
+def _pads(base: np.ndarray, unit: float, thick: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (P, 3) and axes (P, 3, 3) of the palm's pads in the hand frame.
 
-    def point(root: int | None, offset: tuple[float, float, float]) -> Tensor:
-        shift = base.new_tensor(offset) * unit
-        return shift if root is None else base[root] + shift
-
-    start, end = point(pad.start_root, pad.start), point(pad.end_root, pad.end)
-    along = end - start
-    length = along.norm()
-    y = along / length
-    z = torch.linalg.cross(torch.linalg.cross(y, along.new_tensor([0.0, 0.0, 1.0])), y)
-    z = -z / z.norm()
-    x = torch.linalg.cross(y, z)
-    axes = (x * pad.wide * thick, y * (length / 2 + pad.beyond * thick), z * pad.deep * thick)
-    return (start + end) / 2, torch.stack(axes, 1)
+    base: (5, 3) the fingers' roots.  unit, thick: metres of a millimetre.
+    """
+    roots = np.concatenate((base, np.zeros((1, 3))))  # the last one is the wrist
+    start, end = (unit * offset + roots[root] for root, offset in _PAD_ENDS)
+    way = end - start
+    length = np.sqrt(np.square(way).sum(1, keepdims=True))
+    x, y, z = (way / length).T
+    # Across a pad, the hand's z axis as nearly as it can be.
+    level = np.hypot(x, y)
+    out = np.stack((x * z, y * z, -np.square(level)), 1) / level[:, None]
+    side = np.stack((-y, x, np.zeros_like(x)), 1) / level[:, None]
+    wide, deep, beyond = thick * _PAD_SIZES[..., None]
+    axes = side * wide, way / length * (length / 2 + beyond), out * deep
+    return (start + end) / 2, np.stack(axes, 2)

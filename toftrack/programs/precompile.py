@@ -50,12 +50,18 @@ def _compile_here(model: FilterModel) -> None:
     """What the second process leaves, the largest kernel first."""
     from toftrack.detector.proposals_numba import compile_crops
     from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
+    from toftrack.render.numba.bands import evidence_images
+    from toftrack.tracking.confidence_numba import count_out_of_sight, seen_around
 
     model.backend.make_scorer(model.configured.shape)
     compile_crops()
     pixel, hand = np.ones((1, 1), np.float32), np.ones((1, 1), bool)
     smooth_points(pixel, hand, (0, 0), np.eye(3, dtype=np.float32), 1.0, 1.0)
     nearest_of_labels(np.ones((1, 1), np.int32), hand, (0, 0))
+    evidence_images(pixel, hand, hand, None, 1.0)
+    joint = np.ones((1, 3), np.float32)
+    count_out_of_sight(joint, pixel, np.eye(3))
+    seen_around(joint, 1.0, 1.0, pixel, np.eye(3))
 
 
 def _load(model: FilterModel) -> None:

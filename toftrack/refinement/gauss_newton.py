@@ -138,6 +138,9 @@ class Refiner(Protocol):
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
 
+    def pose(self, states: Tensor) -> HandPose:
+        """(N, 27) to joints and frames, see skeleton.forward_kinematics."""
+
 
 class TorchRefiner:
     """The reference, which runs everywhere."""
@@ -160,7 +163,11 @@ class TorchRefiner:
 
     def joints(self, states: Tensor) -> Tensor:
         """See Refiner."""
-        return forward_kinematics(states, self.shape).joints_m
+        return self.pose(states).joints_m
+
+    def pose(self, states: Tensor) -> HandPose:
+        """See Refiner."""
+        return forward_kinematics(states, self.shape)
 
 
 class Residuals(NamedTuple):

@@ -17,7 +17,7 @@ from toftrack.compute.compiling import announced, compiled, entry_point, take
 from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
 from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
-from toftrack.hand.skeleton import ANGLE_LIMITS
+from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement import gauss_newton, residuals_numba, seen_points
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
@@ -38,6 +38,9 @@ from toftrack.refinement.seen_points import SeenPoints
 _SOURCES = (rigid_numba, residuals_numba, gauss_newton, seen_points)
 _cached = entry_point(__file__, *(module.__file__ for module in _SOURCES))
 _LIMITS = np.array(ANGLE_LIMITS)
+_NO_FRAMES = np.empty((0, 16, 3, 3), np.float32)
+_ORIGINS = [0, *(1 + 4 * finger + bone for finger in range(5) for bone in range(3))]
+"""The joints at which the frames of a hand begin."""
 _FREE = 27
 """Degrees of freedom: translation, rotation about the wrist, angles."""
 
@@ -186,10 +189,17 @@ class CompiledRefiner:
 
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
-        joints = torch.empty(len(states), 21, 3)
+        joints = np.empty((len(states), 21, 3), np.float32)
         states_read = np.ascontiguousarray(states.numpy(), np.float32)
-        joints_of(states_read, *self._shape, joints.numpy())
-        return joints
+        joints_of(states_read, *self._shape, joints, _NO_FRAMES)
+        return torch.from_numpy(joints)
+
+    def pose(self, states: Tensor) -> HandPose:
+        """See gauss_newton.Refiner."""
+        joints, frames = torch.empty(len(states), 21, 3), torch.empty(len(states), 16, 3, 3)
+        states_read = np.ascontiguousarray(states.numpy(), np.float32)
+        joints_of(states_read, *self._shape, joints.numpy(), frames.numpy())
+        return HandPose(joints, frames, joints[:, _ORIGINS])
 
     def __call__(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ _MARGIN_PX = 24
 """Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
 _SQUARE = np.ones((3, 3), np.uint8)
 _EDGE_M, _FAR_M = 0.03, 10.0
+_KEPT = 4
+"""Observations: a frame asks for the same points where sides are compared and where it refines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,7 @@ class SeenPoints:
         return self.points_m[index[:, :slots]], there
 
 
+@lru_cache(maxsize=_KEPT)
 def seen_points(observation: Observation) -> SeenPoints:
     """The points and the silhouette of an observation, on its device.
 

@@ -22,17 +22,19 @@ by more than it errs, the fit is begun anew: another person's hand, or a wrong f
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.rotations import rotvec_to_rotmat
+from toftrack.compute.rotations import rotation_matrix, rotvec_to_rotmat
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
-from toftrack.hand.skeleton import forward_kinematics
+from toftrack.hand.skeleton import HandPose, forward_kinematics
 from toftrack.refinement.gauss_newton import Keypoints, keypoint_residuals
 
 _COUNT = len(COMPONENTS)
@@ -118,10 +120,11 @@ class KeyPoses:
         """The most similar key pose to a hand (1, 27), and how far it is, 1 where they differ."""
         if not len(self.weight):
             return -1, math.inf
-        bent = (self.angles - state[:, 6:]).square().mean(1).sqrt() / _KEY_RAD
-        rotation = rotvec_to_rotmat(state[0, 3:6])
-        cosine = 0.5 * ((self.rotations * rotation).sum((1, 2)) - 1)
-        far = torch.hypot(bent, cosine.clamp(-1, 1).acos() / _KEY_TURN_RAD)
+        # In numpy: on a few numbers each of torch's operations takes longer than its arithmetic.
+        angles, rotation = state[0, 6:].numpy(), rotation_matrix(state[0, 3:6].numpy())
+        bent = np.sqrt(np.square(self.angles.numpy() - angles).mean(1)) / _KEY_RAD
+        cosine = 0.5 * ((self.rotations.numpy() * rotation).sum((1, 2)) - 1)
+        far = np.hypot(bent, np.arccos(cosine.clip(-1, 1)) / _KEY_TURN_RAD)
         row = int(far.argmin())
         return row, float(far[row])
 
@@ -243,10 +246,12 @@ def learned(
     keypoints: Keypoints,
     fit: ShapeFit,
     first: HandShape,
+    posed: Callable[[Tensor], HandPose] | None = None,
 ) -> ShapeEstimate:
     """The estimate after a believed estimate; everything on the CPU.
 
     state: (1, 27).  shape: the hand applied.  derivatives: see shape_derivatives.
+    posed: its forward kinematics where they are compiled.
     keypoints: the detection's, as the refinement takes them.
     first: the hand whose components are 0.
     """
@@ -263,7 +268,8 @@ def learned(
         row = int((estimate.keys.square / estimate.keys.weight).argmin())
         if float(estimate.keys.square[row] / estimate.keys.weight[row]) >= weight:
             return estimate
-    information, vector = keypoints_system(state, shape, derivatives, keypoints)
+    pose = posed(state) if posed is not None else forward_kinematics(state, shape)
+    information, vector = keypoints_system(pose, shape, derivatives, keypoints)
     reported_here = torch.tensor(estimate.applied) - torch.tensor(_KEYPOINTS_OFF)
     # The network's length and its keypoints rest on the same image: each counts half.
     vector = 0.5 * fit.keypoints * (information @ reported_here + vector)
@@ -276,13 +282,12 @@ def learned(
 
 
 def keypoints_system(
-    state: Tensor, shape: HandShape, derivatives: tuple[Tensor, Tensor], keypoints: Keypoints
+    pose: HandPose, shape: HandShape, derivatives: tuple[Tensor, Tensor], keypoints: Keypoints
 ) -> tuple[Tensor, Tensor]:
-    """What keypoints say of the components, the pose (1, 27) marginalised.
+    """What keypoints say of the components, the pose of one hand marginalised.
 
     Returns the precision (6, 6) and the precision times the change of the components (6,).
     """
-    pose = forward_kinematics(state, shape)
     keypoints = keypoints.of_each(1)
     found = keypoint_residuals(pose, keypoints, shape)
     by_shape = _joint_derivatives(pose.frames[0], derivatives)  # (63, 6)

@@ -9,6 +9,7 @@ the image.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -24,6 +25,8 @@ _BEHIND_M = 0.06
 _NEAREST_M = 0.05
 _EXITS = 64
 """Points at most where the blob leaves the image."""
+_KEPT = 4
+"""Observations: a frame asks for the same sight where sides are compared and where it chooses."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class ArmSight:
     k: np.ndarray
 
 
+@lru_cache(maxsize=_KEPT)
 def arm_sight(observation: Observation) -> ArmSight:
     """Prepare an image for `forearm_conflict`."""
     depth, k = observation.depth_m.numpy(), observation.k.numpy()

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
+from toftrack.render.numba.bands import evidence_images
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.segmentation import Observation
 
@@ -63,21 +64,17 @@ class FMeasure:
 
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
-        depth, hand = observation.depth_m, observation.hand
-        background = ~hand
-        # Written in place: a frame's images are few, but so are the milliseconds.
-        low = (depth + self.tolerance_m).reciprocal_().masked_fill_(background, torch.inf)
-        high = (depth - self.tolerance_m).clamp_(min=1e-3).reciprocal_()
-        high.masked_fill_(background, -torch.inf)
         # A model surface at an occluder is hidden, not false; at another hand only behind it.
-        front = torch.zeros_like(depth)
-        if observation.other is not None:
-            front = torch.where(observation.other & (depth > 0), depth.reciprocal(), front)
-        front = front.masked_fill_(observation.occluder, torch.inf)
+        other = None if observation.other is None else observation.other.cpu().numpy()
+        given = observation.depth_m, observation.hand, observation.occluder
+        depth, hand, occluder = (one.cpu().numpy() for one in given)
         if observation.thing is not None:
-            front = front.masked_fill_(observation.thing, torch.inf)
+            occluder = occluder | observation.thing.cpu().numpy()
+        images = evidence_images(depth, hand, occluder, other, self.tolerance_m)
+        device = observation.depth_m.device
+        low, high, front = (torch.from_numpy(image).to(device) for image in images)
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
-        return Evidence(low, high, front, hand, observation.k, radius)
+        return Evidence(low, high, front, observation.hand, observation.k, radius)
 
     def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
         """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct).
@@ -120,5 +117,6 @@ class FMeasure:
 
 def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     # On the CPU each of torch's operations takes longer than its arithmetic.
-    correct, false, missed, residual = (count.float().numpy() for count in counts)
+    given = (np.asarray(count.numpy(), np.float32) for count in counts)
+    correct, false, missed, residual = given
     return correct, false, missed, residual

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -69,6 +70,8 @@ class HandFrame:
     expected_m: the depth at which its nearest joint was expected; 0 where the track begins.
     detection: what the detector says of it, and `pending` waits for it where it is still computed.
     others: hands that are tracked as well.  image: the likelihood of the image.
+    mirrored: where the sides are to be compared, waits for what the detector says of the other one.
+    turn: odd or even; in one frame it is another one for each of two hands.
     """
 
     slot: int
@@ -82,12 +85,19 @@ class HandFrame:
     others: tuple[OtherHand, ...]
     image: ImageTerm
     model: TrackerModel
+    mirrored: Callable[[], Detection] | None = None
+    turn: int = 0
 
     @property
+    def in_turn(self) -> int | None:
+        """The turn, where another hand is followed as well; None where nothing else takes time."""
+        return self.turn if any(other.believed for other in self.others) else None
+
+    @cached_property
     def hidden(self) -> bool:
         """Whether something hides part of the hand."""
-        hand, occluder = self.observation.hand, self.observation.occluder
-        return int(occluder.sum()) > _HIDDEN * int(hand.sum())
+        hand, occluder = self.observation.hand.numpy(), self.observation.occluder.numpy()
+        return int(np.count_nonzero(occluder)) > _HIDDEN * int(np.count_nonzero(hand))
 
     def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
         """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""
@@ -302,7 +312,7 @@ def _first_round(number: int, filtered: FilteredFrame) -> tuple[Hypotheses, Tens
         Hypotheses.of(state, number, Source.DYNAMICS),
         Hypotheses.of(_with_fingers(state, track.contender), number, Source.CONTENDER),
     ]
-    if schedule(track, frame.hidden, model.hysteresis.alternate)[0]:
+    if schedule(track, frame.hidden, model.hysteresis.alternate, frame.in_turn)[0]:
         tables.append(Hypotheses.of(detected, number, Source.DETECTOR))
     return Hypotheses.joined(tables), detected[:_DONORS, 6:]
 
@@ -317,8 +327,11 @@ def _second_round(
     """The best pose with single fingers of other poses, as they are and refined, scored."""
     frame, none = filtered.frame, table.rows(slice(0))
     standing = table.of_source(Source.PREVIOUS, Source.DYNAMICS)
-    due = schedule(frame.track, frame.hidden, frame.model.hysteresis.alternate)[1]
-    if not (frame.model.refinement.iterations and len(standing) and due):
+    alternate = frame.model.hysteresis.alternate
+    due = schedule(frame.track, frame.hidden, alternate, frame.in_turn)[1]
+    # One expensive thing a frame, where nothing is at stake.
+    busy = frame.mirrored is not None and _sure(frame.track, alternate)
+    if busy or not (frame.model.refinement.iterations and len(standing) and due):
         return none
     best, exchanged = standing.best, frame.model.hysteresis.exchanged
     poses = torch.cat(
@@ -350,18 +363,28 @@ def _refined(table: Hypotheses, frames: Sequence[FilteredFrame]) -> Hypotheses:
     return Hypotheses.joined(tables)
 
 
-def schedule(track: Track, hidden: bool, alternate: float) -> tuple[bool, bool]:
+def schedule(
+    track: Track, hidden: bool, alternate: float, turn: int | None = None
+) -> tuple[bool, bool]:
     """Whether the detector's poses are candidates in a frame, and whether fingers are exchanged.
 
-    Both; but in turn where the last estimate was surely right and nothing challenges it.
+    Both; but in turn where the last estimate was surely right and nothing challenges it, and of two
+    hands also where it was not.
 
     alternate: probability from which on it was; 1 = never.
+    turn: of one of two hands that are followed; odd for one and even for the other.
     """
-    sure = alternate < 1 and track.log_odds >= log_odds(alternate)
-    if hidden or track.challenged.begun or not sure:
+    if turn is not None and alternate < 1 and not track.challenged.begun:
+        return turn % 2 == 0, turn % 2 == 1
+    if hidden or track.challenged.begun or not _sure(track, alternate):
         return True, True
     even = round(track.age.seconds / FRAME_S) % 2 == 0
     return even, not even
+
+
+def _sure(track: Track, alternate: float) -> bool:
+    """Whether the last estimate was right with so much probability; 1 = never."""
+    return alternate < 1 and track.log_odds >= log_odds(alternate)
 
 
 def _with_fingers(state: Tensor, poses: Tensor) -> Tensor:

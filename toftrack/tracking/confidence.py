@@ -22,6 +22,7 @@ from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError
 from toftrack.hand.regions import joint_axes
+from toftrack.tracking.confidence_numba import count_out_of_sight, seen_around
 
 _LEAST = 1e-3
 _LIKELY = 0.03
@@ -127,17 +128,8 @@ def _log_odds(probability: float) -> float:
 
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
     """Shares of the joints (21, 3) outside of the image (H, W), and of those behind something."""
-    depth, k_px, at = depth_m.cpu().numpy(), k.cpu().numpy(), joints.numpy()
-    z = np.maximum(at[:, 2], np.float32(0.05))
-    u = np.rint(k_px[0, 0] * at[:, 0] / z + k_px[0, 2])
-    v = np.rint(k_px[1, 1] * at[:, 1] / z + k_px[1, 2])
-    height, width = depth.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    column, row = np.where(inside, u, 0).astype(np.int64), np.where(inside, v, 0).astype(np.int64)
-    seen = depth[row, column]
-    behind = inside & (seen > 0) & (seen < z - np.float32(0.04))
-    count = len(at)
-    return 1 - np.count_nonzero(inside) / count, np.count_nonzero(behind) / count
+    outside, behind = count_out_of_sight(joints.numpy(), depth_m.cpu().numpy(), k.cpu().numpy())
+    return float(outside) / len(joints), float(behind) / len(joints)
 
 
 JOINT_FEATURES = (
@@ -180,7 +172,8 @@ _BELOW_M = np.array([0.012, 0.010, 0.010, 0.008, 0.004] + 4 * [0.010, 0.008, 0.0
 """How far joints are below the surface that a camera sees, roughly."""
 _AROUND_M = 0.006
 """Distance of the readings about a joint."""
-_GRID_M = _AROUND_M * np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.float64)
+_NEAREST_M = 0.05
+"""No joint is nearer."""
 _LEAST_CM, _MOST_CM = 0.1, 30.0
 """Standard deviations are never smaller or larger."""
 
@@ -260,13 +253,12 @@ def joint_features(
         off = np.linalg.norm(joints - keypoints.points_m.numpy(), axis=1)
         worst = np.concatenate(([off.mean()], off[1:].reshape(5, 4).max(1).repeat(4)))
         features[:, _KEYPOINTS] = _log_cm_of(keypoints.sigma_m.numpy(), off, worst)
-    depth = np.maximum(joints[:, 2], 0.05)
-    outside, unread, surface = _seen_around(joints[:, :2], depth, depth_m, k)
+    outside, unread, surface = seen_around(joints, _NEAREST_M, _AROUND_M, depth_m, k).T
     deeper = np.where(np.isnan(surface), 0.0, joints[:, 2] - surface - _BELOW_M)
     features[:, 3], features[:, 4] = outside, unread
     features[:, 5], features[:, 6] = deeper.clip(0, 0.05) / 0.02, (-deeper).clip(0, 0.05) / 0.02
     features[:, 7] = -math.log(max(score, 1e-3))
-    features[:, 8] = np.log(1e3 * depth / k[0, 0])
+    features[:, 8] = np.log(1e3 * np.maximum(joints[:, 2], _NEAREST_M) / k[0, 0])
     features[:, 9] = np.logaddexp(0.0, -log_odds)
     return features
 
@@ -288,29 +280,6 @@ def propagated_sigma(
     along = np.einsum("jab,njb->nja", joint_axes(joints_m), half)
     sigma: np.ndarray = np.sqrt(np.square(along).sum(0)).astype(np.float32)
     return sigma
-
-
-def _seen_around(
-    xy_m: np.ndarray, z_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What is seen about points: parts outside, parts without reading, median depth or NaN; (N,).
-
-    xy_m: (N, 2).  z_m: (N,), above 0.
-    """
-    height, width = depth_m.shape
-    focal, middle = k[[0, 1], [0, 1]], k[[0, 1], [2, 2]]
-    pixels = (xy_m[:, None] + _GRID_M) * (focal / z_m[:, None, None]) + middle
-    column, row = np.rint(pixels.clip(-1e6, 1e6)).astype(np.int64).transpose(2, 0, 1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    seen = depth_m[row.clip(0, height - 1), column.clip(0, width - 1)]
-    read = inside & (seen > 0)
-    # The lower middle of what was read; nanmedian takes ten times as long.
-    ordered = np.sort(np.where(read, seen, np.inf), 1)
-    count = read.sum(1)
-    median = ordered[np.arange(len(count)), np.maximum(count - 1, 0) // 2]
-    inside_count = inside.sum(1)
-    unread = (inside_count - count) / len(_GRID_M)
-    return 1 - inside_count / len(_GRID_M), unread, np.where(count > 0, median, np.nan)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,8 @@ _NEAR_M, _DEPTH_M, _MOST = 0.03, 0.05, 0.5
 and along it: hands move a little meanwhile."""
 _ARM_M, _BENT = 0.05, 0.6
 """Half of a forearm's breadth, and the tangent of how far a wrist bends: the arm is the hand's."""
+_AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
+"""What was taken for a hand and was none is left alone for so long, if it stays where it is."""
 
 
 def search_due(hand: HandState, model: TrackerModel) -> bool:
@@ -60,7 +62,7 @@ def search(
 ) -> Detection:
     """The best hand in the whole image that may be this one, or NO_DETECTION."""
     detector, side = model.detector, hand.side
-    likely = partial(_reachable, hand, others)
+    likely = partial(reachable, hand, [other.centre_m for other in others])
     found = detector.search(image.depth_m, image.k, side, likely)
     undecided = not hand.handedness.given
     beside = any(other.believed for other in others)
@@ -71,7 +73,7 @@ def search(
         up = np.array([one.up for one in found[:1]]).reshape(-1, 3)
         found = detector.detect(image.depth_m, image.k, again, side, up)
     elif undecided and not hand.seen.ever:
-        found = _held_out(found)
+        found = held_out(found)
     return found[0] if found else NO_DETECTION
 
 
@@ -133,7 +135,7 @@ def expected_of(detection: Detection) -> Expected:
     return Expected(nearest, farthest, tuple(detection.centre_m.tolist()))
 
 
-def _held_out(found: Sequence[Detection]) -> list[Detection]:
+def held_out(found: Sequence[Detection]) -> list[Detection]:
     """The nearest of those hands that are seen about as well as the best one.
 
     Where nobody said which hand is meant, it is the one that is held out to the camera.
@@ -145,12 +147,19 @@ def _held_out(found: Sequence[Detection]) -> list[Detection]:
     return [min(alike, key=lambda one: float(one.centre_m[2]))]
 
 
-def _reachable(hand: HandState, others: Sequence[OtherHand], centre_m: np.ndarray) -> float:
+def reachable(hand: HandState, others_m: Sequence[np.ndarray], centre_m: np.ndarray) -> float:
     """How likely a hand has come to a place from where it was last believed, log scale.
 
-    Another hand, or the thing that hides the hand, is no place that it has jumped to.
+    Another hand, or the thing that hides the hand, is no place that it has jumped to; nor what was
+    just taken for it and was none.
+
+    others_m: (3,) each, the middles of other hands.
     """
-    if any(np.linalg.norm(other.centre_m - centre_m) < SAME_PLACE_M for other in others):
+    if any(np.linalg.norm(other - centre_m) < SAME_PLACE_M for other in others_m):
+        return -np.inf
+    patience = _WATCHED_AGAIN_S if hand.watched else _AGAIN_S
+    tried = hand.tried.age_s < patience
+    if tried and np.linalg.norm(hand.tried.centre_m - centre_m) < SAME_PLACE_M:
         return -np.inf
     # What was never believed may be a thing, and what is nearer the hand.
     believed = hand.track if hand.believed else None
@@ -158,7 +167,5 @@ def _reachable(hand: HandState, others: Sequence[OtherHand], centre_m: np.ndarra
         return -np.inf
     if hand.seen.age_s >= _FORGOTTEN_S:
         return 0.0
-    particle = hand.seen.particle.numpy()
-    before = particle[0, :3] + pivot_offset(particle[:, 3:6])[0]
-    away = float(np.linalg.norm(before - centre_m))
+    away = float(np.linalg.norm(hand.seen.centre_m - centre_m))
     return -0.5 * (away / (_STEP_M + _SPEED_M_S * hand.seen.age_s)) ** 2

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from toftrack.compute.rigid import pivot_offset
 from toftrack.frames import DepthImage
-from toftrack.render.model_image import model_range_image
+from toftrack.render.model_image import cpu_surface, parted, range_image
 from toftrack.render.segmentation import reduce_image
 from toftrack.tracking.filter import predicted_motion
 from toftrack.tracking.model import FittedHand, TrackerModel
@@ -73,8 +73,10 @@ class PlacedHand:
     @cached_property
     def surface_m(self) -> np.ndarray:
         """(H, W) Z of its surface, 0 = none."""
-        pose = self.pose[0].cpu().numpy()
-        return model_range_image(pose, self.fitted.shape, self.k, *self.size)
+        if not bool(self.pose.isfinite().all()):
+            return np.zeros(self.size, np.float32)
+        posed = cpu_surface(self.fitted.shape).pose(self.fitted.refiner.pose(self.pose.cpu()))
+        return range_image(parted(posed)[0], self.k, *self.size)
 
     @cached_property
     def joints_m(self) -> Tensor:

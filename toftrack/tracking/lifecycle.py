@@ -20,21 +20,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from torch import Tensor
-
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.frames import DepthImage
-from toftrack.refinement import shape_fit
-from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.candidates import (
-    HandFrame,
-    best_start,
-    image_term,
-    posterior_of,
-    without_things,
-)
+from toftrack.tracking.candidates import HandFrame, image_term
+from toftrack.tracking.comparing import begun, compared, observed_shape
 from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
 from toftrack.tracking.detect import (
     detect,
@@ -44,16 +35,9 @@ from toftrack.tracking.detect import (
     search,
     search_due,
     start_detection,
-    was_beside,
 )
-from toftrack.tracking.filter import (
-    Found,
-    drawn_to,
-    new_track,
-    predicted_depths,
-    velocity_after,
-)
-from toftrack.tracking.handedness import OTHER_SIDE, body_offset_m
+from toftrack.tracking.filter import Found, drawn_to, predicted_depths, velocity_after
+from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import (
     OtherHand,
     PlacedHand,
@@ -66,8 +50,9 @@ from toftrack.tracking.hands import (
     without,
 )
 from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.seeking import detect_again, search_is_over
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
-from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S, watched_slots
+from toftrack.tracking.watching import OTHER_HAND, WATCHED_TRIED_S
 
 _HIDDEN = 0.3
 """Share of the joints behind something from which on a hand is hidden."""
@@ -75,16 +60,10 @@ _OUT_OF_VIEW = 0.4
 """Share of the joints outside of the image from which on a hand is out of view."""
 _PATIENT = 10
 """Times as long is waited for a hidden hand."""
-_GONE_S = 1.0
-"""A hand that was believed so long ago may have made way for another one."""
-_SWITCHED = 0.4
-"""The side is changed when it has become less probable than this, so that it does not flicker."""
-_LEAST_PRESENT = 0.5
-"""Where a hand is less probable than this, its sides are not compared."""
-_SECOND_S = 0.12
-"""How often a second hand is searched for."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track ends when it was not believed for so long, and is searched for so much later."""
+_COMPARED_EVERY = 4
+"""The sides of one of two hands are compared in every so many frames at most, never both's."""
 _ONE_FRAMES = 4
 """Two tracks that were believed may be on one hand for so many frames."""
 
@@ -126,19 +105,24 @@ def open_hand(
 ) -> HandFrame | Absence:
     """A slot's hand as it goes into a frame: detected, its side compared, segmented, begun.
 
-    Where a track is believed, and its side need not be compared, the detector runs beside the
-    filter; else it is waited for, as everything depends on it.
+    Where a track is believed, or the other hand's is, the detector runs beside the filter, of both
+    sides where they are to be compared (compared_beside); else everything depends on it, and waits.
     """
-    alone, settings, track = without(image, others), model.configured.handedness, hand.track
-    compared = hand.handedness.comparison_due(settings, track is not None, dt_s)
-    if track is not None and not track.doubted and not compared:
-        asked = detection_due(track, model.detector.settings, dt_s)
+    alone, track, mirrored = without(image, others), hand.track, None
+    if track is not None and not (track.doubted and _waits(hand, others)):
+        due = hand.handedness.comparison_due(model.configured.handedness, True, dt_s)
+        if any(other.believed for other in others):  # one hand in a frame, and not in each
+            due = due and (slot + image.index) % _COMPARED_EVERY == 0
+        asked = due or detection_due(track, model.detector.settings, dt_s)
         pending = start_detection(hand, track, alone, model, dt_s) if asked else _nothing
+        if due:
+            other = replace(hand, side=OTHER_SIDE[hand.side])
+            mirrored = start_detection(other, track, alone, model, dt_s)
         hand = replace(hand, handedness=hand.handedness.waited(dt_s))
         detection = NO_DETECTION
     else:
         hand, detection = _detected(hand, others, alone, model, dt_s)
-        hand, detection = _compared(hand, detection, others, alone, model, dt_s)
+        hand, detection = compared(hand, detection, others, alone, model, dt_s)
         hand = observed_shape(hand, detection, model)
         pending, track = _nothing, hand.track
     fitted = model.hand(hand.side, hand.shape)
@@ -150,7 +134,7 @@ def open_hand(
         hand = observed_shape(hand, pending(), model)
         return Absence(slot, replace(hand, track=None), observation)
     if track is None:
-        track = _begun(hand, detection, observation, others, model)
+        track = begun(hand, detection, observation, others, model)
     return HandFrame(
         slot,
         hand,
@@ -163,7 +147,16 @@ def open_hand(
         others,
         image_term(observation, fitted, model),
         model,
+        mirrored,
+        slot + image.index,
     )
+
+
+def _waits(hand: HandState, others: Sequence[OtherHand]) -> bool:
+    """Whether a doubted track waits for the detector: where nothing is surely followed, or a search
+    beside the other hand has found something elsewhere.
+    """
+    return hand.seeking is not None and search_is_over(hand) or not any(o.certain for o in others)
 
 
 def _nothing() -> Detection:
@@ -182,7 +175,10 @@ def _detected(
     A track that is doubted gives way to a hand that is detected elsewhere.
     """
     track, best = hand.track, NO_DETECTION
-    if search_due(hand, model):
+    if hand.seeking is not None:
+        best = detect_again(hand, hand.seeking, image, others, model)
+        hand = replace(hand, seeking=None)
+    elif search_due(hand, model):
         best = search(hand, image, others, model)
         hand = replace(hand, searched_s=0.0)
     if track is None:
@@ -205,101 +201,6 @@ def _left_behind(hand: HandState, model: TrackerModel) -> HandState:
         return replace(hand, track=None)
     handedness = hand.handedness.left(model.configured.handedness)
     return replace(hand, track=None, beside=False, handedness=handedness)
-
-
-def _compared(
-    hand: HandState,
-    detection: Detection,
-    others: tuple[OtherHand, ...],
-    image: DepthImage,
-    model: TrackerModel,
-    dt_s: float,
-) -> tuple[HandState, Detection]:
-    """The hand after its side was compared, where that is due.
-
-    When the other side has become the likelier one, a track of it begins in this frame.
-    """
-    settings, before = model.configured.handedness, hand.handedness
-    due = before.comparison_due(settings, hand.track is not None, dt_s)
-    if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
-        before = before.left(settings)  # what comes may be the other hand
-        if before.given and was_beside(detection, hand.seen):
-            before = before.stranger(hand.side)
-    handedness = before.waited(dt_s)
-    if detection.present < _LEAST_PRESENT or not due:
-        return replace(hand, handedness=handedness), detection
-    other, centre = OTHER_SIDE[hand.side], detection.centre_m.numpy()
-    up = detection.up[None]
-    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other, up)[0]
-    gain = _best_log_posterior(hand, detection, hand.side, others, image, model)
-    gain -= _best_log_posterior(hand, mirrored, other, others, image, model)
-    gain = gain if hand.side == "right" else -gain
-    handedness = handedness.compared(gain, body_offset_m(image, centre), settings)
-    hand = replace(hand, handedness=handedness)
-    if handedness.probability(hand.side) >= _SWITCHED:  # 1 where the side was given
-        return hand, detection
-    return replace(hand, side=other, shape=first_shape(), gesture=None, track=None), mirrored
-
-
-def _best_log_posterior(
-    hand: HandState,
-    detection: Detection,
-    side: str,
-    others: tuple[OtherHand, ...],
-    image: DepthImage,
-    model: TrackerModel,
-) -> float:
-    """Of the best pose that the detector has for a side; -inf where nothing can be a hand."""
-    observation = model.segmentation(
-        image.depth_m, image.k, expected_of(detection), pixels_of(others)
-    )
-    if observation.empty:
-        return -math.inf
-    shape = hand.shape
-    if hand.track is None:
-        first = model.configured.shape
-        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
-    hand = replace(hand, side=side, shape=shape)
-    return _best_start(hand, detection, observation, others, model)[1]
-
-
-def _begun(
-    hand: HandState,
-    detection: Detection,
-    observation: Observation,
-    others: tuple[OtherHand, ...],
-    model: TrackerModel,
-) -> Track:
-    """A track that begins with the best of the detector's poses."""
-    pose, _ = _best_start(hand, detection, observation, others, model)
-    return new_track(pose, model, model.refinement.carry)
-
-
-def _best_start(
-    hand: HandState,
-    detection: Detection,
-    observation: Observation,
-    others: tuple[OtherHand, ...],
-    model: TrackerModel,
-) -> tuple[Tensor, float]:
-    """The best of the detector's poses of a hand, and its log posterior."""
-    fitted, observation = model.hand(hand.side, hand.shape), without_things(observation, detection)
-    # Very different poses are compared: what explains more of the image counts in full.
-    image = image_term(observation, fitted, model, coverage=1.0)
-    posterior = posterior_of(observation, fitted, detection, others, model, image)
-    return best_start(detection, observation, fitted, posterior, model)
-
-
-def observed_shape(hand: HandState, detection: Detection, model: TrackerModel) -> HandState:
-    """The hand with what a detection says of its shape: the length to begin a track with, and
-    whether it still is the hand that was fitted.
-    """
-    if detection.empty:
-        return hand
-    shape, first = hand.shape, model.configured.shape
-    if hand.track is None:
-        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
-    return replace(hand, shape=shape_fit.contradicted(shape, detection, model.fit, first))
 
 
 def close(
@@ -378,25 +279,6 @@ def _state_name(features: ConfidenceFeatures) -> str:
     return "hidden" if features.hidden > _HIDDEN else "searching"
 
 
-def taking_part(state: TrackerState, watch_s: float) -> list[int]:
-    """The slots that a frame is about, the surest first; one without a hand now and then.
-
-    watch_s: see HandednessSettings.
-    """
-    if state.watched:
-        return watched_slots(state, watch_s)
-    vacant = [hand.track is None for hand in state.hands]
-    sought = all(vacant) or state.second_s >= _SECOND_S
-    slots = [slot for slot in range(len(vacant)) if sought or not vacant[slot]]
-    return sorted(slots, key=lambda slot: -sureness(state.hands[slot]))
-
-
-def since_search(before: TrackerState, slots: Sequence[int]) -> float:
-    """Seconds since a slot without a hand was searched for, after a frame about these slots."""
-    sought = len(slots) == 2 and any(hand.track is None for hand in before.hands)
-    return 0.0 if sought else before.second_s
-
-
 def reconcile(
     before: TrackerState,
     after: TrackerState,
@@ -425,7 +307,7 @@ def reconcile(
             continue  # the hand that is asked for: a better one is searched for meanwhile
         if track.age.seconds > (WATCHED_TRIED_S if after.watched else _TRIED_S):
             second_s = 0.0 if known_side(hand) else -_AGAIN_S
-            hands[slot] = replace(hand, track=None)
+            hands[slot] = replace(hand, track=None, tried=LastSeen(track.mean, 0.0))
     wrong = not after.watched and in_wrong_slot(before.hands, hands)
     hands = exchanged(before.hands, hands) if wrong else hands
     return replace(after, hands=tuple(hands), second_s=second_s, merged=merged), wrong

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.pace import Duration, elapsed_s
+from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.hand_detector import Detection
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
@@ -83,6 +84,34 @@ class LastSeen:
         """Whether there was one."""
         return self.age_s < math.inf
 
+    @property
+    def centre_m(self) -> np.ndarray:
+        """(3,) middle of its palm."""
+        particle = self.particle.numpy()
+        centre: np.ndarray = particle[0, :3] + pivot_offset(particle[:, 3:6])[0]
+        return centre
+
+    def after(self, dt_s: float) -> LastSeen:
+        """As time goes on."""
+        return LastSeen(self.particle, self.age_s + dt_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Seeking:
+    """A search of the whole image for a hand that goes on over frames; see seeking.py.
+
+    centres_m: (P, 3) places that were not looked at yet.  heat: (P,) how likely the finder has a
+    hand there.  seen: what the pose network said of the others, and the finder's probability.
+    """
+
+    centres_m: np.ndarray
+    heat: np.ndarray
+    seen: tuple[tuple[Detection, float], ...] = ()
+
+
+NOWHERE = LastSeen(torch.zeros(1, 6), math.inf)
+"""Before anything was seen."""
+
 
 @dataclass(frozen=True, eq=False)
 class HandState:
@@ -97,6 +126,8 @@ class HandState:
     searched_s: how long ago the whole image was searched for this hand.
     watched: nobody asked for it.
     beside: it was believed while the first hand was, too, so that it is another one.
+    seeking: the search for this hand that goes on beside the other one.
+    tried: where a track ended last that was never believed.
     """
 
     side: str
@@ -109,6 +140,8 @@ class HandState:
     searched_s: float = math.inf
     watched: bool = False
     beside: bool = False
+    seeking: Seeking | None = None
+    tried: LastSeen = NOWHERE
 
     @property
     def believed(self) -> bool:
@@ -117,8 +150,12 @@ class HandState:
 
     def after(self, dt_s: float) -> HandState:
         """The hand as time goes on."""
-        seen = replace(self.seen, age_s=self.seen.age_s + dt_s)
-        return replace(self, seen=seen, searched_s=self.searched_s + dt_s)
+        return replace(
+            self,
+            seen=self.seen.after(dt_s),
+            tried=self.tried.after(dt_s),
+            searched_s=self.searched_s + dt_s,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ from toftrack.tracking.candidates import (
     propose,
     without_things,
 )
+from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
 from toftrack.tracking.hands import PlacedHand, others_of, partnered
@@ -38,13 +39,11 @@ from toftrack.tracking.lifecycle import (
     Absence,
     Status,
     close,
-    observed_shape,
     open_hand,
     reconcile,
-    since_search,
-    taking_part,
 )
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.seeking import since_search, sought, start_seeking, taking_part
 from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
@@ -76,12 +75,21 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
     spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     before = state.at(image)
     with spans("detector"):
+        before, seeking = start_seeking(before, image, model, dt_s)
         opened = open_hands(before, image, model, dt_s)
     frames = [one for one in opened if isinstance(one, HandFrame)]
     with spans("filter: rest"):
         filtered = [filtered_frame(frame, dt_s, generator, spans) for frame in frames]
     with spans("detector"):
-        frames = [waited_for(frame) for frame in frames]
+        waited = [waited_for(frame, image) for frame in frames]
+    again = [new.track is not old.track for new, old in zip(waited, frames, strict=True)]
+    frames = waited
+    if any(again):  # the side has changed
+        with spans("filter: rest"):
+            filtered = [
+                filtered_frame(frame, dt_s, generator, spans) if anew else found
+                for frame, found, anew in zip(frames, filtered, again, strict=True)
+            ]
     with spans("refinement"):
         pairs = list(zip(frames, filtered, strict=True))
         candidates = [FilteredFrame.of(frame, found.mean) for frame, found in pairs]
@@ -89,6 +97,8 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
         choices = [choose(row, one, table, dt_s) for row, one in enumerate(candidates)]
     found = [conclude(*pair, one, image, dt_s) for pair, one in zip(pairs, choices, strict=True)]
     found += [no_hand(one, image, model) for one in opened if isinstance(one, Absence)]
+    with spans("detector"):
+        before = sought(before, seeking, model)
     before = replace(before, generator=generator.get_state())
     return reconciled(before, found, image, model, dt_s, spans)
 
@@ -119,12 +129,16 @@ def filtered_frame(
     return run_filter(track, dt_s, frame.image, model, generator, spans, width)
 
 
-def waited_for(frame: HandFrame) -> HandFrame:
-    """The frame with its detection, if that ran beside the filter, and without what it holds."""
+def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
+    """The frame with its detection, if that ran beside the filter, without what the hand holds, and
+    with both sides compared, if that is due.
+    """
     detection = frame.pending()
     if not detection.empty:
         hand = observed_shape(frame.hand, detection, frame.model)
         frame = replace(frame, hand=hand, detection=detection)
+        if frame.mirrored is not None:
+            frame = compared_beside(frame, frame.mirrored(), image)
     seen = without_things(frame.observation, frame.detection)
     if seen is frame.observation:
         return frame
@@ -197,7 +211,8 @@ def conclude(
 def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
     """The estimate of the hand's shape after a believed estimate of its pose."""
     shape, fitted, model = frame.hand.shape, frame.fitted, frame.model
-    if frame.detection.empty or frame.hidden or shape.applied != fitted.applied:
+    busy = (frame.in_turn or 0) % 2 == 1  # of two hands one learns in a frame
+    if busy or frame.detection.empty or frame.hidden or shape.applied != fitted.applied:
         return shape  # of a hand that was given up in this very frame nothing is learned
     return shape_fit.learned(
         shape,
@@ -208,6 +223,7 @@ def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
         keypoints_of(frame.detection, model),
         model.fit,
         fitted.first,
+        fitted.refiner.pose,
     )
 
 

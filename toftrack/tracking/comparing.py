@@ -1,0 +1,190 @@
+"""The sides of a hand compared, and tracks begun, by the best of the detector's poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from torch import Tensor
+
+from toftrack.detector.hand_detector import Detection
+from toftrack.frames import DepthImage
+from toftrack.refinement import shape_fit
+from toftrack.refinement.shape_fit import first_shape
+from toftrack.render.segmentation import Observation
+from toftrack.tracking.candidates import (
+    HandFrame,
+    best_start,
+    image_term,
+    posterior_of,
+    without_things,
+)
+from toftrack.tracking.detect import expected_of, was_beside
+from toftrack.tracking.filter import new_track
+from toftrack.tracking.handedness import OTHER_SIDE, body_offset_m
+from toftrack.tracking.hands import OtherHand, pixels_of, without
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.posterior import ImageTerm
+from toftrack.tracking.state import HandState, Track
+
+_GONE_S = 1.0
+"""A hand that was believed so long ago may have made way for another one."""
+_SWITCHED = 0.4
+"""The side is changed when it has become less probable than this, so that it does not flicker."""
+_LEAST_PRESENT = 0.5
+"""Where a hand is less probable than this, its sides are not compared."""
+
+
+def compared(
+    hand: HandState,
+    detection: Detection,
+    others: tuple[OtherHand, ...],
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
+) -> tuple[HandState, Detection]:
+    """A hand of which no track is believed, after its sides were compared, where that is due.
+
+    When the other side has become the likelier one, a track of it begins in this frame.
+    """
+    settings, before = model.configured.handedness, hand.handedness
+    due = before.comparison_due(settings, hand.track is not None, dt_s)
+    if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
+        before = before.left(settings)  # what comes may be the other hand
+        if before.given and was_beside(detection, hand.seen):
+            before = before.stranger(hand.side)
+    hand = replace(hand, handedness=before.waited(dt_s))
+    if detection.present < _LEAST_PRESENT or not due:
+        return hand, detection
+    other, centre = OTHER_SIDE[hand.side], detection.centre_m.numpy()
+    up = detection.up[None]
+    mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other, up)[0]
+    gain = _best_log_posterior(hand, detection, hand.side, others, image, model)
+    gain -= _best_log_posterior(hand, mirrored, other, others, image, model)
+    hand = _after(replace(hand, handedness=before), gain, detection, image, model)
+    return hand, detection if hand.side != other else mirrored
+
+
+def compared_beside(frame: HandFrame, mirrored: Detection, image: DepthImage) -> HandFrame:
+    """The frame of a track after its sides were compared in the image that it has segmented.
+
+    mirrored: what the detector says of the other side, where it says anything of this one.
+    When the other side has become the likelier one, a track of it begins in this frame.
+    """
+    hand, detection, model = frame.hand, frame.detection, frame.model
+    if detection.present < _LEAST_PRESENT:
+        return frame
+    gain = _best_of_side(frame, detection, hand.side)
+    gain -= _best_of_side(frame, mirrored, OTHER_SIDE[hand.side])
+    after = _after(hand, gain, detection, without(image, frame.others), model)
+    if after.side == hand.side:
+        return replace(frame, hand=after)
+    expected = expected_of(mirrored)
+    other = pixels_of(frame.others)
+    observation = model.segmentation(image.depth_m, image.k, expected, other)
+    if observation.empty:
+        return frame
+    after = observed_shape(after, mirrored, model)
+    fitted = model.hand(after.side, after.shape)
+    return replace(
+        frame,
+        hand=after,
+        track=begun(after, mirrored, observation, frame.others, model),
+        fitted=fitted,
+        observation=observation,
+        expected_m=expected.nearest_m,
+        detection=mirrored,
+        image=image_term(observation, fitted, model),
+    )
+
+
+def _after(
+    hand: HandState, gain: float, detection: Detection, image: DepthImage, model: TrackerModel
+) -> HandState:
+    """The hand after a comparison in which its own side was better by so much; perhaps of the other
+    side, and without a track.
+    """
+    settings, centre = model.configured.handedness, detection.centre_m.numpy()
+    gain = gain if hand.side == "right" else -gain
+    handedness = hand.handedness.compared(gain, body_offset_m(image, centre), settings)
+    hand = replace(hand, handedness=handedness)
+    if handedness.probability(hand.side) >= _SWITCHED:  # 1 where the side was given
+        return hand
+    other = OTHER_SIDE[hand.side]
+    return replace(hand, side=other, shape=first_shape(), gesture=None, track=None)
+
+
+def _best_of_side(frame: HandFrame, detection: Detection, side: str) -> float:
+    """The log posterior of the best pose that the detector has for a side of a track's hand."""
+    fitted = frame.model.hand(side, frame.hand.shape)
+    # As where a track begins, but with what the frame has made of its image.
+    image = replace(frame.image, scorer=fitted.scorer, coverage=1.0)
+    given = detection, frame.observation, frame.others, frame.model
+    return _best_start(replace(frame.hand, side=side), *given, image)[1]
+
+
+def _best_log_posterior(
+    hand: HandState,
+    detection: Detection,
+    side: str,
+    others: tuple[OtherHand, ...],
+    image: DepthImage,
+    model: TrackerModel,
+) -> float:
+    """Of the best pose that the detector has for a side; -inf where nothing can be a hand."""
+    observation = model.segmentation(
+        image.depth_m, image.k, expected_of(detection), pixels_of(others)
+    )
+    if observation.empty:
+        return -math.inf
+    shape = hand.shape
+    if hand.track is None:
+        first = model.configured.shape
+        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
+    hand = replace(hand, side=side, shape=shape)
+    return _best_start(hand, detection, observation, others, model)[1]
+
+
+def begun(
+    hand: HandState,
+    detection: Detection,
+    observation: Observation,
+    others: tuple[OtherHand, ...],
+    model: TrackerModel,
+) -> Track:
+    """A track that begins with the best of the detector's poses."""
+    pose, _ = _best_start(hand, detection, observation, others, model)
+    return new_track(pose, model, model.refinement.carry)
+
+
+def _best_start(
+    hand: HandState,
+    detection: Detection,
+    observation: Observation,
+    others: Sequence[OtherHand],
+    model: TrackerModel,
+    image: ImageTerm | None = None,
+) -> tuple[Tensor, float]:
+    """The best of the detector's poses of a hand, and its log posterior.
+
+    image: the likelihood of that image, if it was made already.
+    """
+    fitted, seen = model.hand(hand.side, hand.shape), without_things(observation, detection)
+    if image is None or seen is not observation:
+        # Very different poses are compared: what explains more of the image counts in full.
+        image = image_term(seen, fitted, model, coverage=1.0)
+    posterior = posterior_of(seen, fitted, detection, others, model, image)
+    return best_start(detection, seen, fitted, posterior, model)
+
+
+def observed_shape(hand: HandState, detection: Detection, model: TrackerModel) -> HandState:
+    """The hand with what a detection says of its shape: the length to begin a track with, and
+    whether it still is the hand that was fitted.
+    """
+    if detection.empty:
+        return hand
+    shape, first = hand.shape, model.configured.shape
+    if hand.track is None:
+        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
+    return replace(hand, shape=shape_fit.contradicted(shape, detection, model.fit, first))
