@@ -132,7 +132,7 @@ def test_crops_are_read_as_the_reference_reads_them() -> None:
     assert np.array_equal(parts[known], seen[known]) and (parts[~known] == -1).all()
 
 
-def test_a_quarter_turn_of_a_crop_turns_what_is_read_and_not_where_the_image_ends() -> None:
+def test_a_quarter_turn_of_a_crop_is_one_of_what_is_read_and_not_of_where_the_image_ends() -> None:
     generator = np.random.default_rng(0)
     side = 2 * CROP
     depth = generator.uniform(0.3, 0.7, (1, side, side)).astype(np.float32)

@@ -79,7 +79,7 @@ def likely_for(hand: HandState, *others: OtherHand):
     ],
     ids=["it was there", "nothing was there", "where the hand was", "where its arm was"],
 )
-def test_a_hand_that_was_beside_the_one_that_left_is_told_from_one_that_comes(
+def test_a_hand_that_was_beside_the_one_that_left_is_not_one_that_comes(
     moved_m: tuple[float, float], there: bool, beside: bool
 ) -> None:
     model, here = right_hand_model(), hand_at()

@@ -113,15 +113,15 @@ def test_two_hands_are_of_different_sides_the_more_surely_the_surer_one_of_them_
 
 def test_of_two_hands_what_is_seen_of_both_says_which_is_of_the_given_side() -> None:
     fit = handedness_settings(given=2.0, partner=2.0)
-    told = HandednessEstimate(given=True, prior=2.0, fits=-0.3)
-    assert told.alone(fit).seems("right") > 0.8
-    seems = [told.beside(HandednessEstimate(fits=fits), fit).seems("right") for fits in (-2, 0, 2)]
+    given = HandednessEstimate(given=True, prior=2.0, fits=-0.3)
+    assert given.alone(fit).seems("right") > 0.8
+    seems = [given.beside(HandednessEstimate(fits=fits), fit).seems("right") for fits in (-2, 0, 2)]
     assert seems[0] > 0.8 > seems[1] > 0.5 > 0.2 > seems[2]
-    assert told.beside(HandednessEstimate(fits=2.0), fit).doubtful("right")
+    assert given.beside(HandednessEstimate(fits=2.0), fit).doubtful("right")
     mirrored = HandednessEstimate(given=True, prior=-2.0, fits=0.3)
     seems_left = mirrored.beside(HandednessEstimate(fits=-2.0), fit).seems("left")
     assert seems_left == pytest.approx(seems[2])
-    assert told.beside(HandednessEstimate(fits=2.0), fit).alone(fit).seems("right") > 0.8
+    assert given.beside(HandednessEstimate(fits=2.0), fit).alone(fit).seems("right") > 0.8
 
 
 def test_what_was_there_before_is_of_the_given_side_only_if_it_clearly_seems_so() -> None:

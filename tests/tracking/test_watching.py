@@ -94,17 +94,17 @@ def test_only_a_hand_that_was_never_beside_the_first_one_can_be_it_after_all() -
 def test_of_two_hands_the_one_that_rather_is_of_the_given_side_is_the_first() -> None:
     settings = handedness_settings()
     state = with_evidence(with_evidence(watching(True, True), 0, fits=-0.6), 1, fits=0.6)
-    told, other = partnered(
+    given, other = partnered(
         (state.hands[0], replace(state.hands[1], side="right")), right_hand_model()
     )
-    assert told.track is not None and other.track is not None
-    followed = replace(told.track, pose=told.track.pose + 0.01)
-    state = replace(state, hands=(replace(told, track=followed), other))
+    assert given.track is not None and other.track is not None
+    followed = replace(given.track, pose=given.track.pose + 0.01)
+    state = replace(state, hands=(replace(given, track=followed), other))
     after = watched_over(state, settings)
     assert after.hands[0].track is other.track and after.hands[1].track is None
     assert after.hands[0].handedness.given and after.second_s == np.inf
-    as_told = with_evidence(with_evidence(state, 0, fits=0.6, partner=0.6), 1, fits=-0.6)
-    assert watched_over(as_told, settings).hands[0].track is followed
+    as_given = with_evidence(with_evidence(state, 0, fits=0.6, partner=0.6), 1, fits=-0.6)
+    assert watched_over(as_given, settings).hands[0].track is followed
 
 
 @pytest.mark.parametrize(
@@ -126,11 +126,11 @@ def test_a_first_hand_that_nobody_believed_makes_way_for_one_that_rather_is_it(
     believed: bool, beside: bool, fits: float, exchanged: bool
 ) -> None:
     state = with_evidence(with_evidence(watching(True, True), 0, fits=-0.2), 1, fits=fits)
-    told, other = state.hands
-    assert told.track is not None and other.track is not None
-    told = replace(told, track=replace(told.track, believed=believed))
+    given, other = state.hands
+    assert given.track is not None and other.track is not None
+    given = replace(given, track=replace(given.track, believed=believed))
     other = replace(other, side="right", beside=beside, track=replace(other.track, believed=beside))
-    after = watched_over(replace(state, hands=(told, other)), handedness_settings())
+    after = watched_over(replace(state, hands=(given, other)), handedness_settings())
     assert (after.hands[0].track is other.track) is exchanged
 
 

@@ -72,8 +72,8 @@ def start_pose_network(
     if isinstance(pose, PoseNet) or not _may_be_shared(pose):
         return functools.partial(run_pose_network, pose, depth_m, k, centres_m, side, up)
     task = _prepared(pose, depth_m, k, centres_m, side, up)
-    _, depth, left, k, centres, turns, hand, out, _ = task.args
-    turn, image = turns[0], _crop(pose, depth, left, k, centres[0], turns[0])
+    _, depth, left, k, centres, rotations, hand, out, _ = task.args
+    turn, image = rotations[0], _crop(pose, depth, left, k, centres[0], rotations[0])
     wait = beside(functools.partial(pose.outputs, image))
 
     def reported() -> NetworkOutput:
@@ -90,8 +90,8 @@ def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
 
 def _reported(task: functools.partial[None]) -> NetworkOutput:
     """What a task of _prepared has written."""
-    _, _, left, _, centres, turns, _, (*out, kinds), _ = task.args
-    parts = tuple(Parts(*one, left) for one in zip(kinds, turns, centres, strict=True))
+    _, _, left, _, centres, rotations, _, (*out, kinds), _ = task.args
+    parts = tuple(Parts(*one, left) for one in zip(kinds, rotations, centres, strict=True))
     numbers = zip(_SHAPES, map(torch.from_numpy, out), strict=True)
     return NetworkOutput(**dict(numbers), parts=parts)
 
@@ -114,7 +114,7 @@ def _prepared(
     ups = [None] * len(centres) if up is None else list(np.asarray(up, np.float64))
     if left:
         ups = [None if one is None else one * MIRROR.numpy() for one in ups]
-    turns = [crop_rotation(*at) for at in zip(centres, ups, strict=True)]
+    rotations = [crop_rotation(*at) for at in zip(centres, ups, strict=True)]
     return functools.partial(
         _propose,
         pose,
@@ -122,7 +122,7 @@ def _prepared(
         left,
         k,
         centres,
-        turns,
+        rotations,
         _mean_hand(side),
         _empty(len(centres)),
         iter(range(len(centres))),
@@ -135,7 +135,7 @@ def _propose(
     left: bool,
     k: np.ndarray,
     centres: np.ndarray,
-    turns: Sequence[np.ndarray],
+    rotations: Sequence[np.ndarray],
     hand: tuple[np.ndarray, ...],
     out: tuple[np.ndarray, ...],
     rows: Iterator[int],
@@ -145,8 +145,8 @@ def _propose(
     Each by itself: a batch takes as long, and what is said of a crop would depend on the others.
     """
     for row in rows:
-        image = _crop(pose, depth, left, k, centres[row], turns[row])
-        _decode(_outputs(pose, image), image, turns[row], centres[row], left, hand, out, row)
+        image = _crop(pose, depth, left, k, centres[row], rotations[row])
+        _decode(_outputs(pose, image), image, rotations[row], centres[row], left, hand, out, row)
 
 
 def _crop(
