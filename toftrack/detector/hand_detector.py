@@ -249,8 +249,12 @@ def merit(detection: Detection, heat: float) -> float:
     """
     odds = math.log(max(heat, 1e-6)) + math.log(max(detection.present, 1e-6))
     odds += 0.5 * math.log(max(detection.right_side, 1e-3))
-    unsure = float(detection.error_m[0]) + 0.5 * float(detection.keypoints.sigma_m.mean())
-    return odds - unsure / _CLEAR_M
+    return odds - doubt_m(detection) / _CLEAR_M
+
+
+def doubt_m(detection: Detection) -> float:
+    """How far off the pose network takes itself to be, metres."""
+    return float(detection.error_m[0]) + 0.5 * float(detection.keypoints.sigma_m.mean())
 
 
 def _apart(centres_m: np.ndarray) -> list[int]:

@@ -46,6 +46,13 @@ class Observation:
         """True when nothing in the frame can be a hand."""
         return not np.isfinite(self.nearest_m)
 
+    @property
+    def hiding_m(self) -> Tensor:
+        """(H, W) Z of what may hide the hand, 0 where nothing may: a thing that it holds does not
+        hide it as what passes in front does, for it is seen by what it does to the fingers.
+        """
+        return self.depth_m if self.thing is None else self.depth_m.masked_fill(self.thing, 0.0)
+
     def to(self, device: torch.device) -> Observation:
         """The same observation on another device."""
         return replace(

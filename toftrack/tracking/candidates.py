@@ -102,7 +102,7 @@ class HandFrame:
     def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
         """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""
         joints = self.fitted.refiner.joints(pose)[0].cpu()
-        return out_of_sight(joints, self.observation.depth_m, self.observation.k)
+        return out_of_sight(joints, self.observation.hiding_m, self.observation.k)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.hand_detector import NO_DETECTION, Detection, doubt_m
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import HandFrame, image_term
@@ -187,7 +187,9 @@ def _detected(
         return hand, NO_DETECTION
     if is_elsewhere(best, track, model, dt_s) and not _stays_watched(hand, others):
         return _left_behind(hand, model), best
-    return hand, detect(hand, track, image, model, dt_s)
+    there = detect(hand, track, image, model, dt_s)
+    # The prediction of a track that is wrong may show the network what keeps it wrong.
+    return hand, there if best.empty or doubt_m(there) <= doubt_m(best) else best
 
 
 def _stays_watched(hand: HandState, others: Sequence[OtherHand]) -> bool:
