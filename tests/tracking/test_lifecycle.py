@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import (
     EMPTY,
@@ -163,6 +164,14 @@ def test_the_detector_runs_beside_the_filter_for_a_believed_hand_only() -> None:
     assert isinstance(beside, HandFrame) and isinstance(before, HandFrame)
     assert beside.detection.empty and not beside.pending().empty
     assert before.pending().empty and not before.detection.empty
+
+
+@pytest.mark.parametrize(("error_m", "taken"), [(0.005, True), (0.02, False)])
+def test_of_a_doubted_hand_the_surer_detection_is_taken(error_m: float, taken: bool) -> None:
+    found = replace(FOUND_HERE, error_m=torch.tensor([error_m]))  # 0.01 where it is predicted
+    frame = opened(tracks()["doubted"], [found]).result
+    assert isinstance(frame, HandFrame)
+    assert (frame.detection is found) is taken
 
 
 def test_a_track_begins_at_the_pose_that_explains_the_image() -> None:
