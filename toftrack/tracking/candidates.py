@@ -187,13 +187,16 @@ def posterior_of(
     model: TrackerModel,
     image: ImageTerm,
     forearm: bool = True,
+    keypoints: float | None = None,
 ) -> Posterior:
     """The posterior of one hand in one frame; terms of weight 0 are left out.
 
+    keypoints: the weight of these, instead of the posterior's own.
     forearm: whether poses of different places are compared. Those of one place share a forearm.
     """
     weights, terms = model.weights, dict[str, Term]()
-    keypoints = 0.0 if detection.empty else weights.keypoints
+    keypoints = weights.keypoints if keypoints is None else keypoints
+    keypoints = 0.0 if detection.empty else keypoints
     if keypoints or weights.overlap:
         terms["joints"] = JointsTerm(
             model.backend.joints_penalty,

@@ -121,7 +121,8 @@ def _best_of_side(frame: HandFrame, detection: Detection, side: str) -> float:
     # As where a track begins, but with what the frame has made of its image.
     image = replace(frame.image, scorer=fitted.scorer, coverage=1.0)
     given = detection, frame.observation, frame.others, frame.model
-    return _best_start(replace(frame.hand, side=side), *given, image)[1]
+    keypoints = frame.model.configured.handedness.keypoints
+    return _best_start(replace(frame.hand, side=side), *given, image, keypoints)[1]
 
 
 def _best_log_posterior(
@@ -143,7 +144,9 @@ def _best_log_posterior(
         first = model.configured.shape
         shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
     hand = replace(hand, side=side, shape=shape)
-    return _best_start(hand, detection, observation, others, model)[1]
+    keypoints = model.configured.handedness.keypoints
+    given = detection, observation, others, model
+    return _best_start(hand, *given, keypoints=keypoints)[1]
 
 
 def begun(
@@ -165,16 +168,17 @@ def _best_start(
     others: Sequence[OtherHand],
     model: TrackerModel,
     image: ImageTerm | None = None,
+    keypoints: float | None = None,
 ) -> tuple[Tensor, float]:
     """The best of the detector's poses of a hand, and its log posterior.
 
-    image: the likelihood of that image, if it was made already.
+    image: the likelihood of that image, if it was made already.  keypoints: see posterior_of.
     """
     fitted, seen = model.hand(hand.side, hand.shape), without_things(observation, detection)
     if image is None or seen is not observation:
         # Very different poses are compared: what explains more of the image counts in full.
         image = image_term(seen, fitted, model, coverage=1.0)
-    posterior = posterior_of(seen, fitted, detection, others, model, image)
+    posterior = posterior_of(seen, fitted, detection, others, model, image, keypoints=keypoints)
     return best_start(detection, seen, fitted, posterior, model)
 
 

@@ -40,6 +40,7 @@ class HandednessSettings:
 
     weight: float
     largest: float
+    keypoints: float
     most: float
     kept: float
     shoulder: float
