@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from toftrack.detector.crops import CROP_M
-from toftrack.detector.network import PARTS
+from toftrack.detector.network import PARTS, SEGMENTS
 
-BACKGROUND_PART, HAND_PART, FOREARM_PART, OTHER_PART, THING_PART = range(5)
-"""The classes, see network.SEGMENTS."""
+BACKGROUND_PART, HAND_PART, THING_PART = 0, 1, SEGMENTS - 1
+"""Of the classes, see network.SEGMENTS."""
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 

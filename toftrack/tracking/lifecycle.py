@@ -185,11 +185,13 @@ def _detected(
         return hand, best
     if not detection_due(track, model.detector.settings, dt_s):
         return hand, NO_DETECTION
-    if is_elsewhere(best, track, model, dt_s) and not _stays_watched(hand, others):
+    elsewhere = is_elsewhere(best, track, model, dt_s)
+    if elsewhere and not _stays_watched(hand, others):
         return _left_behind(hand, model), best
     there = detect(hand, track, image, model, dt_s)
     # The prediction of a track that is wrong may show the network what keeps it wrong.
-    return hand, there if best.empty or doubt_m(there) <= doubt_m(best) else best
+    surer = not (best.empty or elsewhere) and doubt_m(best) < doubt_m(there)
+    return hand, best if surer else there
 
 
 def _stays_watched(hand: HandState, others: Sequence[OtherHand]) -> bool:
