@@ -24,8 +24,7 @@ from toftrack.json_text import parse_json
 from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-detector-training"
-_VERSION = 1
-_OF_OPTIMISER = ("step", "exp_avg", "exp_avg_sq")
+_VERSION = 2
 
 
 @dataclass
@@ -97,8 +96,8 @@ def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
         for key, tensor in getattr(progress, name).state_dict().items():
             arrays[f"{name}.{key}"] = tensor.detach().cpu().numpy()
     for number, state in progress.optimiser.state_dict()["state"].items():
-        for key in _OF_OPTIMISER:
-            arrays[f"optimiser.{number}.{key}"] = state[key].detach().cpu().numpy()
+        for key, tensor in state.items():
+            arrays[f"optimiser.{number}.{key}"] = tensor.detach().cpu().numpy()
     metadata = {
         "format": FORMAT,
         "version": _VERSION,

@@ -145,11 +145,12 @@ def _yield(finger, angles, base_frames, base, lengths, radii, shifts, parts, fra
     for _ in range(14):
         if _gap(finger, 0, angles, base_frames, base, lengths, radii, shifts, parts, frame) >= 0:
             break
+        if finger == 0 and angles[0] < _WIDEST:
+            angles[0] = min(angles[0] + _BACK, _WIDEST)  # away from the palm first, still opposed
+            continue
         for bone in range(3):
             angle = _bending(finger, bone)
             angles[angle] = max(angles[angle] - _BACK, min(_LEAST, angles[angle]))
-        if finger == 0:
-            angles[0] = min(angles[0] + _BACK / 2, max(_WIDEST, angles[0]))
 
 
 @_entry

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 
+import roma
 import torch
 from torch import Tensor
 
@@ -26,8 +27,10 @@ IN_PALM = {
     "ball": 0.14,
     "box": 0.14,
     "tool": 0.14,
+    "odd": 0.18,
 }
-"""How often each thing is held in the palm, of the power grasps; a tool is a handle and a shaft."""
+"""How often each thing is held in the palm, in parts of their sum, of the power grasps; a tool is a
+handle and a shaft, an odd thing a handle of any shape and another part that stands off it."""
 BETWEEN_TIPS = {
     "plate": (0.75, 0.20, 0.10, 0.05),
     "disc": (0.25, 0.15, 0.10, 0.10),
@@ -39,6 +42,8 @@ BETWEEN_TIPS = {
 }
 """How often each thing is held between tips that leave room of up to 5, 15 and 30 mm, and more."""
 PARTS_OF_A_THING = 2
+_OPPOSED_SHARE = 0.65
+"""Hands about to close on a thing in the palm whose thumb stands before the palm."""
 _PHONE_M = ((0.055, 0.095), (0.115, 0.185), (0.0, 0.016))
 """Width, length and thickness of what could be a phone."""
 
@@ -87,7 +92,7 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     z = torch.linalg.cross(y, torch.nn.functional.normalize(dice.normal(n, 3), dim=1))
     z = torch.nn.functional.normalize(z, dim=1)
     rows = torch.stack((torch.linalg.cross(y, z), y, z), 1)
-    place = torch.stack((between(-0.010, 0.008), between(-0.088, -0.062), zero), 1) * size[:, None]
+    place = torch.stack((between(-0.010, 0.008), between(-0.112, -0.062), zero), 1) * size[:, None]
     along = between(-0.6, 0.6)
 
     def at(half: Tensor, offset: Tensor | None = None) -> Tensor:
@@ -138,6 +143,29 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
         _part(BOX, shaft_place, rows, blade, 0 * edge, zero),
         _part(CONE, shaft_place, rows, rod, 0 * edge, zero),
     )
+    # None is as thin as a hammer's handle.
+    oval = torch.stack((between(0.02, 0.042), between(0.02, 0.042), between(0.02, 0.09)), 1)
+    block = torch.stack((between(0.02, 0.035), between(0.03, 0.10), between(0.02, 0.035)), 1)
+    grips = (
+        _part(CONE, at(oval[:, 2]), rows, oval, 0.3 * oval[:, :2].amin(1), zero),
+        _part(BOX, at(block[:, 1]), rows, block, edge, zero),
+    )
+    off = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
+    # Beyond the hand's width along the axis, or before the palm.
+    off = off * torch.tensor([0.03, 0.03, 0.0]) + y * (along.sign() * between(0.04, 0.11))[:, None]
+    off[:, 2] -= between(0.0, 0.06)
+    turned = roma.unitquat_to_rotmat(torch.nn.functional.normalize(dice.normal(n, 4), dim=1))
+    lump = torch.stack((between(0.005, 0.05), between(0.005, 0.06), between(0.003, 0.05)), 1)
+    lumps = (
+        _part(BOX, place + off, turned, _no_phone(lump), 0.2 * lump.amin(1), zero),
+        _part(CONE, place + off, turned, lump, 0.2 * lump.amin(1), zero),
+        _part(BALL, place + off, turned, lump[:, :1].expand(n, 3), zero, zero),
+        _part(RING, place + off, turned, 0.5 * lump + 0.005, zero, zero),
+    )
+    odd = _thing(
+        _chosen(list(grips), dice.rows(len(grips), n)),
+        _chosen(list(lumps), dice.rows(len(lumps), n)),
+    )
     things = {
         "cylinder": _thing(cylinder),
         "cup": _thing(cup),
@@ -146,16 +174,22 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
         "ball": _thing(ball),
         "box": _thing(box),
         "tool": _thing(handle_2, tool),
+        "odd": odd,
     }
     weights = torch.tensor(list(IN_PALM.values()))
     which = torch.multinomial(weights, n, True, generator=dice.generator)
     # Open, the fingers a little bent, the thumb before the palm or beside it.
     fingers = torch.tensor([0.0, -8.0, 14.0, 8.0])
     fingers = fingers + torch.tensor([5.0, 5.0, 9.0, 5.0]) * dice.normal(n, 4, 4)
-    spread = torch.tensor([12.0, 2.0, -8.0, -16.0]) * dice.uniform(n, 1, low=-0.8, high=0.8)
+    spread = torch.tensor([12.0, 2.0, -8.0, -16.0]) * dice.uniform(n, 1, low=-1.8, high=0.8)
     fingers[..., 0] += spread
     thumb = torch.tensor([10.0, -12.0, 0.0, -5.0, 0.0])
     thumb = thumb + torch.tensor([14.0, 8.0, 8.0, 5.0, 8.0]) * dice.normal(n, 5)
+    # Mostly it is opposed: about what is thick it only reaches when it is held away from the palm.
+    opposed = torch.stack((between(15, 45), between(10, 50), between(-25, 8)), 1)
+    ends = torch.tensor([5.0, 8.0]) + torch.tensor([8.0, 10.0]) * dice.normal(n, 2)
+    opposed = torch.cat((opposed, ends), 1)
+    thumb = torch.where(dice.chance(_OPPOSED_SHARE, n, 1), opposed, thumb)
     angles = torch.cat((thumb, fingers.flatten(1)), 1)
     return within_limits(torch.deg2rad(angles)), _chosen([things[name] for name in IN_PALM], which)
 

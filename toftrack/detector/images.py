@@ -99,7 +99,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     away = away * dice.uniform(n, 1, low=0.13, high=0.30)
     present = ~dice.chance(0.16, n)
     pivot = centre + torch.where(present[:, None], near.clamp(-0.09, 0.09), away)
-    left = dice.chance(0.3, n)
+    left = dice.chance(0.25, n)
     views = random_views(n, dice)
     hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
     labels = hands.labels.clone()

@@ -157,6 +157,12 @@ class PoseNet(nn.Module):
         """Where it is."""
         return self.anchors.device
 
+    @property
+    def ends(self) -> tuple[Tensor, ...]:
+        """Weights of the first layer and of the last ones."""
+        ends = (self.stem[0], self.heads, self.keypoints, self.painted)
+        return tuple(one.get_parameter("weight") for one in ends)
+
     def forward(self, image: Tensor) -> Proposed:
         """See the class."""
         return self.decode(image, *self.features(image))
@@ -245,6 +251,11 @@ class Finder(nn.Module):
     def device(self) -> torch.device:
         """Where it is."""
         return self.heads.weight.device
+
+    @property
+    def ends(self) -> tuple[Tensor, ...]:
+        """Weights of the first layer and of the last one."""
+        return self.body[0].get_parameter("weight"), self.heads.weight
 
     def forward(self, image: Tensor) -> Found:
         """See the class."""

@@ -26,9 +26,11 @@ from toftrack.detector.things_numba import draw_part
 
 _entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
-    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK,
-) = range(10)  # fmt: skip
-SENSOR_TERMS = 10
+    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE,
+) = range(12)  # fmt: skip
+SENSOR_TERMS = 12
+_ONE_SURFACE_M = 0.03
+"""A camera's filter smooths over steps of less than this."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,9 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     HOLES: share of missing pixels.  STEP: of the readings at 0.5 m.  SHADOW: pixels without
     readings beside near edges.  RANGE: nothing is read beyond.  PATCHES: how many patches miss.
     BLUR: 1 mixes with neighbours on one surface.  DARK: 1 = the forearm is not read.
+    SMOOTH: pixels to each side over which the camera's own filter averages one surface; the folds
+    of a fist are lost in it.  COARSE: step of the readings at any distance, as of images that were
+    kept with 8 bits.
     """
     light = dice.chance(0.25, n)
     terms = torch.zeros(n, SENSOR_TERMS)
@@ -64,6 +69,9 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     terms[:, PATCHES] = torch.where(dice.chance(0.15, n), dice.uniform(n, low=1, high=4), 0.0)
     terms[:, BLUR] = dice.chance(0.3, n).float()
     terms[:, DARK] = dice.chance(0.06, n).float()
+    wide = dice.uniform(n, low=1.0, high=3.5).floor()
+    terms[:, SMOOTH] = torch.where(dice.chance(0.3, n), wide, 0.0)
+    terms[:, COARSE] = torch.where(dice.chance(0.1, n), dice.uniform(n, low=0.003, high=0.012), 0.0)
     return terms
 
 
@@ -178,7 +186,28 @@ def _draw(centre, axes, whiten, label, lens, depth, labels):
 
 
 @compiled
-def _sense(sensor, lens, state, depth, labels, clean):
+def _smooth(reach, width, height, depth, scratch):
+    """Each reading becomes the mean of those about it that lie on the same surface."""
+    for v in range(height):
+        for u in range(width):
+            scratch[v, u] = depth[v, u]
+    for v in range(height):
+        for u in range(width):
+            z = scratch[v, u]
+            if z <= 0:
+                continue
+            total, count = np.float32(0), 0
+            for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
+                for u2 in range(max(u - reach, 0), min(u + reach, width - 1) + 1):
+                    other = scratch[v2, u2]
+                    if other > 0 and abs(other - z) < _ONE_SURFACE_M:
+                        total += other
+                        count += 1
+            depth[v, u] = total / count
+
+
+@compiled
+def _sense(sensor, lens, state, depth, labels, clean, scratch):
     """What a sensor makes of a picture: `depth` in place, from `clean`."""
     width, height = int(lens[3]), int(lens[4])
     blur, flying = sensor[BLUR] > 0, sensor[FLYING]
@@ -207,6 +236,12 @@ def _sense(sensor, lens, state, depth, labels, clean):
             if step > 0:
                 z = math.floor(z / step + 0.5) * step
             depth[v, u] = max(z, 0.0)
+    if sensor[SMOOTH] > 0:
+        _smooth(int(sensor[SMOOTH]), width, height, depth, scratch)
+    if sensor[COARSE] > 0:
+        for v in range(height):
+            for u in range(width):
+                depth[v, u] = math.floor(depth[v, u] / sensor[COARSE] + 0.5) * sensor[COARSE]
     if shadow > 0:
         for v in range(height):
             for u in range(width - 1):
@@ -250,7 +285,7 @@ def _take(
     near = np.empty(count, np.float32)
     six = np.empty((6, TILE * TILE), np.float32)
     rays = six[0], six[1], six[2], six[3], six[4], six[5]
-    clean = np.zeros(depth.shape[1:], np.float32)
+    clean, scratch = np.zeros(depth.shape[1:], np.float32), np.empty(depth.shape[1:], np.float32)
     for n in range(len(depth)):
         lens = lenses[n]
         state[0] = seeds[n]
@@ -289,4 +324,4 @@ def _take(
                 near,
                 rays,
             )
-        _sense(sensors[n], lens, state, depth[n], labels[n], clean)
+        _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch)

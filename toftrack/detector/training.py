@@ -26,6 +26,7 @@ from tqdm import tqdm
 from toftrack.detector.checkpoints import Checkpoints, Progress
 from toftrack.detector.images import Crops, WideImages, crop_images, wide_images
 from toftrack.detector.losses import finder_loss, pose_losses
+from toftrack.detector.muon import Muon
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.shapes import shape_bank
 from toftrack.detector.weights import go_on_from
@@ -34,7 +35,9 @@ from toftrack.errors import ToftrackError
 _READY = 6
 """Batches that wait to be trained on."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-Network = TypeVar("Network", bound=nn.Module)
+_DECAY = 0.02
+"""Of the weights, times the learning rate, in each step."""
+Network = TypeVar("Network", PoseNet, Finder)
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ def _train(
 ) -> tuple[Network, Course]:
     _keep_memory()
     steps = math.ceil(schedule.images / schedule.batch)
-    optimiser = torch.optim.AdamW(network.parameters(), schedule.rate, weight_decay=0.02)
+    optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     averaged = deepcopy(network)
     progress = Progress(network, averaged, optimiser)
     settings = {"images": schedule.images, "batch": schedule.batch, "rate": schedule.rate}

@@ -59,6 +59,10 @@ _THUMBS = {
 _APART, _TOGETHER, _ANY, _CROSSED = range(4)
 _SPREAD = (12.0, 2.0, -8.0, -16.0)
 """Degrees of abduction of fingers that are spread; about -1 times it, they touch."""
+_BENT_SPREAD = (-1.5, 1.0)
+"""What bent fingers have of it: the tips of hooked ones lie side by side, those of a fist converge
+on one place of the palm, so that their knuckles' axes do not."""
+_BENT_DEG = 70.0
 
 
 class Shown(NamedTuple):
@@ -195,11 +199,12 @@ def _fingers(flexion: Tensor, spread: Tensor, generator: torch.Generator) -> Ten
     )
     part = kinds.gather(1, spread[:, None])
     own = torch.where(spread == _TOGETHER, 1.2, 4.0)[:, None]
+    bent_part = _BENT_SPREAD[0] + (_BENT_SPREAD[1] - _BENT_SPREAD[0]) * _uniform(generator, n, 1)
+    bent = (flexion[..., :2].amax(2) / _BENT_DEG).clamp(0, 1)
+    part = torch.lerp(part.expand(n, 4), bent_part.expand(n, 4), bent)
     abduction = torch.tensor(_SPREAD) * part + own * _normal(generator, n, 4)
     across = torch.tensor([-14.0, 10.0, 0.0, 0.0])
     abduction = torch.where((spread == _CROSSED)[:, None], abduction + across, abduction)
-    # A bent finger has no room to the sides.
-    abduction = abduction * (1 - 0.006 * flexion[..., 0].clamp(0, 90))
     return torch.deg2rad(torch.cat((abduction[..., None], flexion), 2).flatten(1))
 
 

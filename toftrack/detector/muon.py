@@ -1,0 +1,83 @@
+"""An optimiser that steps along orthogonal matrices (Jordan, "Muon", 2024).
+
+The moving average of a weight matrix's gradients is replaced by the nearest matrix whose singular
+values all are near 1, found by five Newton-Schulz iterations, so that rare directions are learned
+as fast as common ones. Steps have the size of Adam's (Liu et al., "Muon is scalable for LLM
+training", 2025). Biases, norms and the last layers are left to AdamW. With it a training of 176 000
+images is where one with AdamW alone would be after about 1.8 times as many: docs/lab/detector.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+_ITERATIONS = 5
+_QUINTIC = (3.4445, -4.7750, 2.0315)
+"""Of the polynomial that brings singular values in 0 .. 1 to about 1, by Jordan."""
+_ADAM_SIZE = 0.2
+"""Root mean square of a step of Adam, which that of a matrix is brought to."""
+_MOMENTUM = 0.95
+_BETAS, _EPS = (0.9, 0.999), 1e-8
+
+
+class Muon(torch.optim.Optimizer):
+    """Muon for inner matrices, AdamW for all else, with one learning rate and weight decay."""
+
+    def __init__(self, network: nn.Module, last: Iterable[Tensor], rate: float, decay: float):
+        """last: weights that make the network's outputs or see its inputs, left to AdamW."""
+        others = {id(weight) for weight in last}
+        inner = [p for p in network.parameters() if p.ndim >= 2 and id(p) not in others]
+        chosen = {id(p) for p in inner}
+        rest = [p for p in network.parameters() if id(p) not in chosen]
+        groups = [{"params": inner, "inner": True}, {"params": rest, "inner": False}]
+        super().__init__(groups, {"lr": rate, "weight_decay": decay})
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> None:
+        """One step along the gradients that are there."""
+        for group in self.param_groups:
+            for weight in group["params"]:
+                if weight.grad is None:
+                    continue
+                weight.mul_(1 - group["lr"] * group["weight_decay"])
+                along = self._inner(weight) if group["inner"] else self._adam(weight)
+                weight.add_(along, alpha=-group["lr"])
+
+    def _inner(self, weight: Tensor) -> Tensor:
+        state = self.state[weight]
+        if not state:
+            state["exp_avg"] = torch.zeros_like(weight)
+        average = state["exp_avg"].lerp_(weight.grad, 1 - _MOMENTUM)
+        ahead = weight.grad.lerp(average, _MOMENTUM)
+        matrix = orthogonal(ahead.flatten(1))
+        return matrix.view_as(weight) * (_ADAM_SIZE * math.sqrt(max(matrix.shape)))
+
+    def _adam(self, weight: Tensor) -> Tensor:
+        state = self.state[weight]
+        if not state:
+            state["step"] = torch.zeros(())
+            state["exp_avg"] = torch.zeros_like(weight)
+            state["exp_avg_sq"] = torch.zeros_like(weight)
+        state["step"] += 1
+        count = float(state["step"])
+        mean = state["exp_avg"].lerp_(weight.grad, 1 - _BETAS[0])
+        square = state["exp_avg_sq"].lerp_(weight.grad.square(), 1 - _BETAS[1])
+        size = (square / (1 - _BETAS[1] ** count)).sqrt_().add_(_EPS)
+        return mean / (1 - _BETAS[0] ** count) / size
+
+
+def orthogonal(matrix: Tensor) -> Tensor:
+    """(M, N) with the same singular vectors and singular values between about 0.7 and 1.2."""
+    a, b, c = _QUINTIC
+    wide = matrix.shape[0] <= matrix.shape[1]
+    x = (matrix if wide else matrix.mT).bfloat16()
+    x = x / (x.norm() + 1e-7)
+    for _ in range(_ITERATIONS):
+        square = x @ x.mT
+        x = a * x + (b * square + c * square @ square) @ x
+    return (x if wide else x.mT).to(matrix.dtype)
