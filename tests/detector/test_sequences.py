@@ -40,7 +40,7 @@ def test_the_joints_lie_below_the_rendered_surface() -> None:
     below = np.array(depths)
     # Joints are within the flesh, or hidden by a finger or a thing; on edges, pixels mix.
     assert (below > -0.02).mean() > 0.9
-    assert (below < 0.03).mean() > 0.6
+    assert (below < 0.03).mean() > 0.5
     assert np.mean(nothing_there) < 0.4
 
 

@@ -18,6 +18,7 @@ from toftrack.tracking.confidence import (
     NO_FEATURES,
     ConfidenceFeatures,
     ConfidenceModel,
+    WholeHand,
     confidence_features,
 )
 from toftrack.tracking.lifecycle import judge
@@ -37,6 +38,8 @@ GOOD = ConfidenceFeatures(
     other_side=-3.0,
     unseen=0.0,
     hidden=0.0,
+    off_hand=0.0,
+    on_thing=0.0,
     young=0.0,
 )
 K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
@@ -45,7 +48,7 @@ K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 def model_of(**changes: object) -> ConfidenceModel:
     """Of the score alone: log odds 4 at a good score, 0 at 2 below, and so on; no memory."""
     usual = {"memory": 0.0, "intercept": 4.0, "weights": {"log_score": 2.0}}
-    numbers = {"confidence": 0.5, "give_up": 0.1, "patience": 5}
+    numbers = {"confidence": 0.5, "give_up": 0.1, "patience": 5, "whole": WholeHand(0.0, 0.0, {})}
     return confidence_model(**(usual | numbers | changes))
 
 
@@ -158,3 +161,23 @@ def test_joints_out_of_sight_are_counted() -> None:
     u = (200.0 * joints[:, 0] / joints[:, 2] + 87.5).round()
     half[:, : int(u.median())] = 0.3
     assert 0.2 < features_of(joints, half).hidden < 0.8
+
+
+def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:
+    whole = WholeHand(0.5, 3.0, {"other_side": -2.0})
+    model = model_of(whole=whole)
+    for other_side, lost in ((0.0, False), (1.4, False), (1.6, True)):
+        found = judge(followed(), with_odds(4.0, other_side=other_side), FRAME_S, 1.0, 0.0, model)
+        assert found.lost == lost and found.whole_odds == pytest.approx(3.0 - 2.0 * other_side)
+        assert found.confidence == pytest.approx(1 / (1 + math.exp(-4.0)))
+    with pytest.raises(ToftrackError, match="lost.whole.weights.luck is unknown"):
+        WholeHand(0.5, 0.0, {"luck": 1.0})
+    with pytest.raises(ToftrackError, match=r"lost\.whole\.least"):
+        WholeHand(1.5, 0.0, {})
+
+
+def test_odds_of_the_whole_hand_are_smoothed_like_the_others() -> None:
+    model = model_of(whole=WholeHand(0.0, 0.0, {"other_side": -1.0}), memory=0.75)
+    track = replace(followed(), whole_odds=4.0)
+    found = judge(track, with_odds(0.0, other_side=0.0), FRAME_S, 1.0, 0.0, model)
+    assert found.whole_odds == pytest.approx(3.0)

@@ -21,7 +21,7 @@ from helpers.rendered import (
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import SAME_PLACE_M
 from toftrack.frames import DepthImage
-from toftrack.tracking.confidence import NO_FEATURES
+from toftrack.tracking.confidence import NO_FEATURES, WholeHand
 from toftrack.tracking.filter import Filtered, Found
 from toftrack.tracking.lifecycle import (
     Status,
@@ -44,7 +44,8 @@ def image() -> DepthImage:
 
 
 LOST = confidence_model(memory=0.0, confidence=0.3, believe=0.6, second=0.8, give_up=0.1)
-PLAIN = replace(LOST, intercept=0.0, weights={"log_score": 1.0}, patience=5)
+WHOLE = WholeHand(0.0, 0.0, {})
+PLAIN = replace(LOST, intercept=0.0, weights={"log_score": 1.0}, patience=5, whole=WHOLE)
 """Log odds are just the feature log_score."""
 HIDDEN = {"hidden": 0.5}
 

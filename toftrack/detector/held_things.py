@@ -140,7 +140,7 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     rod = torch.stack((between(0.002, 0.006), between(0.002, 0.006), shaft_long), 1)
     tool = torch.where(
         dice.chance(0.5, n)[:, None],
-        _part(BOX, shaft_place, rows, blade, 0 * edge, zero),
+        _part(BOX, shaft_place, rows, _no_phone(blade), 0 * edge, zero),
         _part(CONE, shaft_place, rows, rod, 0 * edge, zero),
     )
     # None is as thin as a hammer's handle.

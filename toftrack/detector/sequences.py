@@ -17,7 +17,7 @@ from torch import Tensor
 
 from toftrack.archives import read_archive
 from toftrack.detector.dice import Dice
-from toftrack.detector.hands import HAND, posed_hands, random_rotations
+from toftrack.detector.hands import HAND, posed_hands, random_rotations, random_views
 from toftrack.detector.images import random_scenes
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
 from toftrack.detector.shapes import ShapeBank
@@ -29,7 +29,7 @@ CAMERAS = ((176, 144, 200.0), (176, 144, 200.0), (320, 240, 280.0), (512, 424, 3
 """Columns, rows and focal length in pixels."""
 _KEY = 14
 """Frames between two poses that are drawn."""
-_STILL_SHARE = 0.4
+_STILL_SHARE = 0.55
 """Scenes in which the fingers do not move; in hands.HOLDING of them the hand holds a thing."""
 
 
@@ -59,7 +59,8 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
     left, empty = dice.chance(0.5, 1), bool(dice.chance(0.125, 1))
     still = bool(dice.chance(_STILL_SHARE, 1))
     place = _places(keys, width / focal, height / focal, dice)
-    rotations = _rotations(keys, dice)
+    views = random_views(1, dice)
+    rotations = _rotations(keys, dice, views)
     angles = _held(shown_poses(keys, generator), dice)
     scene = int(torch.randint(2**31 - 1, (1,), generator=generator))
     sensor = random_sensors(1, dice)
@@ -82,7 +83,7 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         same = Dice(torch.Generator().manual_seed(scene))
         hands = posed_hands(bank, pivot[None], left, same, HAND, turn[None], pose)
         labels = torch.where(hands.labels == HAND, -1, hands.labels) if empty else hands.labels
-        scenes = random_scenes(hands, labels, bank, same, others=0.2, objects=0.06)
+        scenes = random_scenes(hands, labels, bank, same, others=0.2, objects=0.06, views=views)
         depth, which = take_pictures(scenes, lens, sensor, (height, width), dice)
         images.append(depth[0])
         joints.append(hands.joints_m[0])
@@ -135,9 +136,9 @@ def _places(keys: int, wide: float, high: float, dice: Dice) -> Tensor:
     return torch.stack((x, y, z), 1)
 
 
-def _rotations(keys: int, dice: Dice) -> Tensor:
-    """(keys, 3, 3) rotations that follow from one another."""
-    rotations = [random_rotations(1, dice)[0]]
+def _rotations(keys: int, dice: Dice, views: Tensor) -> Tensor:
+    """(keys, 3, 3) rotations that follow from one another, for a camera at views (1,)."""
+    rotations = [random_rotations(1, dice, views)[0]]
     for _ in range(keys - 1):
         step = roma.rotvec_to_rotmat(0.35 * dice.normal(3))
         rotations.append(step @ rotations[-1])

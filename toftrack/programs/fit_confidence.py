@@ -44,19 +44,22 @@ _HELD_OUT = 5
 class Observed:
     """What the tracker's estimates of T frames were formed from, and how right they were.
 
-    features: (T, S).  right: (T,) every joint is within 40 mm.  joints: of each joint.
+    features: (T, S).  right: (T,) every joint is within 40 mm.  whole: (T,) they are on average.
+    joints: of each joint.
     sequence: (T,) numbers of the sequences.
     """
 
     features: np.ndarray
     right: np.ndarray
+    whole: np.ndarray
     joints: JointRows
     sequence: np.ndarray
 
     def of(self, rows: np.ndarray) -> Observed:
         """Some of the frames."""
         joints = self.joints.of(rows)
-        return Observed(self.features[rows], self.right[rows], joints, self.sequence[rows])
+        here = self.features[rows], self.right[rows], self.whole[rows]
+        return Observed(*here, joints, self.sequence[rows])
 
 
 def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
@@ -97,7 +100,14 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     seen = _together([part for part in parts if part is not None])
     kept = seen.sequence % _HELD_OUT == 0
-    log_odds, summary, lines = _fitted_frames(seen, kept)
+    log_odds, summary, lines = _fitted_frames(seen, seen.right, kept)
+    _, of_whole, whole_lines = _fitted_frames(seen, seen.whole, kept)
+    summary["whole"] = of_whole
+    lines += [
+        "whole: # whether the hand as a whole is right: its mean joint error is below 40 mm",
+        "  _target_: toftrack.tracking.confidence.WholeHand",
+        *("  " + line for line in whole_lines),
+    ]
     seen = with_doubt(seen, log_odds, _memory(asked.overrides))
     more, joint_lines = _fitted_joints(seen, kept)
     summary |= more
@@ -111,6 +121,7 @@ def main(arguments: list[str] | None = None) -> None:
             stream,
             features=seen.features,
             right=seen.right,
+            whole=seen.whole,
             sequence=seen.sequence,
             **{f"joint_{name}": values for name, values in seen.joints._asdict().items()},
         )
@@ -138,10 +149,10 @@ def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
 
 
 def _fitted_frames(
-    seen: Observed, kept: np.ndarray
+    seen: Observed, y: np.ndarray, kept: np.ndarray
 ) -> tuple[np.ndarray, dict[str, Any], list[str]]:
-    """Log odds (T,), figures about the kept frames, and the lines of the configuration."""
-    x, y = seen.features, seen.right
+    """Log odds (T,) of y, figures about the kept frames, and the lines of the configuration."""
+    x = seen.features
     intercept, weights = fitted_weights(x[~kept], y[~kept])
     log_odds = intercept + x @ weights
     p = expit(log_odds[kept])
@@ -257,16 +268,24 @@ def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -
             continue
         joints, there = estimate.joints_m.astype(np.float64), bool(sequence.visible[index])
         off = sequence.joints_m[index] - joints
-        near = there & (np.linalg.norm(off, axis=1) < RIGHT_M)
+        far = np.linalg.norm(off, axis=1)
+        near = there & (far < RIGHT_M)
+        whole = there & (far.mean() < RIGHT_M)
         error_cm = 100 * np.einsum("jab,jb->ja", joint_axes(joints), off)
         counted = there and not estimate.lost
         rows.append(
-            (info.features.values(), near.all(), info.joint_features, error_cm, near, counted)
+            (
+                info.features.values(),
+                near.all(),
+                whole,
+                *(info.joint_features, error_cm, near, counted),
+            )
         )
     if not rows:
         return None
-    features, right, *joint_rows = map(np.array, zip(*rows, strict=True))
-    return Observed(features, right, JointRows(*joint_rows), np.full(len(rows), number))
+    features, right, whole, *joint_rows = map(np.array, zip(*rows, strict=True))
+    joints = JointRows(*joint_rows)
+    return Observed(features, right, whole, joints, np.full(len(rows), number))
 
 
 def _together(parts: list[Observed]) -> Observed:
@@ -274,6 +293,7 @@ def _together(parts: list[Observed]) -> Observed:
     return Observed(
         np.concatenate([part.features for part in parts]),
         np.concatenate([part.right for part in parts]),
+        np.concatenate([part.whole for part in parts]),
         JointRows(*map(np.concatenate, joints)),
         np.concatenate([part.sequence for part in parts]),
     )

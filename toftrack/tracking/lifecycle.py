@@ -84,7 +84,8 @@ class Status:
 
     state_name, lost: as Estimate has them.  ends: the track does not go on.
     confidence: probability that every joint is within 40 mm; NaN where nothing says.
-    log_odds: the same, smoothed over time.  doubtful: as Track has it, with this frame.
+    log_odds: the same, smoothed over time.  whole_odds: likewise of the mean joint error.
+    doubtful: as Track has it, with this frame.
     """
 
     state_name: str
@@ -92,6 +93,7 @@ class Status:
     ends: bool = False
     confidence: float = math.nan
     log_odds: float = 0.0
+    whole_odds: float = 0.0
     doubtful: Duration = Duration()
 
 
@@ -238,6 +240,7 @@ def close(
         age=track.age.extended(dt_s),
         doubtful=status.doubtful,
         log_odds=status.log_odds,
+        whole_odds=status.whole_odds,
         doubted=status.lost,
         believed=track.believed or not status.lost,
         unseen_s=track.unseen_s + dt_s if frame.detection.empty else 0.0,
@@ -262,9 +265,10 @@ def judge(
     side: probability that it is of the right side; of the other one every finger is wrong.
     new: confidence that a track needs which was not believed yet.
     """
-    now, kept = model.log_odds(features), model.memory ** (dt_s / FRAME_S)
-    smooth = kept * track.log_odds + (1 - kept) * now if track.age.begun else now
-    confidence = 1 / (1 + math.exp(-min(max(smooth, -30.0), 30.0)))
+    kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
+    smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
+    whole = kept * track.whole_odds + (1 - kept) * model.whole.log_odds(features)
+    confidence = _probability(smooth)
     # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
     doubtful = track.doubtful.extended(dt_s, 2 * FRAME_S)
     doubtful = doubtful if confidence < model.give_up else Duration()
@@ -272,8 +276,13 @@ def judge(
     ends = patience > 0 and doubtful.begun and doubtful.reached(patience)
     # Whether it is a hand at all does not depend on whose it is.
     lost = (confidence < new and not track.believed) or side * confidence < model.confidence
+    lost = lost or _probability(whole) < model.whole.least
     name = _state_name(features) if lost else "tracking"
-    return Status(name, lost, ends, side * confidence, smooth, doubtful)
+    return Status(name, lost, ends, side * confidence, smooth, whole, doubtful)
+
+
+def _probability(log_odds: float) -> float:
+    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
 
 
 def _state_name(features: ConfidenceFeatures) -> str:

@@ -38,7 +38,8 @@ class Track:
     age: how long it has been followed.
     doubtful: how long its confidence has been below what a track is kept for.
     challenged: how long a pose of another place has been better.
-    log_odds: that the estimate is right, smoothed over time.
+    log_odds: that the estimate is right, smoothed over time.  whole_odds: that its mean error is
+        below 40 mm, likewise.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
     unseen_s: how long ago the pose network was asked about it.
     features, joint_features: of the last estimate, (21, J); see confidence.py.
@@ -59,6 +60,7 @@ class Track:
     doubtful: Duration = Duration()
     challenged: Duration = Duration()
     log_odds: float = 0.0
+    whole_odds: float = 0.0
     doubted: bool = False
     believed: bool = False
     unseen_s: float = 0.0
