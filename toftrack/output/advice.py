@@ -156,7 +156,8 @@ def lost_frame(
 
 def _other_side(insight: StepInfo | None) -> bool | None:
     features = None if insight is None else insight.features
-    return None if features is None else features.other_side > 0
+    # Minus the log of the probability that it is this side.
+    return None if features is None else features.other_side > math.log(2)
 
 
 def _apparent_m(insight: StepInfo | None) -> float | None:

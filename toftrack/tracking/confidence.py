@@ -40,7 +40,8 @@ class ConfidenceFeatures:
     likeliest_off: mean distance from the likeliest hypothesis.
     expected_error, unsure: the network's own expected error of its likeliest hypothesis, and the
         mean standard deviation of its keypoints, likewise.
-    absent, other_side: log odds that there is no hand, or that it is the other one.
+    absent, other_side: minus the log of the network's probability that there is a hand, and that it
+        is this one: a hand that is turned round looks like the other one.
     unseen: share of the joints that lie outside of the image.
     hidden: share of the joints that lie behind something.
     off_hand, on_thing: shares of the fingers' joints where the network sees neither hand nor thing
@@ -104,8 +105,8 @@ def confidence_features(
         likeliest_off=_log_cm(float(off[0])),
         expected_error=_log_cm(float(detection.error_m[0])),
         unsure=_log_cm(float(detection.keypoints.sigma_m.numpy().mean())),
-        absent=_log_odds(1 - detection.present),
-        other_side=_log_odds(1 - detection.right_side),
+        absent=_surprise(detection.present),
+        other_side=_surprise(detection.right_side),
         unseen=unseen,
         hidden=hidden,
         off_hand=float(np.count_nonzero((kinds != HAND_PART) & (kinds != THING_PART))) / len(kinds),
@@ -129,9 +130,8 @@ def _log_cm_of(*columns_m: np.ndarray) -> np.ndarray:
     return values
 
 
-def _log_odds(probability: float) -> float:
-    p = min(max(probability, _LEAST), 1 - _LEAST)
-    return math.log(p / (1 - p))
+def _surprise(probability: float) -> float:
+    return -math.log(min(max(probability, _LEAST), 1.0))
 
 
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
