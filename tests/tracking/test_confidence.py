@@ -38,8 +38,6 @@ GOOD = ConfidenceFeatures(
     other_side=0.05,
     unseen=0.0,
     hidden=0.0,
-    off_hand=0.0,
-    on_thing=0.0,
     young=0.0,
 )
 K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])

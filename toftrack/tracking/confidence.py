@@ -20,7 +20,6 @@ from torch import Tensor
 from toftrack.checks import check_number
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import Detection
-from toftrack.detector.parts import HAND_PART, THING_PART
 from toftrack.errors import ToftrackError
 from toftrack.hand.regions import joint_axes
 from toftrack.tracking.confidence_numba import count_out_of_sight, seen_around
@@ -44,8 +43,6 @@ class ConfidenceFeatures:
         is this one: a hand that is turned round looks like the other one.
     unseen: share of the joints that lie outside of the image.
     hidden: share of the joints that lie behind something.
-    off_hand, on_thing: shares of the fingers' joints where the network sees neither hand nor thing
-        in the image, and where it sees a thing.
     young: 1 in the first frame of a track, falling.
     """
 
@@ -60,8 +57,6 @@ class ConfidenceFeatures:
     other_side: float
     unseen: float
     hidden: float
-    off_hand: float
-    on_thing: float
     young: float
 
     def values(self) -> list[float]:
@@ -96,7 +91,6 @@ def confidence_features(
     off = np.linalg.norm(at - detection.joints_m.numpy(), axis=-1).mean(1)
     likely = off[detection.log_probability.numpy() > math.log(_LIKELY)]
     unseen, hidden = out_of_sight(joints, depth_m, k)
-    kinds = detection.parts.at(at[1:])
     return ConfidenceFeatures(
         log_score=math.log(max(score, _LEAST)),
         keypoints_off=_log_cm(float(keypoints.mean())),
@@ -109,8 +103,6 @@ def confidence_features(
         other_side=_surprise(detection.right_side),
         unseen=unseen,
         hidden=hidden,
-        off_hand=float(np.count_nonzero((kinds != HAND_PART) & (kinds != THING_PART))) / len(kinds),
-        on_thing=float(np.count_nonzero(kinds == THING_PART)) / len(kinds),
         young=1 / (1 + age_s / FRAME_S),
     )
 
@@ -150,8 +142,6 @@ JOINT_FEATURES = (
     "before",
     "misfit",
     "pixel",
-    "off_hand",
-    "on_thing",
     "doubt",
 )
 """Features of a joint, each a number of order 1 that is larger where it speaks against it:
@@ -164,7 +154,6 @@ behind, before: how much farther or nearer it is than where it should be below t
     seen there, in units of 20 mm, 50 mm at most.
 misfit: minus the log of the image's score.
 pixel: log of a pixel's width there, in millimetres.
-off_hand, on_thing: 1 where the network sees neither hand nor thing in the image, or a thing.
 doubt: log(1 + exp(-x)) of the log odds x that the whole estimate is right.
 """
 KINDS = (
@@ -177,7 +166,7 @@ COLUMNS = ("ray", "finger", "across", "odds")
 hand/regions.py, and the log odds that the joint is within 40 mm."""
 KIND_OF_JOINT = np.array([0, 1, 2, 3, 4] + 4 * [5, 6, 7, 8])
 """(21,) rows of KINDS."""
-_KEYPOINTS, _PARTS = slice(0, 3), slice(9, 11)
+_KEYPOINTS = slice(0, 3)
 """The features that come from the network."""
 _BELOW_M = np.array([0.012, 0.010, 0.010, 0.008, 0.004] + 4 * [0.010, 0.008, 0.007, 0.004])
 """How far joints are below the surface that a camera sees, roughly."""
@@ -251,29 +240,26 @@ def joint_features(
     """(21, J) in the order of JOINT_FEATURES.
 
     joints_m: (21, 3).
-    last: (21, J) of the frame before; in a frame without a detection, the network's hold.
+    last: (21, J) of the frame before; in a frame without a detection, those of its keypoints hold.
     score: of the image, 0..1.  log_odds: that the estimate is right.
     depth_m: (H, W), 0 = no reading.  k: (3, 3).
     """
     joints = joints_m.astype(np.float64)
     features = np.empty((len(joints), len(JOINT_FEATURES)))
     if detection.empty:
-        features[:, _KEYPOINTS], features[:, _PARTS] = last[:, _KEYPOINTS], last[:, _PARTS]
+        features[:, _KEYPOINTS] = last[:, _KEYPOINTS]
     else:
         keypoints = detection.keypoints
         off = np.linalg.norm(joints - keypoints.points_m.numpy(), axis=1)
         worst = np.concatenate(([off.mean()], off[1:].reshape(5, 4).max(1).repeat(4)))
         features[:, _KEYPOINTS] = _log_cm_of(keypoints.sigma_m.numpy(), off, worst)
-        kinds = detection.parts.at(joints)
-        features[:, 9] = (kinds != HAND_PART) & (kinds != THING_PART)
-        features[:, 10] = kinds == THING_PART
     outside, unread, surface = seen_around(joints, _NEAREST_M, _AROUND_M, depth_m, k).T
     deeper = np.where(np.isnan(surface), 0.0, joints[:, 2] - surface - _BELOW_M)
     features[:, 3], features[:, 4] = outside, unread
     features[:, 5], features[:, 6] = deeper.clip(0, 0.05) / 0.02, (-deeper).clip(0, 0.05) / 0.02
     features[:, 7] = -math.log(max(score, 1e-3))
     features[:, 8] = np.log(1e3 * np.maximum(joints[:, 2], _NEAREST_M) / k[0, 0])
-    features[:, 11] = np.logaddexp(0.0, -log_odds)
+    features[:, 9] = np.logaddexp(0.0, -log_odds)
     return features
 
 
