@@ -117,7 +117,7 @@ def test_of_two_hands_what_is_seen_of_both_says_which_is_of_the_given_side() -> 
     assert given.alone(fit).seems("right") > 0.8
     seems = [given.beside(HandednessEstimate(fits=fits), fit).seems("right") for fits in (-2, 0, 2)]
     assert seems[0] > 0.8 > seems[1] > 0.5 > 0.2 > seems[2]
-    assert given.beside(HandednessEstimate(fits=2.0), fit).doubtful("right", again=True)
+    assert given.beside(HandednessEstimate(fits=2.0), fit).doubtful("right")
     mirrored = HandednessEstimate(given=True, prior=-2.0, fits=0.3)
     seems_left = mirrored.beside(HandednessEstimate(fits=-2.0), fit).seems("left")
     assert seems_left == pytest.approx(seems[2])
@@ -147,11 +147,10 @@ def test_a_body_is_seen_beside_the_hand_only_where_it_is_large_and_near_enough()
     assert place(0.8, slice(60, 62)) == 0.0, "a pole"
 
 
-@pytest.mark.parametrize(("fits", "first", "again"), [(-0.1, False, False), (-0.3, False, True)])
-def test_a_hand_that_comes_back_is_doubted_sooner(fits: float, first: bool, again: bool) -> None:
+@pytest.mark.parametrize(("fits", "doubted"), [(-0.1, False), (-0.3, True)])
+def test_a_new_hand_is_doubted_where_the_first_comparisons_are_against_it(
+    fits: float, doubted: bool
+) -> None:
     given = HandednessEstimate(given=True, prior=2.0, fits=fits, comparisons=1)
-    assert given.doubtful("right", again=False) is first
-    assert given.doubtful("right", again=True) is again
-    surely = replace(given, fits=-0.6)
-    assert surely.doubtful("right", again=False) and surely.doubtful("right", again=True)
-    assert not replace(surely, comparisons=5).doubtful("right", again=True)
+    assert given.doubtful("right") is doubted
+    assert not replace(given, comparisons=5).doubtful("right")

@@ -20,10 +20,8 @@ _BODY_COMPARISONS = 20
 """Comparisons over which the body's place is averaged."""
 _FIRST_COMPARISONS = 5
 """Whatever a given side is taken for, a new hand is compared so often before it is sure."""
-_AGAINST, _AGAINST_FIRST = -0.2, -0.5
-"""Log odds from which on they speak against the given side: of a hand that comes back, beside which
-another one may have been, and of the first hand that is seen.
-"""
+_AGAINST = -0.2
+"""Log odds from which on the first comparisons speak against the given side."""
 _OF_EITHER = 0.25
 """So much of the user's word is left where two hands are seen: it does not say which one it is of.
 """
@@ -110,15 +108,11 @@ class HandednessEstimate:
         log_odds = self.log_odds if side == "right" else -self.log_odds
         return 1 / (1 + math.exp(-log_odds))
 
-    def doubtful(self, side: str, again: bool) -> bool:
-        """Whether the first comparisons of a new hand speak against the side that was given.
-
-        again: a hand was believed before.
-        """
+    def doubtful(self, side: str) -> bool:
+        """Whether the first comparisons of a new hand speak against the side that was given."""
         new = self.given and self.comparisons < _FIRST_COMPARISONS
         compared = self.fits + self.partner
-        against = _AGAINST if again else _AGAINST_FIRST
-        return new and (compared if side == "right" else -compared) < against
+        return new and (compared if side == "right" else -compared) < _AGAINST
 
     def contradicted(self, side: str, settings: HandednessSettings) -> bool:
         """Whether what is followed is surely the other hand than the one that was given."""

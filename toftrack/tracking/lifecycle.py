@@ -219,7 +219,7 @@ def close(
     first = model.lost.again if frame.hand.seen.ever else model.lost.believe
     new = model.lost.second if second else first
     seems = whose.seems(frame.hand.side) if whose.given else 1.0
-    if whose.doubtful(frame.hand.side, frame.hand.seen.ever):
+    if whose.doubtful(frame.hand.side):
         new = math.inf
     side = whose.probability(frame.hand.side)
     status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
