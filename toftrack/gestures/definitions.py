@@ -92,8 +92,8 @@ def _define(name: str, fingers: str, tips: _Features) -> Definition:
     return Definition(name, low, high)
 
 
-# What is near a gesture and none: a hooked hand is no fist, one bent at the knuckles not relaxed, and
-# neither is one with the little finger up, alone or beside the index finger.
+# What is near a gesture and none: a hooked hand is no fist, one bent at the knuckles not relaxed,
+# and neither is one with the little finger up, alone or with the index finger.
 _NONE = tuple(_define(OTHER, fingers, _ANY) for fingers in ("HHHH", "FFFF", "CCCS", "SCCS"))
 _ALL = (
     _define("palm", "SSSS", _OPEN),
