@@ -38,26 +38,26 @@ class Muon(torch.optim.Optimizer):
         super().__init__(groups, {"lr": rate, "weight_decay": decay})
 
     @torch.no_grad()
-    def step(self, closure: Any = None) -> None:
-        """One step along the gradients that are there."""
+    def step(self, closure: Any = None) -> Any:
+        """One step along the gradients that are there; `closure` is not asked for."""
         for group in self.param_groups:
             for weight in group["params"]:
                 if weight.grad is None:
                     continue
                 weight.mul_(1 - group["lr"] * group["weight_decay"])
-                along = self._inner(weight) if group["inner"] else self._adam(weight)
+                along = (self._inner if group["inner"] else self._adam)(weight, weight.grad)
                 weight.add_(along, alpha=-group["lr"])
 
-    def _inner(self, weight: Tensor) -> Tensor:
+    def _inner(self, weight: Tensor, gradient: Tensor) -> Tensor:
         state = self.state[weight]
         if not state:
             state["exp_avg"] = torch.zeros_like(weight)
-        average = state["exp_avg"].lerp_(weight.grad, 1 - _MOMENTUM)
-        ahead = weight.grad.lerp(average, _MOMENTUM)
+        average = state["exp_avg"].lerp_(gradient, 1 - _MOMENTUM)
+        ahead = gradient.lerp(average, _MOMENTUM)
         matrix = orthogonal(ahead.flatten(1))
         return matrix.view_as(weight) * (_ADAM_SIZE * math.sqrt(max(matrix.shape)))
 
-    def _adam(self, weight: Tensor) -> Tensor:
+    def _adam(self, weight: Tensor, gradient: Tensor) -> Tensor:
         state = self.state[weight]
         if not state:
             state["step"] = torch.zeros(())
@@ -65,8 +65,8 @@ class Muon(torch.optim.Optimizer):
             state["exp_avg_sq"] = torch.zeros_like(weight)
         state["step"] += 1
         count = float(state["step"])
-        mean = state["exp_avg"].lerp_(weight.grad, 1 - _BETAS[0])
-        square = state["exp_avg_sq"].lerp_(weight.grad.square(), 1 - _BETAS[1])
+        mean = state["exp_avg"].lerp_(gradient, 1 - _BETAS[0])
+        square = state["exp_avg_sq"].lerp_(gradient.square(), 1 - _BETAS[1])
         size = (square / (1 - _BETAS[1] ** count)).sqrt_().add_(_EPS)
         return mean / (1 - _BETAS[0] ** count) / size
 

@@ -284,8 +284,8 @@ def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -
     if not rows:
         return None
     features, right, whole, *joint_rows = map(np.array, zip(*rows, strict=True))
-    joints = JointRows(*joint_rows)
-    return Observed(features, right, whole, joints, np.full(len(rows), number))
+    of_joints = JointRows(*joint_rows)
+    return Observed(features, right, whole, of_joints, np.full(len(rows), number))
 
 
 def _together(parts: list[Observed]) -> Observed:
