@@ -136,7 +136,8 @@ def test_a_hidden_joint_says_so() -> None:
         model().judge(np.stack(list(reported.values()), 1)) for reported in (before, after)
     )
     assert (wider[behind] > sigma[behind]).all() and (wider[~behind] == sigma[~behind]).all()
-    assert (less <= sure).all() and (less[~behind] == sure[~behind]).all()
+    # Nor any less near for that alone; it is no longer in front of what is seen.
+    assert np.abs(less - sure).max() < 0.002 and (less[~behind] == sure[~behind]).all()
 
 
 def test_what_is_out_of_the_image_or_not_read_is_distinguished() -> None:

@@ -53,8 +53,8 @@ class Muon(torch.optim.Optimizer):
         if not state:
             state["exp_avg"] = torch.zeros_like(weight)
         average = state["exp_avg"].lerp_(gradient, 1 - _MOMENTUM)
-        ahead = gradient.lerp(average, _MOMENTUM)
-        matrix = orthogonal(ahead.flatten(1))
+        nesterov = gradient.lerp(average, _MOMENTUM)
+        matrix = orthogonal(nesterov.flatten(1))
         return matrix.view_as(weight) * (_ADAM_SIZE * math.sqrt(max(matrix.shape)))
 
     def _adam(self, weight: Tensor, gradient: Tensor) -> Tensor:
