@@ -28,7 +28,7 @@ from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.programs import command_line
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
 from toftrack.safe_files import whole_file, write_whole
-from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES
+from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES, ConfidenceModel
 from toftrack.tracking.model import TrackerModel
 from toftrack.views.pictures import write_picture
 
@@ -45,8 +45,7 @@ class Observed:
     """What the tracker's estimates of T frames were formed from, and how right they were.
 
     features: (T, S).  right: (T,) every joint is within 40 mm.  whole: (T,) they are on average.
-    joints: of each joint.
-    sequence: (T,) numbers of the sequences.
+    joints: of each joint.  sequence: (T,) numbers of the sequences.
     """
 
     features: np.ndarray
@@ -103,12 +102,14 @@ def main(arguments: list[str] | None = None) -> None:
     log_odds, summary, lines = _fitted_frames(seen, seen.right, kept)
     _, of_whole, whole_lines = _fitted_frames(seen, seen.whole, kept)
     summary["whole"] = of_whole
+    settings = _settings(asked.overrides)
     lines += [
         "whole: # whether the hand as a whole is right: its mean joint error is below 40 mm",
         "  _target_: toftrack.tracking.confidence.WholeHand",
+        f"  least: {settings.whole.least} # not fitted: what stands there may stay",
         *("  " + line for line in whole_lines),
     ]
-    seen = with_doubt(seen, log_odds, _memory(asked.overrides))
+    seen = with_doubt(seen, log_odds, settings.memory)
     more, joint_lines = _fitted_joints(seen, kept)
     summary |= more
     write_whole(asked.output / "confidence.json", json.dumps(summary, indent=1) + "\n")
@@ -171,12 +172,12 @@ def _fitted_frames(
     return log_odds, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
 
 
-def _memory(overrides: list[str]) -> float:
-    """The part of the log odds that the tracker takes from the frames before."""
+def _settings(overrides: list[str]) -> ConfidenceModel:
+    """The tracker's confidence as it is."""
     model = make_tracker(*overrides).model
     if not isinstance(model, TrackerModel):
         raise ToftrackError("fit_confidence fits lost=calibrated; leave experiment=paper out")
-    return model.lost.memory
+    return model.lost
 
 
 def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
