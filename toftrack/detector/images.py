@@ -255,8 +255,8 @@ def random_scenes(
 ) -> Scenes:
     """Everything around a batch of hands; another hand with probability `others`, or as given.
 
-    labels: (N, E) of the hands' ellipsoids.  barred: (N,) how likely bars are.  views: (N,) where the cameras are, see scenes; None =
-    before the persons.
+    labels: (N, E) of the hands' ellipsoids.  barred: (N,) how likely bars are.
+    views: (N,) where the cameras are, see scenes; None = before the persons.
     """
     n = len(labels)
     if other is None:

@@ -54,8 +54,8 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     readings beside near edges.  RANGE: nothing is read beyond.  PATCHES: how many patches miss.
     BLUR: 1 mixes with neighbours on one surface.  DARK: 1 = the forearm is not read.
     SMOOTH: pixels to each side over which the camera's own filter averages one surface, 1 cm at
-    most; the folds of a fist are lost in it.  COARSE: step of the readings at any distance, as of images that were
-    kept with 8 bits.
+    most; the folds of a fist are lost in it.  COARSE: step of the readings at any distance, as of
+    images that were kept with 8 bits.
     """
     light = dice.chance(0.25, n)
     terms = torch.zeros(n, SENSOR_TERMS)
@@ -73,7 +73,8 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     terms[:, DARK] = dice.chance(0.06, n).float()
     wide = dice.uniform(n, low=1.0, high=3.5).floor()
     terms[:, SMOOTH] = torch.where(dice.chance(0.3, n), wide, 0.0)
-    terms[:, COARSE] = torch.where(dice.chance(0.15, n), dice.uniform(n, low=0.003, high=0.012), 0.0)
+    coarse = dice.uniform(n, low=0.003, high=0.012)
+    terms[:, COARSE] = torch.where(dice.chance(0.15, n), coarse, 0.0)
     return terms
 
 

@@ -18,7 +18,6 @@ from toftrack.detector.hands import ABOVE, BACKGROUND, FRONT, HEAD, THING, Hands
 from toftrack.detector.skin import Skins
 from toftrack.detector.things_numba import PART
 
-
 BARS = 6
 """The most bars side by side."""
 
