@@ -47,6 +47,9 @@ _COVERED = 0.6
 """Share of the joints behind something from which on a hand is held where it was."""
 _UNSEEN = 0.3
 """Share of the joints out of sight from which on the detector is not considered."""
+_PRESENT, _APART_M = 0.9, 0.06
+"""Nevertheless it is where it surely sees a hand in sight whose joints are, on average, so far from
+those of the other hand."""
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no candidates."""
 _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
@@ -101,8 +104,11 @@ class HandFrame:
 
     def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
         """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""
-        joints = self.fitted.refiner.joints(pose)[0].cpu()
-        return out_of_sight(joints, self.observation.hiding_m, self.observation.k)
+        return self.joints_out_of_sight(self.fitted.refiner.joints(pose)[0].cpu())
+
+    def joints_out_of_sight(self, joints_m: Tensor) -> tuple[float, float]:
+        """The same of joints (21, 3)."""
+        return out_of_sight(joints_m, self.observation.hiding_m, self.observation.k)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +117,8 @@ class FilteredFrame:
 
     pose: (1, 27) the filter's estimate.
     detection: as far as it is considered: not of a hand that is mostly out of sight, where the
-        detector sees another one in the rest.  keypoints: as the refinement takes them.
+        detector sees another one in the rest.
+    emerges: it was hidden, and the detector surely sees it.  keypoints: as the refinement takes them.
     """
 
     frame: HandFrame
@@ -120,13 +127,15 @@ class FilteredFrame:
     keypoints: Keypoints
     posterior: Posterior
     seen: SeenPoints
+    emerges: bool = False
 
     @classmethod
     def of(cls, frame: HandFrame, mean: Tensor) -> FilteredFrame:
         """mean: (1, 6 + d) of the particles."""
         pose = frame.model.decode(mean, frame.track.offset)
         unseen = sum(frame.out_of_sight(pose)) > _UNSEEN
-        detection = NO_DETECTION if unseen else frame.detection
+        emerges = (unseen or frame.hidden) and _emerges(frame.detection, frame)
+        detection = frame.detection if emerges or not unseen else NO_DETECTION
         posterior = posterior_of(
             frame.observation,
             frame.fitted,
@@ -137,12 +146,18 @@ class FilteredFrame:
             forearm=_is_elsewhere(detection, pose, frame),
         )
         keypoints = keypoints_of(detection, frame.model)
-        return cls(frame, pose, detection, keypoints, posterior, seen_points(frame.observation))
+        seen = seen_points(frame.observation)
+        return cls(frame, pose, detection, keypoints, posterior, seen, emerges)
 
     @property
     def covered(self) -> bool:
         """Whether so much of the hand is hidden that it is held where it was."""
-        return self.frame.out_of_sight(self.frame.track.pose)[1] > _COVERED
+        return not self.emerges and self.frame.out_of_sight(self.frame.track.pose)[1] > _COVERED
+
+    @property
+    def hidden(self) -> bool:
+        """Whether something hides part of the hand, and not even the detector sees it."""
+        return self.frame.hidden and not self.emerges
 
     def refined(self, poses: Tensor) -> Tensor:
         """Hands (N, 27) brought onto the seen points and the keypoints."""
@@ -214,6 +229,16 @@ def posterior_of(
     if weights.forearm and forearm:
         terms["forearm"] = ForearmTerm(arm_sight(observation), weights.forearm)
     return Posterior(image, fitted.refiner.joints, terms)
+
+
+def _emerges(detection: Detection, frame: HandFrame) -> bool:
+    """Whether the detector surely sees the hand where its prediction is hidden."""
+    if detection.empty or detection.present < _PRESENT:
+        return False
+    joints = detection.joints_m[0]
+    away = [float((other.joints_m - joints).norm(dim=1).mean()) for other in frame.others]
+    in_sight = sum(frame.joints_out_of_sight(joints)) <= _UNSEEN
+    return in_sight and all(one > _APART_M for one in away)
 
 
 def _is_elsewhere(detection: Detection, pose: Tensor, frame: HandFrame) -> bool:

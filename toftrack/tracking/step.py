@@ -124,8 +124,10 @@ def filtered_frame(
 ) -> Filtered:
     """The particles of a hand in a frame."""
     model, track = frame.model, frame.track
-    # A hand that was nearly lost is searched farther away, but not ever farther.
-    width = 1.0 + (track.doubtful.seconds / FRAME_S if model.lost.patience else 0.0)
+    # A hand that was nearly lost is searched farther away, but not ever farther; not one that is
+    # hidden, which would be taken for what is seen beside it: its own forearm, first of all.
+    wider = model.lost.patience and not frame.hidden
+    width = 1.0 + (track.doubtful.seconds / FRAME_S if wider else 0.0)
     return run_filter(track, dt_s, frame.image, model, generator, spans, width)
 
 
@@ -155,9 +157,10 @@ def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) ->
         track.challenged,
         track.log_odds,
         not track.age.begun,
+        filtered.emerges,
     )
     asked, settings = not frame.detection.empty, frame.model.hysteresis
-    return select(mine, joints(mine.pose), incumbent, dt_s, asked, frame.hidden, settings)
+    return select(mine, joints(mine.pose), incumbent, dt_s, asked, filtered.hidden, settings)
 
 
 def conclude(
