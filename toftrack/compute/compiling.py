@@ -102,7 +102,7 @@ if hasattr(os, "register_at_fork"):
 
 def called(kernel: Any, message: str, *arguments: object) -> None:
     """Call an entry point; the message is logged if it must be compiled before."""
-    if kernel.signatures:
+    if kernel.overloads:
         kernel(*arguments)
         return
     with announced(message):
@@ -111,4 +111,4 @@ def called(kernel: Any, message: str, *arguments: object) -> None:
 
 def must_be_compiled(kernel: Any) -> bool:
     """Whether an entry point's code is not on the disk, but can be kept there."""
-    return not kernel.signatures and can_be_kept() and not kernel._cache.is_kept()
+    return not kernel.overloads and can_be_kept() and not kernel._cache.is_kept()

@@ -313,7 +313,7 @@ def _rows(tensor: Tensor) -> np.ndarray:
 
 def motions() -> Motions:
     """The compiled motions; compiles them if need be, about a second once on a machine."""
-    if not difference_rows.signatures:
+    if not difference_rows.overloads:
         with announced("filter: compiling its numba kernels (once, about 1 s)"):
             row = torch.zeros(1, 7)
             difference(compose(row, row), row)

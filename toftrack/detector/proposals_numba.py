@@ -85,7 +85,7 @@ def start_pose_network(
 
 def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
     """Whether other threads may compute: torch has threads of its own, and needs the lock."""
-    return isinstance(pose, OnnxPoseNet) and bool(decode_at.signatures)
+    return isinstance(pose, OnnxPoseNet) and bool(decode_at.overloads)
 
 
 def _reported(task: functools.partial[None]) -> NetworkOutput:

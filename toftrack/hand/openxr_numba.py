@@ -23,7 +23,7 @@ def openxr_hand_compiled(joints_m: np.ndarray, state: np.ndarray, rig: OpenXRRig
     joints, state = np.asarray(joints_m, np.float64), np.asarray(state, np.float64)
     mirror = -1.0 if rig.mirrored else 1.0
     given = (joints, state, *rig[:3], mirror, position, orientation)
-    if place.signatures:
+    if place.overloads:
         place(*given)
     else:
         with announced("compiling the joints of OpenXR (once)"):

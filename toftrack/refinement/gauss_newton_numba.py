@@ -180,7 +180,7 @@ class CompiledRefiner:
             _array(surface.centres_m[:-1]),
             _array(surface.axes_m[:-1]),
         )
-        if not refine_hands.signatures:
+        if not refine_hands.overloads:
             with announced("refine: compiling the numba kernel (once, about 5 s)"):
                 none = torch.zeros(0, 27)
                 seen = SeenPoints(torch.ones(1, 3), torch.zeros(1, 1, 2), torch.eye(3), (1, 1))

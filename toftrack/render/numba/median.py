@@ -115,7 +115,7 @@ def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
     """
     rows, columns = (len(range(offset, size, factor)) for size in image.shape)
     out = np.empty((rows, columns), np.float32)
-    if _thinned.signatures:
+    if _thinned.overloads:
         _thinned(image, factor, offset, out)
     else:
         with announced("segmentation: compiling the numba kernel (once, about 2 s)"):

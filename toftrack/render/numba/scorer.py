@@ -52,7 +52,7 @@ class NumbaScorer:
 
     def _compile(self) -> None:
         """The first call of a process, with a message if it takes long."""
-        if score_hands.signatures:
+        if score_hands.overloads:
             return
         with announced("renderer: compiling the numba kernel (once, about 6 s)"):
             image = torch.zeros(2, 2)
