@@ -31,6 +31,7 @@ from toftrack.tracking.candidates import (
     schedule,
     without_things,
 )
+from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import Track
@@ -120,6 +121,42 @@ def test_a_covered_hand_is_held_where_it_was() -> None:
     assert mine.source.tolist() == [Source.HELD]
     assert torch.equal(mine.pose, covered.frame.track.pose)
     assert len(table.of_hand(1)) > 3, "the other one is not held up by it"
+
+
+def emerging(
+    beside_m: float = 0.02, other_m: float | None = None, **changes: object
+) -> FilteredFrame:
+    """A hand that is covered where it was, and that the detector sees before that.
+
+    other_m: where another hand is, likewise; None = there is none.
+    """
+    hand = filtered(0.0, covered=True)
+    detection = replace(detection_of(hand_at(beside_m, 0.29)), **changes)
+    frame = replace(hand.frame, detection=detection)
+    if other_m is not None:
+        none = np.zeros(frame.observation.depth_m.shape, bool)
+        joints = detection_of(hand_at(other_m, 0.29)).joints_m[0]
+        other = OtherHand(joints, joints[9].numpy(), True, True, none, none)
+        frame = replace(frame, others=(other,))
+    return FilteredFrame.of(frame, frame.track.mean)
+
+
+def test_a_covered_hand_that_the_detector_surely_sees_emerges() -> None:
+    found = emerging()
+    assert found.emerges and not found.covered and not found.hidden
+    assert len(table_of(found).of_source(Source.DETECTOR))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"present": 0.5}, {"other_m": 0.04}, {"beside_m": 0.5}],
+    ids=["it is not sure", "it sees the other hand", "beside the image"],
+)
+def test_else_it_stays_covered(changes: dict[str, float]) -> None:
+    found = emerging(**changes)
+    assert not found.emerges and found.covered and found.detection.empty
+    assert table_of(found).source.tolist() == [Source.HELD]
+    assert emerging(other_m=-0.2).emerges, "the other hand is elsewhere"
 
 
 def test_a_hand_mostly_out_of_sight_is_not_compared_with_the_detector() -> None:

@@ -89,6 +89,8 @@ def test_a_hand_that_was_beside_the_one_that_left_is_not_one_that_comes(
     scene = model.segmentation(image.depth_m, image.k, None, None)
     seen = seen_at(here, 0.4)
     assert was_beside(detection_of(other), replace(seen, scene=scene)) is beside
+    later = replace(seen, scene=scene).after(0.2)
+    assert was_beside(detection_of(other), later) is beside, "it is known as time goes on"
     assert not was_beside(detection_of(other), seen), "nobody says what was there"
     assert not was_beside(NO_DETECTION, replace(seen, scene=scene))
 

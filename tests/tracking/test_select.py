@@ -56,6 +56,7 @@ def random_incumbent(draw: np.random.Generator, table: Hypotheses) -> Incumbent:
         Duration(float(draw.choice((0.0, 0.04, 0.08)))),
         draw.normal(0, 2),
         new,
+        bool(draw.random() < 0.3),
     )
 
 
@@ -77,7 +78,8 @@ def reference(
     if detected:
         leads = not hidden and value[best] - value[base] > s.place_lead
         challenged = challenged.extended(dt_s) if leads else Duration()
-        if leads and (track.new or challenged.reached(s.place_frames)):
+        at_once = track.new or (track.emerges and track.log_odds < -2.4)
+        if leads and (at_once or challenged.reached(s.place_frames)):
             return best, True, None, 0.0, Duration()
     others = [i for i in rows if i not in places and sources[i] > Source.DYNAMICS]
     far = [i for i in others if away[i].max() > 0.025]
@@ -132,6 +134,7 @@ class Followed:
     new: bool = False
     detected: bool = True
     hidden: bool = False
+    emerges: bool = False
     pose: torch.Tensor = field(default_factory=pose)
     choice: Choice | None = None
     frames: int = 0
@@ -149,6 +152,7 @@ class Followed:
             Duration() if before is None else before.challenged,
             self.log_odds,
             self.new and not self.frames,
+            self.emerges,
         )
         joints = joints_of(table.pose)
         found = select(table, joints, incumbent, self.dt_s, self.detected, self.hidden, SETTINGS)
@@ -308,6 +312,18 @@ def test_another_place_never_wins_while_the_hand_is_hidden() -> None:
     assert Followed(hidden=True, new=True).until(OTHER_PLACE, Source.DETECTOR, 5.0, most=1) == 0
     track.hidden = False
     assert track.until(OTHER_PLACE, Source.DETECTOR, 5.0) == SETTINGS.place_frames
+
+
+@pytest.mark.parametrize(
+    ("log_odds", "emerges", "frames"),
+    [(-4.0, True, 1), (-4.0, False, SETTINGS.place_frames), (0.0, True, SETTINGS.place_frames)],
+    ids=["it emerges", "nothing hid it", "it was not wrong"],
+)
+def test_a_hand_that_emerges_elsewhere_is_gone_to_at_once(
+    log_odds: float, emerges: bool, frames: int
+) -> None:
+    track = Followed(log_odds=log_odds, emerges=emerges)
+    assert track.until(OTHER_PLACE, Source.DETECTOR, 1.1 * SETTINGS.place_lead) == frames
 
 
 def test_a_new_track_goes_to_a_better_place_at_once() -> None:

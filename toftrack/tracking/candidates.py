@@ -118,7 +118,8 @@ class FilteredFrame:
     pose: (1, 27) the filter's estimate.
     detection: as far as it is considered: not of a hand that is mostly out of sight, where the
         detector sees another one in the rest.
-    emerges: it was hidden, and the detector surely sees it.  keypoints: as the refinement takes them.
+    keypoints: as the refinement takes them.
+    emerges: it was hidden, and the detector surely sees it.
     """
 
     frame: HandFrame

@@ -215,7 +215,7 @@ def close(
     """What is thought of a frame's estimate, the track as of the frame, and the hand last seen."""
     model, track = frame.model, frame.track
     whose = frame.hand.handedness
-    second = any(other.believed and not other.watched for other in frame.others)
+    second = any(other.believed for other in frame.others)
     first = model.lost.again if frame.hand.seen.ever else model.lost.believe
     new = model.lost.second if second else first
     seems = whose.seems(frame.hand.side) if whose.given else 1.0

@@ -95,7 +95,7 @@ class LastSeen:
 
     def after(self, dt_s: float) -> LastSeen:
         """As time goes on."""
-        return LastSeen(self.particle, self.age_s + dt_s)
+        return replace(self, age_s=self.age_s + dt_s)
 
 
 @dataclass(frozen=True, eq=False)
