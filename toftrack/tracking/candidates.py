@@ -47,9 +47,11 @@ _COVERED = 0.6
 """Share of the joints behind something from which on a hand is held where it was."""
 _UNSEEN = 0.3
 """Share of the joints out of sight from which on the detector is not considered."""
+_HOPELESS = -2.4
+"""Log odds below which the last estimate was surely wrong: 8 %."""
 _PRESENT, _APART_M = 0.9, 0.06
-"""Nevertheless it is where it surely sees a hand in sight whose joints are, on average, so far from
-those of the other hand."""
+"""After such an estimate it is nevertheless, where it surely sees a hand in sight whose joints are,
+on average, so far from those of the other hand."""
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no candidates."""
 _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
@@ -119,7 +121,7 @@ class FilteredFrame:
     detection: as far as it is considered: not of a hand that is mostly out of sight, where the
         detector sees another one in the rest.
     keypoints: as the refinement takes them.
-    emerges: it was hidden, and the detector surely sees it.
+    emerges: it was hidden and lost, and the detector surely sees it.
     """
 
     frame: HandFrame
@@ -233,8 +235,8 @@ def posterior_of(
 
 
 def _emerges(detection: Detection, frame: HandFrame) -> bool:
-    """Whether the detector surely sees the hand where its prediction is hidden."""
-    if detection.empty or detection.present < _PRESENT:
+    """Whether the detector surely sees a hand again whose last estimates were wrong or hidden."""
+    if frame.track.log_odds > _HOPELESS or detection.empty or detection.present < _PRESENT:
         return False
     joints = detection.joints_m[0]
     away = [float((other.joints_m - joints).norm(dim=1).mean()) for other in frame.others]

@@ -219,7 +219,9 @@ def close(
     first = model.lost.again if frame.hand.seen.ever else model.lost.believe
     new = model.lost.second if second else first
     seems = whose.seems(frame.hand.side) if whose.given else 1.0
-    if whose.doubtful(frame.hand.side):
+    # Of two hands that are asked for, the one that is followed says which one comes.
+    partner = any(other.believed and not other.watched for other in frame.others)
+    if whose.doubtful(frame.hand.side) and not partner:
         new = math.inf
     side = whose.probability(frame.hand.side)
     status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)

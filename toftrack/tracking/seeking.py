@@ -25,7 +25,7 @@ _SECOND_S = 0.12
 """How often a second hand is searched for."""
 _AT_ONCE = 2
 """Places that are looked at in a frame."""
-_NEARLY = 1.0
+_NEARLY = 3.0
 """The first look may be so much worse than what a hand needs: the second one is more exact."""
 Sought = Callable[[], Seeking]
 

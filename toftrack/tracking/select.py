@@ -27,8 +27,6 @@ _PAUSE_S = 0.06
 """A time between two frames that is not the usual one."""
 _WORST = -1e6
 """Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
-_HOPELESS = -2.4
-"""Log odds below which the last estimate was surely wrong: 8 %."""
 _LEAST_CREDIT = 0.2
 """Of the lead that is needed against a pose that is surely right, so much is needed against any."""
 
@@ -138,7 +136,7 @@ class Incumbent:
     contender_m: (C, 21, 3) joints of its contender, C = 0 or 1.  lead: of the contender.
     challenged: how long a pose of another place has been better.
     log_odds: that the last estimate was right.  new: this is the track's first frame.
-    emerges: it was hidden, and the detector surely sees it.
+    emerges: it was hidden and lost, and the detector surely sees it.
     """
 
     contender_m: Tensor
@@ -177,8 +175,7 @@ def select(
 
     1. The last frame's fingers stand unless the filter's are better.
     2. A hypothesis of the detector at another place takes over when it was better by `place_lead`
-       in `place_frames` frames, at once where a hand emerges whose last estimate was surely
-       wrong; never while something hides the hand.
+       in `place_frames` frames, at once where a hand emerges; never while something hides it.
     3. Of all others, one that is much the same takes over when it is better;
     4. one with other fingers takes over when its lead, summed up over frames, is large enough.
 
@@ -197,8 +194,7 @@ def select(
     if detected:
         leads = best >= 0 and float(score[best]) > settings.place_lead and not hidden
         challenged = challenged.extended(dt_s) if leads else Duration()
-        hopeless = incumbent.log_odds < _HOPELESS
-        at_once = incumbent.new or (incumbent.emerges and hopeless)
+        at_once = incumbent.new or incumbent.emerges
         if leads and (at_once or challenged.reached(settings.place_frames)):
             return Choice(table.pose[best][None], True, table.pose[:0], 0.0, Duration())
     others = ~elsewhere & ~stands

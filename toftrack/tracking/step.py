@@ -48,6 +48,8 @@ from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
 
+_HIDDEN_WIDER = 2.0
+"""By so many times at most a hidden hand is searched farther away than one that is followed."""
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state, and for each slot what was seen, None where nobody asked, and the estimate."""
 Concluded = tuple[int, HandState, StepInfo, Estimate]
@@ -124,10 +126,10 @@ def filtered_frame(
 ) -> Filtered:
     """The particles of a hand in a frame."""
     model, track = frame.model, frame.track
-    # A hand that was nearly lost is searched farther away, but not ever farther; not one that is
-    # hidden, which would be taken for what is seen beside it: its own forearm, first of all.
-    wider = model.lost.patience and not frame.hidden
-    width = 1.0 + (track.doubtful.seconds / FRAME_S if wider else 0.0)
+    # A hand that was nearly lost is searched farther away, but not ever farther; one that is hidden
+    # not far, or it would be taken for what is seen beside it: its own forearm, first of all.
+    wider = track.doubtful.seconds / FRAME_S if model.lost.patience else 0.0
+    width = 1.0 + (min(wider, _HIDDEN_WIDER) if frame.hidden else wider)
     return run_filter(track, dt_s, frame.image, model, generator, spans, width)
 
 
