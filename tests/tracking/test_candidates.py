@@ -124,13 +124,16 @@ def test_a_covered_hand_is_held_where_it_was() -> None:
 
 
 def emerging(
-    beside_m: float = 0.02, other_m: float | None = None, **changes: object
+    beside_m: float = 0.02,
+    other_m: float | None = None,
+    log_odds: float = -4.0,
+    **changes: object,
 ) -> FilteredFrame:
     """A hand that is covered where it was, and that the detector sees before that.
 
     other_m: where another hand is, likewise; None = there is none.
     """
-    hand = filtered(0.0, covered=True)
+    hand = filtered(0.0, covered=True, log_odds=log_odds)
     detection = replace(detection_of(hand_at(beside_m, 0.29)), **changes)
     frame = replace(hand.frame, detection=detection)
     if other_m is not None:
@@ -149,8 +152,8 @@ def test_a_covered_hand_that_the_detector_surely_sees_emerges() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"present": 0.5}, {"other_m": 0.04}, {"beside_m": 0.5}],
-    ids=["it is not sure", "it sees the other hand", "beside the image"],
+    [{"present": 0.5}, {"other_m": 0.04}, {"beside_m": 0.5}, {"log_odds": 1.0}],
+    ids=["it is not sure", "it sees the other hand", "beside the image", "it was not lost"],
 )
 def test_else_it_stays_covered(changes: dict[str, float]) -> None:
     found = emerging(**changes)

@@ -177,7 +177,7 @@ def test_elapsed_time_is_kept_within_reason() -> None:
     assert elapsed_s(1.0, 1e9) == 0.5 and elapsed_s(0.0, math.inf) == FRAME_S
 
 
-def test_a_hidden_hand_is_not_searched_farther_away() -> None:
+def test_a_hidden_hand_is_searched_for_less_far_away() -> None:
     """Else it is taken for what is seen beside what hides it."""
     track = track_of(hand_at(), log_odds=-4.0, doubted=True, doubtful=Duration(10 * FRAME_S))
     frame = frame_of(image_of(hand_at()), track)
@@ -195,5 +195,4 @@ def test_a_hidden_hand_is_not_searched_farther_away() -> None:
         wide, narrow = (float(particles[:, :3].std(0).norm()) for particles in both)
         return wide / narrow
 
-    assert spread(hidden) == pytest.approx(1.0)
-    assert spread(frame) > 1.5
+    assert 1.0 < spread(hidden) < 0.6 * spread(frame)
