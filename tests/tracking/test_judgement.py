@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
 from helpers.configured import confidence_model
@@ -23,6 +24,8 @@ from toftrack.detector.hand_detector import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.tracking.confidence import NO_FEATURES, WholeHand
 from toftrack.tracking.filter import Filtered, Found
+from toftrack.tracking.handedness import HandednessEstimate
+from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.lifecycle import (
     Status,
     close,
@@ -154,9 +157,17 @@ def test_the_log_odds_are_smoothed_over_time_but_in_a_first_frame() -> None:
 # After a frame: the track.
 
 
-def closed(track: Track, probability: float, **features: float) -> tuple[Status, Track, HandState]:
+def closed(
+    track: Track,
+    probability: float,
+    others: tuple[OtherHand, ...] = (),
+    handedness: HandednessEstimate | None = None,
+    **features: float,
+) -> tuple[Status, Track, HandState]:
     """After a frame that finds the hand 10 mm to the right."""
-    frame = frame_of(image(), track, model=replace(right_hand_model(), lost=PLAIN))
+    frame = frame_of(image(), track, others=others, model=replace(right_hand_model(), lost=PLAIN))
+    if handedness is not None:
+        frame = replace(frame, hand=replace(frame.hand, handedness=handedness))
     moved = hand_at(0.01)
     filtered = Filtered(track.particles, track.weights, track.mean)
     found = Found(filtered, moved, track.trend, *frame.model.nearest(moved))
@@ -177,6 +188,34 @@ def test_a_track_is_believed_once_and_doubted_while_it_is_lost(
     assert after.believed == (believed or not lost)
     assert after.age.seconds == pytest.approx(track.age.seconds + FRAME_S)
     assert hand.seen.ever == (not lost), "remembered as last believed"
+
+
+def beside(watched: bool) -> OtherHand:
+    """Another hand that is believed."""
+    none = np.zeros((2, 2), bool)
+    return OtherHand(torch.ones(21, 3), np.ones(3), True, True, none, none, watched)
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_beside_another_hand_a_new_one_must_be_surer_whether_that_is_reported_or_not(
+    watched: bool,
+) -> None:
+    track = track_of(HERE, believed=False)
+    between = 0.5 * (max(PLAIN.believe, PLAIN.again) + PLAIN.second)
+    assert not closed(track, between)[0].lost
+    assert closed(track, between, (beside(watched),))[0].lost
+    assert not closed(track, 0.97, (beside(watched),))[0].lost
+
+
+def test_a_new_hand_that_looks_like_the_other_one_is_doubted_unless_that_is_followed() -> None:
+    """Of two hands that are asked for, the one that is followed says which one comes."""
+    track = track_of(HERE, believed=False)
+    like_a_left_one = HandednessEstimate(given=True, prior=4.0, fits=-0.8, comparisons=1)
+    others = {"alone": (), "watched": (beside(True),), "reported": (beside(False),)}
+    lost = {
+        name: closed(track, 0.95, there, like_a_left_one)[0].lost for name, there in others.items()
+    }
+    assert lost == {"alone": True, "watched": True, "reported": False}
 
 
 def test_the_particles_follow_the_pose_that_was_found() -> None:
