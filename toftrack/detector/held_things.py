@@ -42,11 +42,8 @@ BETWEEN_TIPS = {
 }
 """How often each thing is held between tips that leave room of up to 5, 15 and 30 mm, and more."""
 PARTS_OF_A_THING = 2
-_OPPOSED_SHARES = (0.4, 0.8)
-"""Hands about to close on a thing in the palm whose thumb stands before the palm: on what is thin,
-over which it closes as well as beside it, and on what is thick."""
-_THICK_M = 0.02
-"""Radius from which on a thing is thick."""
+_OPPOSED_SHARE = 0.65
+"""Hands about to close on a thing in the palm whose thumb stands before the palm."""
 _PHONE_M = ((0.055, 0.095), (0.115, 0.185), (0.0, 0.016))
 """Width, length and thickness of what could be a phone."""
 
@@ -189,14 +186,10 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     thumb = torch.tensor([10.0, -12.0, 0.0, -5.0, 0.0])
     thumb = thumb + torch.tensor([14.0, 8.0, 8.0, 5.0, 8.0]) * dice.normal(n, 5)
     # Mostly it is opposed: about what is thick it only reaches when it is held away from the palm.
-    opposed = torch.stack((between(5, 45), between(10, 50), between(-25, 8)), 1)
+    opposed = torch.stack((between(15, 45), between(10, 50), between(-25, 8)), 1)
     ends = torch.tensor([5.0, 8.0]) + torch.tensor([8.0, 10.0]) * dice.normal(n, 2)
     opposed = torch.cat((opposed, ends), 1)
-    radii = [radius, low, low, body, ball_radius, box_sizes[:, ::2].amin(1), grip, oval[:, 0]]
-    thick = _chosen(radii, which) > _THICK_M
-    thin_share, thick_share = _OPPOSED_SHARES
-    share = torch.where(thick, thick_share, thin_share)[:, None]
-    thumb = torch.where(dice.chance(share, n, 1), opposed, thumb)
+    thumb = torch.where(dice.chance(_OPPOSED_SHARE, n, 1), opposed, thumb)
     angles = torch.cat((thumb, fingers.flatten(1)), 1)
     return within_limits(torch.deg2rad(angles)), _chosen([things[name] for name in IN_PALM], which)
 

@@ -30,7 +30,6 @@ from toftrack.detector.pictures import Lens, random_sensors, take_pictures
 from toftrack.detector.scenes import (
     Scenes,
     background_behind,
-    bars,
     moved,
     surroundings,
     tables_under,
@@ -43,8 +42,6 @@ _WHOLE = math.ceil(_SAMPLES * 2**0.5) + 1
 """Pixels of a picture of which a turned crop is read."""
 NEW_HANDS = 0.25
 """How many crops are as of new hands: as the camera is held, and less well centred."""
-BARRED, BARRED_EMPTY = 0.05, 0.3
-"""Images with bars side by side, and those of them that show no hand."""
 _DIRECTION = 0.25
 """By how much it is uncertain where the fingers of a hand point that is followed, of 1 m."""
 WIDE_SIZE = (80, 96)
@@ -110,10 +107,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     gone = ~present & dice.chance(0.7, n)
     pieces = labels.shape[1] - FOREARM_PIECES
     labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
-    barred = torch.where(gone, BARRED_EMPTY, BARRED)
-    scenes = random_scenes(
-        hands, labels, bank, dice, others=0.25, objects=0.12, barred=barred, views=views
-    )
+    scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12, views=views)
     scenes = moved(scenes, torch.where(gone[:, None], _onto_something(scenes, centre, dice), 0.0))
 
     turned = torch.where(known, _upright_angles(hands, dice), 0.0)
@@ -200,15 +194,7 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     other, other_left = _other_hands(hands, bank, dice)
     there = dice.chance(0.35, n) & raised
     scenes = random_scenes(
-        hands,
-        labels,
-        bank,
-        dice,
-        others=0.0,
-        objects=0.15,
-        barred=torch.where(raised, BARRED, BARRED_EMPTY),
-        other=(other, there),
-        views=views,
+        hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there), views=views
     )
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
 
@@ -249,14 +235,13 @@ def random_scenes(
     dice: Dice,
     others: float,
     objects: float,
-    barred: Tensor,
     other: tuple[Hands, Tensor] | None = None,
     views: Tensor | None = None,
 ) -> Scenes:
     """Everything around a batch of hands; another hand with probability `others`, or as given.
 
-    labels: (N, E) of the hands' ellipsoids.  barred: (N,) how likely bars are.
-    views: (N,) where the cameras are, see scenes; None = before the persons.
+    labels: (N, E) of the hands' ellipsoids.  views: (N,) where the cameras are, see scenes; None =
+    before the persons.
     """
     n = len(labels)
     if other is None:
@@ -264,16 +249,15 @@ def random_scenes(
     second, there = other
     body = surroundings(hands, hands.pivot_m[:, 2], dice, views)
     stuff = things(hands.pivot_m, 2, objects, dice)
-    rack = bars(hands.pivot_m, barred, dice)
     other_labels = torch.where(there[:, None], second.labels, -1)
-    centres = (hands.centres_m, second.centres_m, body[0], stuff[0], rack[0])
-    axes = (hands.axes_m, second.axes_m, body[1], stuff[1], rack[1])
+    centres = (hands.centres_m, second.centres_m, body[0], stuff[0])
+    axes = (hands.axes_m, second.axes_m, body[1], stuff[1])
     planes = background_behind((hands.pivot_m[:, 2] + 0.1).clamp(min=0.4), dice)
     if views is not None:
         # Whoever looks down sees a table, or the floor far below.
         planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)
         planes = torch.cat((planes, tables_under(hands, views, dice)), 1)
-    all_labels = torch.cat((labels, other_labels, body[2], stuff[2], rack[2]), 1)
+    all_labels = torch.cat((labels, other_labels, body[2], stuff[2]), 1)
     covered = torch.cat((hands.skins.covered, second.skins.covered), 1)
     plain = torch.zeros(n, all_labels.shape[1] - covered.shape[1], dtype=torch.bool)
     parts = second.parts.clone()

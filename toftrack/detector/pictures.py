@@ -26,14 +26,11 @@ from toftrack.detector.things_numba import draw_part
 
 _entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
-    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE, WITHIN,
-) = range(13)  # fmt: skip
-SENSOR_TERMS = 13
+    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE,
+) = range(12)  # fmt: skip
+SENSOR_TERMS = 12
 _ONE_SURFACE_M = 0.03
 """A camera's filter smooths over steps of less than this."""
-_SMOOTHED_M = (0.010, 0.025)
-"""And no farther than this to each side: with the first, two fingertips that touch stay two; the
-second loses the folds of a fist, which must be known as one."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +51,9 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     HOLES: share of missing pixels.  STEP: of the readings at 0.5 m.  SHADOW: pixels without
     readings beside near edges.  RANGE: nothing is read beyond.  PATCHES: how many patches miss.
     BLUR: 1 mixes with neighbours on one surface.  DARK: 1 = the forearm is not read.
-    SMOOTH: pixels to each side over which the camera's own filter averages one surface;
-    the folds of a fist are lost in it.  WITHIN: but no farther than this.
-    COARSE: step of the readings at any distance, as of images that were kept with 8 bits.
+    SMOOTH: pixels to each side over which the camera's own filter averages one surface; the folds
+    of a fist are lost in it.  COARSE: step of the readings at any distance, as of images that were
+    kept with 8 bits.
     """
     light = dice.chance(0.25, n)
     terms = torch.zeros(n, SENSOR_TERMS)
@@ -74,9 +71,7 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     terms[:, DARK] = dice.chance(0.06, n).float()
     wide = dice.uniform(n, low=1.0, high=3.5).floor()
     terms[:, SMOOTH] = torch.where(dice.chance(0.3, n), wide, 0.0)
-    coarse = dice.uniform(n, low=0.003, high=0.012)
-    terms[:, COARSE] = torch.where(dice.chance(0.2, n), coarse, 0.0)
-    terms[:, WITHIN] = torch.where(dice.chance(0.5, n), *_SMOOTHED_M)
+    terms[:, COARSE] = torch.where(dice.chance(0.1, n), dice.uniform(n, low=0.003, high=0.012), 0.0)
     return terms
 
 
@@ -191,7 +186,7 @@ def _draw(centre, axes, whiten, label, lens, depth, labels):
 
 
 @compiled
-def _smooth(most, within_m, f_px, width, height, depth, scratch):
+def _smooth(reach, width, height, depth, scratch):
     """Each reading becomes the mean of those about it that lie on the same surface."""
     for v in range(height):
         for u in range(width):
@@ -201,7 +196,6 @@ def _smooth(most, within_m, f_px, width, height, depth, scratch):
             z = scratch[v, u]
             if z <= 0:
                 continue
-            reach = min(most, int(within_m * f_px / z + 0.5))
             total, count = np.float32(0), 0
             for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
                 for u2 in range(max(u - reach, 0), min(u + reach, width - 1) + 1):
@@ -243,7 +237,7 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch):
                 z = math.floor(z / step + 0.5) * step
             depth[v, u] = max(z, 0.0)
     if sensor[SMOOTH] > 0:
-        _smooth(int(sensor[SMOOTH]), sensor[WITHIN], lens[0], width, height, depth, scratch)
+        _smooth(int(sensor[SMOOTH]), width, height, depth, scratch)
     if sensor[COARSE] > 0:
         for v in range(height):
             for u in range(width):

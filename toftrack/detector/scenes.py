@@ -18,9 +18,6 @@ from toftrack.detector.hands import ABOVE, BACKGROUND, FRONT, HEAD, THING, Hands
 from toftrack.detector.skin import Skins
 from toftrack.detector.things_numba import PART
 
-BARS = 6
-"""The most bars side by side."""
-
 
 @dataclass(frozen=True)
 class Scenes:
@@ -154,28 +151,6 @@ def things(around_m: Tensor, n_things: int, p: float, dice: Dice) -> tuple[Tenso
     rotation = torch.where(flat, torch.eye(3), rotation)
     labels = torch.where(dice.chance(p, n, n_things), THING, -1)
     return around_m[:, None] + offset, rotation * log_axes.exp()[..., None, :], labels
-
-
-def bars(around_m: Tensor, p: Tensor, dice: Dice) -> tuple[Tensor, Tensor, Tensor]:
-    """Up to BARS bars side by side behind (N, 3), as of a chair's back or a rack, as likely as p
-    (N,): nothing else in a room looks so much like fingers.
-    """
-    n = len(around_m)
-    level = torch.tensor([1.0, 1.0, 0.3])
-    along = torch.nn.functional.normalize(level * dice.normal(n, 3), dim=1)
-    aside = torch.linalg.cross(along, dice.normal(n, 3) / level)
-    aside = torch.nn.functional.normalize(aside, dim=1)
-    gap = dice.uniform(n, 1, low=0.022, high=0.08)
-    number = torch.arange(BARS) - (BARS - 1) / 2
-    middle = around_m + torch.tensor([0.08, 0.08, 0.0]) * dice.normal(n, 3)
-    middle[:, 2] += dice.uniform(n, low=0.06, high=0.5)
-    centres = middle[:, None] + (number * gap)[..., None] * aside[:, None]
-    radius = dice.uniform(n, low=0.006, high=0.018)
-    axes = _along(along, radius, dice.uniform(n, low=0.1, high=0.6))
-    count = dice.uniform(n, 1, low=2, high=BARS + 1).floor()
-    there = (torch.arange(BARS) < count) & dice.chance(p, n)[:, None]
-    labels = torch.where(there, BACKGROUND, -1)
-    return centres, axes[:, None].expand(n, BARS, 3, 3), labels
 
 
 def background_behind(behind_m: Tensor, dice: Dice) -> Tensor:

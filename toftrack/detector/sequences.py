@@ -18,7 +18,7 @@ from torch import Tensor
 from toftrack.archives import read_archive
 from toftrack.detector.dice import Dice
 from toftrack.detector.hands import HAND, posed_hands, random_rotations, random_views
-from toftrack.detector.images import BARRED, BARRED_EMPTY, random_scenes
+from toftrack.detector.images import random_scenes
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
 from toftrack.detector.shapes import ShapeBank
 from toftrack.errors import ToftrackError
@@ -83,10 +83,7 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         same = Dice(torch.Generator().manual_seed(scene))
         hands = posed_hands(bank, pivot[None], left, same, HAND, turn[None], pose)
         labels = torch.where(hands.labels == HAND, -1, hands.labels) if empty else hands.labels
-        barred = torch.tensor([BARRED_EMPTY if empty else BARRED])
-        scenes = random_scenes(
-            hands, labels, bank, same, others=0.2, objects=0.06, barred=barred, views=views
-        )
+        scenes = random_scenes(hands, labels, bank, same, others=0.2, objects=0.06, views=views)
         depth, which = take_pictures(scenes, lens, sensor, (height, width), dice)
         images.append(depth[0])
         joints.append(hands.joints_m[0])
