@@ -77,18 +77,6 @@ def test_the_networks_see_nothing_near_where_the_other_hand_is_beside() -> None:
     np.testing.assert_array_equal(depth, 0.5, "the image itself is left alone")
 
 
-@pytest.mark.parametrize(("place_z", "gone"), [(0.45, True), (0.51, True), (0.60, False)])
-def test_where_a_hand_is_looked_for_the_other_one_is_left_out_unless_it_may_hide_it(
-    place_z: float, gone: bool
-) -> None:
-    depth = np.full((288, 352), 0.5, np.float32)
-    theirs = np.zeros(SIZE, bool)
-    theirs[:, :88] = True
-    other = OtherHand(torch.zeros(21, 3), np.zeros(3), True, True, theirs, np.zeros(SIZE, bool))
-    seen = without(DepthImage(depth, K, 0, 0.0), [other], np.array([0.0, 0.0, place_z])).depth_m
-    assert (seen[:, :176] > 2.0).all() == gone and (seen[:, 176:] == 0.5).all()
-
-
 def test_only_the_pixels_of_certain_hands_are_taken() -> None:
     left, right = (np.zeros(SIZE, bool) for _ in range(2))
     left[:, :40], right[:, 100:] = True, True

@@ -172,23 +172,15 @@ def pixels_of(others: Sequence[OtherHand]) -> np.ndarray | None:
     return np.logical_or.reduce(masks) if masks else None
 
 
-def without(
-    image: DepthImage, others: Sequence[OtherHand], place_m: np.ndarray | None = None
-) -> DepthImage:
+def without(image: DepthImage, others: Sequence[OtherHand]) -> DepthImage:
     """The image as the detector is to see it: with nothing where other hands are, or its keypoints
     lie on their fingers as well. What may hide a hand stays, for it knows things that hide hands.
-
-    place_m: (3,) where a hand is looked for that has no track; None = the hand's own is known.
     """
-    height, width = image.depth_m.shape
     for other in others:
-        pixels = other.beside if place_m is None else other.pixels
-        if pixels.any():
-            gone = cv2.resize(
-                pixels.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
-            ).view(bool)
-            if place_m is not None:
-                gone &= image.depth_m > float(place_m[2]) - _IN_FRONT_M
+        if other.beside.any():
+            height, width = image.depth_m.shape
+            beside = other.beside.view(np.uint8)
+            gone = cv2.resize(beside, (width, height), interpolation=cv2.INTER_NEAREST)
             image = replace(image, depth_m=np.where(gone, np.float32(_FAR_M), image.depth_m))
     return image
 

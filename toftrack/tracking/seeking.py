@@ -16,7 +16,7 @@ from toftrack.detector.hand_detector import NO_DETECTION, Detection, merit
 from toftrack.frames import DepthImage
 from toftrack.tracking.detect import held_out, reachable, search_due
 from toftrack.tracking.filter import predicted_palm
-from toftrack.tracking.hands import OtherHand, others_of, sureness, without
+from toftrack.tracking.hands import OtherHand, sureness
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import HandState, LastSeen, Seeking, TrackerState
 from toftrack.tracking.watching import watched_slots
@@ -92,11 +92,8 @@ def start_seeking(
     if hand.seeking is not None:
         if search_is_over(hand):
             return state, None
-        others = others_of(state.hands, (slot,), image, model, dt_s)[slot]
-        pending = [
-            detector.start(without(image, others, at).depth_m, image.k, at, hand.side)
-            for at in hand.seeking.centres_m[:_AT_ONCE]
-        ]
+        at = hand.seeking.centres_m[:_AT_ONCE]
+        pending = [detector.start(image.depth_m, image.k, one, hand.side) for one in at]
         return state, partial(_after_detecting, hand.seeking, pending)
     due = hand.track is not None or slot in due_slots(state, watch_s)
     if not due or not search_due(hand, model):
@@ -163,8 +160,7 @@ def detect_again(
     """
     detector, (seen, heat) = model.detector, seeking.seen[0]
     centre, up = seen.centre_m.numpy()[None], seen.up[None]
-    alone = without(image, others, centre[0])
-    found = detector.detect(alone.depth_m, image.k, centre, hand.side, up)[0]
+    found = detector.detect(image.depth_m, image.k, centre, hand.side, up)[0]
     likely = reachable(hand, [other.centre_m for other in others], found.centre_m.numpy())
     better = merit(found, heat) + likely > detector.settings.merit
     return found if better else NO_DETECTION
