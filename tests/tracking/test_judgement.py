@@ -207,7 +207,7 @@ def test_beside_another_hand_a_new_one_must_be_surer_whether_that_is_reported_or
     assert not closed(track, 0.97, (beside(watched),))[0].lost
 
 
-def test_a_new_hand_that_looks_like_the_other_one_is_doubted_unless_that_is_followed() -> None:
+def test_a_new_hand_that_seems_to_be_the_other_one_is_doubted_unless_that_is_followed() -> None:
     """Of two hands that are asked for, the one that is followed says which one comes."""
     track = track_of(HERE, believed=False)
     like_a_left_one = HandednessEstimate(given=True, prior=4.0, fits=-0.8, comparisons=1)
