@@ -9,7 +9,7 @@ import numpy as np
 from toftrack.detector.crops import CROP_M
 from toftrack.detector.network import PARTS, SEGMENTS
 
-BACKGROUND_PART, HAND_PART, THING_PART = 0, 1, SEGMENTS - 1
+BACKGROUND_PART, HAND_PART, FOREARM_PART, THING_PART = 0, 1, 2, SEGMENTS - 1
 """Of the classes, see network.SEGMENTS."""
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
@@ -27,8 +27,8 @@ class Parts:
     centre_m: np.ndarray
     mirrored: bool
 
-    def at(self, points_m: np.ndarray) -> np.ndarray:
-        """(P,) classes of seen points (P, 3), camera frame; background where the crop ends."""
+    def at(self, points_m: np.ndarray, outside: int = BACKGROUND_PART) -> np.ndarray:
+        """(P,) classes of seen points (P, 3), camera frame; `outside` where the crop ends."""
         points = points_m * _MIRROR if self.mirrored else points_m
         away = (points @ self.turn).T
         distance = float(np.linalg.norm(self.centre_m))
@@ -37,7 +37,7 @@ class Parts:
         inside = (column >= 0) & (column < PARTS) & (row >= 0) & (row < PARTS)
         inside &= np.abs(away[2] - distance) < CROP_M / 2
         kind = self.kind[np.where(inside, row, 0), np.where(inside, column, 0)]
-        return np.where(inside, kind, BACKGROUND_PART)
+        return np.where(inside, kind, outside)
 
 
 ALL_HAND = Parts(

@@ -12,13 +12,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
-from toftrack.detector.parts import THING_PART
+from toftrack.detector.parts import FOREARM_PART, HAND_PART, THING_PART
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.proposals import exchange_fingers, swap_fingers
@@ -41,6 +42,9 @@ from toftrack.tracking.state import HandState, Track
 
 _LEAST_PARTS = 4
 """Parts of a crop, of 9 mm, that a thing in the hand has at least."""
+_MOSTLY, _UNKNOWN = 0.5, 255
+"""Of a surface in front of the hand, so much must be its arm where the network sees it; and the class
+of what it does not see."""
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
 _COVERED = 0.6
@@ -103,6 +107,11 @@ class HandFrame:
         """Whether something hides part of the hand."""
         hand, occluder = self.observation.hand.numpy(), self.observation.occluder.numpy()
         return int(np.count_nonzero(occluder)) > _HIDDEN * int(np.count_nonzero(hand))
+
+    @property
+    def may_be_hidden(self) -> bool:
+        """Whether something seems to hide part of the hand; its own arm may, see with_own_arm."""
+        return self.hidden or self.out_of_sight(self.track.pose)[1] > _UNSEEN
 
     def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
         """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""
@@ -176,14 +185,51 @@ def without_things(observation: Observation, detection: Detection) -> Observatio
     kind = detection.parts.kind
     if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
         return observation
-    row, column = np.nonzero(observation.hand.cpu().numpy())
+    thing = _pixels_of(observation.hand, observation, detection, THING_PART)
+    return replace(observation, hand=observation.hand & ~thing, thing=thing)
+
+
+def with_own_arm(observation: Observation, detection: Detection) -> Observation:
+    """The same with what the pose network calls the hand or its forearm told from what hides it.
+
+    Who sees their own hand has its arm nearer to the camera, and the back of a hand is before its
+    fingers: neither hides a hand as what passes in front does. A surface in front is the arm when
+    the network says so of most of it.
+    """
+    valid = observation.depth_m > 0
+    own = _pixels_of(valid, observation, detection, HAND_PART, FOREARM_PART)
+    occluder = observation.occluder.cpu().numpy()
+    count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
+    row, column = np.nonzero(occluder)
+    kind = detection.parts.at(_points_of(row, column, observation), outside=_UNKNOWN)
+    of = surface[row, column]
+    known = np.bincount(of[kind != _UNKNOWN], minlength=count)
+    mine = np.bincount(of[(kind == HAND_PART) | (kind == FOREARM_PART)], minlength=count)
+    arm = torch.from_numpy((mine > _MOSTLY * known)[surface] & occluder).to(own.device)
+    return replace(
+        observation,
+        hand=observation.hand | arm,
+        occluder=observation.occluder & ~arm,
+        own=own | arm,
+    )
+
+
+def _pixels_of(
+    among: Tensor, observation: Observation, detection: Detection, *kinds: int
+) -> Tensor:
+    """(H, W) bool: those pixels of a mask that the pose network says are of some classes."""
+    row, column = np.nonzero(among.cpu().numpy())
+    chosen = np.isin(detection.parts.at(_points_of(row, column, observation)), kinds)
+    mask = np.zeros(among.shape, bool)
+    mask[row[chosen], column[chosen]] = True
+    return torch.from_numpy(mask).to(among.device)
+
+
+def _points_of(row: np.ndarray, column: np.ndarray, observation: Observation) -> np.ndarray:
+    """(P, 3) what is seen at pixels, camera frame."""
     k, z = observation.k.cpu().numpy(), observation.depth_m.cpu().numpy()[row, column]
     x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
-    held = detection.parts.at(np.stack((x, y, z), 1)) == THING_PART
-    thing = np.zeros(observation.hand.shape, bool)
-    thing[row[held], column[held]] = True
-    mask = torch.from_numpy(thing).to(observation.hand.device)
-    return replace(observation, hand=observation.hand & ~mask, thing=mask)
+    return np.stack((x, y, z), 1)
 
 
 def image_term(

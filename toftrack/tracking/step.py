@@ -29,6 +29,7 @@ from toftrack.tracking.candidates import (
     image_term,
     keypoints_of,
     propose,
+    with_own_arm,
     without_things,
 )
 from toftrack.tracking.comparing import compared_beside, observed_shape
@@ -144,6 +145,8 @@ def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
         if frame.mirrored is not None:
             frame = compared_beside(frame, frame.mirrored(), image)
     seen = without_things(frame.observation, frame.detection)
+    if not frame.detection.empty and replace(frame, observation=seen).may_be_hidden:
+        seen = with_own_arm(seen, frame.detection)
     if seen is frame.observation:
         return frame
     return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
