@@ -196,15 +196,14 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     fingers: neither hides a hand as what passes in front does. A surface in front is the arm when
     the network says so of most of it.
     """
-    valid = observation.depth_m > 0
-    own = _pixels_of(valid, observation, detection, HAND_PART, FOREARM_PART)
+    own = _pixels_of(observation.hand, observation, detection, HAND_PART, FOREARM_PART)
     occluder = observation.occluder.cpu().numpy()
     count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
     row, column = np.nonzero(occluder)
     kind = detection.parts.at(_points_of(row, column, observation), outside=_UNKNOWN)
     of = surface[row, column]
     known = np.bincount(of[kind != _UNKNOWN], minlength=count)
-    mine = np.bincount(of[(kind == HAND_PART) | (kind == FOREARM_PART)], minlength=count)
+    mine = np.bincount(of[kind == FOREARM_PART], minlength=count)
     arm = torch.from_numpy((mine > _MOSTLY * known)[surface] & occluder).to(own.device)
     return replace(
         observation,
