@@ -19,17 +19,22 @@ from numba.extending import intrinsic
 
 from toftrack.compute.kernel_cache import KernelCache, can_be_kept
 from toftrack.compute.quick_typing import quick_typing
+from toftrack.compute.whole_kernels import as_kernel, is_part
 
 log = logging.getLogger(__name__)
 
 OPTIONS = {"fastmath": {"contract", "arcp", "nsz"}, "nogil": True, "error_model": "numpy"}
 """nnan and ninf stay off: NaN is how a kernel learns that a square root missed."""
-compiled = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-"""Decorator of the functions that entry points call."""
+_part = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 _SILENT_S = 1.0
 """Taking a kernel from numba's cache is faster than this, compiling it is slower."""
 _compiling = threading.RLock()
+
+
+def compiled(function: Callable) -> Any:
+    """Decorator of the functions that entry points call, and that nothing else can."""
+    return is_part(_part(function))
 
 
 def entry_point(*sources: str | Path | None) -> Callable:
@@ -44,7 +49,7 @@ def entry_point(*sources: str | Path | None) -> Callable:
         function.__qualname__ += f"_{checksum:08x}"
         kernel = numba.njit(**OPTIONS)(function)
         kernel._cache = KernelCache(f"{function.__module__}.{function.__qualname__}")
-        kernel._compiler.compile = quick_typing()(kernel._compiler.compile)
+        kernel._compiler.compile = quick_typing()(as_kernel(kernel._compiler.compile))
         kernel.sources = frozenset(str(Path(file).resolve()) for file in files)
         return kernel
 

@@ -48,12 +48,13 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
 
 def _compile_here(model: FilterModel) -> None:
     """What the second process leaves, the largest kernel first."""
-    from toftrack.detector.proposals_numba import compile_crops
+    from toftrack.detector.proposals_numba import compile_crops, compile_decoding
     from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
     from toftrack.render.numba.bands import evidence_images
     from toftrack.tracking.confidence_numba import count_out_of_sight, seen_around
 
     model.backend.make_scorer(model.configured.shape)
+    compile_decoding()
     compile_crops()
     pixel, hand = np.ones((1, 1), np.float32), np.ones((1, 1), bool)
     smooth_points(pixel, hand, (0, 0), np.eye(3, dtype=np.float32), 1.0, 1.0)
@@ -108,12 +109,11 @@ def _compile_beside() -> None:
     for standard in (1, 2):
         os.dup2(nowhere, standard)
     with small_operations():
-        compile_refinement_and_decoding()
+        compile_refinement()
 
 
-def compile_refinement_and_decoding() -> None:
-    """Kernels that have functions in common, which are compiled once in a process."""
-    from toftrack.detector.proposals_numba import compile_decoding
+def compile_refinement() -> None:
+    """The refinement's kernels, and a small one, so that both processes have as much to do."""
     from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.refinement.penalty_numba import joints_penalty
@@ -122,5 +122,4 @@ def compile_refinement_and_decoding() -> None:
     CompiledRefiner(shape)
     joints = forward_kinematics(torch.zeros(1, 27), shape).joints_m
     joints_penalty(joints, shape.hand_length_m, 1.0, None, 0.0)
-    compile_decoding()
     openxr_hand_compiled(joints[0].numpy(), np.zeros(27), openxr_rig(shape))
