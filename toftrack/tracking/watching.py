@@ -27,6 +27,8 @@ _RATHER, _UNSURE = 0.7, 0.6
 _MORE = 1.2
 """Or with as much, and when by such log odds more speaks for its side, while what is taken for the
 first one was never believed."""
+_SURELY = 0.9
+"""Of two hands that both look like the given side, the first one must be of it so probably."""
 OTHER_HAND = 0.4
 """Where it is less probable than this that what is followed is of the given side, the frame is
 flagged."""
@@ -68,12 +70,22 @@ def watched_over(state: TrackerState, settings: HandednessSettings) -> TrackerSt
 
 
 def first_estimate(estimate: Estimate, state: TrackerState) -> Estimate:
-    """The first hand's estimate, where only the other hand is followed."""
+    """The first hand's estimate: lost where only the other hand is followed, or where either of two
+    may be the one that was asked for.
+    """
     first, other = state.hands
-    if first.track is not None or not (other.believed or state.second_s == math.inf):
+    away = first.track is None and (other.believed or state.second_s == math.inf)
+    if not (away or _either(first, other)):
         return estimate
     none = np.zeros_like(estimate.joint_ok)
     return replace(estimate, lost=True, state_name="other hand", joint_ok=none)
+
+
+def _either(first: HandState, other: HandState) -> bool:
+    """Whether both hands look like the given side, and the first one not surely."""
+    if not (first.handedness.given and first.believed and other.believed):
+        return False
+    return other.side == first.side and first.handedness.seems(first.side) < _SURELY
 
 
 def _other_after_all(state: TrackerState, track: Track) -> TrackerState:
