@@ -27,6 +27,9 @@ _PAUSE_S = 0.06
 """A time between two frames that is not the usual one."""
 _WORST = -1e6
 """Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
+_SURE_LEAD = 2.0
+"""Of the log posterior, with which a hypothesis of the detector at another place takes over at
+once, whatever hides the hand."""
 _LEAST_CREDIT = 0.2
 """Of the lead that is needed against a pose that is surely right, so much is needed against any."""
 
@@ -175,7 +178,8 @@ def select(
 
     1. The last frame's fingers stand unless the filter's are better.
     2. A hypothesis of the detector at another place takes over when it was better by `place_lead`
-       in `place_frames` frames, at once where a hand emerges; never while something hides it.
+       in `place_frames` frames, at once where a hand emerges or with a large lead; with no smaller
+       one while something hides it.
     3. Of all others, one that is much the same takes over when it is better;
     4. one with other fingers takes over when its lead, summed up over frames, is large enough.
 
@@ -192,7 +196,9 @@ def select(
     elsewhere &= source == Source.DETECTOR
     best, challenged = _best_of(score, elsewhere), incumbent.challenged
     if detected:
-        leads = best >= 0 and float(score[best]) > settings.place_lead and not hidden
+        lead = float(score[best]) if best >= 0 else -math.inf
+        surely = lead > _SURE_LEAD
+        leads = lead > settings.place_lead and (surely or not hidden)
         challenged = challenged.extended(dt_s) if leads else Duration()
         at_once = incumbent.new or incumbent.emerges
         if leads and (at_once or challenged.reached(settings.place_frames)):
