@@ -17,7 +17,14 @@ from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.crops import crop_rotation
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.detector.network import PARTS
-from toftrack.detector.parts import HAND_PART, THING_PART, Parts
+from toftrack.detector.parts import (
+    ANOTHER_PART,
+    BACKGROUND_PART,
+    FOREARM_PART,
+    HAND_PART,
+    THING_PART,
+    Parts,
+)
 from toftrack.refinement.proposals import FINGER_OF_ANGLE
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
@@ -29,6 +36,7 @@ from toftrack.tracking.candidates import (
     posterior_of,
     propose,
     schedule,
+    with_own_arm,
     without_things,
 )
 from toftrack.tracking.hands import OtherHand
@@ -336,3 +344,68 @@ def test_without_a_thing_all_stays_as_it_is() -> None:
     assert rest is whole
     parts[0, :3] = THING_PART
     assert seen_with(parts)[1].thing is None, "too little for a thing"
+
+
+def hidden_by(
+    kind: int, visible: int = HAND_PART
+) -> tuple[Observation, Observation, Detection, torch.Tensor]:
+    """A hand and what lies beside it nearer to the camera, which the network says is `kind`: the
+    image as it is segmented, and with the own arm told; the detection, and the pixels beside it.
+    """
+    truth = hand_at()
+    image = image_of(truth)
+    detection = detection_of(truth)
+    centre = detection.keypoints.points_m[9].double().numpy()
+    track = track_of(truth)
+    before = frame_of(image, track, detection).observation
+    rows, columns = before.hand.nonzero().unbind(1)
+    beside = torch.zeros_like(before.hand)
+    beside[int(rows.min()) : int(rows.max()), : int(columns.min()) - 1] = True
+    beside[:, : int(columns.min()) - 12] = False
+    parts = np.full((PARTS, PARTS), visible, np.uint8)
+    whole = Parts(parts, crop_rotation(centre), centre, False)
+    depth = torch.where(beside, float(centre[2]) - 0.06, before.depth_m)
+    observation = replace(before, depth_m=depth, occluder=beside)
+    at = whole.at(points_at(beside, observation), outside=255)
+    assert (at != 255).any(), "the network sees some of it"
+    middle = PARTS // 2
+    parts[:, : middle - 1] = kind
+    detection = replace(detection, parts=whole)
+    return observation, with_own_arm(observation, detection), detection, beside
+
+
+def points_at(mask: torch.Tensor, observation: Observation) -> np.ndarray:
+    """(P, 3) what is seen at a mask's pixels."""
+    row, column = mask.nonzero().unbind(1)
+    z, k = observation.depth_m[row, column], observation.k
+    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
+    return torch.stack((x, y, z), 1).double().numpy()
+
+
+def test_the_own_arm_before_the_hand_hides_nothing_of_it() -> None:
+    segmented, known, _, beside = hidden_by(FOREARM_PART)
+    assert bool(segmented.occluder[beside].all()) and not known.occluder.any()
+    assert torch.equal(known.hand, segmented.hand | beside)
+    assert bool((known.hiding_m[beside] == 0).all())
+
+
+@pytest.mark.parametrize("kind", [BACKGROUND_PART, HAND_PART, ANOTHER_PART, THING_PART])
+def test_whatever_else_is_before_the_hand_hides_it(kind: int) -> None:
+    segmented, known, _, beside = hidden_by(kind)
+    assert torch.equal(known.occluder, segmented.occluder)
+    assert torch.equal(known.hand, segmented.hand)
+    assert bool((known.hiding_m[beside] > 0).all())
+
+
+def test_a_hand_does_not_hide_its_own_fingers() -> None:
+    truth = bent(hand_at(), 3, 1.4)
+    detection, image = detection_of(truth), image_of(truth)
+    centre = detection.keypoints.points_m[9].double().numpy()
+    kind = np.full((PARTS, PARTS), HAND_PART, np.uint8)
+    detection = replace(detection, parts=Parts(kind, crop_rotation(centre), centre, False))
+    seen = frame_of(image, track_of(truth), detection).observation
+    known = with_own_arm(seen, detection)
+    assert bool((known.hiding_m[seen.hand] == 0).all()) and bool(
+        (seen.hiding_m[seen.hand] > 0).all()
+    )
+    assert torch.equal(known.hand, seen.hand) and torch.equal(known.occluder, seen.occluder)

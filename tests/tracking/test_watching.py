@@ -81,6 +81,22 @@ def test_what_is_surely_of_the_other_side_is_followed_as_the_other_hand() -> Non
     assert reported.lost and reported.state_name == "other hand"
 
 
+@pytest.mark.parametrize(("fits", "lost"), [(-0.5, True), (2.0, False)])
+def test_of_two_hands_of_the_given_side_only_a_sure_one_is_reported(
+    fits: float, lost: bool
+) -> None:
+    state = with_evidence(watching(True, True), 0, fits=fits)
+    first, other = (replace(h, track=replace(h.track, believed=True)) for h in state.hands)
+    said = replace(first.last, lost=False)
+    assert not first_estimate(said, replace(state, hands=(first, other))).lost, "of two sides"
+    alike = replace(state, hands=(first, replace(other, side=first.side)))
+    found = first_estimate(said, alike)
+    assert found.lost == lost and (found.state_name == "other hand") == lost
+    assert not (lost and found.joint_ok.any())
+    unsure = replace(other, side=first.side, track=replace(other.track, believed=False))
+    assert not first_estimate(said, replace(state, hands=(first, unsure))).lost
+
+
 def test_only_a_hand_that_was_never_beside_the_first_one_can_be_it_after_all() -> None:
     state = with_evidence(watching(False, True), 1, fits=5.0)
     known = replace(state.hands[1], side="right")

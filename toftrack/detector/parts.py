@@ -9,7 +9,7 @@ import numpy as np
 from toftrack.detector.crops import CROP_M
 from toftrack.detector.network import PARTS, SEGMENTS
 
-BACKGROUND_PART, HAND_PART, FOREARM_PART, THING_PART = 0, 1, 2, SEGMENTS - 1
+BACKGROUND_PART, HAND_PART, FOREARM_PART, ANOTHER_PART, THING_PART = range(SEGMENTS)
 """Of the classes, see network.SEGMENTS."""
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
