@@ -43,8 +43,8 @@ from toftrack.tracking.state import HandState, Track
 _LEAST_PARTS = 4
 """Parts of a crop, of 9 mm, that a thing in the hand has at least."""
 _MOSTLY, _UNKNOWN = 0.5, 255
-"""Of a surface in front of the hand, so much must be its arm where the network sees it; and the class
-of what it does not see."""
+"""Of a surface in front of the hand, so much must be its arm where the network sees it; and the
+class of what it does not see."""
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
 _COVERED = 0.6
