@@ -109,7 +109,8 @@ def test_only_a_hand_that_was_never_beside_the_first_one_can_be_it_after_all() -
 
 def test_of_two_hands_the_one_that_rather_is_of_the_given_side_is_the_first() -> None:
     settings = handedness_settings()
-    state = with_evidence(with_evidence(watching(True, True), 0, fits=-0.6), 1, fits=0.6)
+    state = with_evidence(watching(True, True), 0, fits=-0.6)
+    state = with_evidence(state, 1, fits=0.6, comparisons=3)
     given, other = partnered(
         (state.hands[0], replace(state.hands[1], side="right")), right_hand_model()
     )
@@ -118,6 +119,12 @@ def test_of_two_hands_the_one_that_rather_is_of_the_given_side_is_the_first() ->
     state = replace(state, hands=(replace(given, track=followed), other))
     after = watched_over(state, settings)
     assert after.hands[0].track is other.track and after.hands[1].track is None
+    for less in (
+        replace(other, handedness=replace(other.handedness, comparisons=2)),
+        replace(other, track=replace(other.track, log_odds=followed.log_odds - 1.1)),
+    ):
+        kept = watched_over(replace(state, hands=(state.hands[0], less)), settings)
+        assert kept.hands[0].track is followed, "seldom compared, or hardly a hand"
     assert after.hands[0].handedness.given and after.second_s == np.inf
     as_given = with_evidence(with_evidence(state, 0, fits=0.6, partner=0.6), 1, fits=-0.6)
     assert watched_over(as_given, settings).hands[0].track is followed

@@ -24,6 +24,9 @@ _BACK = 0.9
 """A hand that turns out to be of the given side after all is the first one again."""
 _RATHER, _UNSURE = 0.7, 0.6
 """Likewise with so much, while what is taken for the first one is less probably of that side."""
+_COMPARED, _AS_SURE = 3, 1.0
+"""It must have been compared so often, though. And what is hardly a hand has no side: the log odds
+that its estimate is right must not be lower than the first one's by more than this."""
 _MORE = 1.2
 """Or with as much, and when by such log odds more speaks for its side, while what is taken for the
 first one was never believed."""
@@ -85,7 +88,14 @@ def _either(first: HandState, other: HandState) -> bool:
     """Whether both hands look like the given side, and the first one not surely."""
     if not (first.handedness.given and first.believed and other.believed):
         return False
-    return other.side == first.side and first.handedness.seems(first.side) < _SURELY
+    alike = other.side == first.side and first.handedness.seems(first.side) < _SURELY
+    return alike and _as_sure(first, other)
+
+
+def _as_sure(first: HandState, other: HandState) -> bool:
+    """Whether what is watched is about as surely a hand as what is taken for the first one."""
+    assert first.track is not None and other.track is not None
+    return other.track.log_odds > first.track.log_odds - _AS_SURE
 
 
 def _other_after_all(state: TrackerState, track: Track) -> TrackerState:
@@ -119,8 +129,11 @@ def _is_first(first: HandState, other: HandState) -> bool:
     probable = other.handedness.probability(first.side)
     if first.track is None:
         return probable > _BACK and not other.beside
+    if not _as_sure(first, other):
+        return False
     if first.believed or other.beside:
-        return probable > _RATHER and first.handedness.seems(first.side) < _UNSURE
+        compared = other.handedness.comparisons >= _COMPARED
+        return compared and probable > _RATHER and first.handedness.seems(first.side) < _UNSURE
     more = other.handedness.fits - first.handedness.fits
     return probable > _RATHER and (more if first.side == "right" else -more) > _MORE
 
