@@ -49,6 +49,9 @@ from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
 
+_SURELY_PRESENT = 0.97
+"""Probability of a hand from which on the network is believed which pixels are the hand's own: a
+chair's back was taken for a hand otherwise."""
 _HIDDEN_WIDER = 2.0
 """By so many times at most a hidden hand is searched farther away than one that is followed."""
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
@@ -145,7 +148,8 @@ def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
         if frame.mirrored is not None:
             frame = compared_beside(frame, frame.mirrored(), image)
     seen = without_things(frame.observation, frame.detection)
-    if not frame.detection.empty and replace(frame, observation=seen).may_be_hidden:
+    surely = frame.detection.present >= _SURELY_PRESENT
+    if surely and replace(frame, observation=seen).may_be_hidden:
         seen = with_own_arm(seen, frame.detection)
     if seen is frame.observation:
         return frame
