@@ -16,6 +16,8 @@ from numba.core import types
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.typing.context import BaseContext
 
+from toftrack.compute.replacing import replaced
+
 _PLAIN = (types.Number, types.Boolean, types.Array, types.BaseTuple, types.DType, types.Literal)
 """Types of which the same is said every time; a function among them might be compiled later."""
 _signatures: dict[tuple, Any] = {}
@@ -34,13 +36,13 @@ def quick_typing() -> Iterator[None]:
         yield
         return
     with global_compiler_lock:
-        resolve, collects = BaseContext.resolve_function_type, gc.isenabled()
+        collects = gc.isenabled()
         gc.disable()
-        BaseContext.resolve_function_type = _remembering(resolve)  # type: ignore[method-assign]
+        remembering = _remembering(BaseContext.resolve_function_type)
         try:
-            yield
+            with replaced(BaseContext, resolve_function_type=remembering):
+                yield
         finally:
-            BaseContext.resolve_function_type = resolve  # type: ignore[method-assign]
             if collects:
                 gc.enable()
 

@@ -10,17 +10,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from numba import _dynfunc  # type: ignore[attr-defined]
+import numba
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.cpu import CPUContext
 
+from toftrack.compute.replacing import replaced
+
+_functions: Any = getattr(numba, "_dynfunc", None)
 _INSIDES = (
     (CPUCodeLibrary, "_optimize_final_module"),
     (CPUCodeLibrary, "_finalize_final_module"),
     (CPUCodeLibrary, "_finalize_dynamic_globals"),
     (CPUCodeLibrary, "_ensure_finalized"),
     (CPUContext, "get_executable"),
-    (_dynfunc, "make_function"),
+    (_functions, "make_function"),
 )
 _parts: list[bool] = []
 """Of what is compiled now, the innermost last: whether it is such a function. numba compiles in one
@@ -33,6 +36,11 @@ def is_part(kernel: Any) -> Any:
     return kernel
 
 
+def as_kernel(compile_it: Callable) -> Callable:
+    """numba's compilation of a kernel, as a whole."""
+    return whole_kernels()(_compiling(False, compile_it))
+
+
 @contextmanager
 def whole_kernels() -> Iterator[None]:
     """Within, kernels are compiled as wholes, numba's lock being held.
@@ -42,47 +50,44 @@ def whole_kernels() -> Iterator[None]:
     if not all(hasattr(owner, name) for owner, name in _INSIDES):
         yield
         return
-    optimise, finish = CPUCodeLibrary._optimize_final_module, CPUCodeLibrary._finalize_final_module
+    optimise = CPUCodeLibrary._optimize_final_module
+    finish = CPUCodeLibrary._finalize_final_module
     get_executable = CPUContext.get_executable
 
-    def _optimize_final_module(self: Any) -> None:
-        if not _parts[-1:] == [True]:
+    def optimise_kernel(self: Any) -> None:
+        if not _in_part():
             optimise(self)
 
-    def _finalize_final_module(self: Any) -> None:
-        if not _parts[-1:] == [True]:
+    def finish_kernel(self: Any) -> None:
+        if not _in_part():
             finish(self)
             return
         self._finalize_dynamic_globals()
         self._finalized = True
 
-    def _get_executable(self: Any, library: Any, fndesc: Any, env: Any) -> Any:
-        if not _parts[-1:] == [True]:
+    def executable(self: Any, library: Any, fndesc: Any, env: Any) -> Any:
+        if not _in_part():
             return get_executable(self, library, fndesc, env)
         library._ensure_finalized()
         # What numba knows it by; there is nothing that could be called.
         name = fndesc.qualname.split(".")[-1]
-        return _dynfunc.make_function(fndesc.lookup_module(), name, "", 0, env, (library,))
+        make = _functions.make_function
+        return make(fndesc.lookup_module(), name, "", 0, env, (library,))
 
-    CPUCodeLibrary._optimize_final_module = _optimize_final_module  # type: ignore[method-assign]
-    CPUCodeLibrary._finalize_final_module = _finalize_final_module  # type: ignore[method-assign]
-    CPUContext.get_executable = _get_executable  # type: ignore[method-assign]
-    try:
+    with (
+        replaced(
+            CPUCodeLibrary,
+            _optimize_final_module=optimise_kernel,
+            _finalize_final_module=finish_kernel,
+        ),
+        replaced(CPUContext, get_executable=executable),
+    ):
         yield
-    finally:
-        CPUCodeLibrary._optimize_final_module = optimise  # type: ignore[method-assign]
-        CPUCodeLibrary._finalize_final_module = finish  # type: ignore[method-assign]
-        CPUContext.get_executable = get_executable  # type: ignore[method-assign]
 
 
-def as_kernel(compile_it: Callable) -> Callable:
-    """numba's compilation of a kernel, as a whole."""
-
-    def run(*args: Any, **kwargs: Any) -> Any:
-        with whole_kernels():
-            return _compiling(False, compile_it)(*args, **kwargs)
-
-    return run
+def _in_part() -> bool:
+    """Whether what is compiled now is such a function."""
+    return bool(_parts) and _parts[-1]
 
 
 def _compiling(part: bool, compile_it: Callable) -> Callable:
