@@ -33,8 +33,9 @@ class Estimate:
     timestamp_s: float
     """Seconds, the frame's time as it was given."""
     state_name: str
-    """'tracking', or why not: 'searching', 'hidden', 'out of view', 'initialising', 'lost' or
-    'recovering'; of a frame of a finished run that was not tracked 'dropped'. See STATES."""
+    """'tracking', or why not: 'searching', 'hidden', 'out of view', 'other hand', 'initialising',
+    'lost' or 'recovering'; of a frame of a finished run that was not tracked 'dropped'. See
+    STATES."""
     lost: bool
     """Not to be used: no hand, or a joint that is likely off by more than 40 mm."""
     joints_m: np.ndarray

@@ -87,12 +87,15 @@ def test_of_two_hands_of_the_given_side_only_a_sure_one_is_reported(
 ) -> None:
     state = with_evidence(watching(True, True), 0, fits=fits)
     first, other = (replace(h, track=replace(h.track, believed=True)) for h in state.hands)
-    said = replace(first.last, lost=False)
+    said = replace(first.last, lost=False, gesture="point", pinch=0.8, pinching=True)
+    said = replace(said, pointing_direction=np.eye(3, dtype=np.float32)[0])
     assert not first_estimate(said, replace(state, hands=(first, other))).lost, "of two sides"
     alike = replace(state, hands=(first, replace(other, side=first.side)))
     found = first_estimate(said, alike)
     assert found.lost == lost and (found.state_name == "other hand") == lost
     assert not (lost and found.joint_ok.any())
+    assert (found.gesture == "") == np.isnan(found.pinch) == lost and found.pinching != lost
+    assert np.isnan(found.pointing_direction).all() == lost
     unsure = replace(other, side=first.side, track=replace(other.track, believed=False))
     assert not first_estimate(said, replace(state, hands=(first, unsure))).lost
 

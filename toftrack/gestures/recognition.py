@@ -269,6 +269,20 @@ def pointing_ray(joints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return base.copy(), way / np.linalg.norm(way)
 
 
+def without_gesture(estimate: Estimate) -> Estimate:
+    """The same without a gesture, a pinch and a pointing ray, as of a hand that is lost."""
+    nowhere = np.full(3, np.nan, np.float32)
+    return replace(
+        estimate,
+        gesture="",
+        gesture_probability=math.nan,
+        pinch=math.nan,
+        pinching=False,
+        pointing_origin_m=nowhere,
+        pointing_direction=nowhere,
+    )
+
+
 def tell_gesture(
     gestures: Gestures | None,
     state: GestureState | None,
@@ -283,16 +297,7 @@ def tell_gesture(
     that are ok are asked: a gesture that others decide is not named, and so with the pinch.
     """
     if gestures is None or (estimate.lost and estimate.state_name != "tracking"):
-        nowhere = np.full(3, np.nan, np.float32)
-        return None, replace(
-            estimate,
-            gesture="",
-            gesture_probability=math.nan,
-            pinch=math.nan,
-            pinching=False,
-            pointing_origin_m=nowhere,
-            pointing_direction=nowhere,
-        )
+        return None, without_gesture(estimate)
     angles = estimate.state[6:].astype(np.float64)
     off_rad = math.nan
     if gestures.settings.off_rad is not None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from toftrack.estimate import Estimate
+from toftrack.gestures.recognition import without_gesture
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.handedness import OTHER_SIDE, HandednessSettings
 from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
@@ -81,7 +82,8 @@ def first_estimate(estimate: Estimate, state: TrackerState) -> Estimate:
     if not (away or _either(first, other)):
         return estimate
     none = np.zeros_like(estimate.joint_ok)
-    return replace(estimate, lost=True, state_name="other hand", joint_ok=none)
+    lost = replace(estimate, lost=True, state_name="other hand", joint_ok=none)
+    return without_gesture(lost)
 
 
 def _either(first: HandState, other: HandState) -> bool:
