@@ -40,6 +40,9 @@ from toftrack.tracking.posterior import (
 from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import HandState, Track
 
+_SURELY_PRESENT = 0.97
+"""Probability of a hand from which on the network is believed which pixels are the hand's own: a
+chair's back was taken for a hand otherwise."""
 _LEAST_PARTS = 4
 """Parts of a crop, of 9 mm, that a thing in the hand has at least."""
 _MOSTLY, _UNKNOWN = 0.5, 255
@@ -108,11 +111,6 @@ class HandFrame:
         hand, occluder = self.observation.hand.numpy(), self.observation.occluder.numpy()
         return int(np.count_nonzero(occluder)) > _HIDDEN * int(np.count_nonzero(hand))
 
-    @property
-    def may_be_hidden(self) -> bool:
-        """Whether something seems to hide part of the hand; its own arm may, see with_own_arm."""
-        return self.hidden or self.out_of_sight(self.track.pose)[1] > _UNSEEN
-
     def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
         """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""
         return self.joints_out_of_sight(self.fitted.refiner.joints(pose)[0].cpu())
@@ -175,6 +173,20 @@ class FilteredFrame:
         """Hands (N, 27) brought onto the seen points and the keypoints."""
         cfg, refiner = self.frame.model.refinement, self.frame.fitted.refiner
         return refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
+
+
+def with_parts(frame: HandFrame) -> HandFrame:
+    """The frame with what the pose network says of its pixels: those of a thing in the hand are not
+    the hand's, and where something seems to hide the hand, those of its own arm hide nothing.
+    """
+    seen = without_things(frame.observation, frame.detection)
+    told = replace(frame, observation=seen)
+    surely = frame.detection.present >= _SURELY_PRESENT
+    if surely and (told.hidden or told.out_of_sight(told.track.pose)[1] > _UNSEEN):
+        seen = with_own_arm(seen, frame.detection)
+    if seen is frame.observation:
+        return frame
+    return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
 
 
 def without_things(observation: Observation, detection: Detection) -> Observation:

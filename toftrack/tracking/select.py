@@ -28,8 +28,8 @@ _PAUSE_S = 0.06
 _WORST = -1e6
 """Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
 _SURE_LEAD = 2.0
-"""Of the log posterior, with which a hypothesis of the detector at another place takes over at
-once, whatever hides the hand."""
+"""Of the log posterior, with which a hypothesis of the detector at another place takes over even
+while something hides the hand; as others do, in several frames without a break."""
 _LEAST_CREDIT = 0.2
 """Of the lead that is needed against a pose that is surely right, so much is needed against any."""
 
@@ -178,8 +178,8 @@ def select(
 
     1. The last frame's fingers stand unless the filter's are better.
     2. A hypothesis of the detector at another place takes over when it was better by `place_lead`
-       in `place_frames` frames, at once where a hand emerges or with a large lead; with no smaller
-       one while something hides it.
+       in `place_frames` frames, or at once where a hand emerges; while something hides the hand,
+       only with a large lead.
     3. Of all others, one that is much the same takes over when it is better;
     4. one with other fingers takes over when its lead, summed up over frames, is large enough.
 

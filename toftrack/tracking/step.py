@@ -26,11 +26,9 @@ from toftrack.refinement.steadying import steadied
 from toftrack.tracking.candidates import (
     FilteredFrame,
     HandFrame,
-    image_term,
     keypoints_of,
     propose,
-    with_own_arm,
-    without_things,
+    with_parts,
 )
 from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
@@ -49,9 +47,6 @@ from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
 
-_SURELY_PRESENT = 0.97
-"""Probability of a hand from which on the network is believed which pixels are the hand's own: a
-chair's back was taken for a hand otherwise."""
 _HIDDEN_WIDER = 2.0
 """By so many times at most a hidden hand is searched farther away than one that is followed."""
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
@@ -138,8 +133,8 @@ def filtered_frame(
 
 
 def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
-    """The frame with its detection, if that ran beside the filter, without what the hand holds, and
-    with both sides compared, if that is due.
+    """The frame with its detection, if that ran beside the filter, with both sides compared, if
+    that is due, and with what the detection says of its pixels.
     """
     detection = frame.pending()
     if not detection.empty:
@@ -147,13 +142,7 @@ def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
         frame = replace(frame, hand=hand, detection=detection)
         if frame.mirrored is not None:
             frame = compared_beside(frame, frame.mirrored(), image)
-    seen = without_things(frame.observation, frame.detection)
-    surely = frame.detection.present >= _SURELY_PRESENT
-    if surely and replace(frame, observation=seen).may_be_hidden:
-        seen = with_own_arm(seen, frame.detection)
-    if seen is frame.observation:
-        return frame
-    return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
+    return with_parts(frame)
 
 
 def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
