@@ -1,8 +1,9 @@
 """Before the first frame: kernels that were never compiled here are, by two processes at once.
 
 numba compiles one kernel after the other in a process, and keeps the code on the disk for all. The
-second process compiles the refinement's, and what has most in common with it. What only some
-recordings need (the median of large images, handedness) is compiled when they do.
+second process compiles the refinement's kernel, the largest one, and two small ones; the first
+process all others. What only some recordings need (the median of large images, handedness) is
+compiled when they do.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ def _compile_beside() -> None:
 
 
 def compile_refinement() -> None:
-    """The refinement's kernels, and a small one, so that both processes have as much to do."""
+    """The refinement's kernel and two small ones, so that both processes have as much to do."""
     from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.refinement.penalty_numba import joints_penalty
