@@ -20,7 +20,8 @@ from helpers.rendered import (
 )
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.detector.hand_detector import NO_DETECTION, SAME_PLACE_M, Detection
+from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.detect import (
     detect,
     detection_due,
@@ -236,6 +237,16 @@ def test_a_hand_has_not_jumped_since_it_was_believed() -> None:
     assert at_once(here) == pytest.approx(0, abs=0.01) and at_once(aside) < -1
     assert at_once(aside) < later(aside) < 0, "it may have moved on meanwhile"
     assert at_once(here + 0.02) > at_once(here + 0.05) > at_once(aside)
+
+
+def test_a_hand_that_was_hardly_believed_may_be_elsewhere() -> None:
+    far = np.array([0.3, 0.0, 0.5])
+    known = [replace(seen_at(hand_at(), 0.04), surest=surest) for surest in (-3.0, 0.0, 3.0)]
+    hardly, perhaps, surely = (likely_for(slot_of(None, seen=seen))(far) for seen in known)
+    assert 0 > hardly > perhaps > surely
+    assert surely == pytest.approx(-1.5 - 3.0, abs=0.1)
+    certain = likely_for(slot_of(None, seen=seen_at(hand_at(), 0.04)))
+    assert certain(far) < surely, "then only its speed counts"
 
 
 def test_another_hand_is_no_place_that_a_hand_has_come_to() -> None:

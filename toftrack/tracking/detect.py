@@ -9,12 +9,8 @@ import numpy as np
 
 from toftrack.compute.pace import Duration
 from toftrack.compute.rigid import pivot_offset
-from toftrack.detector.hand_detector import (
-    NO_DETECTION,
-    SAME_PLACE_M,
-    Detection,
-    DetectorSettings,
-)
+from toftrack.detector.hand_detector import NO_DETECTION, Detection, DetectorSettings
+from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.confidence import log_odds
@@ -30,6 +26,8 @@ _IN_FRONT_M = 0.03
 """What is so much nearer than a hidden hand is what hides it."""
 _STEP_M, _SPEED_M_S = 0.04, 0.25
 """How far a hand has moved since it was last believed: at once, and a second."""
+_ANYWHERE = -1.5
+"""Log probability of a place if the hand was not where it was last believed."""
 _FORGOTTEN_S = 1.0
 _OTHER_PLACE_M = 0.1
 """A hand that is so far from where the one that was believed was seen last may be another one."""
@@ -168,4 +166,6 @@ def reachable(hand: HandState, others_m: Sequence[np.ndarray], centre_m: np.ndar
     if hand.seen.age_s >= _FORGOTTEN_S:
         return 0.0
     away = float(np.linalg.norm(hand.seen.centre_m - centre_m))
-    return -0.5 * (away / (_STEP_M + _SPEED_M_S * hand.seen.age_s)) ** 2
+    near = -0.5 * (away / (_STEP_M + _SPEED_M_S * hand.seen.age_s)) ** 2
+    # Or it was never there.
+    return max(near, _ANYWHERE - float(np.logaddexp(0.0, hand.seen.surest)))

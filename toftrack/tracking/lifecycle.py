@@ -243,6 +243,7 @@ def close(
         doubtful=status.doubtful,
         log_odds=status.log_odds,
         whole_odds=status.whole_odds,
+        surest=max(track.surest, status.log_odds),
         doubted=status.lost,
         believed=track.believed or not status.lost,
         unseen_s=track.unseen_s + dt_s if frame.detection.empty else 0.0,
@@ -250,7 +251,8 @@ def close(
         nearest_m=frame.expected_m if frame.hidden else 0.0,
     )
     remembered = not status.lost and track.age.reached(model.lost.probation + 1)
-    seen = LastSeen(track.mean, 0.0, frame.observation) if remembered else frame.hand.seen
+    now = LastSeen(track.mean, 0.0, frame.observation, track.surest)
+    seen = now if remembered else frame.hand.seen
     return status, track, seen
 
 

@@ -40,6 +40,7 @@ class Track:
     challenged: how long a pose of another place has been better.
     log_odds: that the estimate is right, smoothed over time.  whole_odds: that its mean error is
         below 40 mm, likewise.
+    surest: the highest log odds so far.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
     unseen_s: how long ago the pose network was asked about it.
     features, joint_features: of the last estimate, (21, J); see confidence.py.
@@ -61,6 +62,7 @@ class Track:
     challenged: Duration = Duration()
     log_odds: float = 0.0
     whole_odds: float = 0.0
+    surest: float = -math.inf
     doubted: bool = False
     believed: bool = False
     unseen_s: float = 0.0
@@ -75,11 +77,13 @@ class LastSeen:
 
     particle: (1, 6 + d).  age_s: how long ago; inf = it never was.
     scene: what was seen then; None where nobody says.
+    surest: the highest log odds of its track that an estimate was right.
     """
 
     particle: Tensor
     age_s: float
     scene: Observation | None = None
+    surest: float = math.inf
 
     @property
     def ever(self) -> bool:
