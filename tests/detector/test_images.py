@@ -11,16 +11,19 @@ import torch
 from helpers.detection import small_bank
 
 from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M, channels
+from toftrack.detector.dice import Dice
 from toftrack.detector.images import (
     NEW_HANDS,
     WIDE_SIZE,
     Crops,
     WideImages,
     crop_images,
+    poorly_read,
     wide_images,
 )
 from toftrack.detector.images_numba import read_pictures
 from toftrack.detector.network import PARTS, SEGMENTS
+from toftrack.detector.pictures import Lens
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -80,7 +83,23 @@ def test_whole_images_are_complete(images: WideImages) -> None:
         assert getattr(images, field.name).isfinite().all(), field.name
     assert (images.seen >= 0).all() and images.seen.max() < 3
     assert 0.5 < (images.seen[:, 0] > 0.15).float().mean() < 1, "some without a raised hand"
-    assert images.left.any() and not images.left.all()
+
+
+def test_what_is_far_is_read_in_part_and_nothing_else_changes() -> None:
+    lens = Lens(*(torch.full((64,), value) for value in (100.0, 48.0, 40.0, 90.0, 70.0)))
+    taken = torch.full((64, *WIDE_SIZE), 0.3)
+    taken[:, :, 60:] = 2.0
+    taken[:, 50:, :] = 0.0
+    seen = poorly_read(taken, lens, Dice(torch.Generator().manual_seed(0)))
+    near, far, nothing = taken == 0.3, taken == 2.0, taken == 0.0
+    assert torch.equal(seen[near], taken[near])
+    read = (seen == 2.0).flatten(1).sum(1) / far.flatten(1).sum(1)
+    assert (read == 1).any() and (read < 0.1).any(), "of some cameras"
+    stray = ((seen > 0) & nothing).flatten(1).sum(1)
+    assert (stray == 0).any() and (stray > 0).any()
+    outside = torch.zeros(WIDE_SIZE, dtype=torch.bool)
+    outside[70:], outside[:, 90:] = True, True
+    assert not (seen[:, outside & (taken[0] == 0)] > 0).any()
 
 
 def test_hands_are_seen_where_it_is_said(images: WideImages) -> None:

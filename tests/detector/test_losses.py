@@ -125,20 +125,20 @@ def found_at(images: WideImages) -> Found:
     n = len(images.depth_m)
     h, w = WIDE_SIZE[0] // STRIDE, WIDE_SIZE[1] // STRIDE
     v, u = torch.arange(h)[:, None], torch.arange(w)
-    heat = torch.full((n, 2, h, w), -12.0)
-    column, row, depth = (torch.zeros(n, 2, h, w) for _ in range(3))
+    heat = torch.full((n, h, w), -12.0)
+    column, row, depth = (torch.zeros(n, h, w) for _ in range(3))
     for i in range(n):
         for hand in range(2):
-            side, (x, y) = int(images.left[i, hand]), images.cell[i, hand]
+            x, y = images.cell[i, hand]
             if images.seen[i, hand] <= 0.15:
                 continue
             bump = torch.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 0.7**2)
             p = torch.where(bump >= bump.max(), 1.0, bump).clamp(1e-5, 1 - 1e-5)
-            heat[i, side] = torch.maximum(heat[i, side], p.logit())
+            heat[i] = torch.maximum(heat[i], p.logit())
             near = ((u - x).abs() < 1.5) & ((v - y).abs() < 1.5)
-            column[i, side] = torch.where(near, x - u, column[i, side])
-            row[i, side] = torch.where(near, y - v, row[i, side])
-            depth[i, side] = torch.where(near, images.depth_m[i, hand].log(), depth[i, side])
+            column[i] = torch.where(near, x - u, column[i])
+            row[i] = torch.where(near, y - v, row[i])
+            depth[i] = torch.where(near, images.depth_m[i, hand].log(), depth[i])
     return Found(heat, column, row, depth)
 
 

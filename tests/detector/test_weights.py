@@ -26,7 +26,7 @@ from toftrack.errors import ToftrackError
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 CROPS = 2 * torch.rand(2, CROP_CHANNELS, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
-WHOLE = torch.rand(1, 2, 40, 48, generator=torch.Generator().manual_seed(0))
+WHOLE = torch.rand(1, 2, 32, 48, generator=torch.Generator().manual_seed(0))
 ABOUT = {"seed": 3, "images": 12}
 
 
@@ -283,3 +283,21 @@ def test_files_of_before_the_detector_had_its_name_are_read(file: Path) -> None:
     metadata |= {"format": "toftrack-relocaliser", "sha256": module._checksum(arrays)}
     np.savez(file, metadata=np.array(json.dumps(metadata)), **arrays)
     assert load_weights(file)[2] == ABOUT
+
+
+@torch.no_grad()
+def test_older_weights_of_another_finder_use_that_of_the_package(
+    networks: tuple[nn.Module, nn.Module], file: Path
+) -> None:
+    with np.load(file) as content:
+        arrays = {n: a for n, a in content.items() if not n.startswith("finder.")}
+    arrays["finder.body.0.weight"] = np.zeros((16, 2, 5, 5), np.float16)
+    metadata = json.loads(str(arrays.pop("metadata")))
+    metadata["sha256"] = module._checksum(arrays)
+    np.savez(file, metadata=np.array(json.dumps(metadata)), **arrays)
+    older, package = load_weights(file), load_weights()
+    assert older.sha256 == metadata["sha256"]
+    for one, two in zip(older.finder(WHOLE), package.finder(WHOLE), strict=True):
+        assert torch.equal(one, two)
+    for one, two in zip(older.pose(CROPS), networks[0](CROPS), strict=True):
+        torch.testing.assert_close(one, two, atol=2e-3, rtol=1e-3)

@@ -16,6 +16,7 @@ from toftrack.detector.hand_detector import Detection
 from toftrack.detector.hands import HAND, Hands, posed_hands
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
+from toftrack.detector.proposals import Places
 from toftrack.detector.scenes import Scenes, plain_scenes
 from toftrack.detector.shapes import ShapeBank, shape_bank
 from toftrack.detector.weights import make_ready
@@ -119,7 +120,8 @@ class FixedDetector:
     """In the networks' place: finds what it is given, and records the places it was asked about.
 
     found: what a search of the whole image finds, whichever side is searched for.
-    searched: the sides of all searches.  likely: of the last one, None before any.
+    searched: the sides of all searches, "either" of those that are spread over frames.
+    likely: of the last one, None before any.
     centres_m: (C, 3) of all calls of `detect` and `start`.
     """
 
@@ -135,10 +137,10 @@ class FixedDetector:
         self.likely = likely
         return self.found
 
-    def start_search(self, depth_m, k, side) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-        self.searched.append(side)
+    def start_search(self, depth_m, k) -> Callable[[], Places]:
+        self.searched.append("either")
         centres = np.array([one.centre_m.numpy() for one in self.found]).reshape(-1, 3)
-        return lambda: (centres, np.full(len(centres), 0.9, np.float32))
+        return lambda: Places(centres, np.full(len(centres), 0.9, np.float32))
 
     def detect(self, depth_m, k, centres_m, side, up=None) -> list[Detection]:
         """An open palm whose middle is at each place."""

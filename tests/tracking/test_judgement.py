@@ -20,7 +20,7 @@ from helpers.rendered import (
 )
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.detector.hand_detector import SAME_PLACE_M
+from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.tracking.confidence import NO_FEATURES, WholeHand
 from toftrack.tracking.filter import Filtered, Found

@@ -22,7 +22,8 @@ from helpers.rendered import (
 )
 
 from toftrack.compute.pace import FRAME_S
-from toftrack.detector.hand_detector import SAME_PLACE_M, Detection
+from toftrack.detector.hand_detector import Detection
+from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.candidates import HandFrame

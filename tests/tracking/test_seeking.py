@@ -12,7 +12,7 @@ from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import hand_at, image_of, right_hand_model, track_of
 
 from toftrack.compute.pace import FRAME_S
-from toftrack.detector.hand_detector import SAME_PLACE_M
+from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.detect import reachable
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.seeking import detect_again, sought, start_seeking, taking_part

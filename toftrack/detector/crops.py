@@ -21,6 +21,8 @@ CROP_CHANNELS = 8
 """Of a crop, see `channels`; older weights see the first three or four."""
 WIDE_F_PX = 100.0
 """Focal length of the whole image that the finder sees, pixels."""
+WIDE_MULTIPLE = 16
+"""Its columns and rows are a multiple of this."""
 WIDE_LARGEST_PX = 512
 """Its most columns and rows: a wider view than 137 degrees is seen at a smaller focal length."""
 WIDE_RANGE_M = 1.6
@@ -129,8 +131,11 @@ def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
     height, width = depth_m.shape
     focal = np.minimum(WIDE_F_PX, k.diagonal()[:2] * WIDE_LARGEST_PX / (width, height))
     scale = focal / k.diagonal()[:2]
-    # A multiple of 8, for the network's stride; what is added has no reading.
-    w, h = (8 * int(np.ceil(s * f / 8 - 1e-9)) for s, f in zip((width, height), scale, strict=True))
+    # A multiple, for the network's strides; what is added has no reading.
+    w, h = (
+        WIDE_MULTIPLE * int(np.ceil(s * f / WIDE_MULTIPLE - 1e-9))
+        for s, f in zip((width, height), scale, strict=True)
+    )
     u = np.rint((np.arange(w) + 0.5) / scale[0] - 0.5).astype(int)
     v = np.rint((np.arange(h) + 0.5) / scale[1] - 0.5).astype(int)
     read = np.zeros((h, w), np.float32)

@@ -21,8 +21,6 @@ from toftrack.detector.proposals_numba import run_pose_network, start_pose_netwo
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 
-SAME_PLACE_M = 0.06
-"""Places that lie closer together are one."""
 _AGAIN = 2.0
 """Places whose merit is so much lower than the best are not considered again."""
 _CLEAR_M = 0.010
@@ -205,7 +203,7 @@ class HandDetector:
         """
         cfg = self.settings
         found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)
-        centres, heat = self._places(found, side)
+        centres, heat = found.centre_m, found.probability
         detections = self.detect(depth_m, k, centres, side)
 
         def merits() -> np.ndarray:
@@ -222,24 +220,10 @@ class HandDetector:
         order = np.argsort(-second, kind="stable")
         return [detections[row] for row in order if second[row] > cfg.merit]
 
-    def start_search(
-        self, depth_m: np.ndarray, k: np.ndarray, side: str
-    ) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-        """The first part of a search, begun beside whatever does not need it: the places (P, 3)
-        where a hand of a side may be, the likeliest first, and their probabilities (P,).
-        """
+    def start_search(self, depth_m: np.ndarray, k: np.ndarray) -> Callable[[], Places]:
+        """Where hands may be, the first part of a search; begun beside whatever can do without."""
         cfg = self.settings
-        wait = start_finding(self.finder, depth_m, k, cfg.places, cfg.least)
-        return lambda: self._places(wait(), side)
-
-    def _places(self, found: dict[str, Places], side: str) -> tuple[np.ndarray, np.ndarray]:
-        # The finder knows sides only roughly: places of the other side may be this one's as well.
-        other = "left" if side == "right" else "right"
-        centres = np.concatenate((found[side].centre_m, found[other].centre_m))
-        heat = np.concatenate((found[side].probability, 0.3 * found[other].probability))
-        order = np.argsort(-heat, kind="stable")
-        order = order[_apart(centres[order])][: self.settings.places]
-        return centres[order], heat[order]
+        return start_finding(self.finder, depth_m, k, cfg.places, cfg.least)
 
 
 def merit(detection: Detection, heat: float) -> float:
@@ -255,15 +239,6 @@ def merit(detection: Detection, heat: float) -> float:
 def doubt_m(detection: Detection) -> float:
     """How far off the pose network takes itself to be, metres."""
     return float(detection.error_m[0]) + 0.5 * float(detection.keypoints.sigma_m.mean())
-
-
-def _apart(centres_m: np.ndarray) -> list[int]:
-    """Rows of the first of all places that are the same, in their order."""
-    kept: list[int] = []
-    for row, centre in enumerate(centres_m):
-        if all(np.linalg.norm(centre - centres_m[other]) > SAME_PLACE_M for other in kept):
-            kept.append(row)
-    return kept
 
 
 def _detection(seen: NetworkOutput, row: int) -> Detection:

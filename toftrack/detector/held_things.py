@@ -48,7 +48,7 @@ _PHONE_M = ((0.055, 0.095), (0.115, 0.185), (0.0, 0.016))
 """Width, length and thickness of what could be a phone."""
 
 
-def _part(
+def make_part(
     kind: int, place: Tensor, rows: Tensor, sizes: Tensor, edge: Tensor, wall: Tensor
 ) -> Tensor:
     """(N, PART); place: (N, 3), rows: (N, 3, 3), sizes: (N, 3), edge, wall: (N,)."""
@@ -102,17 +102,17 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     edge = between(0.0, 0.004)
     radius, half = between(0.008, 0.042), between(0.035, 0.13)
     taper = 1 + 0.08 * dice.normal(n)
-    cylinder = _part(
+    cylinder = make_part(
         CONE, at(half), rows, torch.stack((radius, radius * taper, half), 1), edge, zero
     )
     low, high, tall = between(0.022, 0.038), between(1.0, 1.35), between(0.035, 0.07)
     wall = between(0.0015, 0.004)
     cup_sizes = torch.stack((low, low * high, tall), 1)
-    cup = _part(CONE, at(tall, 0.3 * along * tall), rows, cup_sizes, 0 * edge, wall)
+    cup = make_part(CONE, at(tall, 0.3 * along * tall), rows, cup_sizes, 0 * edge, wall)
     ring, thick = between(0.016, 0.028), between(0.0035, 0.007)
     beside = torch.where(dice.chance(0.5, n), 1.0, -1.0)[:, None] * rows[:, 0]
     handle_rows = torch.stack((y, rows[:, 0], rows[:, 2]), 1)
-    handle = _part(
+    handle = make_part(
         RING,
         at(tall, 0.3 * along * tall) + beside * (0.5 * low * (1 + high) + 0.6 * ring)[:, None],
         handle_rows,
@@ -122,16 +122,20 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     )
     body, neck = between(0.022, 0.040), between(0.25, 0.5)
     tall_2, neck_long = between(0.05, 0.10), between(0.02, 0.05)
-    bottle = _part(CONE, at(tall_2), rows, torch.stack((body, body, tall_2), 1), 0.3 * body, zero)
+    bottle = make_part(
+        CONE, at(tall_2), rows, torch.stack((body, body, tall_2), 1), 0.3 * body, zero
+    )
     neck_place = at(tall_2) + y * (tall_2 + 0.8 * neck_long)[:, None]
     neck_sizes = torch.stack((body * neck * 1.3, body * neck, neck_long), 1)
-    neck_part = _part(CONE, neck_place, rows, neck_sizes, 0 * edge, zero)
+    neck_part = make_part(CONE, neck_place, rows, neck_sizes, 0 * edge, zero)
     ball_radius = between(0.014, 0.045)
-    ball = _part(BALL, at(ball_radius, zero), rows, ball_radius[:, None].expand(n, 3), zero, zero)
+    ball = make_part(
+        BALL, at(ball_radius, zero), rows, ball_radius[:, None].expand(n, 3), zero, zero
+    )
     box_sizes = torch.stack((between(0.010, 0.035), between(0.03, 0.10), between(0.008, 0.035)), 1)
-    box = _part(BOX, at(box_sizes[:, 1]), rows, _no_phone(box_sizes), edge, zero)
+    box = make_part(BOX, at(box_sizes[:, 1]), rows, _no_phone(box_sizes), edge, zero)
     grip, grip_long = between(0.008, 0.017), between(0.045, 0.07)
-    handle_2 = _part(
+    handle_2 = make_part(
         CONE, at(grip_long, 0 * along), rows, torch.stack((grip, grip, grip_long), 1), edge, zero
     )
     shaft_long = between(0.03, 0.09)
@@ -140,15 +144,15 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     rod = torch.stack((between(0.002, 0.006), between(0.002, 0.006), shaft_long), 1)
     tool = torch.where(
         dice.chance(0.5, n)[:, None],
-        _part(BOX, shaft_place, rows, _no_phone(blade), 0 * edge, zero),
-        _part(CONE, shaft_place, rows, rod, 0 * edge, zero),
+        make_part(BOX, shaft_place, rows, _no_phone(blade), 0 * edge, zero),
+        make_part(CONE, shaft_place, rows, rod, 0 * edge, zero),
     )
     # None is as thin as a hammer's handle.
     oval = torch.stack((between(0.02, 0.042), between(0.02, 0.042), between(0.02, 0.09)), 1)
     block = torch.stack((between(0.02, 0.035), between(0.03, 0.10), between(0.02, 0.035)), 1)
     grips = (
-        _part(CONE, at(oval[:, 2]), rows, oval, 0.3 * oval[:, :2].amin(1), zero),
-        _part(BOX, at(block[:, 1]), rows, block, edge, zero),
+        make_part(CONE, at(oval[:, 2]), rows, oval, 0.3 * oval[:, :2].amin(1), zero),
+        make_part(BOX, at(block[:, 1]), rows, block, edge, zero),
     )
     off = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     # Beyond the hand's width along the axis, or before the palm.
@@ -157,10 +161,10 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     turned = roma.unitquat_to_rotmat(torch.nn.functional.normalize(dice.normal(n, 4), dim=1))
     lump = torch.stack((between(0.005, 0.05), between(0.005, 0.06), between(0.003, 0.05)), 1)
     lumps = (
-        _part(BOX, place + off, turned, _no_phone(lump), 0.2 * lump.amin(1), zero),
-        _part(CONE, place + off, turned, lump, 0.2 * lump.amin(1), zero),
-        _part(BALL, place + off, turned, lump[:, :1].expand(n, 3), zero, zero),
-        _part(RING, place + off, turned, 0.5 * lump + 0.005, zero, zero),
+        make_part(BOX, place + off, turned, _no_phone(lump), 0.2 * lump.amin(1), zero),
+        make_part(CONE, place + off, turned, lump, 0.2 * lump.amin(1), zero),
+        make_part(BALL, place + off, turned, lump[:, :1].expand(n, 3), zero, zero),
+        make_part(RING, place + off, turned, 0.5 * lump + 0.005, zero, zero),
     )
     odd = _thing(
         _chosen(list(grips), dice.rows(len(grips), n)),
@@ -232,10 +236,10 @@ def things_between_tips(
     plate_sizes = _no_phone(torch.stack((wide, long, half), 1))
     out = (plate_sizes[:, 1] - between(0.006, 0.025)).clamp(min=0)
     edge = torch.minimum(between(0.0, 0.004), 0.5 * half)
-    plate = _part(BOX, middle + away * out[:, None], flat, plate_sizes, edge, zero)
+    plate = make_part(BOX, middle + away * out[:, None], flat, plate_sizes, edge, zero)
     disc_radius = between(0.012, 0.075)
     disc_out = (disc_radius - between(0.006, 0.025)).clamp(min=0)
-    disc = _part(
+    disc = make_part(
         CONE,
         middle + away * disc_out[:, None],
         torch.stack((side, u, -away), 1),
@@ -248,18 +252,18 @@ def things_between_tips(
     pen_rows = torch.stack((torch.linalg.cross(pen, u), pen, u), 1)
     pen_half, pen_out = between(0.055, 0.09), between(0.02, 0.05)
     pen_sizes = torch.stack((half * between(0.5, 1.0), half, pen_half), 1)
-    pens = _part(
+    pens = make_part(
         CONE, middle + pen * (pen_half - pen_out)[:, None], pen_rows, pen_sizes, 0 * edge, zero
     )
     cube = torch.stack((between(0.006, 0.03), between(0.006, 0.03), half), 1)
-    cubes = _part(BOX, middle, flat, cube, edge, zero)
-    ball = _part(BALL, middle, flat, half[:, None].expand(n, 3), zero, zero)
+    cubes = make_part(BOX, middle, flat, cube, edge, zero)
+    ball = make_part(BALL, middle, flat, half[:, None].expand(n, 3), zero, zero)
     tall = between(0.012, 0.07)
     down = torch.stack((side, away, u), 1)
     turned = torch.stack((away, -side, u), 1)
     standing = torch.where(dice.chance(0.6, n)[:, None, None], turned, down)
     middle_2 = middle + standing[:, 1] * (tall * between(-0.7, 0.7))[:, None]
-    cylinder = _part(
+    cylinder = make_part(
         CONE,
         middle_2,
         standing,
@@ -267,7 +271,7 @@ def things_between_tips(
         torch.minimum(edge, 0.3 * half),
         zero,
     )
-    cup = _part(
+    cup = make_part(
         CONE,
         middle_2,
         standing,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, wide_channels
 from toftrack.detector.dice import Dice
+from toftrack.detector.furniture import furniture
 from toftrack.detector.hands import (
     BACKGROUND,
     FOREARM,
@@ -46,6 +47,12 @@ _DIRECTION = 0.25
 """By how much it is uncertain where the fingers of a hand point that is followed, of 1 m."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
+_EMPTY = 0.25
+"""Whole images without a raised hand."""
+_FURNISHED = 0.3, 0.8
+"""Those with a hand, and those without one, that show furniture."""
+_MIDDLE = 0.6
+"""Whole images whose hand is near the middle; of the others it is anywhere, also at the border."""
 _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
@@ -77,13 +84,12 @@ class WideImages:
     """Whole images and the hands in them: the first is raised, the second another's.
 
     image: (N, 2, *WIDE_SIZE).  cell: (N, 2, 2) column and row of the middle of the palm in cells.
-    depth_m: (N, 2) its Z.  left: (N, 2).  seen: (N, 2) which part of the hand is in view, 0 = none.
+    depth_m: (N, 2) its Z.  seen: (N, 2) which part of the hand is in view, 0 = none.
     """
 
     image: Tensor
     cell: Tensor
     depth_m: Tensor
-    left: Tensor
     seen: Tensor
 
 
@@ -165,7 +171,7 @@ def _onto_something(scenes: Scenes, centre_m: Tensor, dice: Dice) -> Tensor:
 
 
 def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImages:
-    """n whole images, a sixth of them without a raised hand."""
+    """n whole images, a quarter of them without a raised hand."""
     dice = Dice(generator)
     height, width = WIDE_SIZE
     wide = dice.uniform(n, low=60, high=width).round()
@@ -178,14 +184,15 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
         high,
     )
     z = dice.uniform(n, low=math.log(0.25), high=math.log(1.15)).exp()
-    u = wide * dice.uniform(n, low=-0.05, high=1.05)
-    v = high * dice.uniform(n, low=-0.05, high=1.05)
+    anywhere = dice.uniform(n, 2, low=-0.05, high=1.05)
+    at = torch.where(dice.chance(_MIDDLE, n, 1), 0.5 + 0.2 * dice.normal(n, 2), anywhere)
+    u, v = wide * at[:, 0], high * at[:, 1]
     pivot = torch.stack(((u - lens.cx) / WIDE_F_PX * z, (v - lens.cy) / WIDE_F_PX * z, z), 1)
     left = dice.chance(0.5, n)
     views = random_views(n, dice)
     hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
     labels = hands.labels.clone()
-    raised = ~dice.chance(0.17, n)
+    raised = ~dice.chance(_EMPTY, n)
     pieces = labels.shape[1] - FOREARM_PIECES
     labels[:, :pieces] = torch.where(raised[:, None], labels[:, :pieces], -1)
     # Without its hand, mostly no forearm is held up either.
@@ -196,7 +203,9 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     scenes = random_scenes(
         hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there), views=views
     )
-    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
+    scenes = _furnished(scenes, dice.chance(torch.where(raised, *_FURNISHED), n), dice)
+    taken, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
+    depth = poorly_read(torch.from_numpy(taken), lens, dice)
 
     cells, seen = [], []
     shown = torch.from_numpy(which)
@@ -205,15 +214,39 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
         at = at + torch.stack((lens.cx, lens.cy), 1)
         cells.append((at + 0.5) / STRIDE - 0.5)
         expected = _HAND_M2 * (2 * one.log_size).exp() * (WIDE_F_PX / one.pivot_m[:, 2]) ** 2
-        part = (shown == label).sum((1, 2)) / expected
+        part = ((shown == label) & (depth > 0)).sum((1, 2)) / expected
         seen.append(torch.where(exists, part, torch.zeros(n)))
     return WideImages(
-        image=wide_channels(torch.from_numpy(depth)),
+        image=wide_channels(depth),
         cell=torch.stack(cells, 1),
         depth_m=torch.stack((hands.pivot_m[:, 2], other.pivot_m[:, 2]), 1),
-        left=torch.stack((left, other_left), 1),
         seen=torch.stack(seen, 1),
     )
+
+
+def _furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
+    """Scenes with furniture, and mostly without walls before it; there: (N,) where there is any."""
+    planes = scenes.planes.clone()
+    open_room = there & dice.chance(0.7, len(there))
+    planes[..., 3] = torch.where(open_room[:, None], torch.inf, planes[..., 3])
+    parts = torch.cat((scenes.parts, furniture(there, dice)), 1)
+    return replace(scenes, planes=planes, parts=parts)
+
+
+def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
+    """Images (N, H, W) as some cameras take them: of what is far few pixels are read, and some
+    where there is nothing.
+    """
+    n, height, width = depth_m.shape
+    begins = torch.where(dice.chance(0.3, n), dice.uniform(n, low=0.5, high=1.5), 9.0)
+    falls = dice.uniform(n, low=0.1, high=0.8)
+    missed = ((depth_m - begins[:, None, None]) / falls[:, None, None]).clamp(max=0.97)
+    depth_m = torch.where(dice.uniform(n, height, width) < missed, 0.0, depth_m)
+    share = torch.where(dice.chance(0.3, n), dice.uniform(n, high=0.03), 0.0)
+    stray = (dice.uniform(n, height, width) < share[:, None, None]) & (depth_m == 0)
+    stray &= torch.arange(height)[:, None] < lens.height[:, None, None]
+    stray &= torch.arange(width) < lens.width[:, None, None]
+    return torch.where(stray, dice.uniform(n, height, width, low=0.05, high=1.5), depth_m)
 
 
 def _other_hands(hands: Hands, bank: ShapeBank, dice: Dice) -> tuple[Hands, Tensor]:

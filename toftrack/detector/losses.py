@@ -100,30 +100,26 @@ def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> PoseLosses:
 
 def finder_loss(found: Found, images: WideImages) -> Tensor:
     """Focal loss of the heat (Law and Deng, "CornerNet", ECCV 2018), L1 of places and depths."""
-    n, _, height, width = found.heat.shape
+    n, height, width = found.heat.shape
     v = torch.arange(height)[:, None]
     u = torch.arange(width)
-    target = torch.zeros(n, 2, height, width)
-    ignored = torch.zeros(n, 2, height, width, dtype=torch.bool)
+    target = torch.zeros(n, height, width)
+    ignored = torch.zeros(n, height, width, dtype=torch.bool)
     places = found.heat.new_zeros(())
     for hand in range(2):
-        side = images.left[:, hand].long()
         column, row = images.cell[:, hand].unbind(1)
         seen = images.seen[:, hand]
         du, dv = u - column[:, None, None], v - row[:, None, None]
         bump = torch.exp(-0.5 * (du.square() + dv.square()) / 0.7**2)
         bump = torch.where((bump >= bump.amax((1, 2), keepdim=True)) & (bump > 0.3), 1.0, bump)
         bump = torch.where((seen > _SEEN)[:, None, None], bump, torch.zeros(()))
-        index = torch.arange(n)
-        target[index, side] = torch.maximum(target[index, side], bump)
-        near = (du.square() + dv.square() < 9) & ((seen > _BARELY_SEEN) & (seen <= _SEEN))[
-            :, None, None
-        ]
-        ignored[index, side] |= near
+        target = torch.maximum(target, bump)
+        barely = (seen > _BARELY_SEEN) & (seen <= _SEEN)
+        ignored |= (du.square() + dv.square() < 9) & barely[:, None, None]
         at = ((du.abs() < 1.5) & (dv.abs() < 1.5) & (seen > _SEEN)[:, None, None]).nonzero()
         if len(at):
             b, r, c = at.unbind(1)
-            here = (b, side[b], r, c)
+            here = (b, r, c)
             places = (
                 places
                 + (

@@ -173,7 +173,7 @@ class PoseNet(nn.Module):
         middle = self.middle(fine)
         dense = self.dense(self.coarse(middle))
         merged = self.lateral_16(fine) + self.context(dense)[:, :, None, None]
-        merged = merged + F.interpolate(self.lateral_8(middle), scale_factor=2.0, mode="nearest")
+        merged = merged + _twice_as_fine(self.lateral_8(middle))
         merged = self.smooth(F.relu(merged))
         return self.heads(dense), self.keypoints(merged), self.painted(merged)
 
@@ -215,7 +215,7 @@ class PoseNet(nn.Module):
 
 
 class Found(NamedTuple):
-    """What the finder says of N images of h x w cells: each (N, 2, h, w), right hands first.
+    """What the finder says of N images of h x w cells: each (N, h, w).
 
     heat: logit that a hand's middle lies in the cell.  column, row: offsets from the cell's middle,
     in cells.  log_depth: of the middle of the palm, Z in metres.
@@ -228,24 +228,36 @@ class Found(NamedTuple):
 
 
 class Finder(nn.Module):
-    """Whole images (N, 2, H, W) to Found, a cell to 4 x 4 pixels."""
+    """Whole images (N, 2, H, W), H and W multiples of WIDE_MULTIPLE, to Found, a cell to 4 x 4
+    pixels.
+
+    What is coarse is added to what is fine, as in feature pyramids (Lin et al., "Feature pyramid
+    networks for object detection", CVPR 2017).
+    """
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
-        self.body = nn.Sequential(
+        w1, w2 = width, 2 * width
+        self.fine = nn.Sequential(
             nn.Conv2d(2, 16, 5, 2, 2, bias=False),
             nn.BatchNorm2d(16),
             nn.ReLU(),
-            nn.Conv2d(16, width, 3, 2, 1, bias=False),
-            nn.BatchNorm2d(width),
+            nn.Conv2d(16, w1, 3, 2, 1, bias=False),
+            nn.BatchNorm2d(w1),
             nn.ReLU(),
-            Residual(width, width),
-            Residual(width, width, dilation=2),
-            Residual(width, width, dilation=3),
+            Residual(w1, w1),
         )
-        self.heads = nn.Conv2d(width, 8, 1)
+        self.middle = nn.Sequential(Residual(w1, w2, 2), Residual(w2, w2))
+        self.coarse = nn.Sequential(
+            Residual(w2, w2, 2), Residual(w2, w2), Residual(w2, w2, dilation=2)
+        )
+        self.lateral_coarse = nn.Conv2d(w2, w2, 1)
+        self.merged_middle = Residual(w2, w2)
+        self.lateral_middle = nn.Conv2d(w2, w1, 1)
+        self.merged = Residual(w1, w1)
+        self.heads = nn.Conv2d(w1, 4, 1)
         assert self.heads.bias is not None
-        self.heads.bias.data[:2] = -5.0  # at first there are no hands anywhere
+        self.heads.bias.data[0] = -5.0  # at first there are no hands anywhere
 
     @property
     def device(self) -> torch.device:
@@ -255,11 +267,18 @@ class Finder(nn.Module):
     @property
     def ends(self) -> tuple[Tensor, ...]:
         """Weights of the first layer and of the last one."""
-        return self.body[0].get_parameter("weight"), self.heads.weight
+        return self.fine[0].get_parameter("weight"), self.heads.weight
 
     def forward(self, image: Tensor) -> Found:
         """See the class."""
-        heat, column, row, depth = (
-            self.heads(self.body(image)).float().unflatten(1, (4, 2)).unbind(1)
-        )
+        fine = self.fine(image)
+        middle = self.middle(fine)
+        coarse = self.lateral_coarse(self.coarse(middle))
+        middle = self.merged_middle(F.relu(middle + _twice_as_fine(coarse)))
+        merged = self.merged(F.relu(fine + _twice_as_fine(self.lateral_middle(middle))))
+        heat, column, row, depth = self.heads(merged).float().unbind(1)
         return Found(heat, column, row, depth - 0.7)
+
+
+def _twice_as_fine(features: Tensor) -> Tensor:
+    return F.interpolate(features, scale_factor=2.0, mode="nearest")

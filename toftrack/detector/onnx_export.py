@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from toftrack.detector.crops import CROP
+from toftrack.detector.crops import CROP, WIDE_MULTIPLE
 from toftrack.detector.network import Found, PoseNet
 from toftrack.detector.onnx_networks import (
     DIGEST,
@@ -62,7 +62,10 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     loaded = load_weights(weights)
     crops = torch.zeros(2, loaded.pose.inputs, CROP, CROP)
     several = torch.export.Dim("n", min=1, max=1 << 16)
-    rows, columns = (torch.export.Dim(name, min=8, max=1 << 16) for name in ("h", "w"))
+    # In multiples, as `crops.wide` makes them.
+    rows, columns = (
+        WIDE_MULTIPLE * torch.export.Dim(name, min=1, max=1 << 12) for name in ("h", "w")
+    )
     outputs = {
         "pose": ["heads", "keypoints", "parts"],
         "finder": list(Found._fields),
@@ -71,14 +74,14 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
         "pose": _exported(_Features(loaded.pose), crops, "crops", outputs["pose"], {0: several}),
         "finder": _exported(
             loaded.finder,
-            torch.zeros(2, 2, 72, 96),
+            torch.zeros(2, 2, 5 * WIDE_MULTIPLE, 6 * WIDE_MULTIPLE),
             "images",
             outputs["finder"],
             {0: several, 2: rows, 3: columns},
         ),
     }
     _compare(_Features(loaded.pose), contents["pose"], "crops", crops.shape[1:])
-    _compare(loaded.finder, contents["finder"], "images", (2, 56, 80))
+    _compare(loaded.finder, contents["finder"], "images", (2, 3 * WIDE_MULTIPLE, 4 * WIDE_MULTIPLE))
     precision = dict.fromkeys(contents, FLOAT)
     if whole_numbers:
         examples = example_crops(loaded.pose.inputs)

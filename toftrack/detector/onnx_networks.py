@@ -24,7 +24,7 @@ from toftrack.errors import ToftrackError
 from toftrack.safe_files import open_to_read
 
 FORMAT = "toftrack-detector-network"
-VERSION = "2"
+VERSION = "3"
 """Of the inputs and outputs of such files; one of another version is made anew."""
 DIGEST = 64
 """Last bytes of such a file, the SHA-256 in hexadecimal of all before: a property's value."""

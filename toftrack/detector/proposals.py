@@ -27,6 +27,8 @@ from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
+SAME_PLACE_M = 0.06
+"""Places that lie closer together are one."""
 KEPT = 12
 """Hypotheses of a crop that are used further."""
 DOUBT_M = 0.06
@@ -37,7 +39,7 @@ MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Places:
-    """Where hands of one side may be, likeliest first.
+    """Where hands may be, likeliest first.
 
     centre_m: (P, 3) middles of palms, camera frame.  probability: (P,).
     """
@@ -83,8 +85,8 @@ def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray
 @torch.inference_mode()
 def find_hands(
     finder: Finder | OnnxFinder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
-) -> dict[str, Places]:
-    """Where hands of either side may be: at most `most` places each, at least `least` likely.
+) -> Places:
+    """Where hands of either side may be: at most `most` places, at least `least` likely.
 
     depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
     """
@@ -95,7 +97,7 @@ def find_hands(
 
 def start_finding(
     finder: Finder | OnnxFinder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
-) -> Callable[[], dict[str, Places]]:
+) -> Callable[[], Places]:
     """The same, begun in another thread if there may be one; what is returned waits for it."""
     if not isinstance(finder, OnnxFinder):
         return partial(find_hands, finder, depth_m, k, most, least)
@@ -105,23 +107,32 @@ def start_finding(
 
 
 @torch.inference_mode()
-def _places(found: Found, wide_k: np.ndarray, most: int, least: float) -> dict[str, Places]:
+def _places(found: Found, wide_k: np.ndarray, most: int, least: float) -> Places:
     """See find_hands; wide_k: (3, 3) of the image that the finder has seen."""
     heat = found.heat.sigmoid()
     peaks = (heat == F.max_pool2d(heat, 3, 1, 1)) & (heat >= least)
-    places = {}
-    for channel, side in enumerate(("right", "left")):
-        row, column = peaks[0, channel].nonzero().unbind(1)
-        at = (0, channel, row, column)
-        order = heat[at].argsort(descending=True)[:most]
-        row, column = row[order], column[order]
-        at = (0, channel, row, column)
-        z = found.log_depth[at].exp().clamp(0.1, 3.0).numpy()
-        u = (column + found.column[at].clamp(-2, 2) + 0.5).numpy() * STRIDE - 0.5
-        v = (row + found.row[at].clamp(-2, 2) + 0.5).numpy() * STRIDE - 0.5
-        x, y = (u - wide_k[0, 2]) / wide_k[0, 0] * z, (v - wide_k[1, 2]) / wide_k[1, 1] * z
-        places[side] = Places(np.stack((x, y, z), 1).astype(np.float32), heat[at].numpy())
-    return places
+    row, column = peaks[0].nonzero().unbind(1)
+    order = heat[0, row, column].argsort(descending=True)
+    row, column = row[order], column[order]
+    at = (0, row, column)
+    z = found.log_depth[at].exp().clamp(0.1, 3.0).numpy()
+    u = (column + found.column[at].clamp(-2, 2) + 0.5).numpy() * STRIDE - 0.5
+    v = (row + found.row[at].clamp(-2, 2) + 0.5).numpy() * STRIDE - 0.5
+    x, y = (u - wide_k[0, 2]) / wide_k[0, 0] * z, (v - wide_k[1, 2]) / wide_k[1, 1] * z
+    centres = np.stack((x, y, z), 1).astype(np.float32)
+    rows = _apart(centres, most)
+    return Places(centres[rows], heat[at].numpy()[rows])
+
+
+def _apart(centres_m: np.ndarray, most: int) -> list[int]:
+    """Rows of the first of all places that are the same, in their order, `most` at most."""
+    kept: list[int] = []
+    for row, centre in enumerate(centres_m):
+        if len(kept) == most:
+            break
+        if all(np.linalg.norm(centre - centres_m[other]) > SAME_PLACE_M for other in kept):
+            kept.append(row)
+    return kept
 
 
 @torch.inference_mode()

@@ -29,6 +29,9 @@ DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
 _LARGEST_BYTES = 64 << 20
 _WIDEST = 256
 """Channels; ten times those of the package's networks."""
+_OLD_FINDER = "finder.body.0.weight"
+"""Files that have this hold a finder of before it had maps of several sizes; the package's is used
+instead."""
 _NEW_CLASS = -4.0
 """Bias of the logits of a class that was not known before: at first it is hardly ever said."""
 _AGAIN = "train them anew with python -m toftrack.programs.train_detector, or install again"
@@ -73,6 +76,8 @@ def load_weights(path: str | Path | None = None) -> Weights:
     """
     path = DEFAULT_FILE if path is None else Path(path)
     arrays, metadata = _read(path)
+    if _OLD_FINDER in arrays:
+        arrays, metadata = _with_the_package_s_finder(arrays, metadata)
     try:
         pose = PoseNet(_width(metadata, "pose"), *_pose_channels(arrays))
         finder = Finder(_width(metadata, "finder"))
@@ -107,6 +112,16 @@ def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> N
         network.load_state_dict(_widened(tensors, network.state_dict()))
     except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
+
+
+def _with_the_package_s_finder(
+    arrays: dict[str, np.ndarray], metadata: dict[str, Any]
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The pose network of a file and the package's finder."""
+    own, about = _read(DEFAULT_FILE)
+    arrays = {name: array for name, array in arrays.items() if not name.startswith("finder.")}
+    arrays |= {name: array for name, array in own.items() if name.startswith("finder.")}
+    return arrays, metadata | {"finder_width": about["finder_width"]}
 
 
 def _widened(tensors: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:

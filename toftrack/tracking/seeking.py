@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 from toftrack.detector.hand_detector import NO_DETECTION, Detection, merit
+from toftrack.detector.proposals import Places
 from toftrack.frames import DepthImage
 from toftrack.tracking.detect import held_out, reachable, search_due
 from toftrack.tracking.filter import predicted_palm
@@ -98,18 +99,18 @@ def start_seeking(
     due = hand.track is not None or slot in due_slots(state, watch_s)
     if not due or not search_due(hand, model):
         return state, None
-    wait = detector.start_search(image.depth_m, image.k, hand.side)
+    wait = detector.start_search(image.depth_m, image.k)
     hands = list(state.hands)
     hands[slot] = replace(hand, searched_s=0.0)
     second_s = 0.0 if hand.track is None else state.second_s
     return replace(state, hands=tuple(hands), second_s=second_s), partial(_found, wait, likely)
 
 
-def _found(wait: Callable[[], tuple], likely: Callable[..., float]) -> Seeking:
+def _found(wait: Callable[[], Places], likely: Callable[..., float]) -> Seeking:
     """A search after the finder's part; places where the hand cannot be are none."""
-    centres, heat = wait()
-    possible = [row for row in range(len(heat)) if likely(centres[row]) > -math.inf]
-    return Seeking(centres[possible], heat[possible])
+    places = wait()
+    possible = [row for row, at in enumerate(places.centre_m) if likely(at) > -math.inf]
+    return Seeking(places.centre_m[possible], places.probability[possible])
 
 
 def _after_detecting(seeking: Seeking, pending: Sequence[Callable[[], Detection]]) -> Seeking:

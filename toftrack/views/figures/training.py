@@ -34,16 +34,16 @@ def images_figure(seed: int) -> np.ndarray:
     tiles = []
     for i, image in enumerate(wides.image.numpy()):
         tile = _grey(1 - image[0], (2 * _SIDE, round(scale * image.shape[1])))
-        for cell, left, seen in zip(wides.cell[i], wides.left[i], wides.seen[i], strict=True):
+        for hand, (cell, seen) in enumerate(zip(wides.cell[i], wides.seen[i], strict=True)):
             if float(seen) > 0.15:
                 u, v = ((cell + 0.5) * 4 * scale).tolist()
-                colour = VERMILLION if bool(left) else BLUE
+                colour = VERMILLION if hand else BLUE
                 cv2.circle(tile, (round(u), round(v)), 7, colour, 2, cv2.LINE_AA)
         tiles.append(tile)
     wide_rows = [np.hstack(tiles[i : i + 4]) for i in (0, 4)]
     note = (
         "Above, crops: hand green, forearm blue, another hand red, things yellow, outside violet."
-        " Below, whole images: a blue ring on a right palm, a red one on a left one."
+        " Below, whole images: a blue ring on a palm, a red one on another hand's."
     )
     return titled(np.vstack(crop_rows + wide_rows), "Training images", note)
 

@@ -1,0 +1,54 @@
+"""What stands about in whole training images and is no hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from toftrack.detector.dice import Dice
+from toftrack.detector.furniture import PIECES, furniture
+from toftrack.detector.hands import HAND, OTHER_HAND
+from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
+from toftrack.detector.scenes import Scenes
+from toftrack.detector.things_numba import PART
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+N = 64
+
+
+def pieces(there: torch.Tensor, seed: int = 0) -> torch.Tensor:
+    return furniture(there, Dice(torch.Generator().manual_seed(seed)))
+
+
+def test_where_there_is_furniture_there_are_two_pieces_or_more() -> None:
+    there = torch.arange(N) % 2 == 0
+    made = pieces(there)
+    assert made.shape == (N, PIECES, PART) and made.isfinite().all()
+    count = (made[..., 0] >= 0).sum(1)
+    assert (count[there] >= 2).all() and (count[~there] == 0).all()
+    assert len(count.unique()) > 4
+    assert torch.equal(made, pieces(there)) and not torch.equal(made, pieces(there, 1))
+
+
+def test_it_is_seen_and_is_no_hand() -> None:
+    n = N
+    none = torch.zeros(n, 1, dtype=torch.long) - 1
+    scenes = Scenes(
+        torch.zeros(n, 1, 3),
+        torch.eye(3).expand(n, 1, 3, 3),
+        none,
+        torch.tensor([0.0, 0.0, 1.0, torch.inf]).expand(n, 1, 4),
+        torch.zeros_like(none, dtype=torch.bool),
+        (),
+        pieces(torch.ones(n, dtype=torch.bool)),
+    )
+    lens = Lens(*(torch.full((n,), value) for value in (100.0, 48.0, 40.0, 96.0, 80.0)))
+    sensors = torch.zeros(n, SENSOR_TERMS)
+    sensors[:, RANGE] = 9.0
+    depth, labels = take_pictures(
+        scenes, lens, sensors, (80, 96), Dice(torch.Generator().manual_seed(0))
+    )
+    seen = (depth > 0).reshape(n, -1).sum(1)
+    assert (seen > 30).mean() > 0.8 and depth[depth > 0].min() > 0.05
+    assert not ((labels == HAND) | (labels == OTHER_HAND)).any()

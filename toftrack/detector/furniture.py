@@ -1,0 +1,114 @@
+"""What stands about in rooms and is no hand: bars side by side, boards, clutter and leaves.
+
+Nothing else in a room looks so much like fingers and palms at a finder's resolution.
+"""
+
+from __future__ import annotations
+
+import math
+
+import roma
+import torch
+from torch import Tensor
+
+from toftrack.detector.dice import Dice
+from toftrack.detector.held_things import make_part
+from toftrack.detector.things_numba import BALL, BOX, CONE
+
+PIECES = 9
+"""Parts of the furniture in an image."""
+
+
+def furniture(there: Tensor, dice: Dice) -> Tensor:
+    """(N, PIECES, PART) of one kind each, before a camera; there: (N,) where there is any."""
+    n = len(there)
+    z = dice.uniform(n, low=0.4, high=1.2)
+    at = torch.tensor([0.22, 0.18]) * dice.normal(n, 2)
+    middle = torch.cat((z[:, None] * at, z[:, None]), 1)
+    kinds = torch.stack([make(middle, dice) for make in (_bars, _boards, _clutter, _leaves)])
+    pieces = kinds[dice.rows(len(kinds), n), torch.arange(n)]
+    some = dice.uniform(n, 1, low=2, high=PIECES + 1).floor()
+    pieces[..., 0] = torch.where(
+        (torch.arange(PIECES) < some) & there[:, None], pieces[..., 0], -1.0
+    )
+    return pieces
+
+
+def _standing(n: int, dice: Dice) -> Tensor:
+    """(N, 3, 3) rotations, y nearly along the image's; a third lies or leans."""
+    lean = torch.where(dice.chance(0.33, n, 1), 1.2, 0.15)
+    most = torch.cat((lean, torch.full((n, 1), 1.5), lean), 1)
+    return roma.rotvec_to_rotmat(most * dice.normal(n, 3))
+
+
+def _any_way(n: int, dice: Dice) -> Tensor:
+    q = torch.nn.functional.normalize(dice.normal(n, 4), dim=1)
+    return roma.unitquat_to_rotmat(q)
+
+
+def _in_row(middle: Tensor, rows: Tensor, axis: int, gap: Tensor, number: int) -> Tensor:
+    """(N, 3) the place of one of PIECES along an axis of a rotation."""
+    return middle + (number - (PIECES - 1) / 2) * gap[:, None] * rows[:, axis]
+
+
+def _bars(middle: Tensor, dice: Dice) -> Tensor:
+    """As of a chair's back or a rack, with a board across."""
+    n, zero = len(middle), torch.zeros(len(middle))
+    rows = _standing(n, dice)
+    radius, half = dice.uniform(n, low=0.005, high=0.02), dice.uniform(n, low=0.06, high=0.4)
+    gap = 2 * radius + dice.uniform(n, low=0.005, high=0.08)
+    sizes = torch.stack((radius, radius, half), 1)
+    across = torch.stack((PIECES / 2 * gap, radius + 0.02, radius), 1)
+    board = make_part(BOX, middle - half[:, None] * rows[:, 1], rows, across, zero, zero)
+    bars = [
+        make_part(CONE, _in_row(middle, rows, 0, gap, number), rows, sizes, zero, zero)
+        for number in range(PIECES - 1)
+    ]
+    return torch.stack((board, *bars), 1)
+
+
+def _boards(middle: Tensor, dice: Dice) -> Tensor:
+    """As of a shelf, a table or books."""
+    n, zero = len(middle), torch.zeros(len(middle))
+    rows = _standing(n, dice)
+    gap = dice.uniform(n, low=0.03, high=0.3)
+    boards = []
+    for number in range(PIECES):
+        half = torch.exp(dice.uniform(n, 3, low=math.log(0.03), high=math.log(0.35)))
+        half[:, 1] = dice.uniform(n, low=0.003, high=0.02)
+        place = _in_row(middle, rows, 1, gap, number) + 0.05 * dice.normal(n, 3)
+        boards.append(make_part(BOX, place, rows, half, zero, zero))
+    return torch.stack(boards, 1)
+
+
+def _clutter(middle: Tensor, dice: Dice) -> Tensor:
+    """Boxes, cups and balls."""
+    n, zero = len(middle), torch.zeros(len(middle))
+    spread = dice.uniform(n, 1, low=0.05, high=0.35)
+    pieces = []
+    for number in range(PIECES):
+        sizes = torch.exp(dice.uniform(n, 3, low=math.log(0.012), high=math.log(0.12)))
+        place = middle + spread * torch.tensor([1.0, 0.4, 1.0]) * dice.normal(n, 3)
+        kind = (BOX, CONE, BALL)[number % 3]
+        pieces.append(make_part(kind, place, _standing(n, dice), sizes, zero, zero))
+    order = torch.randperm(PIECES, generator=dice.generator)
+    return torch.stack(pieces, 1)[:, order]
+
+
+def _leaves(middle: Tensor, dice: Dice) -> Tensor:
+    """As of a plant, a fan or cables."""
+    n, zero = len(middle), torch.zeros(len(middle))
+    reach = dice.uniform(n, 1, low=0.03, high=0.15)
+    leaves = []
+    for _ in range(PIECES):
+        half = torch.stack(
+            (
+                dice.uniform(n, low=0.004, high=0.035),
+                dice.uniform(n, low=0.02, high=0.10),
+                dice.uniform(n, low=0.001, high=0.006),
+            ),
+            1,
+        )
+        place = middle + reach * dice.normal(n, 3)
+        leaves.append(make_part(BOX, place, _any_way(n, dice), half, zero, zero))
+    return torch.stack(leaves, 1)
