@@ -54,4 +54,4 @@ def test_as_a_kinects_recording_through_a_rational_lens(tmp_path: Path, straight
     ]
     about = calibration(K, 512, (96, 90))
     path = write_kinect(tmp_path / "hand.mkv", np.stack(words), about=about)
-    assert error_mm(Replay(path)) == pytest.approx(straight_mm, abs=0.5)
+    assert error_mm(Replay(path)) == pytest.approx(straight_mm, abs=1.0)

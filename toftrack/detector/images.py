@@ -227,8 +227,8 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
 def _furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
     """Scenes with furniture, and mostly without walls before it; there: (N,) where there is any."""
     planes = scenes.planes.clone()
-    open_room = there & dice.chance(0.7, len(there))
-    planes[..., 3] = torch.where(open_room[:, None], torch.inf, planes[..., 3])
+    without_walls = there & dice.chance(0.7, len(there))
+    planes[..., 3] = torch.where(without_walls[:, None], torch.inf, planes[..., 3])
     parts = torch.cat((scenes.parts, furniture(there, dice)), 1)
     return replace(scenes, planes=planes, parts=parts)
 

@@ -180,9 +180,9 @@ def with_parts(frame: HandFrame) -> HandFrame:
     the hand's, and where something seems to hide the hand, those of its own arm hide nothing.
     """
     seen = without_things(frame.observation, frame.detection)
-    told = replace(frame, observation=seen)
+    held = replace(frame, observation=seen)
     surely = frame.detection.present >= _SURELY_PRESENT
-    if surely and (told.hidden or told.out_of_sight(told.track.pose)[1] > _UNSEEN):
+    if surely and (held.hidden or held.out_of_sight(held.track.pose)[1] > _UNSEEN):
         seen = with_own_arm(seen, frame.detection)
     if seen is frame.observation:
         return frame
