@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import roma
 import torch
 from torch import Tensor
 
@@ -19,6 +20,10 @@ class Dice:
     def normal(self, *size: int) -> Tensor:
         """Mean 0, standard deviation 1."""
         return torch.randn(*size, generator=self.generator)
+
+    def rotations(self, n: int) -> Tensor:
+        """(n, 3, 3) any way round, each as likely."""
+        return roma.unitquat_to_rotmat(torch.nn.functional.normalize(self.normal(n, 4), dim=1))
 
     def chance(self, p: float | Tensor, *size: int) -> Tensor:
         """True with probability p, one for all or of a shape like the size."""

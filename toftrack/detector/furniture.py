@@ -41,11 +41,6 @@ def _standing(n: int, dice: Dice) -> Tensor:
     return roma.rotvec_to_rotmat(most * dice.normal(n, 3))
 
 
-def _any_way(n: int, dice: Dice) -> Tensor:
-    q = torch.nn.functional.normalize(dice.normal(n, 4), dim=1)
-    return roma.unitquat_to_rotmat(q)
-
-
 def _in_row(middle: Tensor, rows: Tensor, axis: int, gap: Tensor, number: int) -> Tensor:
     """(N, 3) the place of one of PIECES along an axis of a rotation."""
     return middle + (number - (PIECES - 1) / 2) * gap[:, None] * rows[:, axis]
@@ -110,5 +105,5 @@ def _leaves(middle: Tensor, dice: Dice) -> Tensor:
             1,
         )
         place = middle + reach * dice.normal(n, 3)
-        leaves.append(make_part(BOX, place, _any_way(n, dice), half, zero, zero))
+        leaves.append(make_part(BOX, place, dice.rotations(n), half, zero, zero))
     return torch.stack(leaves, 1)

@@ -96,8 +96,7 @@ def random_rotations(n: int, dice: Dice, views: Tensor | None = None) -> Tensor:
     azimuth = torch.where(face > 0.75, dice.uniform(n, low=-math.pi, high=math.pi), azimuth)
     rotations = [turn(roll, 2), turn(tilt, 0), turn(azimuth, 1)]
     held = rotations[0] @ rotations[1] @ rotations[2]
-    q = torch.nn.functional.normalize(dice.normal(n, 4), dim=1)
-    return torch.where(pointing[:, None, None], held, roma.unitquat_to_rotmat(q))
+    return torch.where(pointing[:, None, None], held, dice.rotations(n))
 
 
 def thumb_is_up(angles: Tensor) -> Tensor:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 
-import roma
 import torch
 from torch import Tensor
 
@@ -158,7 +157,7 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     # Beyond the hand's width along the axis, or before the palm.
     off = off * torch.tensor([0.03, 0.03, 0.0]) + y * (along.sign() * between(0.04, 0.11))[:, None]
     off[:, 2] -= between(0.0, 0.06)
-    turned = roma.unitquat_to_rotmat(torch.nn.functional.normalize(dice.normal(n, 4), dim=1))
+    turned = dice.rotations(n)
     lump = torch.stack((between(0.005, 0.05), between(0.005, 0.06), between(0.003, 0.05)), 1)
     lumps = (
         make_part(BOX, place + off, turned, _no_phone(lump), 0.2 * lump.amin(1), zero),

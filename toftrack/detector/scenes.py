@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 from torch import Tensor
 
@@ -145,8 +144,7 @@ def things(around_m: Tensor, n_things: int, p: float, dice: Dice) -> tuple[Tenso
     offset = spread * dice.normal(n, n_things, 3)
     offset[..., 2] = nearer
     log_axes = dice.uniform(n, n_things, 3, low=math.log(0.006), high=math.log(0.12))
-    q = torch.nn.functional.normalize(dice.normal(n * n_things, 4), dim=1)
-    rotation = roma.unitquat_to_rotmat(q).view(n, n_things, 3, 3)
+    rotation = dice.rotations(n * n_things).view(n, n_things, 3, 3)
     flat = dice.chance(0.5, n, n_things)[..., None, None]
     rotation = torch.where(flat, torch.eye(3), rotation)
     labels = torch.where(dice.chance(p, n, n_things), THING, -1)

@@ -77,7 +77,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
     path = DEFAULT_FILE if path is None else Path(path)
     arrays, metadata = _read(path)
     if _OLD_FINDER in arrays:
-        arrays, metadata = _with_the_package_s_finder(arrays, metadata)
+        arrays, metadata = _with_package_finder(arrays, metadata)
     try:
         pose = PoseNet(_width(metadata, "pose"), *_pose_channels(arrays))
         finder = Finder(_width(metadata, "finder"))
@@ -114,7 +114,7 @@ def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> N
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
 
 
-def _with_the_package_s_finder(
+def _with_package_finder(
     arrays: dict[str, np.ndarray], metadata: dict[str, Any]
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The pose network of a file and the package's finder."""
