@@ -1,4 +1,4 @@
-"""`toftrack benchmark [speed | accuracy | ablation]`: speed where none is named."""
+"""`toftrack benchmark [speed | turns | accuracy | ablation]`: speed where none is named."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 _MODULES = {
     "speed": "toftrack.benchmark.scoring",
+    "turns": "toftrack.benchmark.turns",
     "accuracy": "toftrack.benchmark.accuracy",
     "ablation": "toftrack.benchmark.ablation",
 }
@@ -19,6 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[:1] in (["-h"], ["--help"]):
         print(
             "usage: toftrack benchmark [speed] ...     how fast hypotheses are scored, and frames\n"
+            "       toftrack benchmark turns ...       frames, in turn with MediaPipe's; starts\n"
             "       toftrack benchmark accuracy ...    how accurate, on recordings with truth\n"
             "       toftrack benchmark ablation ...    what each part of the tracker brings\n\n"
             "toftrack benchmark speed --help and so on say more"

@@ -99,10 +99,10 @@ class Peer:
             self._process.wait()
         self._errors.close()
 
-    def begin(self, camera: Camera, side: str = "") -> None:
-        """A new recording. side: whose hand is meant, "" for any."""
+    def begin(self, camera: Camera, side: str = "", hands: int = 2) -> None:
+        """A new recording. side: whose hand is meant, "" for any.  hands: looked for at most."""
         self._size = (camera.height, camera.width)
-        facts = {"size": self._size, "k": camera.K.ravel().tolist(), "side": side}
+        facts = {"size": self._size, "k": camera.K.ravel().tolist(), "side": side, "hands": hands}
         self._send(json.dumps({"begin": facts}).encode() + b"\n")
 
     def step(self, depth_m: np.ndarray, amplitude: np.ndarray) -> PeerEstimate:

@@ -3,7 +3,8 @@
 Run by that environment's Python, it imports nothing of toftrack; what comes in and goes out are
 JSON lines and plain arrays:
 
-- in `{"begin": {"size": [H, W], "k": [...9], "side": "left" | "right" | ""}}`: a new recording;
+- in `{"begin": {"size": [H, W], "k": [...9], "side": "left" | "right" | "", "hands":
+  N}}`: a new recording, in which so many hands are looked for;
 - in `{"frame": true}`, then H * W uint16 of amplitude and H * W float32 of depth in metres: out 63
   float64, the joints (21, 3) in metres, not finite where there is no hand; the seconds that it
   took; the probability of the side; and 1.0 for a right hand, 0.0 for a left one;
@@ -42,7 +43,6 @@ INWARDS = 0.2
 """At a tip the depth is read so far towards the joint before it."""
 SETTINGS = {
     "static_image_mode": False,
-    "max_num_hands": 2,
     "model_complexity": 1,
     "min_detection_confidence": 0.5,
     "min_tracking_confidence": 0.5,
@@ -125,7 +125,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             begin = reported["begin"]
             height, width = begin["size"]
             k, side = np.array(begin["k"]).reshape(3, 3), begin["side"]
-            hand = hands(**SETTINGS)
+            hand = hands(**SETTINGS | {"max_num_hands": begin["hands"]})
             hand.process(np.zeros((height, width, 3), np.uint8))  # loads what it needs
             continue
         amplitude = np.frombuffer(source.read(2 * height * width), np.uint16)
