@@ -1,4 +1,4 @@
-"""`toftrack benchmark [speed | turns | accuracy | ablation]`: speed where none is named."""
+"""`toftrack benchmark [speed | alternating | accuracy | ablation]`: speed where none is named."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 _MODULES = {
     "speed": "toftrack.benchmark.scoring",
-    "turns": "toftrack.benchmark.turns",
+    "alternating": "toftrack.benchmark.alternating",
     "accuracy": "toftrack.benchmark.accuracy",
     "ablation": "toftrack.benchmark.ablation",
 }
@@ -19,10 +19,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else list(arguments)
     if given[:1] in (["-h"], ["--help"]):
         print(
-            "usage: toftrack benchmark [speed] ...     how fast hypotheses are scored, and frames\n"
-            "       toftrack benchmark turns ...       frames, in turn with MediaPipe's; starts\n"
-            "       toftrack benchmark accuracy ...    how accurate, on recordings with truth\n"
-            "       toftrack benchmark ablation ...    what each part of the tracker brings\n\n"
+            "usage: toftrack benchmark [speed] ...       how fast hypotheses are scored, and frames\n"
+            "       toftrack benchmark alternating ...   frames, in turn with MediaPipe's; starts\n"
+            "       toftrack benchmark accuracy ...      how accurate, on recordings with truth\n"
+            "       toftrack benchmark ablation ...      what each part of the tracker brings\n\n"
             "toftrack benchmark speed --help and so on say more"
         )
         return 0

@@ -331,7 +331,7 @@ def _spread(values: Sequence[float], digits: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(prog="toftrack benchmark turns", description=__doc__)
+    parser = argparse.ArgumentParser(prog="toftrack benchmark alternating", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--rounds", type=int, default=5, help="of all programs (5); 0 = none")
     parser.add_argument("--starts", type=int, default=0, help="of the command line (0)")

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toftrack.benchmark import command, peer, turns
-from toftrack.benchmark.turns import FIRST, PEER_HANDS, Program, Runner, Start, Times, show
+from toftrack.benchmark import alternating, command, peer
+from toftrack.benchmark.alternating import FIRST, PEER_HANDS, Program, Runner, Start, Times, show
 from toftrack.errors import ToftrackError
 
-LEFT = str(Path(turns.__file__).parents[1] / "data" / "sample_left_hand.npz")
+LEFT = str(Path(alternating.__file__).parents[1] / "data" / "sample_left_hand.npz")
 
 
 def times(name: str, *rounds: float) -> Times:
@@ -46,15 +46,15 @@ def test_the_table_has_the_ratios_and_the_starts() -> None:
 
 
 def test_every_frame_of_the_packaged_recording_counts_forwards_and_backwards() -> None:
-    once = turns._one_round(Program("few particles", ("filter.particles=20",)))
+    once = alternating._one_round(Program("few particles", ("filter.particles=20",)))
     found = once()
     assert len(found) == 198 and min(found) > 0
 
 
 def test_of_a_recording_frames_count_in_which_the_hands_are_believed() -> None:
-    once = turns._one_round(Program("one", ("hand.side=left",), LEFT, hands=1))
+    once = alternating._one_round(Program("one", ("hand.side=left",), LEFT, hands=1))
     assert 0 < len(once()) <= 90
-    two = turns._one_round(Program("two", ("hands=2",), LEFT, hands=2))
+    two = alternating._one_round(Program("two", ("hands=2",), LEFT, hands=2))
     with pytest.raises(ToftrackError, match="2 hands were in none"):
         two()
 
@@ -64,7 +64,7 @@ def test_what_a_program_s_process_cannot_do_is_one_sentence() -> None:
         pass
 
 
-def test_a_peer_looks_for_as_many_hands_as_it_should(tmp_path, monkeypatch) -> None:
+def test_a_peer_searches_for_as_many_hands_as_it_should(tmp_path, monkeypatch) -> None:
     file = tmp_path / "fake.py"
     file.write_text(
         "import json, sys\n"
@@ -79,15 +79,17 @@ def test_a_peer_looks_for_as_many_hands_as_it_should(tmp_path, monkeypatch) -> N
     )
     monkeypatch.setitem(peer.PEERS, "mediapipe", str(file))
     for name in PEER_HANDS:
-        with turns._PeerRunner(name, sys.executable) as runner:
+        with alternating._PeerRunner(name, sys.executable) as runner:
             assert np.allclose(runner.round(), 2.0), "milliseconds"
 
 
 def test_the_command_writes_what_it_prints(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(turns, "timed", lambda *given: [times(FIRST, 5.0, 6.0)])
-    monkeypatch.setattr(turns, "starts", lambda count: [Start(True, 3.0, 3.9, 4.0, 0.5)] * count)
-    file = tmp_path / "turns.json"
-    assert command.main(["turns", "--rounds", "2", "--starts", "1", "--json", str(file)]) == 0
+    monkeypatch.setattr(alternating, "timed", lambda *given: [times(FIRST, 5.0, 6.0)])
+    monkeypatch.setattr(
+        alternating, "starts", lambda count: [Start(True, 3.0, 3.9, 4.0, 0.5)] * count
+    )
+    file = tmp_path / "alternating.json"
+    assert command.main(["alternating", "--rounds", "2", "--starts", "1", "--json", str(file)]) == 0
     written = json.loads(file.read_text(encoding="utf-8"))
     assert len(written["frames"][0]["rounds"]) == 2 and len(written["starts"]) == 1
     assert FIRST in capsys.readouterr().out
@@ -96,4 +98,4 @@ def test_the_command_writes_what_it_prints(tmp_path, monkeypatch, capsys) -> Non
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
 def test_more_cores_than_there_are_is_one_sentence() -> None:
     with pytest.raises(ToftrackError, match="can be used here"):
-        turns.main(["--cores", "4096", "--rounds", "0"])
+        alternating.main(["--cores", "4096", "--rounds", "0"])
