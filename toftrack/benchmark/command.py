@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else list(arguments)
     if given[:1] in (["-h"], ["--help"]):
         print(
-            "usage: toftrack benchmark [speed] ...       how fast hypotheses are scored, and frames\n"
+            "usage: toftrack benchmark [speed] ...       how fast hypotheses and frames are\n"
             "       toftrack benchmark alternating ...   frames, in turn with MediaPipe's; starts\n"
             "       toftrack benchmark accuracy ...      how accurate, on recordings with truth\n"
             "       toftrack benchmark ablation ...      what each part of the tracker brings\n\n"

@@ -155,6 +155,16 @@ def explained(depth_m: np.ndarray, theirs_m: np.ndarray, mine_m: np.ndarray) -> 
 
     depth_m, theirs_m, mine_m: (H, W) Z, 0 = none.
     """
+    found = np.zeros(depth_m.shape, bool)
+    rows, columns = (theirs_m > 0).any(1).nonzero()[0], (theirs_m > 0).any(0).nonzero()[0]
+    if not len(rows):
+        return found
+    # Within its own box, and a pixel around: most of the image is far from it.
+    box = (
+        slice(max(rows[0] - 1, 0), rows[-1] + 2),
+        slice(max(columns[0] - 1, 0), columns[-1] + 2),
+    )
+    depth_m, theirs_m, mine_m = depth_m[box], theirs_m[box], mine_m[box]
     there = (depth_m > 0) & (theirs_m > 0)
     off = np.where(there, np.abs(depth_m - theirs_m), np.inf)
     my_off = np.where(mine_m > 0, np.abs(depth_m - mine_m), np.inf)
@@ -163,7 +173,8 @@ def explained(depth_m: np.ndarray, theirs_m: np.ndarray, mine_m: np.ndarray) -> 
     near = cv2.dilate(sure.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
     around = cv2.dilate(np.where(sure, theirs_m, np.float32(0)), np.ones((3, 3), np.float32))
     mixed = near & ~sure & (depth_m > around) & (depth_m < around + _EDGE_M)
-    return sure | (mixed & (my_off >= _TOLERANCE_M))
+    found[box] = sure | (mixed & (my_off >= _TOLERANCE_M))
+    return found
 
 
 def pixels_of(others: Sequence[OtherHand]) -> np.ndarray | None:
