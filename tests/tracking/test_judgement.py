@@ -22,6 +22,7 @@ from helpers.rendered import (
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
+from toftrack.tracking import lifecycle
 from toftrack.tracking.confidence import NO_FEATURES, WholeHand
 from toftrack.tracking.filter import Filtered, Found
 from toftrack.tracking.handedness import HandednessEstimate
@@ -205,6 +206,17 @@ def test_beside_another_hand_a_new_one_must_be_surer_whether_that_is_reported_or
     assert not closed(track, between)[0].lost
     assert closed(track, between, (beside(watched),))[0].lost
     assert not closed(track, 0.97, (beside(watched),))[0].lost
+
+
+def test_what_lies_on_a_watched_hand_s_forearm_is_lost_unless_it_is_surer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(lifecycle, "on_forearm", lambda joints, other: True)
+    track, other = track_of(HERE, believed=True), beside(True)
+    surer, less_sure = replace(other, log_odds=9.0), replace(other, log_odds=-9.0)
+    assert closed(track, 0.9, (surer,))[0].lost
+    assert not closed(track, 0.9, (less_sure,))[0].lost
+    assert not closed(track, 0.9, (replace(surer, watched=False),))[0].lost
 
 
 def test_a_new_hand_that_seems_to_be_the_other_one_is_doubted_unless_that_is_followed() -> None:

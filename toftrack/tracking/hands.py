@@ -33,6 +33,9 @@ _BELIEVED = 20.0
 """A hand that was believed once comes before one that never was, log odds."""
 _KNOWN = 0.5
 """Log odds from which on a slot's side is known."""
+_ARM_M, _THROUGH_M, _OPPOSITE = 0.16, 0.075, -0.5
+"""A forearm is seen so far from the wrist; it goes through a palm whose middle is so near to its
+axis; the cosine below which two hands point away from each other."""
 _ONE_M, _ONE = 0.045, 0.3
 """Two tracks are of one hand where their palms are so near, and so much of one is in the other."""
 
@@ -46,7 +49,7 @@ class OtherHand:
     certain: its last estimate was not flagged, so that pixels are its own.
     pixels: (H, W) bool of the reduced image, those that it explains better.
     beside: (H, W) bool, those of them that cannot hide this hand.
-    watched: nobody asked for it.
+    watched: nobody asked for it.  log_odds: of its last estimate.
     """
 
     joints_m: Tensor
@@ -56,6 +59,7 @@ class OtherHand:
     pixels: np.ndarray
     beside: np.ndarray
     watched: bool = False
+    log_odds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +129,9 @@ def others_of(
     return [
         tuple(
             replace(
-                _other_hand(hands[slot].track, theirs, mine, depth_m), watched=hands[slot].watched
+                _other_hand(hands[slot].track, theirs, mine, depth_m),
+                watched=hands[slot].watched,
+                log_odds=sureness(hands[slot]),
             )
             for slot, theirs in enumerate(there)
             if theirs is not None and slot != own and own in slots
@@ -219,6 +225,22 @@ def on_one_hand(first: PlacedHand, second: PlacedHand) -> bool:
     if float(np.linalg.norm(first.centre_m - second.centre_m)) > _ONE_M:
         return False
     return float(touching(first.joints_m[None], second.joints_m)) > _ONE
+
+
+def on_forearm(joints_m: np.ndarray, other: OtherHand) -> bool:
+    """Whether what is taken for a hand (21, 3) is the forearm of another one: a forearm of its own
+    would go through that one's palm, and both point away from each other.
+    """
+    if not other.certain:
+        return False
+    theirs = other.joints_m.numpy()
+    mine, their = joints_m[9] - joints_m[0], theirs[9] - theirs[0]
+    mine, their = mine / np.linalg.norm(mine), their / np.linalg.norm(their)
+    if mine @ their > _OPPOSITE:
+        return False
+    from_wrist = other.centre_m - joints_m[0]
+    along = float(np.clip(-from_wrist @ mine, 0.0, _ARM_M))
+    return bool(np.linalg.norm(from_wrist + along * mine) < _THROUGH_M)
 
 
 def known_side(hand: HandState) -> str:
