@@ -1,8 +1,8 @@
 """Fingers that close on a thing: each joint bends until a bone beyond it meets the thing's surface.
 
 Bones are capsules, the thing is a signed distance, everything in the frame of a right hand whose
-wrist is the origin. The thumb closes last, on the thing or on the fingers, and is tried from several
-places until it touches the thing.
+wrist is the origin. The thumb closes last, on the thing or on the fingers, and begins anew
+elsewhere until its pad touches the thing.
 """
 
 from __future__ import annotations
@@ -186,35 +186,18 @@ def _bending(finger, bone):
 
 
 @compiled
-def _close(finger, most, angles, base_frames, base, lengths, radii, shifts, parts, frame, others):
+def _close(finger, most, angles, hand):
+    """Bend a finger about the thing; hand: what _gap needs besides."""
     for bone in range(3):
         angle = _bending(finger, bone)
         free = angles[angle]
         while True:
             angles[angle] = min(free + _STEP, most[angle])
-            if (
-                _gap(finger, bone, angles, base_frames, base, lengths, radii, shifts, parts, frame, others)
-                < 0
-            ):
+            if _gap(finger, bone, angles, *hand) < 0:
                 meets = angles[angle]
                 for _ in range(_HALVINGS):
                     angles[angle] = 0.5 * (free + meets)
-                    if (
-                        _gap(
-                            finger,
-                            bone,
-                            angles,
-                            base_frames,
-                            base,
-                            lengths,
-                            radii,
-                            shifts,
-                            parts,
-                            frame,
-                            others,
-                        )
-                        < 0
-                    ):
+                    if _gap(finger, bone, angles, *hand) < 0:
                         meets = angles[angle]
                     else:
                         free = angles[angle]
@@ -226,9 +209,10 @@ def _close(finger, most, angles, base_frames, base, lengths, radii, shifts, part
 
 
 @compiled
-def _yield(finger, angles, base_frames, base, lengths, radii, shifts, parts, frame, others):
+def _yield(finger, angles, hand):
+    """Stretch a finger until it is not in the thing; hand: what _gap needs besides."""
     for _ in range(14):
-        if _gap(finger, 0, angles, base_frames, base, lengths, radii, shifts, parts, frame, others) >= 0:
+        if _gap(finger, 0, angles, *hand) >= 0:
             break
         if finger == 0:  # away from the palm first, then straight; as long as it can, opposed
             if angles[0] < _WIDEST:
@@ -245,7 +229,20 @@ def _yield(finger, angles, base_frames, base, lengths, radii, shifts, parts, fra
 
 @_entry
 def grasp(
-    angles, thumbs, opposed, most, tasks, in_palm, flesh, base_frames, base, lengths, radii, shifts, parts, said
+    angles,
+    thumbs,
+    opposed,
+    most,
+    tasks,
+    in_palm,
+    flesh,
+    base_frames,
+    base,
+    lengths,
+    radii,
+    shifts,
+    parts,
+    said,
 ):
     """N hands on N things.
 
@@ -266,18 +263,19 @@ def grasp(
         if in_palm[n]:
             _place_in_palm(parts[n], base[n], flesh[n])
         for finger in (1, 2, 3, 4):
-            _yield(finger, angles[n], *hand)
+            _yield(finger, angles[n], hand)
             if tasks[n, finger] == CLOSE:
-                _close(finger, most[n], angles[n], *hand)
+                _close(finger, most[n], angles[n], hand)
         # The thumb last: the fingers hold the thing already.
         if in_palm[n]:
             for finger in (1, 2, 3):
                 _capsules_of(finger, angles[n], *bones, before[3 * (finger - 1) : 3 * finger])
+            about = (*bones, parts[n], frame, before)
             best = -2.0
             for start in range(thumbs.shape[1]):
                 angles[n, :5] = thumbs[n, start]
-                _yield(0, angles[n], *bones, parts[n], frame, before)
-                _close(0, most[n], angles[n], *bones, parts[n], frame, before)
+                _yield(0, angles[n], about)
+                _close(0, most[n], angles[n], about)
                 opposition = _opposition(angles[n], *bones, parts[n], frame)
                 if opposition > best:
                     best = opposition
@@ -286,9 +284,9 @@ def grasp(
                     break
             angles[n, :5] = thumb
         else:
-            _yield(0, angles[n], *hand)
+            _yield(0, angles[n], hand)
             if tasks[n, 0] == CLOSE:
-                _close(0, most[n], angles[n], *hand)
+                _close(0, most[n], angles[n], hand)
         touching, deepest = 0, 0.0
         for finger in range(5):
             gap = _gap(finger, 0, angles[n], *hand)
