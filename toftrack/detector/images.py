@@ -118,8 +118,13 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     pieces = labels.shape[1] - FOREARM_PIECES
     labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
     scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12, views=views)
-    scenes = moved(scenes, torch.where(gone[:, None], _onto_something(scenes, centre, dice), 0.0))
-    scenes = _with_furniture(scenes, centre, gone, dice)
+    # What a hand held is as likely to lie there alone.
+    alone = gone & (hands.parts[..., 0] >= 0).any(1) & dice.chance(0.6, n)
+    onto = _onto_something(scenes, centre, dice)
+    onto_thing = centre + 0.02 * dice.normal(n, 3) - hands.parts[:, 0, 1:4]
+    onto = torch.where(alone[:, None], onto_thing, onto)
+    scenes = moved(scenes, torch.where(gone[:, None], onto, 0.0))
+    scenes = _with_furniture(scenes, centre, gone & ~alone, dice)
 
     turned = torch.where(known, _upright_angles(hands, dice), 0.0)
     pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
