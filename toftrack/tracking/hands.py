@@ -162,7 +162,7 @@ def explained(depth_m: np.ndarray, theirs_m: np.ndarray, mine_m: np.ndarray) -> 
     depth_m, theirs_m, mine_m: (H, W) Z, 0 = none.
     """
     found = np.zeros(depth_m.shape, bool)
-    rows, columns = (theirs_m > 0).any(1).nonzero()[0], (theirs_m > 0).any(0).nonzero()[0]
+    rows, columns = (np.flatnonzero((theirs_m > 0).any(axis)) for axis in (1, 0))
     if not len(rows):
         return found
     # Within its own box, and a pixel around: most of the image is far from it.
