@@ -86,7 +86,7 @@ def test_a_peer_searches_for_as_many_hands_as_it_should(tmp_path, monkeypatch) -
 def test_the_command_writes_what_it_prints(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(alternating, "timed", lambda *given: [times(FIRST, 5.0, 6.0)])
     monkeypatch.setattr(
-        alternating, "starts", lambda count: [Start(True, 3.0, 3.9, 4.0, 0.5)] * count
+        alternating, "starts", lambda times: [Start(True, 3.0, 3.9, 4.0, 0.5)] * times
     )
     file = tmp_path / "alternating.json"
     assert command.main(["alternating", "--rounds", "2", "--starts", "1", "--json", str(file)]) == 0

@@ -20,15 +20,15 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from itertools import count
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import torch
 
 from toftrack.api import make_device, make_hands_tracker
-from toftrack.benchmark.frames import SIZES, enlarged, enlarged_camera
+from toftrack.benchmark.frames import SIZES, enlarged
 from toftrack.benchmark.peer import Peer
 from toftrack.benchmark.table import processor
 from toftrack.devices.replay import Replay
@@ -122,12 +122,7 @@ class Runner:
         self._answer()  # it is ready
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._process.terminate()
         self._process.join()
 
@@ -166,24 +161,26 @@ def _one_round(program: Program) -> Callable[[], list[float]]:
     with device or Replay(str(program.recording)) as source:
         camera, images = source.camera, [(frame.depth, frame.radial) for frame in source]
     if program.size is not None:
-        images = [(enlarged(camera.rectify(*image), program.size), False) for image in images]
-        camera = enlarged_camera(camera, program.size)
+        camera, images = enlarged(camera, images, program.size)
     order = list(range(len(images)))
     if program.recording is None:
         order += order[-2:0:-1]
+
+    numbers = count()
 
     def once() -> list[float]:
         found = []
         if program.recording is not None:
             tracker.restart()
-        for number, index in enumerate(order):
+        for seen, index in enumerate(order):
+            number = next(numbers)
             began = time.perf_counter()
             estimates = tracker.step(
                 camera.rectify(*images[index]), camera.K, number, 0.04 * number
             )
             took = 1e3 * (time.perf_counter() - began)
             believed = sum(not estimate.lost for estimate in estimates)
-            if program.recording is None or (number >= _UNDERWAY and believed >= program.hands):
+            if program.recording is None or (seen >= _UNDERWAY and believed >= program.hands):
                 found.append(took)
         if not found:
             raise ToftrackError(f"{program.hands} hands were in none of its frames")
@@ -249,10 +246,10 @@ class Start:
     system_s: float
 
 
-def starts(count: int) -> list[Start]:
+def starts(times: int) -> list[Start]:
     """Runs without compiled kernels, each followed by one with them. Raises ToftrackError."""
     found = []
-    for _ in range(count):
+    for _ in range(times):
         with tempfile.TemporaryDirectory() as folder:
             found += [_start(folder, kernels) for kernels in (False, True)]
     return found
@@ -262,11 +259,9 @@ def _start(folder: str, kernels: bool) -> Start:
     command = [sys.executable, "-m", "toftrack", "track", *_START, f"hydra.run.dir={folder}/run"]
     before = os.times()
     began = time.perf_counter()
+    env = os.environ | {"NUMBA_CACHE_DIR": folder}
     with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"XDG_CACHE_HOME": folder},
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env
     ) as process:
         assert process.stdout is not None
         line = process.stdout.readline()

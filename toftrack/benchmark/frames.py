@@ -111,9 +111,7 @@ def _times(
     with hydra.utils.instantiate(config.device) as device:
         camera, frames = device.camera, [(frame.depth, frame.radial) for frame in device]
     if size is not None:
-        depths = [camera.rectify(*frame) for frame in frames]
-        frames = [(enlarged(depth, size), False) for depth in depths]
-        camera = enlarged_camera(camera, size)
+        camera, frames = enlarged(camera, frames, size)
 
     def step(index: int) -> tuple[float, Mapping[str, float]]:
         depth, radial = frames[index % len(frames)]
@@ -170,7 +168,15 @@ def _place(width: int, height: int, size: tuple[int, int]) -> tuple[float, int, 
     return scale, (size[0] - round(scale * width)) // 2, (size[1] - round(scale * height)) // 2
 
 
-def enlarged(depth_m: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def enlarged(
+    camera: Camera, frames: Sequence[tuple[np.ndarray, bool]], size: tuple[int, int]
+) -> tuple[Camera, list[tuple[np.ndarray, bool]]]:
+    """A camera and its frames (depth, radial) as of a camera with so many columns and rows."""
+    depths = [camera.rectify(*frame) for frame in frames]
+    return _enlarged_camera(camera, size), [(_enlarged(depth, size), False) for depth in depths]
+
+
+def _enlarged(depth_m: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """An image (H, W) in the middle of a larger one, each pixel repeated, with the wall around."""
     scale, left, top = _place(depth_m.shape[1], depth_m.shape[0], size)
     rows, columns = (np.arange(round(scale * side)) / scale for side in depth_m.shape)
@@ -181,8 +187,8 @@ def enlarged(depth_m: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return image
 
 
-def enlarged_camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The pinhole camera of `enlarged` images."""
+def _enlarged_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The pinhole camera of `_enlarged` images."""
     scale, left, top = _place(camera.width, camera.height, size)
     k = camera.K * np.array([[scale], [scale], [1.0]])
     k[:2, 2] += (scale - 1) / 2 + np.array([left, top])

@@ -49,7 +49,7 @@ class OtherHand:
     certain: its last estimate was not flagged, so that pixels are its own.
     pixels: (H, W) bool of the reduced image, those that it explains better.
     beside: (H, W) bool, those of them that cannot hide this hand.
-    watched: nobody asked for it.  log_odds: of its last estimate.
+    watched: nobody asked for it.
     """
 
     joints_m: Tensor
@@ -59,7 +59,6 @@ class OtherHand:
     pixels: np.ndarray
     beside: np.ndarray
     watched: bool = False
-    log_odds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +128,7 @@ def others_of(
     return [
         tuple(
             replace(
-                _other_hand(hands[slot].track, theirs, mine, depth_m),
-                watched=hands[slot].watched,
-                log_odds=sureness(hands[slot]),
+                _other_hand(hands[slot].track, theirs, mine, depth_m), watched=hands[slot].watched
             )
             for slot, theirs in enumerate(there)
             if theirs is not None and slot != own and own in slots

@@ -228,10 +228,10 @@ def close(
     status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
     if seems < OTHER_HAND and status.confidence >= model.lost.confidence:
         status = replace(status, lost=True, state_name="other hand")
-    surer = [one for one in frame.others if one.watched and one.log_odds > status.log_odds]
-    if surer and not status.lost:
+    watched = [other for other in frame.others if other.watched]
+    if watched and not status.lost:
         joints = frame.fitted.refiner.joints(found.pose)[0].cpu().numpy()
-        if any(on_forearm(joints, other) for other in surer):
+        if any(on_forearm(joints, other) for other in watched):
             status = replace(status, lost=True, state_name="searching")
     # Without refinement the particles stay where they are.
     followed = drawn_to(found, model) if model.refinement.iterations else found.filtered
