@@ -6,11 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from toftrack.configuration.check import check_groups, check_tracker
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
+
+_PARTS = (
+    "hand pose_space segmentation likelihood filter gestures renderer compute detector"
+    " lost start refine posterior hysteresis"
+).split()
+"""Of a configuration, what build_model makes a model of."""
 
 if TYPE_CHECKING:
     import torch
@@ -18,6 +24,7 @@ if TYPE_CHECKING:
     from toftrack.compute.quality import Pace
     from toftrack.devices.base import Device
     from toftrack.tracking.model import FilterModel
+    from toftrack.tracking.second_process import SecondProcess
     from toftrack.tracking.tracker import HandsTracker, Tracker
 
 
@@ -96,7 +103,19 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
 
     hands = config.get("hands", 1)
     with small_operations():
-        return HandsTracker(build_model(config), config.seed, hands, pace=_pace(config))
+        model, pace = build_model(config), _pace(config)
+        return HandsTracker(model, config.seed, hands, pace, second=_second_process(config))
+
+
+def _second_process(config: DictConfig) -> SecondProcess | None:
+    """What follows the second one of two hands; it begins when it is needed."""
+    # A configuration of one's own may do without.
+    if not (config.get("tracker") or {}).get("second_process"):
+        return None
+    from toftrack.tracking.second_process import SecondProcess
+
+    parts = {name: config[name] for name in _PARTS if name in config}
+    return SecondProcess(OmegaConf.to_container(OmegaConf.create(parts), resolve=True))
 
 
 def _pace(config: DictConfig) -> Pace:

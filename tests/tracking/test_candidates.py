@@ -74,35 +74,14 @@ def filtered(
     return FilteredFrame.of(frame, track.mean)
 
 
-def table_of(*frames: FilteredFrame) -> Hypotheses:
-    return propose(frames, torch.Generator().manual_seed(0))
+def table_of(hand: FilteredFrame) -> Hypotheses:
+    return propose(hand, torch.Generator().manual_seed(0))
 
 
-def same(one: Hypotheses, two: Hypotheses) -> bool:
-    fields = ("pose", "source", "log_posterior")
-    return all(torch.equal(getattr(one, name), getattr(two, name)) for name in fields)
-
-
-def test_the_hypotheses_of_two_hands_stay_with_their_hand() -> None:
-    """Both together are each one's own, whichever comes first."""
-    left, right = filtered(-0.1, 1), filtered(0.1, 2)
-    alone = [table_of(one) for one in (left, right)]
-    for order in ((0, 1), (1, 0)):
-        both = table_of(*((left, right)[number] for number in order))
-        assert sorted(set(both.hand.tolist())) == [0, 1]
-        for row, number in enumerate(order):
-            assert same(both.of_hand(row), alone[number])
-    wrists = table_of(left, right)
-    assert bool((wrists.of_hand(0).pose[:, 0] < 0).all())
-    assert bool((wrists.of_hand(1).pose[:, 0] > 0).all())
-
-
-def test_every_hypothesis_is_scored_by_the_posterior_of_its_hand() -> None:
-    hands = filtered(-0.1, 1, exchanged=16), filtered(0.1, 2, exchanged=16)
-    table = table_of(*hands)
-    for row, hand in enumerate(hands):
-        mine = table.of_hand(row)
-        torch.testing.assert_close(mine.log_posterior, hand.posterior(mine.pose))
+def test_every_hypothesis_is_scored_by_the_posterior() -> None:
+    hand = filtered(-0.1, 1, exchanged=16)
+    table = table_of(hand)
+    torch.testing.assert_close(table.log_posterior, hand.posterior(table.pose))
 
 
 def test_each_source_proposes_its_poses() -> None:
@@ -123,12 +102,10 @@ def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> Non
 
 
 def test_a_covered_hand_is_held_where_it_was() -> None:
-    covered, other = filtered(0.0, exchanged=16, covered=True), filtered(0.1, 2, exchanged=16)
-    table = table_of(covered, other)
-    mine = table.of_hand(0)
-    assert mine.source.tolist() == [Source.HELD]
-    assert torch.equal(mine.pose, covered.frame.track.pose)
-    assert len(table.of_hand(1)) > 3, "the other one is not held up by it"
+    covered = filtered(0.0, exchanged=16, covered=True)
+    table = table_of(covered)
+    assert table.source.tolist() == [Source.HELD]
+    assert torch.equal(table.pose, covered.frame.track.pose)
 
 
 def emerging(
@@ -179,15 +156,13 @@ def test_a_hand_mostly_out_of_sight_is_not_compared_with_the_detector() -> None:
 
 
 def test_fingers_are_exchanged_from_the_second_round_on_only() -> None:
-    hands = filtered(-0.1, 1, exchanged=64), filtered(0.1, 2, exchanged=64)
-    table = table_of(*hands)
-    exchanged = table.source == Source.EXCHANGED
-    assert exchanged.any(), "the track has other fingers than the image"
-    assert exchanged.int().diff().min() >= 0, "all others come before"
-    for row, hand in enumerate(hands):
-        mine = table.of_hand(row)
-        best = mine.of_source(Source.PREVIOUS, Source.DYNAMICS).best
-        tried = mine.of_source(Source.EXCHANGED)
+    for hand in (filtered(-0.1, 1, exchanged=64), filtered(0.1, 2, exchanged=64)):
+        table = table_of(hand)
+        exchanged = table.source == Source.EXCHANGED
+        assert exchanged.any(), "the track has other fingers than the image"
+        assert exchanged.int().diff().min() >= 0, "all others come before"
+        best = table.of_source(Source.PREVIOUS, Source.DYNAMICS).best
+        tried = table.of_source(Source.EXCHANGED)
         as_they_are = tried.rows(torch.arange(len(tried) // 2))
         for pose, value in zip(as_they_are.pose, as_they_are.log_posterior, strict=True):
             changed = (pose[6:] != best.pose[0, 6:]).nonzero()[:, 0].tolist()

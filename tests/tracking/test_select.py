@@ -43,7 +43,7 @@ def random_table(draw: np.random.Generator) -> Hypotheses:
     sources = torch.from_numpy(draw.choice([int(source) for source in Source], n))
     sources[draw.integers(n)] = int(draw.choice((Source.PREVIOUS, Source.DYNAMICS)))
     values = torch.from_numpy(draw.normal(0, 0.05, n)).float()
-    return Hypotheses(poses, torch.zeros(n, dtype=torch.long), sources, values)
+    return Hypotheses(poses, sources, values)
 
 
 def random_incumbent(draw: np.random.Generator, table: Hypotheses) -> Incumbent:
@@ -142,8 +142,8 @@ class Followed:
     def frame(self, others: Sequence[tuple[torch.Tensor, Source, float]]) -> Choice:
         """A frame in which other poses (1, 27) are better than the standing one by so much."""
         before = self.choice
-        tables = [Hypotheses.of(self.pose, 0, Source.PREVIOUS)]
-        tables += [Hypotheses.of(other, 0, source) for other, source, _ in others]
+        tables = [Hypotheses.of(self.pose, Source.PREVIOUS)]
+        tables += [Hypotheses.of(other, source) for other, source, _ in others]
         gains = torch.tensor([0.0] + [gain for _, _, gain in others])
         table = replace(Hypotheses.joined(tables), log_posterior=gains)
         incumbent = Incumbent(
@@ -269,7 +269,7 @@ def test_the_last_fingers_stand_until_those_of_the_filter_are_better() -> None:
 
 
 def test_a_hand_that_is_held_stays_as_it_is() -> None:
-    table = replace(Hypotheses.of(OTHER_FINGER, 0, Source.HELD), log_posterior=torch.tensor([-9.0]))
+    table = replace(Hypotheses.of(OTHER_FINGER, Source.HELD), log_posterior=torch.tensor([-9.0]))
     none = Incumbent(torch.zeros(0, 21, 3), 0.0, Duration(), 5.0, False)
     joints = joints_of(table.pose)
     choice = select(table, joints, none, FRAME_S, True, True, SETTINGS)
@@ -331,18 +331,18 @@ def test_only_the_detector_moves_a_hand_to_another_place() -> None:
     assert not any(track.frame([(OTHER_PLACE, Source.EXCHANGED, 0.5)]).moved for _ in range(5))
 
 
-def test_a_table_keeps_each_row_with_its_hand_and_source() -> None:
-    one = Hypotheses.of(torch.ones(2, 27), 0, Source.DETECTOR)
-    two = Hypotheses.of(2 * torch.ones(3, 27), 1, Source.CONTENDER)
+def test_a_table_keeps_each_row_with_its_source() -> None:
+    one = Hypotheses.of(torch.ones(2, 27), Source.DETECTOR)
+    two = Hypotheses.of(2 * torch.ones(3, 27), Source.CONTENDER)
     table = Hypotheses.joined((one, two))
     assert len(table) == 5 and bool(table.log_posterior.isnan().all())
-    assert torch.equal(table.of_hand(1).pose, two.pose)
+    assert torch.equal(table.of_source(Source.CONTENDER).pose, two.pose)
     assert torch.equal(table.of_source(Source.DETECTOR, Source.HELD).pose, one.pose)
     assert len(Hypotheses.joined(())) == 0
 
 
 def test_of_equally_good_rows_the_first_is_the_best() -> None:
-    table = Hypotheses.of(torch.arange(4.0)[:, None].repeat(1, 27), 0, Source.DETECTOR)
+    table = Hypotheses.of(torch.arange(4.0)[:, None].repeat(1, 27), Source.DETECTOR)
     scored = replace(table, log_posterior=torch.tensor([-1.0, 0.5, 0.5, -torch.inf]))
     assert float(scored.best.pose[0, 0]) == 1.0
 
@@ -370,7 +370,7 @@ def test_poses_that_explain_nothing_stand_and_have_no_lead() -> None:
     poses = torch.cat((pose(), pose(finger=0.06)))
     sources = torch.tensor([int(Source.PREVIOUS), int(Source.EXCHANGED)])
     values = torch.full((2,), -math.inf)
-    table = Hypotheses(poses, torch.zeros(2, dtype=torch.long), sources, values)
+    table = Hypotheses(poses, sources, values)
     track = Incumbent(joints_of(poses[:0]), 0.0, Duration(), 2.0, False)
     choice = select(table, joints_of(poses), track, FRAME_S, False, False, SETTINGS)
     assert torch.equal(choice.pose, pose())

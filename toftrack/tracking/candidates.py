@@ -368,18 +368,15 @@ def best_start(
     return poses[best][None], float(values[best])
 
 
-def propose(frames: Sequence[FilteredFrame], generator: torch.Generator) -> Hypotheses:
-    """The scored hypotheses of a frame's hands, in two rounds."""
-    proposed = [_first_round(number, frame) for number, frame in enumerate(frames)]
-    first = _refined(Hypotheses.joined([table for table, _ in proposed]), frames)
-    second = [
-        _second_round(number, frame, first.of_hand(number), donors, generator)
-        for number, (frame, (_, donors)) in enumerate(zip(frames, proposed, strict=True))
-    ]
-    return Hypotheses.joined([table for table in (first, *second) if len(table)])
+def propose(filtered: FilteredFrame, generator: torch.Generator) -> Hypotheses:
+    """The scored hypotheses of a frame's hand, in two rounds."""
+    proposed, donors = _first_round(filtered)
+    first = _refined(proposed, filtered)
+    second = _second_round(filtered, first, donors, generator)
+    return Hypotheses.joined((first, second)) if len(second) else first
 
 
-def _first_round(number: int, filtered: FilteredFrame) -> tuple[Hypotheses, Tensor]:
+def _first_round(filtered: FilteredFrame) -> tuple[Hypotheses, Tensor]:
     """What the filter and the detector propose, not refined; and the poses (M, 21) to take single
     fingers from.
 
@@ -389,28 +386,24 @@ def _first_round(number: int, filtered: FilteredFrame) -> tuple[Hypotheses, Tens
     frame, track, state = filtered.frame, filtered.frame.track, filtered.pose
     model, settings = frame.model, frame.model.detector.settings
     if not model.refinement.iterations:
-        return Hypotheses.of(state, number, Source.DYNAMICS), state[:0, 6:]
+        return Hypotheses.of(state, Source.DYNAMICS), state[:0, 6:]
     if filtered.covered:
-        return Hypotheses.of(track.pose, number, Source.HELD), state[:0, 6:]
+        return Hypotheses.of(track.pose, Source.HELD), state[:0, 6:]
     detected = detected_poses(
         filtered.detection, frame.observation, frame.fitted, model, settings.candidates
     )
     tables = [
-        Hypotheses.of(_with_fingers(state, track.pose), number, Source.PREVIOUS),
-        Hypotheses.of(state, number, Source.DYNAMICS),
-        Hypotheses.of(_with_fingers(state, track.contender), number, Source.CONTENDER),
+        Hypotheses.of(_with_fingers(state, track.pose), Source.PREVIOUS),
+        Hypotheses.of(state, Source.DYNAMICS),
+        Hypotheses.of(_with_fingers(state, track.contender), Source.CONTENDER),
     ]
     if schedule(track, frame.hidden, model.hysteresis.alternate, frame.in_turn)[0]:
-        tables.append(Hypotheses.of(detected, number, Source.DETECTOR))
+        tables.append(Hypotheses.of(detected, Source.DETECTOR))
     return Hypotheses.joined(tables), detected[:_DONORS, 6:]
 
 
 def _second_round(
-    number: int,
-    filtered: FilteredFrame,
-    table: Hypotheses,
-    donors: Tensor,
-    generator: torch.Generator,
+    filtered: FilteredFrame, table: Hypotheses, donors: Tensor, generator: torch.Generator
 ) -> Hypotheses:
     """The best pose with single fingers of other poses, as they are and refined, scored."""
     frame, none = filtered.frame, table.rows(slice(0))
@@ -436,19 +429,15 @@ def _second_round(
     if not len(rows):
         return none
     tried = torch.cat((poses[rows], filtered.refined(poses[rows])))
-    found = Hypotheses.of(tried, number, Source.EXCHANGED)
+    found = Hypotheses.of(tried, Source.EXCHANGED)
     return replace(found, log_posterior=filtered.posterior(tried))
 
 
-def _refined(table: Hypotheses, frames: Sequence[FilteredFrame]) -> Hypotheses:
-    """The same table, each hand's rows refined, but for a pose that is held, and scored."""
-    tables = []
-    for number, filtered in enumerate(frames):
-        mine = table.of_hand(number)
-        if filtered.frame.model.refinement.iterations and mine.source[0] != Source.HELD:
-            mine = replace(mine, pose=filtered.refined(mine.pose))
-        tables.append(replace(mine, log_posterior=filtered.posterior(mine.pose)))
-    return Hypotheses.joined(tables)
+def _refined(table: Hypotheses, filtered: FilteredFrame) -> Hypotheses:
+    """The same table, refined, but for a pose that is held, and scored."""
+    if filtered.frame.model.refinement.iterations and table.source[0] != Source.HELD:
+        table = replace(table, pose=filtered.refined(table.pose))
+    return replace(table, log_posterior=filtered.posterior(table.pose))
 
 
 def schedule(

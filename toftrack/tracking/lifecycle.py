@@ -112,7 +112,7 @@ def open_hand(
     sides where they are to be compared (compared_beside); else everything depends on it, and waits.
     """
     alone, track, mirrored = without(image, others), hand.track, None
-    if track is not None and not (track.doubted and _waits(hand, others)):
+    if track is not None and goes_on(hand, others):
         due = hand.handedness.comparison_due(model.configured.handedness, True, dt_s)
         if any(other.believed for other in others):  # one hand in a frame, and not in each
             due = due and (slot + image.index) % _COMPARED_EVERY == 0
@@ -155,11 +155,14 @@ def open_hand(
     )
 
 
-def _waits(hand: HandState, others: Sequence[OtherHand]) -> bool:
-    """Whether a doubted track waits for the detector: where nothing is surely followed, or a search
-    beside the other hand has found something elsewhere.
+def goes_on(hand: HandState, others: Sequence[OtherHand]) -> bool:
+    """Whether a hand's track goes on in a frame. One that is doubted waits for the detector where
+    nothing is surely followed, or a search beside the other hand has found something elsewhere.
     """
-    return hand.seeking is not None and search_is_over(hand) or not any(o.certain for o in others)
+    if hand.track is None:
+        return False
+    elsewhere = hand.seeking is not None and search_is_over(hand)
+    return not hand.track.doubted or (not elsewhere and any(o.certain for o in others))
 
 
 def _nothing() -> Detection:

@@ -53,48 +53,36 @@ class Source(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """A table of poses, a row each; of one hand or of two.
+    """A table of poses of one hand, a row each.
 
-    pose: (N, 27).  hand: (N,) which hand is meant, a row of the frame's hands.
-    source: (N,) see Source.  log_posterior: (N,), NaN before they are scored.
+    pose: (N, 27).  source: (N,) see Source.  log_posterior: (N,), NaN before they are scored.
     """
 
     pose: Tensor
-    hand: Tensor
     source: Tensor
     log_posterior: Tensor
 
     @classmethod
-    def of(cls, pose: Tensor, hand: int, source: Source) -> Hypotheses:
-        """Poses (N, 27) of one hand and source, not scored."""
+    def of(cls, pose: Tensor, source: Source) -> Hypotheses:
+        """Poses (N, 27) of one source, not scored."""
         n = len(pose)
-        return cls(
-            pose, torch.full((n,), hand), torch.full((n,), int(source)), torch.full((n,), math.nan)
-        )
+        return cls(pose, torch.full((n,), int(source)), torch.full((n,), math.nan))
 
     @classmethod
     def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
         """One below the other; of no tables, one without rows."""
-        tables = tables or [cls.of(torch.zeros(0, 27), 0, Source.HELD)]
+        tables = tables or [cls.of(torch.zeros(0, 27), Source.HELD)]
         if len(tables) == 1:
             return tables[0]
         return cls(
             torch.cat([table.pose for table in tables]),
-            torch.cat([table.hand for table in tables]),
             torch.cat([table.source for table in tables]),
             torch.cat([table.log_posterior for table in tables]),
         )
 
     def rows(self, rows: Tensor | slice) -> Hypotheses:
         """Some rows, by number, as a mask or a slice."""
-        return Hypotheses(
-            self.pose[rows], self.hand[rows], self.source[rows], self.log_posterior[rows]
-        )
-
-    def of_hand(self, hand: int) -> Hypotheses:
-        """The rows of one hand."""
-        mine = self.hand == hand
-        return self if bool(mine.all()) else self.rows(mine)
+        return Hypotheses(self.pose[rows], self.source[rows], self.log_posterior[rows])
 
     def of_source(self, *sources: Source) -> Hypotheses:
         """The rows of some sources."""

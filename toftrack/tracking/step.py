@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 from toftrack.compute import particle_filter
 from toftrack.compute.pace import FRAME_S
 from toftrack.compute.spans import Spans
-from toftrack.compute.threads import small_operations
+from toftrack.compute.threads import at_most, small_operations, threads
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
@@ -33,11 +33,12 @@ from toftrack.tracking.candidates import (
 from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
-from toftrack.tracking.hands import PlacedHand, others_of, partnered
+from toftrack.tracking.hands import OtherHand, PlacedHand, others_of, partnered
 from toftrack.tracking.lifecycle import (
     Absence,
     Status,
     close,
+    goes_on,
     open_hand,
     reconcile,
 )
@@ -55,69 +56,139 @@ Concluded = tuple[int, HandState, StepInfo, Estimate]
 """A slot and its hand after a frame."""
 
 
+@dataclass(frozen=True, eq=False)
+class HandTask:
+    """All that a hand's part of a frame needs, but for the model.
+
+    others: as the frame begins.
+    """
+
+    slot: int
+    hand: HandState
+    others: tuple[OtherHand, ...]
+    image: DepthImage
+    dt_s: float
+    generator: torch.Generator
+
+
+Beside = Callable[[HandTask], Callable[[], Concluded | None] | None]
+"""Begins a hand's part of a frame elsewhere; what it returns waits, and may have failed: None. It
+returns None itself where nothing can be begun."""
+
+
 @small_operations()
-def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped:
+def step(
+    state: TrackerState, image: DepthImage, model: TrackerModel, beside: Beside | None = None
+) -> Stepped:
     """One frame of one hand or two; a pure function: the state given stays as it is.
 
     A particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and
-    local optimisation of few hypotheses (Gall et al., IJCV 87, 2010). For H hands:
+    local optimisation of few hypotheses (Gall et al., IJCV 87, 2010). For each hand:
 
-    1. Predict the hands, and *open*: detect (a network that votes for joints, as A2J: Xiong et al.,
-       ICCV 2019), compare the sides, segment, begin tracks. -> H frames
+    1. Predict it, and *open*: detect (a network that votes for joints, as A2J: Xiong et al., ICCV
+       2019), compare the sides, segment, begin a track.
     2. Filter: N particles (N, 6 + d) in the pose space, resampled, diffused and weighed by the
        F-measure of the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
     3. Wait for detections that ran beside it.
-    4. *Propose*: one table of hypotheses (M, 27) of all hands, refined by Levenberg-Marquardt
-       steps, scored by the posterior; in a second round the best ones with exchanged fingers.
-    5. *Select* a pose for each hand, with hysteresis (Page's test, Biometrika 41, 1954).
+    4. *Propose*: a table of hypotheses (M, 27), refined by Levenberg-Marquardt steps, scored by the
+       posterior; in a second round the best ones with exchanged fingers.
+    5. *Select* a pose, with hysteresis (Page's test, Biometrika 41, 1954).
     6. *Close*: steady the pose, judge it, carry the track on or end it, learn the hand's shape.
-    7. Reconcile the slots of two hands.
+
+    Two hands know of each other where they are predicted; at the end their slots are reconciled.
+
+    beside: where the second of two hands may be followed meanwhile; None = nowhere. The estimates
+        are the same.
     """
     spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     before = state.at(image)
     with spans("detector"):
         before, seeking = start_seeking(before, image, model, dt_s)
-        opened = open_hands(before, image, model, dt_s)
-    frames = [one for one in opened if isinstance(one, HandFrame)]
-    with spans("filter: rest"):
-        filtered = [filtered_frame(frame, dt_s, generator, spans) for frame in frames]
-    with spans("detector"):
-        waited = [waited_for(frame, image) for frame in frames]
-    again = [new.track is not old.track for new, old in zip(waited, frames, strict=True)]
-    frames = waited
-    if any(again):  # the side has changed
-        with spans("filter: rest"):
-            filtered = [
-                filtered_frame(frame, dt_s, generator, spans) if anew else found
-                for frame, found, anew in zip(frames, filtered, again, strict=True)
-            ]
-    with spans("refinement"):
-        pairs = list(zip(frames, filtered, strict=True))
-        candidates = [FilteredFrame.of(frame, found.mean) for frame, found in pairs]
-        table = propose(candidates, generator)
-        choices = [choose(row, one, table, dt_s) for row, one in enumerate(candidates)]
-    found = [conclude(*pair, one, image, dt_s) for pair, one in zip(pairs, choices, strict=True)]
-    found += [no_hand(one, image, model) for one in opened if isinstance(one, Absence)]
+    found = followed(before, image, model, dt_s, generator, spans, beside)
     with spans("detector"):
         before = sought(before, seeking, model)
     before = replace(before, generator=generator.get_state())
     return reconciled(before, found, image, model, dt_s, spans)
 
 
-def open_hands(
-    state: TrackerState, image: DepthImage, model: TrackerModel, dt_s: float
-) -> list[HandFrame | Absence]:
-    """The hands that a frame is about, the surest first; each knows where the others are."""
-    hands, opened = partnered(state.hands, model), list[HandFrame | Absence]()
+def followed(
+    state: TrackerState,
+    image: DepthImage,
+    model: TrackerModel,
+    dt_s: float,
+    generator: torch.Generator,
+    spans: Spans,
+    beside: Beside | None,
+) -> list[Concluded]:
+    """The hands that a frame is about after it, the surest first."""
+    hands = partnered(state.hands, model)
     slots = taking_part(state, model.configured.handedness.watch_s)
-    others = others_of(hands, slots, image, model, dt_s)
-    for slot in slots:
-        opened.append(open_hand(slot, hands[slot], others[slot], image, model, dt_s))
-        track = opened[-1].track
-        if track is not hands[slot].track:  # it began or ended: the next one must know
-            hands[slot] = replace(opened[-1].hand, track=track)
-            others = others_of(hands, slots, image, model, dt_s)
-    return opened
+    dice = [generator] + [_seeded_by(generator) for _ in slots[1:]]
+
+    def tasks() -> list[HandTask]:
+        others = others_of(hands, slots, image, model, dt_s)
+        each = zip(slots, dice, strict=True)
+        return [HandTask(slot, hands[slot], others[slot], image, dt_s, own) for slot, own in each]
+
+    with spans("detector"):
+        todo = tasks()
+    both_go_on = len(todo) == 2 and all(goes_on(task.hand, task.others) for task in todo)
+    wait = None
+    if both_go_on and beside is not None:
+        with spans("the other hand"):
+            wait = beside(todo[1])
+    if wait is not None:
+        with at_most(max(1, threads() - 1)):
+            first = follow_hand(todo[0], model, spans)
+        with spans("the other hand"):
+            second = wait()
+        return [first, second or follow_hand(todo[1], model, spans)]
+    opened = list[HandFrame | Absence]()
+    for number, slot in enumerate(slots):
+        with spans("detector"):
+            opened.append(opened_by(todo[number], model))
+            track = opened[-1].track
+            if track is not hands[slot].track and not both_go_on:  # the next one must know
+                hands[slot] = replace(opened[-1].hand, track=track)
+                todo = tasks()
+    return [concluded(one, task, model, spans) for one, task in zip(opened, todo, strict=True)]
+
+
+def _seeded_by(generator: torch.Generator) -> torch.Generator:
+    """Another one: a hand's random numbers do not depend on how many the other one uses."""
+    return torch.Generator().manual_seed(int(torch.randint(2**62, (1,), generator=generator)))
+
+
+def follow_hand(task: HandTask, model: TrackerModel, spans: Spans) -> Concluded:
+    """A hand's part of a frame, where that does not depend on what becomes of another's track."""
+    with spans("detector"):
+        opened = opened_by(task, model)
+    return concluded(opened, task, model, spans)
+
+
+def opened_by(task: HandTask, model: TrackerModel) -> HandFrame | Absence:
+    """See open_hand."""
+    return open_hand(task.slot, task.hand, task.others, task.image, model, task.dt_s)
+
+
+def concluded(
+    opened: HandFrame | Absence, task: HandTask, model: TrackerModel, spans: Spans
+) -> Concluded:
+    """A slot's hand after a frame that it was opened for."""
+    image, dt_s, generator = task.image, task.dt_s, task.generator
+    if isinstance(opened, Absence):
+        return no_hand(opened, image, model)
+    with spans("filter: rest"):
+        filtered = filtered_frame(opened, dt_s, generator, spans)
+    with spans("detector"):
+        frame = waited_for(opened, image)
+    if frame.track is not opened.track:  # the side has changed
+        with spans("filter: rest"):
+            filtered = filtered_frame(frame, dt_s, generator, spans)
+    with spans("refinement"):
+        candidates = FilteredFrame.of(frame, filtered.mean)
+        choice = choose(candidates, propose(candidates, generator), dt_s)
+    return conclude(frame, filtered, choice, image, dt_s)
 
 
 def filtered_frame(
@@ -145,10 +216,10 @@ def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
     return with_parts(frame)
 
 
-def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
-    """The pose of one of the table's hands."""
+def choose(filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
+    """One of the table's poses."""
     frame, track = filtered.frame, filtered.frame.track
-    mine, joints = table.of_hand(row), frame.fitted.refiner.joints
+    joints = frame.fitted.refiner.joints
     incumbent = Incumbent(
         joints(track.contender) if len(track.contender) else torch.zeros(0, 21, 3),
         track.lead,
@@ -158,7 +229,7 @@ def choose(row: int, filtered: FilteredFrame, table: Hypotheses, dt_s: float) ->
         filtered.emerges,
     )
     asked, settings = not frame.detection.empty, frame.model.hysteresis
-    return select(mine, joints(mine.pose), incumbent, dt_s, asked, filtered.hidden, settings)
+    return select(table, joints(table.pose), incumbent, dt_s, asked, filtered.hidden, settings)
 
 
 def conclude(

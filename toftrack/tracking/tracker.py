@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,8 +25,9 @@ from toftrack.render.scoring import Scorer
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
+from toftrack.tracking.second_process import SecondProcess
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
-from toftrack.tracking.step import Stepped, step
+from toftrack.tracking.step import Beside, Stepped, step
 
 AUTO = "auto"
 _RENDERED_PX = 72, 88
@@ -47,8 +49,10 @@ class HandsTracker:
         hands: int = 1,
         pace: Pace | None = None,
         clock: Callable[[], float] = time.perf_counter,
+        second: SecondProcess | None = None,
     ) -> None:
         """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`.
+        second: the process that follows the second hand, where there are two.
 
         Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without a detector.
         """
@@ -59,6 +63,7 @@ class HandsTracker:
                 " give hands=1, or leave experiment=paper out"
             )
         self.model, self.time = model, Timekeeper(pace, clock)
+        self._second = second if hands == 2 and model.device.type == "cpu" else None
         self.state = model.first_state(seed, hands)
         self.infos: tuple[StepInfo | None, ...] = (None,) * hands
 
@@ -88,9 +93,15 @@ class HandsTracker:
         image = DepthImage(depth_m, k, index, timestamp_s)
         with at_most(quality.threads):
             model = self.model.at_quality(quality)
-            self.state, self.infos, estimates = _stepped(self.state, image, model)
+            beside = None if self._second is None else partial(self._second.begin, quality)
+            self.state, self.infos, estimates = _stepped(self.state, image, model, beside)
         took_s = self.time.took_s()
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
+
+    def close(self) -> None:
+        """End the second process, if there is one; it ends with the tracker, too."""
+        if self._second is not None:
+            self._second.close()
 
     @small_operations()
     def prepare(self) -> None:
@@ -236,12 +247,14 @@ class Tracker:
         return self.hands.device
 
 
-def _stepped(state: TrackerState, image: DepthImage, model: FilterModel) -> Stepped:
+def _stepped(
+    state: TrackerState, image: DepthImage, model: FilterModel, beside: Beside | None = None
+) -> Stepped:
     """One frame, by the tracker that a model is of: see step and paper_step."""
     if isinstance(model, PaperModel):
         return paper_step(state, image, model)
     assert isinstance(model, TrackerModel)
-    return step(state, image, model)
+    return step(state, image, model, beside)
 
 
 def restarted(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:

@@ -1,0 +1,206 @@
+"""A second process that follows the second one of two hands while this one follows the first.
+
+Most of a frame is many small operations, between which Python's lock is held, so that threads would
+wait for each other. A hand's part of a frame is a function of what it is given (step.HandTask), so
+it is sent there, and the answer is what this process would have computed.
+
+What is sent between the two, through a socket with a key of their own, are pickles; nothing else
+may send any.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import os
+import pickle
+import secrets
+import signal
+import subprocess
+import sys
+import weakref
+from collections.abc import Callable
+from functools import partial
+from multiprocessing.connection import Client, Connection, Listener
+from threading import Thread
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from toftrack.compute.quality import Quality
+from toftrack.compute.spans import Spans
+from toftrack.compute.threads import at_most, small_operations, threads
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.step import Concluded, HandTask, follow_hand
+
+_log = logging.getLogger(__name__)
+_PROGRAM = "from toftrack.tracking.second_process import main; main()"
+
+
+class SecondProcess:
+    """The process, as the first one has it. It begins when it is first needed, and ends with this
+    object or with the first process.
+    """
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        """config: of a tracker (conf/config.yaml), as JSON can say it."""
+        self._config = config
+        self._began: _Began | None = None
+        self._failed = False
+
+    def begin(self, quality: Quality, task: HandTask) -> Callable[[], Concluded | None] | None:
+        """Begin a hand's part of a frame there; what is returned waits for it, and says None where
+        the process has ended meanwhile.
+
+        Returns None itself where the process is not ready yet, or there is no core for it.
+        """
+        if self._failed or threads() < 2:
+            return None
+        if self._began is None:
+            self._start()
+        began = self._began
+        if began is None or began.connection is None or began.of_process != os.getpid():
+            if began is not None and began.process.poll() is not None:
+                self._give_up("it did not start")
+            return None
+        try:
+            began.connection.send_bytes(_pickled((quality, task)))
+        except OSError as error:
+            self._give_up(str(error))
+            return None
+        return partial(self._answer, began.connection)
+
+    def close(self) -> None:
+        """End the process."""
+        if self._began is not None:
+            self._began.end()
+        self._began = None
+
+    def _start(self) -> None:
+        try:
+            self._began = _Began(self._config)
+        except OSError as error:
+            self._give_up(str(error))
+            return
+        weakref.finalize(self, self._began.end)
+
+    def _answer(self, connection: Connection) -> Concluded | None:
+        try:
+            answer = pickle.loads(connection.recv_bytes())
+        except (OSError, EOFError) as error:
+            self._give_up(str(error) or "it has ended")
+            return None
+        if isinstance(answer, str):
+            self._give_up(answer)
+            return None
+        found: Concluded = answer
+        return found
+
+    def _give_up(self, why: str) -> None:
+        self.close()
+        self._failed = True
+        _log.warning("both hands are followed by one process, which is slower: %s", why)
+
+
+class _Began:
+    """A process that was begun.
+
+    connection: to it, as soon as it is ready.  of_process: the number of the one that began it; a
+    process that was forked from that one must not use it.
+    """
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        self.connection: Connection | None = None
+        self.of_process = os.getpid()
+        key = secrets.token_bytes(32)
+        self._listener = Listener(authkey=key)
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )
+        assert self.process.stdin is not None
+        line = json.dumps({"address": self._listener.address, "key": key.hex()})
+        self.process.stdin.write(line.encode() + b"\n")
+        self.process.stdin.close()
+        Thread(target=self._meet, args=(config,), daemon=True).start()
+
+    def _meet(self, config: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError, EOFError):
+            connection: Connection = self._listener.accept()
+            connection.send_bytes(json.dumps(config).encode())
+            connection.recv_bytes()
+            self.connection = connection
+
+    def end(self) -> None:
+        """End it; in a forked process nothing happens to it."""
+        if os.getpid() != self.of_process:
+            return
+        if self.connection is not None:
+            self.connection.close()
+        self.process.terminate()
+        self.process.wait()
+        self._listener.close()
+
+
+class _Pickler(pickle.Pickler):
+    """Tensors as arrays, which is twenty times as fast as torch's own way."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if type(value) is Tensor:
+            return torch.from_numpy, (value.numpy(),)
+        if type(value) is torch.Generator:
+            return _generator_of, (value.get_state(),)
+        return NotImplemented
+
+
+def _generator_of(state: Tensor) -> torch.Generator:
+    generator = torch.Generator()
+    generator.set_state(state)
+    return generator
+
+
+def _pickled(value: Any) -> memoryview:
+    stream = io.BytesIO()
+    _Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(value)
+    return stream.getbuffer()
+
+
+def main() -> None:
+    """What the second process does, until the first one closes the connection."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first one's end is this one's, too
+    said = json.loads(sys.stdin.readline())
+    with contextlib.suppress(OSError, EOFError):  # the first one has ended
+        with Client(said["address"], authkey=bytes.fromhex(said["key"])) as connection:
+            model = _prepared(json.loads(connection.recv_bytes()))
+            connection.send_bytes(b"ready")
+            while True:
+                quality, task = pickle.loads(connection.recv_bytes())
+                connection.send_bytes(_pickled(_followed(model, quality, task)))
+
+
+@small_operations()
+def _prepared(config: dict[str, Any]) -> TrackerModel:
+    """The model, with all that the first frame would have to wait for."""
+    from omegaconf import OmegaConf
+
+    from toftrack.api import build_model
+    from toftrack.tracking.tracker import HandsTracker
+
+    model = build_model(OmegaConf.create(config))
+    assert isinstance(model, TrackerModel)
+    HandsTracker(model).prepare()
+    return model
+
+
+@small_operations()
+def _followed(model: TrackerModel, quality: Quality, task: HandTask) -> Concluded | str:
+    try:
+        with at_most(1):
+            return follow_hand(task, model.at_quality(quality), Spans())
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
