@@ -260,7 +260,9 @@ def close(
         nearest_m=frame.expected_m if frame.hidden else 0.0,
     )
     remembered = not status.lost and track.age.reached(model.lost.probation + 1)
-    now = LastSeen(track.mean, 0.0, frame.observation, track.surest)
+    # What was beside it says which hand comes later, but not where that was the other one of two.
+    alone = not any(other.certain and not other.watched for other in frame.others)
+    now = LastSeen(track.mean, 0.0, frame.observation if alone else None, track.surest)
     seen = now if remembered else frame.hand.seen
     return status, track, seen
 
