@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import numba
+import numpy as np
 import pytest
 import torch
 
 from toftrack.detector.dice import Dice
-from toftrack.detector.furniture import PIECES, furniture
+from toftrack.detector.furniture import PIECES, before_camera, furniture, on_a_piece
 from toftrack.detector.hands import HAND, OTHER_HAND
 from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
 from toftrack.detector.scenes import Scenes
-from toftrack.detector.things_numba import PART
+from toftrack.detector.things_numba import PART, part_distance
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 N = 64
 
 
+@numba.njit
+def distance_to(part, point):
+    return part_distance(part, point[0], point[1], point[2])
+
+
 def pieces(there: torch.Tensor, seed: int = 0) -> torch.Tensor:
-    return furniture(there, Dice(torch.Generator().manual_seed(seed)))
+    dice = Dice(torch.Generator().manual_seed(seed))
+    return furniture(there, before_camera(len(there), dice), dice)
 
 
 def test_where_there_is_furniture_there_are_two_pieces_or_more() -> None:
@@ -29,6 +37,17 @@ def test_where_there_is_furniture_there_are_two_pieces_or_more() -> None:
     assert (count[there] >= 2).all() and (count[~there] == 0).all()
     assert len(count.unique()) > 4
     assert torch.equal(made, pieces(there)) and not torch.equal(made, pieces(there, 1))
+
+
+def test_a_place_on_a_piece_is_in_it_or_nearly() -> None:
+    made = pieces(torch.ones(N, dtype=torch.bool))
+    places = on_a_piece(made, Dice(torch.Generator().manual_seed(0))).numpy()
+    some = [[part for part in row.numpy().astype(np.float64) if part[0] >= 0] for row in made]
+    away = [
+        min(distance_to(part, place) for part in row)
+        for row, place in zip(some, places.astype(np.float64), strict=True)
+    ]
+    assert np.median(away) < 0.001 and max(away) < 0.1, "at corners of what is round, beside it"
 
 
 def test_it_is_seen_and_is_no_hand() -> None:

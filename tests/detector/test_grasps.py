@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers.detection import clean_picture, dice, intrinsics, small_bank
 
+from toftrack.detector import grasps as grasping
 from toftrack.detector import hands as module
 from toftrack.detector.grasps import Grasps, random_grasps
 from toftrack.detector.hands import HAND, THING, posed_hands
@@ -60,6 +61,53 @@ def test_most_hands_hold_something_and_their_fingers_are_at_it() -> None:
     # A bone lies some 8 mm below the skin that touches; some hands are just letting go.
     assert np.median(nearest) < 0.014 and np.mean(np.array(nearest) < 0.02) > 0.8
     assert np.percentile(deepest, 5) > 0.0
+
+
+def in_palm(
+    opposed: float, tries: int, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Grasps, np.ndarray]:
+    """Power grasps, and their joints (N, 21, 3)."""
+    monkeypatch.setattr(grasping, "POWER_SHARE", 1.0)
+    monkeypatch.setattr(grasping, "_OPENED_SHARE", 0.0)
+    monkeypatch.setattr(grasping, "_OPPOSED_SHARE", opposed)
+    monkeypatch.setattr(grasping, "_THUMB_TRIES", tries)
+    held, shape = grasps()
+    state = torch.cat((torch.zeros(N, 6), held.angles), 1)
+    return held, forward_kinematics(state, shape).joints_m.numpy()
+
+
+def test_thumbs_try_until_their_pads_touch_what_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    touching = []
+    at = np.array([[0.3], [0.6], [0.9]])
+    for tries in (1, 10):
+        held, joints = in_palm(0.0, tries, monkeypatch)
+        rows = torch.nonzero(held.held)[:, 0].tolist()
+        ends = [
+            distances(held.parts[r].numpy(), joints[r, 3] + at * (joints[r, 4] - joints[r, 3]))
+            for r in rows
+        ]
+        touching.append(np.mean([end.min() < 0.013 for end in ends]))
+    assert touching[1] > touching[0] + 0.05
+
+
+def test_most_thumbs_stand_opposed_across_what_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    def opposed(share: float) -> float:
+        held, joints = in_palm(share, 10, monkeypatch)
+        tip = joints[held.held.numpy(), 4]
+        middle = 0.5 * (joints[held.held.numpy(), 5, 0] + joints[held.held.numpy(), 9, 0])
+        return float(np.mean(-tip[:, 2] - 0.5 * np.abs(tip[:, 0] - middle)))
+
+    assert opposed(1.0) > opposed(0.0) + 0.004, "metres, on average"
+
+
+def test_thumbs_about_a_thing_do_not_go_through_fingers(monkeypatch: pytest.MonkeyPatch) -> None:
+    held, joints = in_palm(0.75, 10, monkeypatch)
+    along = np.linspace(0, 1, 9)[:, None]
+    chains = joints[held.held.numpy(), 1:].reshape(-1, 5, 4, 3)
+    lines = chains[:, :, :-1, None] + along * (chains[:, :, 1:] - chains[:, :, :-1])[:, :, :, None]
+    thumb, fingers = lines[:, 0, 1:].reshape(-1, 18, 3), lines[:, 1:4].reshape(-1, 81, 3)
+    nearest = np.linalg.norm(thumb[:, :, None] - fingers[:, None], axis=-1).min((1, 2))
+    assert np.mean(nearest > 0.008) > 0.95
 
 
 def test_a_hand_that_could_not_hold_its_thing_is_bare() -> None:

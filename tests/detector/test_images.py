@@ -76,6 +76,13 @@ def test_absent_hands_are_beside_the_crop_s_middle(crops: Crops) -> None:
     assert (away[crops.present] < 0.16).all()
 
 
+def test_crops_without_a_hand_show_things_more_often() -> None:
+    made = crop_images(512, small_bank(), torch.Generator().manual_seed(1))
+    things = (made.parts == SEGMENTS - 1).float().mean((1, 2)) > 0.1
+    with_hand, without = things[made.present].float().mean(), things[~made.present].float().mean()
+    assert without > 1.4 * with_hand, "furniture, too"
+
+
 def test_whole_images_are_complete(images: WideImages) -> None:
     assert images.image.shape == (N, 2, *WIDE_SIZE)
     assert images.image.min() >= 0 and images.image.max() <= 1

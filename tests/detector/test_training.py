@@ -114,16 +114,16 @@ def test_an_interrupted_training_ends_with_the_same_weights(
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
     network = torch.nn.Linear(2, 2)
-    progress = Progress(network, network, torch.optim.AdamW(network.parameters()))
+    progress = Progress(network, network, torch.optim.AdamW(network.parameters()), 24)
     resumed = Checkpoints(tmp_path, 1.0, resume=tmp_path)
-    save(resumed.path("poses"), progress, {"images": 24, "seed": 0})
-    resumed.restore("poses", progress, {"images": 24, "seed": 0})
-    with pytest.raises(ToftrackError, match="a training with images=24, and now it is 32"):
-        resumed.restore("poses", progress, {"images": 32, "seed": 0})
+    save(resumed.path("poses"), progress, {"batch": 24, "seed": 0})
+    resumed.restore("poses", progress, {"batch": 24, "seed": 0})
+    with pytest.raises(ToftrackError, match="a training with batch=24, and now it is 32"):
+        resumed.restore("poses", progress, {"batch": 32, "seed": 0})
     other = torch.nn.Linear(3, 2)
-    wrong = Progress(other, other, torch.optim.AdamW(other.parameters()))
+    wrong = Progress(other, other, torch.optim.AdamW(other.parameters()), 24)
     with pytest.raises(ToftrackError, match=r"poses.checkpoint.npz is no checkpoint"):
-        resumed.restore("poses", wrong, {"images": 24})
+        resumed.restore("poses", wrong, {"batch": 24})
     resumed.path("poses").write_bytes(b"PK no archive")
     with pytest.raises(ToftrackError, match="is no checkpoint"):
         resumed.restore("poses", progress, {})

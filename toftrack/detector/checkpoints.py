@@ -1,7 +1,7 @@
 """The state of a training, written while it goes on, so that it can be gone on with exactly.
 
-Arrays and JSON, as everything here. What is read must be of the same training: the number of
-images, the batch, the rates and the seed make the schedule, which continues where it was.
+Arrays and JSON, as everything here. What is read must be of the same training: the batch,
+the rate, the width, the seed and the number of hands; it continues where it was.
 """
 
 from __future__ import annotations
@@ -24,20 +24,22 @@ from toftrack.json_text import parse_json
 from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-detector-training"
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass
 class Progress:
     """What changes while a network is trained.
 
-    step: batches that it has seen.  seconds: that took.  recent: running means.
+    images: that it is to see in all.  step: batches that it has seen.  seconds: that took.
+    recent: running means.
     course: rows of the errors so far.
     """
 
     network: nn.Module
     averaged: nn.Module
     optimiser: torch.optim.Optimizer
+    images: int
     step: int = 0
     seconds: float = 0.0
     recent: dict[str, float] = field(default_factory=dict)
@@ -102,6 +104,7 @@ def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
         "format": FORMAT,
         "version": _VERSION,
         "settings": settings,
+        "images": progress.images,
         "step": progress.step,
         "seconds": progress.seconds,
         "recent": progress.recent,
@@ -137,7 +140,8 @@ def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
         progress.optimiser.load_state_dict(
             {"state": state, "param_groups": optimiser["param_groups"]}
         )
-        progress.step, progress.seconds = int(metadata["step"]), float(metadata["seconds"])
+        progress.images, progress.step = int(metadata["images"]), int(metadata["step"])
+        progress.seconds = float(metadata["seconds"])
         progress.recent, progress.course = dict(metadata["recent"]), list(metadata["course"])
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ToftrackError(f"{broken} ({error})") from None

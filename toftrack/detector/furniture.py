@@ -19,12 +19,16 @@ PIECES = 9
 """Parts of the furniture in an image."""
 
 
-def furniture(there: Tensor, dice: Dice) -> Tensor:
-    """(N, PIECES, PART) of one kind each, before a camera; there: (N,) where there is any."""
-    n = len(there)
+def before_camera(n: int, dice: Dice) -> Tensor:
+    """(N, 3) where furniture may stand, in metres in the camera frame."""
     z = dice.uniform(n, low=0.4, high=1.2)
     at = torch.tensor([0.22, 0.18]) * dice.normal(n, 2)
-    middle = torch.cat((z[:, None] * at, z[:, None]), 1)
+    return torch.cat((z[:, None] * at, z[:, None]), 1)
+
+
+def furniture(there: Tensor, middle: Tensor, dice: Dice) -> Tensor:
+    """(N, PIECES, PART) of one kind each about (N, 3); there: (N,) where there is any."""
+    n = len(there)
     kinds = torch.stack([make(middle, dice) for make in (_bars, _boards, _clutter, _leaves)])
     pieces = kinds[dice.rows(len(kinds), n), torch.arange(n)]
     some = dice.uniform(n, 1, low=2, high=PIECES + 1).floor()
@@ -32,6 +36,21 @@ def furniture(there: Tensor, dice: Dice) -> Tensor:
         (torch.arange(PIECES) < some) & there[:, None], pieces[..., 0], -1.0
     )
     return pieces
+
+
+def on_a_piece(pieces: Tensor, dice: Dice) -> Tensor:
+    """(N, 3) a place on one of the pieces, as often at an end of it as between; pieces: as
+    furniture gives them.
+    """
+    n = len(pieces)
+    weights = (pieces[..., 0] >= 0) + 1e-6  # where there is no piece, any place does
+    one = torch.multinomial(weights, 1, generator=dice.generator)[:, 0]
+    piece = pieces[torch.arange(n), one]
+    place, rows, sizes = piece[:, 1:4], piece[:, 4:13].unflatten(1, (3, 3)), piece[:, 13:16]
+    balls, cones = piece[:, :1] == BALL, piece[:, :1] == CONE
+    sizes = torch.where(balls, sizes[:, :1], torch.where(cones, sizes[:, [0, 2, 1]], sizes))
+    along = (1.6 * dice.uniform(n, 3, low=-1.0, high=1.0)).clamp(-1, 1)
+    return place + ((sizes * along)[:, None] @ rows)[:, 0]
 
 
 def _standing(n: int, dice: Dice) -> Tensor:
@@ -82,7 +101,7 @@ def _clutter(middle: Tensor, dice: Dice) -> Tensor:
     spread = dice.uniform(n, 1, low=0.05, high=0.35)
     pieces = []
     for number in range(PIECES):
-        sizes = torch.exp(dice.uniform(n, 3, low=math.log(0.012), high=math.log(0.12)))
+        sizes = 0.036 * torch.exp(0.55 * dice.normal(n, 3).clamp(-2, 2))
         place = middle + spread * torch.tensor([1.0, 0.4, 1.0]) * dice.normal(n, 3)
         kind = (BOX, CONE, BALL)[number % 3]
         pieces.append(make_part(kind, place, _standing(n, dice), sizes, zero, zero))

@@ -15,7 +15,11 @@ from torch import Tensor
 from toftrack.compute.compiling import announced
 from toftrack.detector.dice import Dice
 from toftrack.detector.grasps_numba import CLOSE, YIELD, grasp
-from toftrack.detector.held_things import things_between_tips, things_in_palms
+from toftrack.detector.held_things import (
+    open_thumbs,
+    things_between_tips,
+    things_in_palms,
+)
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import HandSurface
 from toftrack.pose_space.data.shown_poses import shown_poses, within_limits
@@ -24,6 +28,10 @@ POWER_SHARE = 0.52
 """Of all grasps; the others are precision grasps."""
 _OPENED_SHARE = 0.12
 """Grasps that are just being opened or closed."""
+_THUMB_TRIES = 10
+"""Places from which a thumb tries to reach what is held in the palm."""
+_OPPOSED_SHARE = 0.5
+"""Thumbs that face the palm across what is held in it, if they can."""
 _DEEPEST_M = 0.004
 
 
@@ -47,11 +55,12 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     radii, shifts = _capsules(surface)
     bare = shown_poses(n, dice.generator)
     palm_angles, palm_parts = things_in_palms(size, dice)
-    tip_angles, tip_parts = things_between_tips(shape, radii, shifts, bare, dice)
+    thumbs = open_thumbs(n, _THUMB_TRIES, dice)
+    opposed = dice.chance(_OPPOSED_SHARE, n)
+    tip_angles, tip_parts, closing = things_between_tips(shape, radii, shifts, bare, dice)
     angles = torch.where(power[:, None], palm_angles, tip_angles)
     parts = torch.where(power[:, None, None], palm_parts, tip_parts)
-    free = dice.chance(0.5, n, 1) | (parts[:, :1, 0] < 0)
-    others = torch.where(free, YIELD, CLOSE).expand(n, 3)
+    others = torch.where(closing & (parts[:, 0, 0] >= 0), CLOSE, YIELD)[:, None].expand(n, 3)
     tips = torch.cat((torch.full((n, 2), CLOSE), others), 1)
     tasks = torch.where(power[:, None], torch.full((n, 5), CLOSE), tips)
     said = torch.zeros(n, 2, dtype=torch.float64)
@@ -62,6 +71,8 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     with announced("detector: compiling the grasps' kernel (once, about 5 s)"):
         grasp(
             angles.numpy(),
+            _doubles(thumbs),
+            opposed.numpy(),
             most.numpy(),
             tasks.contiguous().numpy(),
             power.numpy(),

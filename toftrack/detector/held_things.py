@@ -181,36 +181,46 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     }
     weights = torch.tensor(list(IN_PALM.values()))
     which = torch.multinomial(weights, n, True, generator=dice.generator)
-    # Open, the fingers a little bent, the thumb before the palm or beside it.
+    # Open, the fingers a little bent.
     fingers = torch.tensor([0.0, -8.0, 14.0, 8.0])
     fingers = fingers + torch.tensor([5.0, 5.0, 9.0, 5.0]) * dice.normal(n, 4, 4)
     spread = torch.tensor([12.0, 2.0, -8.0, -16.0]) * dice.uniform(n, 1, low=-1.8, high=0.8)
     fingers[..., 0] += spread
-    thumb = torch.tensor([10.0, -12.0, 0.0, -5.0, 0.0])
-    thumb = thumb + torch.tensor([14.0, 8.0, 8.0, 5.0, 8.0]) * dice.normal(n, 5)
-    # Mostly it is opposed: about what is thick it only reaches when it is held away from the palm.
-    opposed = torch.stack((between(15, 45), between(10, 50), between(-25, 8)), 1)
-    ends = torch.tensor([5.0, 8.0]) + torch.tensor([8.0, 10.0]) * dice.normal(n, 2)
-    opposed = torch.cat((opposed, ends), 1)
-    thumb = torch.where(dice.chance(_OPPOSED_SHARE, n, 1), opposed, thumb)
-    angles = torch.cat((thumb, fingers.flatten(1)), 1)
+    angles = torch.cat((torch.zeros(n, 5), fingers.flatten(1)), 1)
     return within_limits(torch.deg2rad(angles)), _chosen([things[name] for name in IN_PALM], which)
+
+
+def open_thumbs(n: int, tries: int, dice: Dice) -> Tensor:
+    """(N, tries, 5) thumbs about to close on a thing in the palm: before it or beside it."""
+    many = (n, tries)
+
+    def between(low: float, high: float) -> Tensor:
+        return dice.uniform(*many, low=low, high=high)
+
+    beside = torch.tensor([10.0, -12.0, 0.0, -5.0, 0.0])
+    beside = beside + torch.tensor([14.0, 8.0, 8.0, 5.0, 8.0]) * dice.normal(*many, 5)
+    # Mostly it is opposed: about what is thick it only reaches when it is held away from the palm.
+    wide = 45 - 40 * between(0, 1).square()
+    opposed = torch.stack((wide, between(-5, 50), between(-25, 8)), -1)
+    ends = torch.tensor([5.0, 8.0]) + torch.tensor([8.0, 10.0]) * dice.normal(*many, 2)
+    opposed = torch.cat((opposed, ends), -1)
+    thumbs = torch.where(dice.chance(_OPPOSED_SHARE, *many, 1), opposed, beside)
+    low, high = torch.tensor(ANGLE_LIMITS)[:5].unbind(1)
+    return torch.deg2rad(thumbs).clamp(low, high)
 
 
 def things_between_tips(
     shape: HandShape, radii: Tensor, shifts: Tensor, bare: Tensor, dice: Dice
-) -> tuple[Tensor, Tensor]:
-    """Hands (N, 21) whose thumb and index finger hold things (N, Q, PART) between their pads."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Hands (N, 21) whose thumb and index finger hold things (N, Q, PART) between their pads, and
+    (N,) whether the other fingers close on them, too.
+    """
     n = len(bare)
     thumbs, fingers = _opposed_pairs()
     # Sorted by the room between the tips; the narrow ones oftener.
     row = (dice.uniform(n).square() * len(thumbs)).long()
     angles = bare.clone()
     angles[:, :5], angles[:, 5:9] = thumbs[row], fingers[row]
-    closing = dice.chance(0.5, n, 1)
-    reaching = torch.deg2rad(torch.tensor([0.0, 15.0, 20.0, 10.0]).repeat(3))
-    reaching = reaching + math.radians(6.0) * dice.normal(n, 12)
-    angles[:, 9:] = torch.where(closing, reaching, angles[:, 9:])
     state = torch.cat((torch.zeros(n, 6), angles), 1)
     pads = _pads(state, shape, radii, shifts)
     across = pads[1][0] - pads[0][0]
@@ -283,7 +293,13 @@ def things_between_tips(
     thickness = torch.bucketize(thick, torch.tensor([0.005, 0.015, 0.03]))
     which = torch.multinomial(chances[thickness], 1, generator=dice.generator)[:, 0]
     parts = _chosen([plate, disc, pens, cubes, ball, cylinder, cup], which)
-    return angles, _thing(parts)
+    # A pen lies on the middle finger.
+    closing = dice.chance(torch.where(which == list(BETWEEN_TIPS).index("pen"), 0.85, 0.4), n)
+    reaching = torch.deg2rad(torch.tensor([0.0, 15.0, 20.0, 10.0]).repeat(3))
+    reaching = reaching + math.radians(6.0) * dice.normal(n, 12)
+    reaching = torch.where(dice.chance(0.65, n, 1), reaching, angles[:, 9:])
+    angles[:, 9:] = torch.where(closing[:, None], reaching, angles[:, 9:])
+    return angles, _thing(parts), closing
 
 
 def _no_phone(half: Tensor) -> Tensor:

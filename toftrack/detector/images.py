@@ -10,7 +10,7 @@ from torch import Tensor
 
 from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, wide_channels
 from toftrack.detector.dice import Dice
-from toftrack.detector.furniture import furniture
+from toftrack.detector.furniture import before_camera, furniture, on_a_piece
 from toftrack.detector.hands import (
     BACKGROUND,
     FOREARM,
@@ -51,6 +51,10 @@ _EMPTY = 0.25
 """Whole images without a raised hand."""
 _FURNISHED = 0.3, 0.8
 """Those with a hand, and those without one, that show furniture."""
+_FURNISHED_CROPS = 0.6, 0.12
+"""Crops about something else, and crops of hands, that show furniture."""
+_CUT = 0.45, 0.25
+"""Those that are cut by a border of the image."""
 _MIDDLE = 0.6
 """Whole images whose hand is near the middle; of the others it is anywhere, also at the border."""
 _HAND_M2 = 0.0105
@@ -103,18 +107,24 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     near = torch.where(far, 0.036, 0.014)[:, None] * dice.normal(n, 3)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.13, high=0.30)
-    present = ~dice.chance(0.16, n)
+    present = ~dice.chance(0.18, n)
     pivot = centre + torch.where(present[:, None], near.clamp(-0.09, 0.09), away)
     left = dice.chance(0.25, n)
     views = random_views(n, dice)
     hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
     labels = hands.labels.clone()
     # Most of the crops about something else: there is no hand at all, only its arm, or nothing.
-    gone = ~present & dice.chance(0.7, n)
+    gone = ~present & dice.chance(0.75, n)
     pieces = labels.shape[1] - FOREARM_PIECES
     labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
     scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12, views=views)
-    scenes = moved(scenes, torch.where(gone[:, None], _onto_something(scenes, centre, dice), 0.0))
+    # What a hand held is as likely to lie there alone.
+    alone = gone & (hands.parts[..., 0] >= 0).any(1) & dice.chance(0.6, n)
+    onto = _onto_something(scenes, centre, dice)
+    onto_thing = centre + 0.02 * dice.normal(n, 3) - hands.parts[:, 0, 1:4]
+    onto = torch.where(alone[:, None], onto_thing, onto)
+    scenes = moved(scenes, torch.where(gone[:, None], onto, 0.0))
+    scenes = _with_furniture(scenes, centre, gone & ~alone, dice)
 
     turned = torch.where(known, _upright_angles(hands, dice), 0.0)
     pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
@@ -129,7 +139,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
         torch.stack((whole, side), 1).int().numpy(),
         distance.numpy(),
         turned.numpy(),
-        _borders(n, dice).numpy(),
+        _borders(torch.where(gone, *_CUT), dice).numpy(),
     )
     parts = torch.from_numpy(seen_parts).long()
     parts[parts == OTHER_HAND] = OTHER_FOREARM
@@ -224,12 +234,30 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     )
 
 
+def _with_furniture(scenes: Scenes, centre_m: Tensor, gone: Tensor, dice: Dice) -> Scenes:
+    """Crops' scenes, many of those without a hand with a piece of furniture in their middle, and
+    some of the others with furniture behind or beside the hand.
+    """
+    n = len(gone)
+    there = dice.chance(torch.where(gone, *_FURNISHED_CROPS), n)
+    aside = 0.2 * dice.normal(n, 2)
+    behind = dice.uniform(n, 1, low=0.0, high=0.5)
+    pieces = furniture(there, centre_m + torch.cat((aside, behind), 1), dice)
+    onto = centre_m + 0.02 * dice.normal(n, 3) - on_a_piece(pieces, dice)
+    pieces[..., 1:4] += torch.where((gone & there)[:, None, None], onto[:, None], 0.0)
+    planes = scenes.planes.clone()
+    without_walls = gone & there & dice.chance(0.7, n)
+    planes[..., 3] = torch.where(without_walls[:, None], torch.inf, planes[..., 3])
+    return replace(scenes, planes=planes, parts=torch.cat((scenes.parts, pieces), 1))
+
+
 def _furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
     """Scenes with furniture, and mostly without walls before it; there: (N,) where there is any."""
     planes = scenes.planes.clone()
     without_walls = there & dice.chance(0.7, len(there))
     planes[..., 3] = torch.where(without_walls[:, None], torch.inf, planes[..., 3])
-    parts = torch.cat((scenes.parts, furniture(there, dice)), 1)
+    middle = before_camera(len(there), dice)
+    parts = torch.cat((scenes.parts, furniture(there, middle, dice)), 1)
     return replace(scenes, planes=planes, parts=parts)
 
 
@@ -310,15 +338,16 @@ def random_scenes(
     )
 
 
-def _borders(n: int, dice: Dice) -> Tensor:
+def _borders(p: Tensor, dice: Dice) -> Tensor:
     """(N, 2, 3) what lies in the image: a x + b y < c for x, y in -0.5 .. 0.5 across the crop.
 
-    A quarter of the crops is cut by a border of the image, some of them in a corner; crops are
-    turned a little against the image.
+    Crops are cut by a border of the image with probabilities p (N,), some of them in a corner, and
+    are turned a little against the image.
     """
+    n = len(p)
     which = dice.uniform(n)
     c = dice.uniform(n, 2, low=-0.2, high=0.45)
     angle = 0.5 * math.pi * dice.rows(4, n)[:, None] + 0.12 * dice.normal(n, 1)
     angle = angle + torch.tensor([0.0, 0.5 * math.pi])
-    cut = which[:, None] < torch.tensor([0.25, 0.04])
+    cut = which[:, None] < p[:, None] * torch.tensor([1.0, 0.16])
     return torch.stack((angle.cos(), angle.sin(), torch.where(cut, c, 9.0)), 2)

@@ -1,21 +1,26 @@
-"""Training of the detector: one process makes images, one trains; everything from a seed.
+"""Training of the detector: processes make images, one trains; everything from a seed.
 
-Each batch is drawn by a generator of its own, of the seed and the batch's number, so that an
-interrupted training goes on with the batches that it would have seen (checkpoints.py).
+The rate stays where it is for two thirds of the images and then falls to nothing along a line
+(Hägele et al., "Scaling laws and compute-optimal training beyond fixed training durations",
+NeurIPS 2024), so that a training can still be made longer or shorter while the rate has not begun
+to fall. Each batch is drawn by a generator of its own, of the seed and the batch's number, so that
+an interrupted training goes on with the batches that it would have seen (checkpoints.py).
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import math
 import multiprocessing
+import os
 import queue as queues
 import sys
 import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,6 +28,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from toftrack.compute.threads import threads
 from toftrack.detector.checkpoints import Checkpoints, Progress
 from toftrack.detector.images import Crops, WideImages, crop_images, wide_images
 from toftrack.detector.losses import finder_loss, pose_losses
@@ -33,7 +39,13 @@ from toftrack.detector.weights import go_on_from
 from toftrack.errors import ToftrackError
 
 _READY = 6
-"""Batches that wait to be trained on."""
+"""Batches of each process that wait to be trained on."""
+_NICE = 19
+"""By how much the processes that make images give way to the one that trains."""
+_WARM = 300
+"""Steps in which the rate rises."""
+_STEADY = 2 / 3
+"""Share of the images after which it falls."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _DECAY = 0.02
 """Of the weights, times the learning rate, in each step."""
@@ -44,7 +56,7 @@ Network = TypeVar("Network", PoseNet, Finder)
 class Schedule:
     """How a network is trained; see conf/train_detector.yaml.
 
-    images: in all.  batch: images of a step.  rate: the highest learning rate.
+    images: in all.  batch: images of a step.  rate: the highest learning rate, see rate_at.
     width: channels of the network's first layer.
     start: a file of weights to go on from; None begins from nothing.
     """
@@ -61,6 +73,16 @@ class Schedule:
                 raise ToftrackError(f"{name} of a network must be a whole number above 0")
         if not 0 < self.rate < 1:
             raise ToftrackError("rate of a network must be between 0 and 1")
+
+    @property
+    def steps(self) -> int:
+        """Batches in all."""
+        return math.ceil(self.images / self.batch)
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step, 0, 1, ..."""
+        left = (self.steps - step) / ((1 - _STEADY) * self.steps)
+        return self.rate * min(1.0, (step + 1) / _WARM, left)
 
 
 Course = list[dict[str, Any]]
@@ -125,15 +147,16 @@ def _train(
     checkpoints: Checkpoints | None,
 ) -> tuple[Network, Course]:
     _keep_memory()
-    steps = math.ceil(schedule.images / schedule.batch)
+    steps = schedule.steps
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     averaged = deepcopy(network)
-    progress = Progress(network, averaged, optimiser)
-    settings = {"images": schedule.images, "batch": schedule.batch, "rate": schedule.rate}
-    settings |= {"width": schedule.width, "shapes": shapes, "seed": seed}
+    progress = Progress(network, averaged, optimiser, schedule.images)
+    settings = {"batch": schedule.batch, "rate": schedule.rate, "width": schedule.width}
+    settings |= {"shapes": shapes, "seed": seed}
     writing: Any = contextlib.nullcontext(lambda: None)
     if checkpoints is not None:
         checkpoints.restore(name, progress, settings)
+        _check_length(name, progress, schedule)
         writing = checkpoints.writing(name, progress, settings)
     recent, course = progress.recent, progress.course
     before, began = progress.seconds, time.perf_counter()
@@ -144,10 +167,8 @@ def _train(
     with bar, writing as stepped:
         for batch in _batches(make, schedule.batch, range(progress.step, steps), shapes, seed):
             number = progress.step
-            warm = min(1.0, (number + 1) / 300)
-            cosine = 0.5 * (1 + math.cos(math.pi * number / steps))
             for group in optimiser.param_groups:
-                group["lr"] = schedule.rate * warm * (0.01 + 0.99 * cosine)
+                group["lr"] = schedule.rate_at(number)
             loss, reported = step(batch)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -166,6 +187,21 @@ def _train(
                 course.append({"images": images, "seconds": seconds} | recent)
             stepped()
     return averaged, course
+
+
+def _check_length(name: str, progress: Progress, schedule: Schedule) -> None:
+    """A training that goes on may end elsewhere than was meant, if neither would have begun to end.
+
+    Raises ToftrackError.
+    """
+    meant = replace(schedule, images=progress.images)
+    if meant.steps != schedule.steps and progress.step > _STEADY * min(meant.steps, schedule.steps):
+        raise ToftrackError(
+            f"the training of {name} has seen {progress.step * schedule.batch} images of"
+            f" {meant.images}: its rate falls, or would have to already, so that {name}.images"
+            f" cannot become {schedule.images} any more; give {meant.images}"
+        )
+    progress.images = schedule.images
 
 
 def _keep_memory() -> None:
@@ -191,17 +227,21 @@ def _average(averaged: nn.Module, network: nn.Module, kept: float) -> None:
 def _batches(
     make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int
 ) -> Iterator[Any]:
-    """The batches of these numbers, made by another process, in order."""
+    """The batches of these numbers, made by other processes, one to a core, in order."""
     if len(numbers) == 0:
         return
     context = multiprocessing.get_context("spawn")
-    queue = context.Queue(_READY)
-    worker = context.Process(
-        target=_make_batches, args=(queue, make, batch, numbers, shapes, seed), daemon=True
-    )
-    worker.start()
+    makers = []
+    for first in range(min(threads(), len(numbers))):
+        queue = context.Queue(_READY)
+        mine = numbers[first :: threads()]
+        worker = context.Process(
+            target=_make_batches, args=(queue, make, batch, mine, shapes, seed), daemon=True
+        )
+        worker.start()
+        makers.append((queue, worker))
     try:
-        for _ in numbers:
+        for _, (queue, worker) in zip(numbers, itertools.cycle(makers), strict=False):
             while True:
                 try:
                     yield _tensors(*queue.get(timeout=10))
@@ -209,17 +249,20 @@ def _batches(
                 except queues.Empty:
                     if not worker.is_alive():
                         raise ToftrackError(
-                            "the process that makes the training images has ended; is there enough"
+                            "a process that makes training images has ended; is there enough"
                             " memory?"
                         ) from None
     finally:
-        worker.terminate()
-        worker.join()
+        for _, worker in makers:
+            worker.terminate()
+            worker.join()
 
 
 def _make_batches(
     queue: Any, make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int
 ) -> None:
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
     torch.set_num_threads(1)
     _keep_memory()
     generator = torch.Generator().manual_seed(seed)

@@ -8,6 +8,7 @@ What was interrupted goes on by the same command with resume=FOLDER, the folder 
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -37,6 +38,8 @@ def main(config: DictConfig) -> float:
 
 def train(config: DictConfig) -> float:
     """See main; everything goes into Hydra's output folder."""
+    # Threads that wait must not keep the processes that make images from working.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     import torch
 
     from toftrack.detector.checkpoints import Checkpoints
@@ -62,7 +65,6 @@ def train(config: DictConfig) -> float:
     resume = None if config.resume is None else Path(to_absolute_path(config.resume))
     checkpoints = Checkpoints(folder, config.checkpoint_minutes, resume)
     write_picture(folder / "images.png", images_figure(config.seed))
-    torch.set_num_threads(1)  # the other core makes the images
     each = (config.shapes, config.seed, checkpoints)
     finder_network, finder_course = train_finder(finder, *each)
     pose_network, pose_course = train_poses(poses, *each)
