@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,15 @@ def test_a_seed_gives_the_same_weights(train) -> None:
 def test_a_schedule_that_cannot_be_is_refused(change: dict, words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         Schedule(**{"images": 8, "batch": 8, "rate": 0.002, "width": 4, **change})
+
+
+def test_the_rate_rises_stays_and_falls_to_nothing() -> None:
+    schedule = Schedule(images=30_000, batch=10, rate=0.002, width=4)
+    rates = [schedule.rate_at(step) for step in range(schedule.steps)]
+    assert rates[0] < 0.01 * 0.002 and rates == sorted(rates[:300]) + rates[300:]
+    assert set(rates[300:2000]) == {0.002}
+    falling = rates[2000:]
+    assert falling == sorted(falling, reverse=True) and 0 < falling[-1] < 0.002 * 0.002
 
 
 def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
@@ -91,17 +101,7 @@ def test_an_interrupted_training_ends_with_the_same_weights(
     for name in ("whole", "part", "rest", "end"):
         (tmp_path / name).mkdir()
     whole, course = train(TINY, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
-    kept = checkpoints.save
-
-    def save(path: Path, progress: Progress, settings: dict) -> None:
-        kept(path, progress, settings)
-        if progress.step == 2:
-            raise SwitchedOffError
-
-    monkeypatch.setattr(checkpoints, "save", save)
-    with pytest.raises(SwitchedOffError):
-        train(TINY, 6, 0, Checkpoints(tmp_path / "part", 1e-9))
-    monkeypatch.undo()
+    interrupted(train, tmp_path / "part", monkeypatch, after=2)
     again = Checkpoints(tmp_path / "rest", 1e-9, resume=tmp_path / "part")
     rest, other = train(TINY, 6, 0, again)
     for key, value in whole.state_dict().items():
@@ -110,6 +110,41 @@ def test_an_interrupted_training_ends_with_the_same_weights(
     assert errors[0] == errors[1]
     done, _ = train(TINY, 6, 0, Checkpoints(tmp_path / "end", 1e-9, resume=tmp_path / "rest"))
     assert torch.equal(done.state_dict()["heads.weight"], rest.state_dict()["heads.weight"])
+
+
+def interrupted(train, folder: Path, monkeypatch: pytest.MonkeyPatch, after: int) -> None:
+    """A training that ends after some batches, with a checkpoint."""
+    kept = checkpoints.save
+
+    def save(path: Path, progress: Progress, settings: dict) -> None:
+        kept(path, progress, settings)
+        if progress.step == after:
+            raise SwitchedOffError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoints, "save", save)
+        with pytest.raises(SwitchedOffError):
+            train(TINY, 6, 0, Checkpoints(folder, 1e-9))
+
+
+@pytest.mark.slow
+def test_a_training_can_be_made_longer_before_its_rate_falls(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("whole", "early", "late", "rest"):
+        (tmp_path / name).mkdir()
+    longer = replace(TINY, images=48)
+    whole, _ = train_finder(longer, 6, 0, Checkpoints(tmp_path / "whole", 1.0))
+    interrupted(train_finder, tmp_path / "early", monkeypatch, after=1)
+    resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "early")
+    rest, course = train_finder(longer, 6, 0, resumed)
+    assert course[-1]["images"] == 48
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, rest.state_dict()[key]), key
+    interrupted(train_finder, tmp_path / "late", monkeypatch, after=3)
+    late = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "late")
+    with pytest.raises(ToftrackError, match="finder.images cannot become 48 any more; give 24"):
+        train_finder(longer, 6, 0, late)
 
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
