@@ -7,8 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 from helpers.rendered import (
+    frame_of,
     hand_at,
+    image_of,
     right_hand_model,
     track_of,
 )
@@ -18,7 +21,7 @@ from toftrack.tracking.handedness import HandednessEstimate
 from toftrack.tracking.hands import PlacedHand
 from toftrack.tracking.lifecycle import reconcile
 from toftrack.tracking.seeking import due_slots, since_search
-from toftrack.tracking.state import HandState, Track, TrackerState
+from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -34,8 +37,19 @@ def known_tracks() -> dict[str, Track]:
         "less sure": track_of(HERE, log_odds=3.0),
         "new": track_of(HERE, log_odds=9.0, **never),
         "doubtful": track_of(HERE, log_odds=1.0, **never),
+        "other fingers": track_of(bent_fist(0.015), log_odds=3.0),
+        "as thick as a palm away": track_of(bent_fist(0.03), log_odds=3.0),
         "apart": track_of(hand_at(0.3), log_odds=1.0),
     }
+
+
+def bent_fist(behind_m: float) -> torch.Tensor:
+    """(1, 27) a fist about the palm of HERE, or behind it."""
+    state = HERE.clone()
+    state[0, 2] += behind_m
+    for finger in range(12, 27, 4):
+        state[0, finger : finger + 3] = 1.3
+    return state
 
 
 def two(*names: str | None, **changes: object) -> TrackerState:
@@ -72,6 +86,8 @@ def followed_after(frames: int, *names: str | None) -> list[bool]:
         (("sure", "new"), 1, [True, False]),
         (("new", "sure"), 1, [False, True]),
         (("new", "doubtful"), 1, [True, False]),
+        (("sure", "other fingers"), 4, [True, False]),
+        (("sure", "as thick as a palm away"), 50, [True, True]),
         (("sure", "apart"), 50, [True, True]),
         (("sure", None), 50, [True, False]),
     ],
@@ -82,6 +98,8 @@ def followed_after(frames: int, *names: str | None) -> list[bool]:
         "one that was never believed ends at once",
         "whichever slot that is, too",
         "of two that were not, the less sure one",
+        "of two in one palm with other fingers, too",
+        "two that lie on each other go on",
         "two that are apart go on",
         "and so does one alone",
     ],
@@ -90,6 +108,17 @@ def test_of_two_tracks_on_one_hand_the_less_sure_one_ends(
     tracks: tuple[str | None, str | None], frames: int, expected: list[bool]
 ) -> None:
     assert followed_after(frames, *tracks) == expected
+
+
+def test_of_a_hand_whose_track_was_on_another_one_nothing_lay_beside_it() -> None:
+    state = two("less sure", "sure")
+    scene = frame_of(image_of(HERE), known_tracks()["sure"]).observation
+    seen = LastSeen(state.hands[0].seen.particle, 0.1, scene)
+    hands = tuple(replace(hand, seen=seen) for hand in state.hands)
+    state = replace(state, hands=hands)
+    for _ in range(4):
+        state = afterwards(state)[0]
+    assert state.hands[0].seen.scene is None and state.hands[1].seen.scene is scene
 
 
 def test_tracks_that_come_apart_for_a_frame_may_be_on_one_hand_anew() -> None:

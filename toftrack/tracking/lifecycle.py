@@ -326,7 +326,9 @@ def reconcile(
     sure = all(hand.believed for hand in before.hands)
     if merged.begun and (merged.reached(_ONE_FRAMES) or not sure):
         worse = min((0, 1), key=lambda slot: sureness(hands[slot]))
-        hands[worse], merged = replace(hands[worse], track=None), Duration()
+        ended = hands[worse]  # what lay beside the other hand lay not beside this one
+        hands[worse] = replace(ended, track=None, seen=replace(ended.seen, scene=None))
+        merged = Duration()
     for slot, hand in enumerate(hands):
         track = hand.track
         if track is None or track.believed or not hands[1 - slot].believed:
