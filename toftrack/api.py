@@ -115,7 +115,12 @@ def _second_process(config: DictConfig) -> SecondProcess | None:
     from toftrack.tracking.second_process import SecondProcess
 
     parts = {name: config[name] for name in _PARTS if name in config}
-    return SecondProcess(OmegaConf.to_container(OmegaConf.create(parts), resolve=True))
+    return SecondProcess(
+        {
+            name: OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
+            for name, part in parts.items()
+        }
+    )
 
 
 def _pace(config: DictConfig) -> Pace:

@@ -37,6 +37,8 @@ from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.step import Concluded, HandTask, follow_hand
 
 _log = logging.getLogger(__name__)
+_LONGEST_S = 10.0
+"""So long is waited for an answer."""
 _PROGRAM = "from toftrack.tracking.second_process import main; main()"
 
 
@@ -50,6 +52,7 @@ class SecondProcess:
         self._config = config
         self._began: _Began | None = None
         self._failed = False
+        self._asked = 0
 
     def begin(self, quality: Quality, task: HandTask) -> Callable[[], Concluded | None] | None:
         """Begin a hand's part of a frame there; what is returned waits for it, and says None where
@@ -66,12 +69,13 @@ class SecondProcess:
             if began is not None and began.process.poll() is not None:
                 self._give_up("it did not start")
             return None
+        self._asked += 1
         try:
-            began.connection.send_bytes(_pickled((quality, task)))
+            began.connection.send_bytes(_pickled((self._asked, quality, task)))
         except OSError as error:
             self._give_up(str(error))
             return None
-        return partial(self._answer, began.connection)
+        return partial(self._answer, began.connection, self._asked)
 
     def close(self) -> None:
         """End the process."""
@@ -87,16 +91,20 @@ class SecondProcess:
             return
         weakref.finalize(self, self._began.end)
 
-    def _answer(self, connection: Connection) -> Concluded | None:
+    def _answer(self, connection: Connection, asked: int) -> Concluded | None:
+        answered, found = 0, None
         try:
-            answer = pickle.loads(connection.recv_bytes())
+            while answered < asked:  # a frame that failed here has left its answer unread
+                if not connection.poll(_LONGEST_S):
+                    self._give_up(f"no answer came within {_LONGEST_S:g} s")
+                    return None
+                answered, found = pickle.loads(connection.recv_bytes())
         except (OSError, EOFError) as error:
             self._give_up(str(error) or "it has ended")
             return None
-        if isinstance(answer, str):
-            self._give_up(answer)
+        if isinstance(found, str):
+            self._give_up(found)
             return None
-        found: Concluded = answer
         return found
 
     def _give_up(self, why: str) -> None:
@@ -179,8 +187,8 @@ def main() -> None:
             model = _prepared(json.loads(connection.recv_bytes()))
             connection.send_bytes(b"ready")
             while True:
-                quality, task = pickle.loads(connection.recv_bytes())
-                connection.send_bytes(_pickled(_followed(model, quality, task)))
+                asked, quality, task = pickle.loads(connection.recv_bytes())
+                connection.send_bytes(_pickled((asked, _followed(model, quality, task))))
 
 
 @small_operations()
