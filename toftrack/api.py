@@ -12,12 +12,6 @@ from toftrack.configuration.check import check_groups, check_tracker
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
 
-_PARTS = (
-    "hand pose_space segmentation likelihood filter gestures renderer compute detector"
-    " lost start refine posterior hysteresis"
-).split()
-"""Of a configuration, what build_model makes a model of."""
-
 if TYPE_CHECKING:
     import torch
 
@@ -105,6 +99,13 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
     with small_operations():
         model, pace = build_model(config), _pace(config)
         return HandsTracker(model, config.seed, hands, pace, second=_second_process(config))
+
+
+_PARTS = (
+    "hand pose_space segmentation likelihood filter gestures renderer compute detector"
+    " lost start refine posterior hysteresis"
+).split()
+"""Of a configuration, what build_model makes a model of."""
 
 
 def _second_process(config: DictConfig) -> SecondProcess | None:

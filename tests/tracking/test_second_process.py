@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import logging
+import pickle
 import time
+from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from helpers.tracking import configuration, sample
 from helpers.two_hands import TwoHands, beside_its_mirror
 
@@ -68,6 +73,13 @@ def wait_until_ready(process: SecondProcess) -> None:
         time.sleep(0.05)
 
 
+def killed_before(process: SecondProcess, answer: Callable[..., Any], *asked: object) -> Any:
+    """Its answer after it was killed."""
+    assert process._began is not None
+    process._began.process.kill()
+    return answer(*asked)
+
+
 def same(one: list[tuple[Estimate, ...]], two: list[tuple[Estimate, ...]]) -> bool:
     names = [field.name for field in fields(Estimate) if field.name != "compute_s"]
     pairs = [
@@ -94,17 +106,12 @@ def test_the_estimates_are_those_of_one_process_also_after_it_has_ended(
     answers = []
     answer = process._answer
     process._answer = lambda *asked: answers.append(answer(*asked)) or answers[-1]  # type: ignore[method-assign,func-returns-value]
-    begin = process.begin
-    process.begin = lambda *task: (begin(*task), begin(*task))[1]  # type: ignore[method-assign]
     tracker.state = tracker.model.first_state(0, 2)
     half = FRAMES - 4
     found = stepped(tracker, scene, range(half))
     assert len(answers) > 2 and None not in answers
-    assert not caplog.records, "although in each frame a first answer was left unread"
-    process.begin = begin  # type: ignore[method-assign]
-    assert process._began is not None
-    process._began.process.kill()
-    process._began.process.wait()
+    assert not caplog.records and process._began is not None
+    process._answer = partial(killed_before, process, answer)  # type: ignore[method-assign]
     with caplog.at_level(logging.WARNING):
         found += stepped(tracker, scene, range(half, FRAMES))
     assert same(found, expected)
@@ -131,6 +138,20 @@ def test_it_begins_only_where_there_are_two_cores_and_two_hands(
     assert tracker_of("tracker.second_process=false")._second is None
 
 
+def test_after_a_frame_that_failed_here_the_process_begins_anew(scene: TwoHands) -> None:
+    tracker = tracker_of()
+    assert asked(tracker, scene)
+    process = process_of(tracker)
+    wait_until_ready(process)
+    first, begin, tasks = process._began, process.begin, list[tuple[Any, ...]]()
+    process.begin = lambda *task: tasks.append(task) or begin(*task)  # type: ignore[method-assign,func-returns-value]
+    stepped(tracker, scene, range(FRAMES))
+    assert first is not None and process._began is first and not process._busy
+    assert begin(*tasks[-1]) is not None, "and nobody waits for it"
+    assert begin(*tasks[-1]) is None
+    assert first.process.poll() is not None and process._began is not first
+
+
 def test_it_ends_with_its_tracker(scene: TwoHands) -> None:
     process = SecondProcess({})
     task = object()
@@ -143,10 +164,6 @@ def test_it_ends_with_its_tracker(scene: TwoHands) -> None:
 
 
 def test_tensors_and_generators_arrive_as_they_were() -> None:
-    import pickle
-
-    import torch
-
     generator = torch.Generator().manual_seed(3)
     sent = {"a": torch.arange(6.0).reshape(2, 3)[:, 1], "b": torch.tensor(True), "g": generator}
     got = pickle.loads(second_process._pickled(sent))

@@ -338,7 +338,6 @@ def test_a_table_keeps_each_row_with_its_source() -> None:
     assert len(table) == 5 and bool(table.log_posterior.isnan().all())
     assert torch.equal(table.of_source(Source.CONTENDER).pose, two.pose)
     assert torch.equal(table.of_source(Source.DETECTOR, Source.HELD).pose, one.pose)
-    assert len(Hypotheses.joined(())) == 0
 
 
 def test_of_equally_good_rows_the_first_is_the_best() -> None:

@@ -38,7 +38,7 @@ def known_tracks() -> dict[str, Track]:
         "new": track_of(HERE, log_odds=9.0, **never),
         "doubtful": track_of(HERE, log_odds=1.0, **never),
         "other fingers": track_of(bent_fist(0.015), log_odds=3.0),
-        "as thick as a palm away": track_of(bent_fist(0.03), log_odds=3.0),
+        "30 mm behind": track_of(bent_fist(0.03), log_odds=3.0),
         "apart": track_of(hand_at(0.3), log_odds=1.0),
     }
 
@@ -87,7 +87,7 @@ def followed_after(frames: int, *names: str | None) -> list[bool]:
         (("new", "sure"), 1, [False, True]),
         (("new", "doubtful"), 1, [True, False]),
         (("sure", "other fingers"), 4, [True, False]),
-        (("sure", "as thick as a palm away"), 50, [True, True]),
+        (("sure", "30 mm behind"), 50, [True, True]),
         (("sure", "apart"), 50, [True, True]),
         (("sure", None), 50, [True, False]),
     ],

@@ -40,6 +40,8 @@ from toftrack.errors import ToftrackError
 
 _READY = 6
 """Batches of each process that wait to be trained on."""
+_MAKERS = 8
+"""At most so many processes make images: one that trains takes no more."""
 _NICE = 19
 """By how much the processes that make images give way to the one that trains."""
 _WARM = 300
@@ -227,20 +229,20 @@ def _average(averaged: nn.Module, network: nn.Module, kept: float) -> None:
 def _batches(
     make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int
 ) -> Iterator[Any]:
-    """The batches of these numbers, made by other processes, one to a core, in order."""
+    """The batches of these numbers, made by other processes, in order."""
     if len(numbers) == 0:
         return
     context = multiprocessing.get_context("spawn")
-    makers = []
-    for first in range(min(threads(), len(numbers))):
-        queue = context.Queue(_READY)
-        mine = numbers[first :: threads()]
-        worker = context.Process(
-            target=_make_batches, args=(queue, make, batch, mine, shapes, seed), daemon=True
-        )
-        worker.start()
-        makers.append((queue, worker))
+    makers: list[tuple[Any, Any]] = []
+    count = min(threads(), len(numbers), _MAKERS)
     try:
+        for first in range(count):
+            queue, mine = context.Queue(_READY), numbers[first::count]
+            worker = context.Process(
+                target=_make_batches, args=(queue, make, batch, mine, shapes, seed), daemon=True
+            )
+            worker.start()
+            makers.append((queue, worker))
         for _, (queue, worker) in zip(numbers, itertools.cycle(makers), strict=False):
             while True:
                 try:

@@ -17,7 +17,6 @@ import logging
 import os
 import pickle
 import secrets
-import signal
 import subprocess
 import sys
 import weakref
@@ -39,7 +38,11 @@ from toftrack.tracking.step import Concluded, HandTask, follow_hand
 _log = logging.getLogger(__name__)
 _LONGEST_S = 10.0
 """So long is waited for an answer."""
-_PROGRAM = "from toftrack.tracking.second_process import main; main()"
+_PROGRAM = (
+    "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+    "from toftrack.tracking.second_process import main; main()"
+)
+"""Ctrl-C ends the first process, and with it this one."""
 
 
 class SecondProcess:
@@ -51,8 +54,7 @@ class SecondProcess:
         """config: of a tracker (conf/config.yaml), as JSON can say it."""
         self._config = config
         self._began: _Began | None = None
-        self._failed = False
-        self._asked = 0
+        self._failed = self._busy = False
 
     def begin(self, quality: Quality, task: HandTask) -> Callable[[], Concluded | None] | None:
         """Begin a hand's part of a frame there; what is returned waits for it, and says None where
@@ -62,46 +64,52 @@ class SecondProcess:
         """
         if self._failed or threads() < 2:
             return None
+        if self._began is not None and self._began.of_process != os.getpid():
+            return None  # this process was forked from the one that began it
+        if self._busy:  # a frame that failed here has left its answer unread
+            self.close()
         if self._began is None:
             self._start()
         began = self._began
-        if began is None or began.connection is None or began.of_process != os.getpid():
+        if began is None or began.connection is None:
             if began is not None and began.process.poll() is not None:
                 self._give_up("it did not start")
             return None
-        self._asked += 1
+        self._busy = True
         try:
-            began.connection.send_bytes(_pickled((self._asked, quality, task)))
-        except OSError as error:
-            self._give_up(str(error))
+            began.connection.send_bytes(_pickled((quality, task)))
+        except Exception as error:
+            self._give_up(_words(error))
             return None
-        return partial(self._answer, began.connection, self._asked)
+        return partial(self._answer, began.connection)
 
     def close(self) -> None:
-        """End the process."""
+        """End the process; it begins anew when it is needed again."""
         if self._began is not None:
             self._began.end()
-        self._began = None
+        self._began, self._busy = None, False
 
     def _start(self) -> None:
+        if not sys.executable or getattr(sys, "frozen", False):
+            self._give_up("this program is not run by a Python that could be started again")
+            return
         try:
             self._began = _Began(self._config)
         except OSError as error:
-            self._give_up(str(error))
+            self._give_up(_words(error))
             return
         weakref.finalize(self, self._began.end)
 
-    def _answer(self, connection: Connection, asked: int) -> Concluded | None:
-        answered, found = 0, None
+    def _answer(self, connection: Connection) -> Concluded | None:
         try:
-            while answered < asked:  # a frame that failed here has left its answer unread
-                if not connection.poll(_LONGEST_S):
-                    self._give_up(f"no answer came within {_LONGEST_S:g} s")
-                    return None
-                answered, found = pickle.loads(connection.recv_bytes())
-        except (OSError, EOFError) as error:
-            self._give_up(str(error) or "it has ended")
+            if not connection.poll(_LONGEST_S):
+                self._give_up(f"no answer came within {_LONGEST_S:g} s")
+                return None
+            found: Concluded | str = pickle.loads(connection.recv_bytes())
+        except Exception as error:
+            self._give_up(_words(error))
             return None
+        self._busy = False
         if isinstance(found, str):
             self._give_up(found)
             return None
@@ -125,16 +133,26 @@ class _Began:
         self.of_process = os.getpid()
         key = secrets.token_bytes(32)
         self._listener = Listener(authkey=key)
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )
-        assert self.process.stdin is not None
-        line = json.dumps({"address": self._listener.address, "key": key.hex()})
-        self.process.stdin.write(line.encode() + b"\n")
-        self.process.stdin.close()
+        # It finds what this process finds, and does not look into the working directory first.
+        path = os.pathsep.join(map(os.path.abspath, sys.path))
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", _PROGRAM],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                env=os.environ | {"PYTHONPATH": path},
+            )
+        except OSError:
+            self._listener.close()
+            raise
+        try:
+            assert self.process.stdin is not None
+            line = json.dumps({"address": self._listener.address, "key": key.hex()})
+            self.process.stdin.write(line.encode() + b"\n")
+            self.process.stdin.close()
+        except OSError:
+            self.end()
+            raise
         Thread(target=self._meet, args=(config,), daemon=True).start()
 
     def _meet(self, config: dict[str, Any]) -> None:
@@ -150,7 +168,7 @@ class _Began:
             return
         if self.connection is not None:
             self.connection.close()
-        self.process.terminate()
+        self.process.kill()
         self.process.wait()
         self._listener.close()
 
@@ -180,15 +198,14 @@ def _pickled(value: Any) -> memoryview:
 
 def main() -> None:
     """What the second process does, until the first one closes the connection."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first one's end is this one's, too
     said = json.loads(sys.stdin.readline())
     with contextlib.suppress(OSError, EOFError):  # the first one has ended
         with Client(said["address"], authkey=bytes.fromhex(said["key"])) as connection:
             model = _prepared(json.loads(connection.recv_bytes()))
             connection.send_bytes(b"ready")
             while True:
-                asked, quality, task = pickle.loads(connection.recv_bytes())
-                connection.send_bytes(_pickled((asked, _followed(model, quality, task))))
+                quality, task = pickle.loads(connection.recv_bytes())
+                connection.send_bytes(_pickled(_followed(model, quality, task)))
 
 
 @small_operations()
@@ -211,4 +228,8 @@ def _followed(model: TrackerModel, quality: Quality, task: HandTask) -> Conclude
         with at_most(1):
             return follow_hand(task, model.at_quality(quality), Spans())
     except Exception as error:
-        return f"{type(error).__name__}: {error}"
+        return _words(error)
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

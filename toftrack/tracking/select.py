@@ -70,8 +70,7 @@ class Hypotheses:
 
     @classmethod
     def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
-        """One below the other; of no tables, one without rows."""
-        tables = tables or [cls.of(torch.zeros(0, 27), Source.HELD)]
+        """One below the other."""
         if len(tables) == 1:
             return tables[0]
         return cls(

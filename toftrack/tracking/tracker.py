@@ -99,7 +99,9 @@ class HandsTracker:
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
 
     def close(self) -> None:
-        """End the second process, if there is one; it ends with the tracker, too."""
+        """End the second process, which otherwise ends with the tracker; a frame of two hands begins
+        it anew.
+        """
         if self._second is not None:
             self._second.close()
 
