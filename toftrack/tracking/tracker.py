@@ -99,8 +99,8 @@ class HandsTracker:
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
 
     def close(self) -> None:
-        """End the second process, which otherwise ends with the tracker; a frame of two hands begins
-        it anew.
+        """End the second process now, and not with the tracker; a frame of two hands begins it
+        anew.
         """
         if self._second is not None:
             self._second.close()
