@@ -56,7 +56,7 @@ def stepped(tracker: HandsTracker, scene: TwoHands, rows: range) -> list[tuple[E
 
 def process_of(tracker: HandsTracker) -> SecondProcess:
     process = tracker._second
-    assert process is not None
+    assert isinstance(process, SecondProcess)
     return process
 
 

@@ -27,22 +27,26 @@ from threading import Thread
 from typing import Any
 
 import torch
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from toftrack.compute.quality import Quality
 from toftrack.compute.spans import Spans
 from toftrack.compute.threads import at_most, small_operations, threads
-from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.step import Concluded, HandTask, follow_hand
+from toftrack.tracking.tracker import HandsTracker
 
 _log = logging.getLogger(__name__)
 _LONGEST_S = 10.0
 """So long is waited for an answer."""
 _PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-    "from toftrack.tracking.second_process import main; main()"
+    "from toftrack.api import build_model\n"
+    "from toftrack.tracking.second_process import main; main(build_model)"
 )
 """Ctrl-C ends the first process, and with it this one."""
+Build = Callable[[DictConfig], FilterModel]
 
 
 class SecondProcess:
@@ -196,12 +200,15 @@ def _pickled(value: Any) -> memoryview:
     return stream.getbuffer()
 
 
-def main() -> None:
-    """What the second process does, until the first one closes the connection."""
+def main(build: Build) -> None:
+    """What the second process does, until the first one closes the connection.
+
+    build: makes a model of a configuration.
+    """
     said = json.loads(sys.stdin.readline())
     with contextlib.suppress(OSError, EOFError):  # the first one has ended
         with Client(said["address"], authkey=bytes.fromhex(said["key"])) as connection:
-            model = _prepared(json.loads(connection.recv_bytes()))
+            model = _prepared(build, json.loads(connection.recv_bytes()))
             connection.send_bytes(b"ready")
             while True:
                 quality, task = pickle.loads(connection.recv_bytes())
@@ -209,14 +216,9 @@ def main() -> None:
 
 
 @small_operations()
-def _prepared(config: dict[str, Any]) -> TrackerModel:
+def _prepared(build: Build, config: dict[str, Any]) -> TrackerModel:
     """The model, with all that the first frame would have to wait for."""
-    from omegaconf import OmegaConf
-
-    from toftrack.api import build_model
-    from toftrack.tracking.tracker import HandsTracker
-
-    model = build_model(OmegaConf.create(config))
+    model = build(OmegaConf.create(config))
     assert isinstance(model, TrackerModel)
     HandsTracker(model).prepare()
     return model

@@ -6,12 +6,13 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from toftrack.checks import check_number
-from toftrack.compute.quality import Pace, Timekeeper
+from toftrack.compute.quality import Pace, Quality, Timekeeper
 from toftrack.compute.threads import at_most, small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
@@ -25,13 +26,22 @@ from toftrack.render.scoring import Scorer
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
-from toftrack.tracking.second_process import SecondProcess
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
-from toftrack.tracking.step import Beside, Stepped, step
+from toftrack.tracking.step import Beside, Concluded, HandTask, Stepped, step
 
 AUTO = "auto"
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
+
+
+class SecondHand(Protocol):
+    """Follows the second one of two hands elsewhere; see second_process.py."""
+
+    def begin(self, quality: Quality, task: HandTask) -> Callable[[], Concluded | None] | None:
+        """See step.Beside."""
+
+    def close(self) -> None:
+        """End it."""
 
 
 class HandsTracker:
@@ -49,10 +59,10 @@ class HandsTracker:
         hands: int = 1,
         pace: Pace | None = None,
         clock: Callable[[], float] = time.perf_counter,
-        second: SecondProcess | None = None,
+        second: SecondHand | None = None,
     ) -> None:
         """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`.
-        second: the process that follows the second hand, where there are two.
+        second: follows the second hand, where there are two.
 
         Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without a detector.
         """
