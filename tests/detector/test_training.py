@@ -131,24 +131,24 @@ def interrupted(train, folder: Path, monkeypatch: pytest.MonkeyPatch, after: int
 
 
 @pytest.mark.slow
-def test_a_training_can_be_made_longer_before_its_rate_falls(
+def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "_WARM", 1)
     for name in ("whole", "early", "late", "rest"):
         (tmp_path / name).mkdir()
-    longer = replace(TINY, images=48)
-    whole, _ = train_finder(longer, 6, 0, Checkpoints(tmp_path / "whole", 1.0))
+    more_images = replace(TINY, images=48)
+    whole, _ = train_finder(more_images, 6, 0, Checkpoints(tmp_path / "whole", 1.0))
     interrupted(train_finder, tmp_path / "early", monkeypatch, after=1)
     resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "early")
-    rest, course = train_finder(longer, 6, 0, resumed)
+    rest, course = train_finder(more_images, 6, 0, resumed)
     assert course[-1]["images"] == 48
     for key, value in whole.state_dict().items():
         assert torch.equal(value, rest.state_dict()[key]), key
     interrupted(train_finder, tmp_path / "late", monkeypatch, after=3)
     late = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "late")
     with pytest.raises(ToftrackError, match="finder.images cannot become 48 any more; give 24"):
-        train_finder(longer, 6, 0, late)
+        train_finder(more_images, 6, 0, late)
 
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
