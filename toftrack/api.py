@@ -98,7 +98,8 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
     hands = config.get("hands", 1)
     with small_operations():
         model, pace = build_model(config), _pace(config)
-        return HandsTracker(model, config.seed, hands, pace, second=_second_process(config))
+        second = _second_process(config) if hands == 2 else None
+        return HandsTracker(model, config.seed, hands, pace, second=second)
 
 
 _PARTS = (

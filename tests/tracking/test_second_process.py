@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import pickle
+import multiprocessing
 import time
 from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from toftrack.compute.quality import Quality
 from toftrack.estimate import Estimate
 from toftrack.tracking import second_process
 from toftrack.tracking.second_process import SecondProcess
+from toftrack.tracking.step import HandTask
 from toftrack.tracking.tracker import HandsTracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -97,7 +98,10 @@ def same(one: list[tuple[Estimate, ...]], two: list[tuple[Estimate, ...]]) -> bo
 
 
 def test_the_estimates_are_those_of_one_process_also_after_it_has_ended(
-    scene: TwoHands, expected: list[tuple[Estimate, ...]], caplog: pytest.LogCaptureFixture
+    scene: TwoHands,
+    expected: list[tuple[Estimate, ...]],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tracker = tracker_of()
     assert asked(tracker, scene), "both hands are followed"
@@ -105,13 +109,18 @@ def test_the_estimates_are_those_of_one_process_also_after_it_has_ended(
     wait_until_ready(process)
     answers = []
     answer = process._answer
-    process._answer = lambda *asked: answers.append(answer(*asked)) or answers[-1]  # type: ignore[method-assign,func-returns-value]
+
+    def kept(*asked: Any) -> Any:
+        answers.append(answer(*asked))
+        return answers[-1]
+
+    monkeypatch.setattr(process, "_answer", kept)
     tracker.state = tracker.model.first_state(0, 2)
     half = FRAMES - 4
     found = stepped(tracker, scene, range(half))
     assert len(answers) > 2 and None not in answers
     assert not caplog.records and process._began is not None
-    process._answer = partial(killed_before, process, answer)  # type: ignore[method-assign]
+    monkeypatch.setattr(process, "_answer", partial(killed_before, process, answer))
     with caplog.at_level(logging.WARNING):
         found += stepped(tracker, scene, range(half, FRAMES))
     assert same(found, expected)
@@ -138,13 +147,20 @@ def test_it_begins_only_where_there_are_two_cores_and_two_hands(
     assert tracker_of("tracker.second_process=false")._second is None
 
 
-def test_after_a_frame_that_failed_here_the_process_begins_anew(scene: TwoHands) -> None:
+def test_after_a_frame_that_failed_here_the_process_begins_anew(
+    scene: TwoHands, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tracker = tracker_of()
     assert asked(tracker, scene)
     process = process_of(tracker)
     wait_until_ready(process)
     first, begin, tasks = process._began, process.begin, list[tuple[Any, ...]]()
-    process.begin = lambda *task: tasks.append(task) or begin(*task)  # type: ignore[method-assign,func-returns-value]
+
+    def noted(*task: Any) -> Any:
+        tasks.append(task)
+        return begin(*task)
+
+    monkeypatch.setattr(process, "begin", noted)
     stepped(tracker, scene, range(FRAMES))
     assert first is not None and process._began is first and not process._busy
     assert begin(*tasks[-1]) is not None, "and nobody waits for it"
@@ -154,8 +170,7 @@ def test_after_a_frame_that_failed_here_the_process_begins_anew(scene: TwoHands)
 
 def test_it_ends_with_its_tracker(scene: TwoHands) -> None:
     process = SecondProcess({})
-    task = object()
-    assert process.begin(Quality(), task) is None  # type: ignore[arg-type]
+    assert process.begin(Quality(), cast(HandTask, None)) is None, "it is not ready yet"
     assert process._began is not None
     running = process._began.process
     assert running.poll() is None
@@ -166,6 +181,8 @@ def test_it_ends_with_its_tracker(scene: TwoHands) -> None:
 def test_tensors_and_generators_arrive_as_they_were() -> None:
     generator = torch.Generator().manual_seed(3)
     sent = {"a": torch.arange(6.0).reshape(2, 3)[:, 1], "b": torch.tensor(True), "g": generator}
-    got = pickle.loads(second_process._pickled(sent))
+    one, other = multiprocessing.Pipe()
+    one.send_bytes(second_process._pickled(sent))
+    got = other.recv()
     assert torch.equal(got["a"], sent["a"]) and bool(got["b"])
     assert torch.equal(torch.rand(5, generator=got["g"]), torch.rand(5, generator=generator))

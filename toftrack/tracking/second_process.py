@@ -109,7 +109,7 @@ class SecondProcess:
             if not connection.poll(_LONGEST_S):
                 self._give_up(f"no answer came within {_LONGEST_S:g} s")
                 return None
-            found: Concluded | str = pickle.loads(connection.recv_bytes())
+            found: Concluded | str = connection.recv()
         except Exception as error:
             self._give_up(_words(error))
             return None
@@ -211,7 +211,7 @@ def main(build: Build) -> None:
             model = _prepared(build, json.loads(connection.recv_bytes()))
             connection.send_bytes(b"ready")
             while True:
-                quality, task = pickle.loads(connection.recv_bytes())
+                quality, task = connection.recv()
                 connection.send_bytes(_pickled(_followed(model, quality, task)))
 
 
