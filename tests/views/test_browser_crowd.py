@@ -29,7 +29,8 @@ def test_connections_that_ask_nothing_are_few_and_keep_nobody_out(view, words: b
                 time.sleep(0.02)
             opened.enter_context(raw(view)).sendall(words)
         assert urlopen(view.url, timeout=PATIENCE_S).status == 200
-        assert len(ours()) <= server._MOST_CONNECTIONS + 4
+        assert len(ours()) <= 2 * server._MOST_CONNECTIONS + 4  # who is cut off needs a moment
+        eventually(lambda: len(ours()) <= server._MOST_CONNECTIONS + 4)
         view.close()
         assert ours() == []
 
