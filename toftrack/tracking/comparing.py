@@ -34,6 +34,18 @@ _SWITCHED = 0.4
 """The side is changed when it has become less probable than this, so that it does not flicker."""
 _LEAST_PRESENT = 0.5
 """Where a hand is less probable than this, its sides are not compared."""
+_LEAST_LOG_ODDS = -1.0
+"""Nor are those of a given side's track that is less surely right than this: neither pose is the
+hand's, and which one explains more of the image is chance."""
+
+
+def comparison_due(hand: HandState, model: TrackerModel, dt_s: float) -> bool:
+    """Whether both sides of a hand are to be compared in a frame, dt_s after the last."""
+    track, settings = hand.track, model.configured.handedness
+    if hand.handedness.given and track is not None and track.believed:
+        if track.log_odds < _LEAST_LOG_ODDS:
+            return False
+    return hand.handedness.comparison_due(settings, track is not None, dt_s)
 
 
 def compared(
@@ -49,7 +61,7 @@ def compared(
     When the other side has become the likelier one, a track of it begins in this frame.
     """
     settings, before = model.configured.handedness, hand.handedness
-    due = before.comparison_due(settings, hand.track is not None, dt_s)
+    due = comparison_due(hand, model, dt_s)
     if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
         before = before.left(settings)  # what comes may be the other hand
         if before.given and was_beside(detection, hand.seen):

@@ -25,7 +25,7 @@ from toftrack.detector.hand_detector import NO_DETECTION, Detection, doubt_m
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import HandFrame, image_term
-from toftrack.tracking.comparing import begun, compared, observed_shape
+from toftrack.tracking.comparing import begun, compared, comparison_due, observed_shape
 from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
 from toftrack.tracking.detect import (
     detect,
@@ -113,7 +113,7 @@ def open_hand(
     """
     alone, track, mirrored = without(image, others), hand.track, None
     if track is not None and goes_on(hand, others):
-        due = hand.handedness.comparison_due(model.configured.handedness, True, dt_s)
+        due = comparison_due(hand, model, dt_s)
         if any(other.believed for other in others):  # one hand in a frame, and not in each
             due = due and (slot + image.index) % _COMPARED_EVERY == 0
         asked = due or detection_due(track, model.detector.settings, dt_s)
