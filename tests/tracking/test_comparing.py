@@ -5,30 +5,16 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import cast
 
+import hydra
 import pytest
+from helpers.tracking import configuration
 
 from toftrack.tracking.comparing import comparison_due
-from toftrack.tracking.handedness import HandednessEstimate, HandednessSettings
+from toftrack.tracking.handedness import HandednessEstimate
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import HandState
 
-SETTINGS = HandednessSettings(
-    weight=2.0,
-    largest=3.0,
-    keypoints=0.1,
-    most=6.0,
-    kept=1.4,
-    shoulder=10.0,
-    shoulder_most=1.0,
-    partner=2.0,
-    sure=0.95,
-    interval_unsure_s=0.08,
-    interval_sure_s=0.4,
-    given=2.0,
-    interval_given_s=1.2,
-    other=0.08,
-    watch_s=2.0,
-)
+SETTINGS = hydra.utils.instantiate(configuration()["hand"]["sides"])
 
 
 def due(given: bool, believed: bool, log_odds: float) -> bool:
