@@ -84,7 +84,7 @@ def frames_until_end(
 
 @pytest.mark.parametrize(
     ("patience", "features", "frames"),
-    [(1, {}, 1), (5, {}, 5), (8, {}, 8), (5, HIDDEN, 45), (1, HIDDEN, 5), (0, {}, None)],
+    [(1, {}, 1), (5, {}, 5), (8, {}, 8), (5, HIDDEN, 45), (1, HIDDEN, 6), (0, {}, None)],
 )
 def test_a_doubtful_track_ends_after_its_patience_and_a_hidden_one_much_later(
     patience: int, features: dict[str, float], frames: int | None
