@@ -14,8 +14,8 @@ from helpers.tracking import ROOT
 
 from toftrack.detector import checkpoints, training
 from toftrack.detector.checkpoints import Checkpoints, Progress, save
-from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.training import Schedule, train_finder, train_poses
 from toftrack.detector.weights import load_weights, save_weights
 from toftrack.errors import ToftrackError

@@ -218,7 +218,7 @@ def test_the_hand_that_is_held_out_is_found_whichever_side_it_is_of() -> None:
     detector = OneOfEachSide([near])
     model = model_with(detector, any_side=True)
     assert search(slot_of(None, model), IMAGE, (), model) is not far
-    np.testing.assert_allclose(detector.centres_m[0], near.centre_m.numpy(), atol=1e-6)
+    np.testing.assert_allclose(detector.centres_m[0][0], near.centre_m.numpy(), atol=1e-6)
     given = model_with(detector, any_side=False)
     assert search(slot_of(None, given), IMAGE, (), given) is far, "its side was given"
 

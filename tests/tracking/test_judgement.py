@@ -92,7 +92,7 @@ def test_a_doubtful_track_ends_after_its_patience_and_a_hidden_one_much_later(
     assert frames_until_end(patience, **features) == frames
 
 
-def test_what_was_never_believed_is_waited_for_no_longer_when_it_is_hidden() -> None:
+def test_what_was_never_believed_is_not_waited_for_when_it_is_hidden() -> None:
     assert frames_until_end(5, track=track_of(HERE, believed=False), **HIDDEN) == 5
 
 

@@ -58,7 +58,8 @@ Network = TypeVar("Network", PoseNet, Finder)
 class Schedule:
     """How a network is trained; see conf/train_detector.yaml.
 
-    images: in all; 0 leaves the weights of `start` as they are.  batch: images of a step.  rate: the highest learning rate, see rate_at.
+    images: in all; 0 leaves the weights of `start` as they are.  batch: images of a step.  rate:
+    the highest learning rate, see rate_at.
     width: channels of the network's first layer.
     start: a file of weights to go on from; None begins from nothing.
     """
