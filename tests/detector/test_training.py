@@ -14,9 +14,10 @@ from helpers.tracking import ROOT
 
 from toftrack.detector import checkpoints, training
 from toftrack.detector.checkpoints import Checkpoints, Progress, save
+from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.training import Schedule, train_finder, train_poses
-from toftrack.detector.weights import load_weights
+from toftrack.detector.weights import load_weights, save_weights
 from toftrack.errors import ToftrackError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -50,6 +51,17 @@ def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -
 def test_a_schedule_that_cannot_be_is_refused(change: dict, words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         Schedule(**{"images": 8, "batch": 8, "rate": 0.002, "width": 4, **change})
+
+
+def test_no_images_leave_the_weights_of_a_start_as_they_are(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    finder = Finder(8)
+    save_weights(tmp_path / "w.npz", PoseNet(4), finder, {})
+    start = str(tmp_path / "w.npz")
+    same, course = train_finder(Schedule(0, 8, 0.002, 8, start), shapes=6, seed=0)
+    assert course == []
+    for key, value in finder.state_dict().items():
+        torch.testing.assert_close(same.state_dict()[key], value, atol=1e-3, rtol=1e-3)
 
 
 def test_the_rate_rises_stays_and_falls_to_nothing() -> None:

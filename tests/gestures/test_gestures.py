@@ -134,6 +134,14 @@ def test_a_gesture_is_reported_by_its_fingers_and_thumb(
         assert probability > 0.6, thumb
 
 
+def test_a_thumb_is_up_over_loosely_curled_fingers_which_make_no_fist() -> None:
+    angles = fingers(0, 1, 2, 3)
+    for finger in range(4):
+        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians([40, 85, 45])
+    assert label_of(of_thumb(angles, "up")) == label_of(of_thumb(angles, "out")) == "thumb_up"
+    assert label_of(of_thumb(angles, "across")) != "fist"
+
+
 def test_a_half_closed_hand_is_relaxed_and_a_pinch_with_straight_fingers_ok() -> None:
     assert label_of((pose("palm") + pose("fist", "out")) / 2) == "relaxed"
     angles = fingers()

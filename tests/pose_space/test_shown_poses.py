@@ -59,6 +59,22 @@ def test_fingers_of_a_flat_hand_touch_and_those_of_a_palm_do_not() -> None:
     assert float(gaps("palm").median()) > 1.25 * float(gaps("flat").median())
 
 
+def test_stretched_palms_are_spread_as_far_as_real_ones() -> None:
+    """From the index to the little finger 35 degrees and more, as in labelled images."""
+    rows = torch.full((N,), NAMES.index("stretched palm"))
+    degrees = torch.rad2deg(poses.shown_only(N, generator(), rows))
+    assert 0.1 < float((degrees[:, 5] - degrees[:, 17] > 35).float().mean()) < 0.5
+
+
+def test_some_hands_close_one_finger_after_another() -> None:
+    still, moved = torch.zeros(2000, 21), torch.ones(2000, 21)
+    part = poses.on_the_way(still, moved, generator())[:, [6, 10, 14, 18]]
+    steps = part.diff(dim=1)
+    in_turn = (steps > 0.05).all(1) | (steps < -0.05).all(1)
+    assert 0.08 < float(in_turn.float().mean()) < 0.5
+    assert float(part.min()) >= 0 and float(part.max()) <= 1
+
+
 def test_a_thumb_that_is_up_points_away_from_the_fist() -> None:
     away = {
         name: float((joints(name)[:, 4] - joints(name)[:, 6]).norm(dim=1).median())

@@ -101,6 +101,19 @@ def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> Non
     assert float(table.best.log_posterior) > before + 0.1
 
 
+def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hand = filtered(0.0, contender=torch.zeros(0, 27))
+    far = hand.pose.clone()
+    far[:, 2] += 0.5
+    assert bool(hand.posterior(far).isneginf())
+    monkeypatch.setattr(FilteredFrame, "refined", lambda _, poses: far.repeat(len(poses), 1))
+    standing = table_of(hand).of_source(Source.PREVIOUS, Source.DYNAMICS)
+    torch.testing.assert_close(standing.pose[:, :3], hand.pose[:, :3].repeat(2, 1))
+    assert bool(standing.log_posterior.isneginf().all())
+
+
 def test_a_covered_hand_is_held_where_it_was() -> None:
     covered = filtered(0.0, exchanged=16, covered=True)
     table = table_of(covered)

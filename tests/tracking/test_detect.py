@@ -208,6 +208,21 @@ def test_a_hand_that_nobody_described_is_the_one_that_is_held_out() -> None:
     assert searched([far, near], any_side=True, seen=known) is far, "the best is the same hand"
 
 
+def test_the_hand_that_is_held_out_is_found_whichever_side_it_is_of() -> None:
+    far, near = detection_of(hand_at(0.1, z=0.7)), detection_of(hand_at(-0.1, z=0.4), side="left")
+
+    class OneOfEachSide(FixedDetector):
+        def search(self, depth_m, k, side, likely) -> list[Detection]:
+            return [near] if side == "left" else [far]
+
+    detector = OneOfEachSide([near])
+    model = model_with(detector, any_side=True)
+    assert search(slot_of(None, model), IMAGE, (), model) is not far
+    np.testing.assert_allclose(detector.centres_m[0][0], near.centre_m.numpy(), atol=1e-6)
+    given = model_with(detector, any_side=False)
+    assert search(slot_of(None, given), IMAGE, (), given) is far, "its side was given"
+
+
 def test_where_no_hand_of_a_side_is_found_one_of_the_other_side_may_be_it() -> None:
     class LeftHands(FixedDetector):
         def search(self, depth_m, k, side, likely) -> list[Detection]:

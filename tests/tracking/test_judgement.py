@@ -69,9 +69,11 @@ def judged(
     return judge(track, features, dt_s, side, new, replace(PLAIN, patience=patience))
 
 
-def frames_until_end(patience: int, dt_s: float = FRAME_S, **features: float) -> int | None:
+def frames_until_end(
+    patience: int, dt_s: float = FRAME_S, track: Track | None = None, **features: float
+) -> int | None:
     """After so many doubtful frames a track ends; None = it does not."""
-    track = track_of(HERE)
+    track = track_of(HERE) if track is None else track
     for number in range(1, 500):
         status = judged(track, 0.05, patience=patience, dt_s=dt_s, **features)
         if status.ends:
@@ -82,12 +84,24 @@ def frames_until_end(patience: int, dt_s: float = FRAME_S, **features: float) ->
 
 @pytest.mark.parametrize(
     ("patience", "features", "frames"),
-    [(1, {}, 1), (5, {}, 5), (8, {}, 8), (5, HIDDEN, 50), (1, HIDDEN, 10), (0, {}, None)],
+    [(1, {}, 1), (5, {}, 5), (8, {}, 8), (5, HIDDEN, 45), (1, HIDDEN, 6), (0, {}, None)],
 )
-def test_a_doubtful_track_ends_after_its_patience_and_a_hidden_one_ten_times_as_late(
+def test_a_doubtful_track_ends_after_its_patience_and_a_hidden_one_much_later(
     patience: int, features: dict[str, float], frames: int | None
 ) -> None:
     assert frames_until_end(patience, **features) == frames
+
+
+def test_what_was_never_believed_is_not_waited_for_when_it_is_hidden() -> None:
+    assert frames_until_end(5, track=track_of(HERE, believed=False), **HIDDEN) == 5
+
+
+def test_of_a_hand_that_was_doubtful_before_it_was_hidden_little_patience_is_left() -> None:
+    before = judged(track_of(HERE, doubtful=Duration(3 * FRAME_S)), 0.05)
+    hidden = track_of(HERE, doubtful=before.doubtful)
+    frames = frames_until_end(5, track=hidden, **HIDDEN)
+    assert frames is not None
+    assert frames <= 10, "one frame is left of five"
 
 
 def test_patience_is_a_time_but_what_was_dropped_was_not_doubtful() -> None:

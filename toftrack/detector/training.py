@@ -58,7 +58,8 @@ Network = TypeVar("Network", PoseNet, Finder)
 class Schedule:
     """How a network is trained; see conf/train_detector.yaml.
 
-    images: in all.  batch: images of a step.  rate: the highest learning rate, see rate_at.
+    images: in all; 0 leaves the weights of `start` as they are.  batch: images of a step.  rate:
+    the highest learning rate, see rate_at.
     width: channels of the network's first layer.
     start: a file of weights to go on from; None begins from nothing.
     """
@@ -71,8 +72,10 @@ class Schedule:
 
     def __post_init__(self) -> None:
         for name in ("images", "batch", "width"):
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) > 0):
-                raise ToftrackError(f"{name} of a network must be a whole number above 0")
+            least = 0 if name == "images" and self.start is not None else 1
+            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= least):
+                more = "" if name != "images" else ", or 0 with weights to start from"
+                raise ToftrackError(f"{name} of a network must be a whole number above 0{more}")
         if not 0 < self.rate < 1:
             raise ToftrackError("rate of a network must be between 0 and 1")
 

@@ -8,6 +8,7 @@ What was interrupted goes on by the same command with resume=FOLDER, the folder 
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -31,7 +32,7 @@ from toftrack.views.pictures import write_picture
 def main(config: DictConfig) -> float:
     """Train, write weights, their ONNX files and figures.
 
-    Returns the mean joint error of the last images, mm.
+    Returns the mean joint error of the pose network's last images, mm; NaN if it saw none.
     """
     return train(config)
 
@@ -45,7 +46,7 @@ def train(config: DictConfig) -> float:
     from toftrack.detector.checkpoints import Checkpoints
     from toftrack.detector.onnx_export import export_networks, missing_packages, needed
     from toftrack.detector.training import train_finder, train_poses
-    from toftrack.detector.weights import save_weights
+    from toftrack.detector.weights import load_weights, save_weights
     from toftrack.errors import ToftrackError
     from toftrack.views.figures.training import course_figure, images_figure
 
@@ -68,7 +69,8 @@ def train(config: DictConfig) -> float:
     each = (config.shapes, config.seed, checkpoints)
     finder_network, finder_course = train_finder(finder, *each)
     pose_network, pose_course = train_poses(poses, *each)
-    minutes = round((finder_course[-1]["seconds"] + pose_course[-1]["seconds"]) / 60, 1)
+    courses = [course for course in (finder_course, pose_course) if course]
+    minutes = round(sum(course[-1]["seconds"] for course in courses) / 60, 1)
     about = {
         "seed": config.seed,
         "shapes": config.shapes,
@@ -77,21 +79,30 @@ def train(config: DictConfig) -> float:
         "torch": torch.__version__,
         "minutes": minutes,
     }
+    for name, schedule in (("pose", poses), ("finder", finder)):
+        if schedule.start is not None:
+            about[f"{name}_start"] = load_weights(schedule.start).about
     save_weights(path, pose_network, finder_network, about)
-    write_picture(folder / "course.png", course_figure(pose_course))
+    pictures = ["images.png"]
+    if pose_course:
+        write_picture(folder / "course.png", course_figure(pose_course))
+        pictures.append("course.png")
     summary = about | {"poses": pose_course, "finder": finder_course}
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     derived = [] if missing else [file.name for file in export_networks(path)]
-    last = pose_course[-1]
-    print(
-        f"trained in {minutes} minutes; on the last training images: joints"
-        f" {last['keypoints_mm']:.1f} mm by keypoints, {last['joints_mm']:.1f} mm by the likeliest"
-        " hypothesis"
-    )
-    for name in (config.output, *derived, "images.png", "course.png", "summary.json"):
+    error_mm, learned = math.nan, ""
+    if pose_course:
+        last = pose_course[-1]
+        error_mm = float(last["keypoints_mm"])
+        learned = (
+            f"; on the last training images: joints {error_mm:.1f} mm by keypoints,"
+            f" {last['joints_mm']:.1f} mm by the likeliest hypothesis"
+        )
+    print(f"trained in {minutes} minutes{learned}")
+    for name in (config.output, *derived, *pictures, "summary.json"):
         print(f"  {folder / name}")
     print(f"use it: toftrack track detector.weights={path}")
-    return float(last["keypoints_mm"])
+    return error_mm
 
 
 if __name__ == "__main__":

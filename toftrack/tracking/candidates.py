@@ -434,10 +434,17 @@ def _second_round(
 
 
 def _refined(table: Hypotheses, filtered: FilteredFrame) -> Hypotheses:
-    """The same table, refined, but for a pose that is held, and scored."""
+    """The same table, refined, but for a pose that is held, and scored.
+
+    Poses that then explain nothing of the image stay as they were proposed: of a hand that leaves
+    the image a few points are left, which may draw it anywhere.
+    """
+    pose = table.pose
     if filtered.frame.model.refinement.iterations and table.source[0] != Source.HELD:
-        table = replace(table, pose=filtered.refined(table.pose))
-    return replace(table, log_posterior=filtered.posterior(table.pose))
+        pose = filtered.refined(pose)
+    values = filtered.posterior(pose)
+    pose = torch.where(values.isneginf()[:, None], table.pose, pose)
+    return replace(table, pose=pose, log_posterior=values)
 
 
 def schedule(

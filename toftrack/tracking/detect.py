@@ -63,16 +63,26 @@ def search(
     likely = partial(reachable, hand, [other.centre_m for other in others])
     found = detector.search(image.depth_m, image.k, side, likely)
     undecided = not hand.handedness.given
-    beside = any(other.believed for other in others)
-    if not found and hand.track is None and undecided and not beside:
+    alone = hand.track is None and not any(other.believed for other in others)
+    of_other: list[Detection] = []
+    if undecided and alone and (not found or not hand.seen.ever):
         # A hand of the other side may be too unlike one of this to be found as such.
-        found = detector.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
-        again = np.array([one.centre_m.numpy() for one in found[:1]]).reshape(-1, 3)
-        up = np.array([one.up for one in found[:1]]).reshape(-1, 3)
-        found = detector.detect(image.depth_m, image.k, again, side, up)
-    elif undecided and not hand.seen.ever:
+        mirrored = detector.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
+        of_other = [one for one in mirrored if not any(_same_place(one, seen) for seen in found)]
+        found = [*found, *of_other]
+    if undecided and not hand.seen.ever:
         found = held_out(found)
-    return found[0] if found else NO_DETECTION
+    if not found:
+        return NO_DETECTION
+    if not any(found[0] is one for one in of_other):
+        return found[0]
+    centre, up = found[0].centre_m.numpy()[None], np.asarray(found[0].up)[None]
+    return detector.detect(image.depth_m, image.k, centre, side, up)[0]
+
+
+def _same_place(one: Detection, other: Detection) -> bool:
+    """Whether two detections are of one hand."""
+    return float((one.centre_m - other.centre_m).norm()) < SAME_PLACE_M
 
 
 def detect(
@@ -140,8 +150,8 @@ def held_out(found: Sequence[Detection]) -> list[Detection]:
     """
     if not found:
         return []
-    most = _AS_WELL * float(found[0].error_m[0])
-    alike = [one for one in found if float(one.error_m[0]) < most] or [found[0]]
+    most = _AS_WELL * min(float(one.error_m[0]) for one in found)
+    alike = [one for one in found if float(one.error_m[0]) < most]
     return [min(alike, key=lambda one: float(one.centre_m[2]))]
 
 

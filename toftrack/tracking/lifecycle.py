@@ -60,7 +60,7 @@ _HIDDEN = 0.3
 _OUT_OF_VIEW = 0.4
 """Share of the joints outside of the image from which on a hand is out of view."""
 _PATIENT = 10
-"""Times as long is waited for a hidden hand."""
+"""Times as long is waited for a hand that is hidden: each of its frames counts so much less."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track ends when it was not believed for so long, and is searched for so much later."""
 _COMPARED_EVERY = 4
@@ -285,10 +285,12 @@ def judge(
     whole = kept * track.whole_odds + (1 - kept) * model.whole.log_odds(features)
     confidence = _probability(smooth)
     # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
-    doubtful = track.doubtful.extended(dt_s, 2 * FRAME_S)
+    passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
+    # What was never believed may be no hand, and may hide behind anything.
+    waits = track.believed and features.hidden > _HIDDEN
+    doubtful = Duration(track.doubtful.seconds + passed / (_PATIENT if waits else 1))
     doubtful = doubtful if confidence < model.give_up else Duration()
-    patience = model.patience * (_PATIENT if features.hidden > _HIDDEN else 1)
-    ends = patience > 0 and doubtful.begun and doubtful.reached(patience)
+    ends = model.patience > 0 and doubtful.begun and doubtful.reached(model.patience)
     # Whether it is a hand at all does not depend on whose it is.
     lost = (confidence < new and not track.believed) or side * confidence < model.confidence
     lost = lost or _probability(whole) < model.whole.least

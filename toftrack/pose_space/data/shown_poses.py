@@ -35,7 +35,7 @@ KINDS = {
 # Degrees (knuckle, middle joint, last joint) and their standard deviations.
 _STATES = {
     "straight": ((0, 3, 2), (8, 6, 5)),
-    "back": ((-12, 4, 0), (7, 5, 5)),  # bent backwards a little, as of a hand stretched out
+    "back": ((-14, 4, 0), (8, 5, 5)),  # bent backwards a little, as of a hand stretched out
     "tight": ((86, 105, 65), (5, 6, 8)),  # as a fist closes: the tip is 26 to 37 mm off the knuckle
     "loose": ((74, 92, 45), (11, 12, 14)),
     "hooked": ((5, 92, 55), (12, 14, 16)),
@@ -82,7 +82,7 @@ def _four(state: str) -> tuple[str, str, str, str]:
 _CLOSED = ("across", "tucked", "hooked", "folded")
 SHOWN = (
     Shown("palm", ("out", "up", "beside"), _four("straight"), _APART, 6),
-    Shown("stretched palm", ("out", "up"), _four("back"), _APART, 3),
+    Shown("stretched palm", ("out", "up"), _four("back"), _APART, 5),
     Shown("flat", ("beside", "out", "folded"), _four("straight"), _TOGETHER, 8),
     Shown("flat, thumb away", ("up", "out"), _four("straight"), _TOGETHER, 4),
     Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 9),
@@ -127,6 +127,8 @@ SHOWN = (
     Shown("relaxed", ("out", "opposed", "beside"), _four("half"), _ANY, 6),
 )
 _TOUCHING_M = 0.020
+_ONE_BY_ONE = 0.25
+"""Standard deviation of how much further than its neighbour a finger is on its way."""
 
 
 def shown_poses(n: int, generator: torch.Generator) -> Tensor:
@@ -134,9 +136,7 @@ def shown_poses(n: int, generator: torch.Generator) -> Tensor:
     shown, second = shown_only(n, generator), shown_only(n, generator)
     fingers = any_fingers(n, generator)
     other = torch.where(_uniform(generator, n, 1) < 0.3, fingers, second)
-    # On the way from one pose to another, each finger ahead or behind.
-    part = (_uniform(generator, n, 1) + 0.15 * _normal(generator, n, 5)).clamp(0, 1)
-    moving = torch.lerp(shown, other, part[:, FINGER_OF_ANGLE])
+    moving = on_the_way(shown, other, generator)
     poses = {
         "shown": shown,
         "pinch": pinched(torch.where(_uniform(generator, n, 1) < 0.3, fingers, second), generator),
@@ -148,6 +148,18 @@ def shown_poses(n: int, generator: torch.Generator) -> Tensor:
     kind = torch.multinomial(torch.tensor(list(KINDS.values())), n, True, generator=generator)
     angles = torch.stack([poses[name] for name in KINDS])[kind, torch.arange(n)]
     return within_limits(angles)
+
+
+def on_the_way(first: Tensor, last: Tensor, generator: torch.Generator) -> Tensor:
+    """(n, 21) between poses (n, 21) and others: each finger ahead or behind, and in half of them
+    one after another, as a hand opens or closes from one side on.
+    """
+    n = len(first)
+    one_by_one = _ONE_BY_ONE * _normal(generator, n, 1) * (torch.arange(5.0) - 2.0)
+    part = _uniform(generator, n, 1) + 0.15 * _normal(generator, n, 5)
+    some = _uniform(generator, n, 1) < 0.5
+    part = (part + torch.where(some, one_by_one, 0.0)).clamp(0, 1)
+    return torch.lerp(first, last, part[:, FINGER_OF_ANGLE])
 
 
 def within_limits(angles: Tensor) -> Tensor:
@@ -190,7 +202,7 @@ def _fingers(flexion: Tensor, spread: Tensor, generator: torch.Generator) -> Ten
     n = len(spread)
     kinds = torch.stack(
         (
-            _uniform(generator, n) * 0.9 + 0.3,
+            _uniform(generator, n) * 1.3 + 0.3,
             _uniform(generator, n) * 0.35 - 1.2,
             _uniform(generator, n) * 1.6 - 0.6,
             _uniform(generator, n) * 0.5 - 0.2,
