@@ -46,7 +46,12 @@ K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 def model_of(**changes: object) -> ConfidenceModel:
     """Of the score alone: log odds 4 at a good score, 0 at 2 below, and so on; no memory."""
     usual = {"memory": 0.0, "intercept": 4.0, "weights": {"log_score": 2.0}}
-    numbers = {"confidence": 0.5, "give_up": 0.1, "patience": 5, "whole": WholeHand(0.0, 0.0, {})}
+    numbers = {
+        "confidence": 0.5,
+        "give_up": 0.1,
+        "patience": 5,
+        "whole": WholeHand(0.0, 1.0, 0.0, {}),
+    }
     return confidence_model(**(usual | numbers | changes))
 
 
@@ -95,7 +100,7 @@ def test_log_odds_rise_and_fall_with_a_feature_as_its_weight_says(name: str) -> 
 
 @pytest.mark.parametrize("log_odds", [-1e9, -40.0, -2.0, 0.1, 3.0, 1e9])
 def test_the_confidence_is_the_probability_of_the_log_odds(log_odds: float) -> None:
-    found = judge(followed(), with_odds(log_odds), FRAME_S, 1.0, 0.0, model_of())
+    found = judge(followed(), with_odds(log_odds), FRAME_S, 1.0, 0.0, 1.0, model_of())
     assert found.confidence == pytest.approx(1 / (1 + math.exp(-max(min(log_odds, 50), -50))))
     assert 0 <= found.confidence <= 1
     assert found.lost == (found.confidence < 0.5)
@@ -162,20 +167,22 @@ def test_joints_out_of_sight_are_counted() -> None:
 
 
 def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:
-    whole = WholeHand(0.5, 3.0, {"other_side": -2.0})
+    whole = WholeHand(0.5, 1.0, 3.0, {"other_side": -2.0})
     model = model_of(whole=whole)
     for other_side, lost in ((0.0, False), (1.4, False), (1.6, True)):
-        found = judge(followed(), with_odds(4.0, other_side=other_side), FRAME_S, 1.0, 0.0, model)
+        found = judge(
+            followed(), with_odds(4.0, other_side=other_side), FRAME_S, 1.0, 0.0, 1.0, model
+        )
         assert found.lost == lost and found.whole_odds == pytest.approx(3.0 - 2.0 * other_side)
         assert found.confidence == pytest.approx(1 / (1 + math.exp(-4.0)))
     with pytest.raises(ToftrackError, match="lost.whole.weights.luck is unknown"):
-        WholeHand(0.5, 0.0, {"luck": 1.0})
+        WholeHand(0.5, 1.0, 0.0, {"luck": 1.0})
     with pytest.raises(ToftrackError, match=r"lost\.whole\.least"):
-        WholeHand(1.5, 0.0, {})
+        WholeHand(1.5, 1.0, 0.0, {})
 
 
 def test_odds_of_the_whole_hand_are_smoothed_like_the_others() -> None:
-    model = model_of(whole=WholeHand(0.0, 0.0, {"other_side": -1.0}), memory=0.75)
+    model = model_of(whole=WholeHand(0.0, 1.0, 0.0, {"other_side": -1.0}), memory=0.75)
     track = replace(followed(), whole_odds=4.0)
-    found = judge(track, with_odds(0.0, other_side=0.0), FRAME_S, 1.0, 0.0, model)
+    found = judge(track, with_odds(0.0, other_side=0.0), FRAME_S, 1.0, 0.0, 1.0, model)
     assert found.whole_odds == pytest.approx(3.0)

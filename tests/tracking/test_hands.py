@@ -135,6 +135,6 @@ def test_two_hands_without_networks_are_refused() -> None:
         tracker_of("hands=2", "experiment=paper")
 
 
-def test_the_second_hand_has_to_convince_more_than_the_first() -> None:
+def test_beside_another_hand_one_that_comes_back_has_to_convince_more() -> None:
     lost = confidence_model()
-    assert lost.second > lost.believe
+    assert lost.second > lost.again

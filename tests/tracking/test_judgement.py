@@ -23,7 +23,7 @@ from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.tracking import lifecycle
-from toftrack.tracking.confidence import NO_FEATURES, WholeHand
+from toftrack.tracking.confidence import NO_FEATURES, ConfidenceModel, WholeHand
 from toftrack.tracking.filter import Filtered, Found
 from toftrack.tracking.handedness import HandednessEstimate
 from toftrack.tracking.hands import OtherHand
@@ -33,7 +33,7 @@ from toftrack.tracking.lifecycle import (
     judge,
 )
 from toftrack.tracking.select import Choice
-from toftrack.tracking.state import HandState, Track
+from toftrack.tracking.state import NOWHERE, HandState, LastSeen, Track
 from toftrack.tracking.step import conclude
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -48,7 +48,7 @@ def image() -> DepthImage:
 
 
 LOST = confidence_model(memory=0.0, confidence=0.3, believe=0.6, second=0.8, give_up=0.1)
-WHOLE = WholeHand(0.0, 0.0, {})
+WHOLE = WholeHand(0.0, 1.0, 0.0, {})
 PLAIN = replace(LOST, intercept=0.0, weights={"log_score": 1.0}, patience=5, whole=WHOLE)
 """Log odds are just the feature log_score."""
 HIDDEN = {"hidden": 0.5}
@@ -66,7 +66,8 @@ def judged(
     log_odds = math.log(probability / (1 - probability))
     features = replace(NO_FEATURES, log_score=log_odds, **features)
     new = PLAIN.second if second else PLAIN.believe
-    return judge(track, features, dt_s, side, new, replace(PLAIN, patience=patience))
+    model = replace(PLAIN, patience=patience)
+    return judge(track, features, dt_s, side, new, PLAIN.whole.believe, model)
 
 
 def frames_until_end(
@@ -163,7 +164,7 @@ def test_the_log_odds_are_smoothed_over_time_but_in_a_first_frame() -> None:
     features = replace(NO_FEATURES, log_score=2.0)
     older, new = track_of(HERE, log_odds=-2.0), track_of(HERE, age=Duration(), log_odds=-2.0)
     found = [
-        judge(track, features, dt_s, 1.0, 0.0, model).log_odds
+        judge(track, features, dt_s, 1.0, 0.0, 1.0, model).log_odds
         for track, dt_s in ((older, FRAME_S), (older, 2 * FRAME_S), (new, FRAME_S))
     ]
     assert found == pytest.approx([0.0, 1.0, 2.0])
@@ -177,10 +178,13 @@ def closed(
     probability: float,
     others: tuple[OtherHand, ...] = (),
     handedness: HandednessEstimate | None = None,
+    model: ConfidenceModel = PLAIN,
+    seen: LastSeen = NOWHERE,
     **features: float,
 ) -> tuple[Status, Track, HandState]:
     """After a frame that finds the hand 10 mm to the right."""
-    frame = frame_of(image(), track, others=others, model=replace(right_hand_model(), lost=PLAIN))
+    frame = frame_of(image(), track, others=others, model=replace(right_hand_model(), lost=model))
+    frame = replace(frame, hand=replace(frame.hand, seen=seen))
     if handedness is not None:
         frame = replace(frame, hand=replace(frame.hand, handedness=handedness))
     moved = hand_at(0.01)
@@ -203,6 +207,34 @@ def test_a_track_is_believed_once_and_doubted_while_it_is_lost(
     assert after.believed == (believed or not lost)
     assert after.age.seconds == pytest.approx(track.age.seconds + FRAME_S)
     assert hand.seen.ever == (not lost), "remembered as last believed"
+
+
+def believed_as(probability: float, as_whole: float, seen: LastSeen = NOWHERE) -> bool:
+    """Whether a new hand is believed that is right, and right as a whole, so probably."""
+    odds = math.log(as_whole / (1 - as_whole))
+    whole = WholeHand(0.0, 0.9, 0.0, {"other_side": odds})
+    return not closed(
+        track_of(HERE, believed=False),
+        probability,
+        model=replace(PLAIN, whole=whole),
+        seen=seen,
+        other_side=1.0,
+    )[0].lost
+
+
+def test_a_new_hand_is_believed_that_is_right_or_else_right_as_a_whole() -> None:
+    assert believed_as(0.7, 0.5) and believed_as(0.4, 0.95)
+    assert not believed_as(0.4, 0.85)
+    assert not believed_as(0.2, 0.95), "what would be flagged later is flagged now"
+
+
+def test_one_that_was_believed_before_is_believed_sooner_but_not_one_that_was_only_followed() -> (
+    None
+):
+    between = 0.5 * (PLAIN.again + PLAIN.believe)
+    before = LastSeen(track_of(HERE).mean, 1.0)
+    assert believed_as(between, 0.5, before)
+    assert not believed_as(between, 0.5, replace(before, surest=-math.inf))
 
 
 def beside(watched: bool) -> OtherHand:

@@ -321,15 +321,19 @@ class WholeHand:
     same, but for that joint (`joint_ok`). A hand taken for another one, or turned round, is not.
 
     least: estimates that are right as a whole with a lower probability are flagged lost.
+    believe: a new hand that is right as a whole with this probability is believed, whatever the
+        confidence: of a hand that holds a thing a joint is often far off.
     intercept, weights: of the features, by name.
     """
 
     least: float
+    believe: float
     intercept: float
     weights: Mapping[str, float]
 
     def __post_init__(self) -> None:
         check_number("lost.whole.least", self.least, 0, 1)
+        check_number("lost.whole.believe", self.believe, 0, 1)
         _ = self.log_odds
 
     @cached_property
@@ -343,8 +347,8 @@ class ConfidenceModel:
     """When an estimate is not to be used, and when its track is given up; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time.  again: or of a hand that was
-        believed before.  second: or while another hand is believed.
+    believe: likewise, until a track was believed for the first time (but see WholeHand).  again: or
+        of a hand that was believed before.  second: or while another hand is believed.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
     joint_ok: joints of an estimate that are near with a lower probability are not ok.

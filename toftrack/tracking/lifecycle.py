@@ -219,16 +219,18 @@ def close(
     """What is thought of a frame's estimate, the track as of the frame, and the hand last seen."""
     model, track = frame.model, frame.track
     whose = frame.hand.handedness
-    second = any(other.believed for other in frame.others)
-    first = model.lost.again if frame.hand.seen.ever else model.lost.believe
-    new = model.lost.second if second else first
+    new, as_whole = model.lost.believe, model.lost.whole.believe
+    if frame.hand.seen.believed:
+        new, as_whole = model.lost.again, math.inf
     seems = whose.seems(frame.hand.side) if whose.given else 1.0
+    if any(other.believed for other in frame.others):
+        new = max(new, model.lost.second)
     # Of two hands that are asked for, the one that is followed says which one comes.
     partner = any(other.believed and not other.watched for other in frame.others)
     if whose.doubtful(frame.hand.side) and not partner:
-        new = math.inf
+        new = as_whole = math.inf
     side = whose.probability(frame.hand.side)
-    status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
+    status = judge(track, features, dt_s, side, new / max(seems, 1e-3), as_whole, model.lost)
     if seems < OTHER_HAND and status.confidence >= model.lost.confidence:
         status = replace(status, lost=True, state_name="other hand")
     watched = [other for other in frame.others if other.watched]
@@ -273,12 +275,14 @@ def judge(
     dt_s: float,
     side: float,
     new: float,
+    as_whole: float,
     model: ConfidenceModel,
 ) -> Status:
     """What is thought of an estimate, dt_s after the last, and whether its track goes on.
 
     side: probability that it is of the right side; of the other one every finger is wrong.
-    new: confidence that a track needs which was not believed yet.
+    new: confidence that a track needs which was not believed yet.  as_whole: or the probability
+        that the hand as a whole is right.
     """
     kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
     smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
@@ -292,8 +296,9 @@ def judge(
     doubtful = doubtful if confidence < model.give_up else Duration()
     ends = model.patience > 0 and doubtful.begun and doubtful.reached(model.patience)
     # Whether it is a hand at all does not depend on whose it is.
-    lost = (confidence < new and not track.believed) or side * confidence < model.confidence
-    lost = lost or _probability(whole) < model.whole.least
+    probable = _probability(whole)
+    believed = track.believed or confidence >= new or probable >= as_whole
+    lost = not believed or side * confidence < model.confidence or probable < model.whole.least
     name = _state_name(features) if lost else "tracking"
     return Status(name, lost, ends, side * confidence, smooth, whole, doubtful)
 

@@ -77,7 +77,7 @@ class LastSeen:
 
     particle: (1, 6 + d).  age_s: how long ago; inf = it never was.
     scene: what was seen then; None where nobody says.
-    surest: the highest log odds of its track that an estimate was right.
+    surest: the highest log odds of its track that an estimate was right; -inf = none was believed.
     """
 
     particle: Tensor
@@ -89,6 +89,11 @@ class LastSeen:
     def ever(self) -> bool:
         """Whether there was one."""
         return self.age_s < math.inf
+
+    @property
+    def believed(self) -> bool:
+        """Whether there was one, and not just a place where one may be."""
+        return self.ever and self.surest > -math.inf
 
     @property
     def centre_m(self) -> np.ndarray:
