@@ -13,12 +13,14 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from helpers.rendered import right_hand_model
 from helpers.tracking import configuration, sample
 from helpers.two_hands import TwoHands, beside_its_mirror
 
 from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import Quality
 from toftrack.estimate import Estimate
+from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking import second_process
 from toftrack.tracking.second_process import SecondProcess
 from toftrack.tracking.step import HandTask
@@ -178,11 +180,28 @@ def test_it_ends_with_its_tracker(scene: TwoHands) -> None:
     assert running.poll() is not None
 
 
+def test_what_both_processes_have_is_named_and_not_sent() -> None:
+    kept, new = torch.rand(2000), torch.rand(3)
+    theirs = kept.clone()
+    message = second_process._pickled((kept, new, None), (None, kept))
+    got = second_process._unpickled(bytes(message), (None, theirs))
+    assert got[0] is theirs and torch.equal(got[1], new) and got[2] is None
+    assert len(message) < 1000
+
+
+def test_a_hand_that_was_made_for_a_shape_arrives_as_the_one_made_there() -> None:
+    model = right_hand_model()
+    hand = model.made_hand("left", first_shape().applied)
+    message = bytes(second_process._pickled([hand, hand]))
+    assert second_process._unpickled(message, model=model) == [hand, hand]
+    assert len(message) < 1000
+
+
 def test_tensors_and_generators_arrive_as_they_were() -> None:
     generator = torch.Generator().manual_seed(3)
     sent = {"a": torch.arange(6.0).reshape(2, 3)[:, 1], "b": torch.tensor(True), "g": generator}
     one, other = multiprocessing.Pipe()
     one.send_bytes(second_process._pickled(sent))
-    got = other.recv()
+    got = second_process._unpickled(other.recv_bytes())
     assert torch.equal(got["a"], sent["a"]) and bool(got["b"])
     assert torch.equal(torch.rand(5, generator=got["g"]), torch.rand(5, generator=generator))

@@ -111,13 +111,39 @@ def placed(
     return PlacedHand(pose, model.hand(hand.side, hand.shape), k, size)
 
 
-def others_of(
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """Another hand as a frame begins, before the image was looked at; see OtherHand.
+
+    theirs: where it is.  mine: where this hand is, None where it has no place yet.
+    """
+
+    theirs: PlacedHand
+    mine: PlacedHand | None
+    believed: bool
+    certain: bool
+    watched: bool
+
+    def seen(self, depth_m: np.ndarray) -> OtherHand:
+        """It in the reduced image (H, W)."""
+        theirs, mine = self.theirs, self.mine
+        pixels = beside = np.zeros(depth_m.shape, bool)
+        if self.certain and mine is None:
+            pixels = explained(depth_m, theirs.surface_m, np.zeros_like(depth_m))
+        elif self.certain and mine is not None:
+            pixels = explained(depth_m, theirs.surface_m, mine.surface_m)
+            beside = pixels & (depth_m > float(mine.pose[0, 2]) - _IN_FRONT_M)
+        known = self.believed, self.certain
+        return OtherHand(theirs.joints_m, theirs.centre_m, *known, pixels, beside, self.watched)
+
+
+def neighbours_of(
     hands: Sequence[HandState],
     slots: Sequence[int],
     image: DepthImage,
     model: TrackerModel,
     dt_s: float,
-) -> list[tuple[OtherHand, ...]]:
+) -> list[tuple[Neighbour, ...]]:
     """For each of the slots that take part, the other hands as they are predicted in a frame."""
     if not any(hands[own - 1].track is not None for own in slots):
         return [() for _ in hands]
@@ -129,9 +155,7 @@ def others_of(
     ]
     return [
         tuple(
-            replace(
-                _other_hand(hands[slot].track, theirs, mine, depth_m), watched=hands[slot].watched
-            )
+            _neighbour(hands[slot], theirs, mine)
             for slot, theirs in enumerate(there)
             if theirs is not None and slot != own and own in slots
         )
@@ -139,20 +163,21 @@ def others_of(
     ]
 
 
-def _other_hand(
-    track: Track | None, theirs: PlacedHand, mine: PlacedHand | None, depth_m: np.ndarray
-) -> OtherHand:
-    """Another hand as this one, which may have no place yet, has to know it."""
+def _neighbour(hand: HandState, theirs: PlacedHand, mine: PlacedHand | None) -> Neighbour:
+    track = hand.track
     assert track is not None
-    none = np.zeros(depth_m.shape, bool)
-    if track.doubted or not track.believed:
-        return OtherHand(theirs.joints_m, theirs.centre_m, track.believed, False, none, none)
-    if mine is None:
-        pixels = explained(depth_m, theirs.surface_m, np.zeros_like(depth_m))
-        return OtherHand(theirs.joints_m, theirs.centre_m, True, True, pixels, none)
-    pixels = explained(depth_m, theirs.surface_m, mine.surface_m)
-    beside = pixels & (depth_m > float(mine.pose[0, 2]) - _IN_FRONT_M)
-    return OtherHand(theirs.joints_m, theirs.centre_m, True, True, pixels, beside)
+    certain = track.believed and not track.doubted
+    return Neighbour(theirs, mine, track.believed, certain, hand.watched)
+
+
+def seen_in(
+    neighbours: Sequence[Neighbour], image: DepthImage, model: TrackerModel
+) -> tuple[OtherHand, ...]:
+    """Other hands in an image."""
+    if not neighbours:
+        return ()
+    depth_m, _ = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
+    return tuple(neighbour.seen(depth_m) for neighbour in neighbours)
 
 
 def explained(depth_m: np.ndarray, theirs_m: np.ndarray, mine_m: np.ndarray) -> np.ndarray:

@@ -39,6 +39,7 @@ from toftrack.tracking.detect import (
 from toftrack.tracking.filter import Found, drawn_to, predicted_depths, velocity_after
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import (
+    Neighbour,
     OtherHand,
     PlacedHand,
     exchanged,
@@ -155,7 +156,7 @@ def open_hand(
     )
 
 
-def goes_on(hand: HandState, others: Sequence[OtherHand]) -> bool:
+def goes_on(hand: HandState, others: Sequence[OtherHand | Neighbour]) -> bool:
     """Whether a hand's track goes on in a frame. One that is doubted waits for the detector where
     nothing is surely followed, or a search beside the other hand has found something elsewhere.
     """

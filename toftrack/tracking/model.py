@@ -154,7 +154,11 @@ class FilterModel:
 
     def hand(self, side: str, shape: ShapeEstimate) -> FittedHand:
         """The hand of a side in the shape that is applied."""
-        return self._hands(side, shape.applied)
+        return self.made_hand(side, shape.applied)
+
+    def made_hand(self, side: str, applied: tuple[float, ...]) -> FittedHand:
+        """The same of the components that are applied; made once."""
+        return self._hands(side, applied)
 
     @cached_property
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:

@@ -5,7 +5,8 @@ wait for each other. A hand's part of a frame is a function of what it is given 
 it is sent there, and the answer is what this process would have computed.
 
 What is sent between the two, through a socket with a key of their own, are pickles; nothing else
-may send any.
+may send any. What the other process has already is named in them instead of sent: the hands that
+were made for a shape, and those parts of a hand that came with the message before.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ import pickle
 import secrets
 import subprocess
 import sys
+import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing.connection import Client, Connection, Listener
-from threading import Thread
 from typing import Any
 
 import torch
@@ -33,7 +34,8 @@ from torch import Tensor
 from toftrack.compute.quality import Quality
 from toftrack.compute.spans import Spans
 from toftrack.compute.threads import at_most, small_operations, threads
-from toftrack.tracking.model import FilterModel, TrackerModel
+from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.state import HandState
 from toftrack.tracking.step import Concluded, HandTask, follow_hand
 from toftrack.tracking.tracker import HandsTracker
 
@@ -81,10 +83,11 @@ class SecondProcess:
             return None
         self._busy = True
         try:
-            began.connection.send_bytes(_pickled((quality, task)))
+            began.connection.send_bytes(_pickled((quality, task), began.common))
         except Exception as error:
             self._give_up(_words(error))
             return None
+        began.common = _asked(task)
         return partial(self._answer, began.connection)
 
     def close(self) -> None:
@@ -109,7 +112,8 @@ class SecondProcess:
             if not connection.poll(_LONGEST_S):
                 self._give_up(f"no answer came within {_LONGEST_S:g} s")
                 return None
-            found: Concluded | str = connection.recv()
+            assert self._began is not None
+            found: Concluded | str = _unpickled(connection.recv_bytes(), self._began.common)
         except Exception as error:
             self._give_up(_words(error))
             return None
@@ -117,6 +121,7 @@ class SecondProcess:
         if isinstance(found, str):
             self._give_up(found)
             return None
+        self._began.common = _parts(found[1])
         return found
 
     def _give_up(self, why: str) -> None:
@@ -129,12 +134,14 @@ class _Began:
     """A process that was begun.
 
     connection: to it, as soon as it is ready.  of_process: the number of the one that began it; a
-    process that was forked from that one must not use it.
+    process that was forked from that one must not use it.  common: what both have of the last
+    message.
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
         self.connection: Connection | None = None
         self.of_process = os.getpid()
+        self.common: Sequence[object] = ()
         key = secrets.token_bytes(32)
         self._listener = Listener(authkey=key)
         # It finds what this process finds, and does not look into the working directory first.
@@ -157,7 +164,7 @@ class _Began:
         except OSError:
             self.end()
             raise
-        Thread(target=self._meet, args=(config,), daemon=True).start()
+        threading.Thread(target=self._meet, args=(config,), daemon=True).start()
 
     def _meet(self, config: dict[str, Any]) -> None:
         with contextlib.suppress(OSError, EOFError):
@@ -178,14 +185,39 @@ class _Began:
 
 
 class _Pickler(pickle.Pickler):
-    """Tensors as arrays, which is twenty times as fast as torch's own way."""
+    """Tensors as arrays, which is twenty times as fast as torch's own way, and names for what both
+    processes have.
+    """
+
+    def __init__(self, stream: io.BytesIO, common: Sequence[object]) -> None:
+        super().__init__(stream, pickle.HIGHEST_PROTOCOL)
+        # None, and what else there is only one of, is named by itself.
+        self._numbers = {id(one): number for number, one in enumerate(common) if one is not None}
 
     def reducer_override(self, value: Any) -> Any:
+        number = self._numbers.get(id(value))
+        if number is not None:
+            return _common_one, (number,)
         if type(value) is Tensor:
             return torch.from_numpy, (value.numpy(),)
         if type(value) is torch.Generator:
             return _generator_of, (value.get_state(),)
+        if type(value) is FittedHand:
+            return _fitted_hand_of, (value.shape.side, value.applied)
         return NotImplemented
+
+
+_here = threading.local()
+"""What a message may name, while a thread reads it: `common` and `model`, see _unpickled."""
+
+
+def _common_one(number: int) -> object:
+    return _here.common[number]
+
+
+def _fitted_hand_of(side: str, applied: tuple[float, ...]) -> FittedHand:
+    model: TrackerModel = _here.model
+    return model.made_hand(side, applied)
 
 
 def _generator_of(state: Tensor) -> torch.Generator:
@@ -194,10 +226,33 @@ def _generator_of(state: Tensor) -> torch.Generator:
     return generator
 
 
-def _pickled(value: Any) -> memoryview:
+def _pickled(value: Any, common: Sequence[object] = ()) -> memoryview:
     stream = io.BytesIO()
-    _Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(value)
+    _Pickler(stream, common).dump(value)
     return stream.getbuffer()
+
+
+def _unpickled(
+    message: bytes, common: Sequence[object] = (), model: TrackerModel | None = None
+) -> Any:
+    """common: as the sender had it when this was sent.  model: of the hands that it names."""
+    _here.common, _here.model = common, model
+    try:
+        return pickle.loads(message)
+    finally:
+        _here.common, _here.model = (), None
+
+
+def _parts(hand: HandState) -> tuple[object, ...]:
+    """What often stays as it is from one message to the next."""
+    seen, tried = hand.seen, hand.tried
+    whole = hand.track, hand.shape, hand.gesture, hand.last, hand.seeking, hand.handedness
+    return *whole, seen.particle, seen.scene, tried.particle
+
+
+def _asked(task: HandTask) -> tuple[object, ...]:
+    """What both processes have after a task was sent."""
+    return task.image.depth_m, *_parts(task.hand)
 
 
 def main(build: Build) -> None:
@@ -210,9 +265,12 @@ def main(build: Build) -> None:
         with Client(said["address"], authkey=bytes.fromhex(said["key"])) as connection:
             model = _prepared(build, json.loads(connection.recv_bytes()))
             connection.send_bytes(b"ready")
+            common: tuple[object, ...] = ()
             while True:
-                quality, task = connection.recv()
-                connection.send_bytes(_pickled(_followed(model, quality, task)))
+                quality, task = _unpickled(connection.recv_bytes(), common, model)
+                found = _followed(model, quality, task)
+                connection.send_bytes(_pickled(found, _asked(task)))
+                common = () if isinstance(found, str) else _parts(found[1])
 
 
 @small_operations()

@@ -33,7 +33,7 @@ from toftrack.tracking.candidates import (
 from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
-from toftrack.tracking.hands import OtherHand, PlacedHand, others_of, partnered
+from toftrack.tracking.hands import Neighbour, PlacedHand, neighbours_of, partnered, seen_in
 from toftrack.tracking.lifecycle import (
     Absence,
     Status,
@@ -65,7 +65,7 @@ class HandTask:
 
     slot: int
     hand: HandState
-    others: tuple[OtherHand, ...]
+    others: tuple[Neighbour, ...]
     image: DepthImage
     dt_s: float
     generator: torch.Generator
@@ -126,7 +126,7 @@ def followed(
     dice = [generator] + [_seeded_by(generator) for _ in slots[1:]]
 
     def tasks() -> list[HandTask]:
-        others = others_of(hands, slots, image, model, dt_s)
+        others = neighbours_of(hands, slots, image, model, dt_s)
         each = zip(slots, dice, strict=True)
         return [HandTask(slot, hands[slot], others[slot], image, dt_s, own) for slot, own in each]
 
@@ -168,7 +168,8 @@ def follow_hand(task: HandTask, model: TrackerModel, spans: Spans) -> Concluded:
 
 def opened_by(task: HandTask, model: TrackerModel) -> HandFrame | Absence:
     """See open_hand."""
-    return open_hand(task.slot, task.hand, task.others, task.image, model, task.dt_s)
+    others = seen_in(task.others, task.image, model)
+    return open_hand(task.slot, task.hand, others, task.image, model, task.dt_s)
 
 
 def concluded(
