@@ -43,7 +43,7 @@ BOUNDS = {
     "silent_pct": (0.0, 4.0),
     "jitter_mm": (0.0, 3.0),
     "coverage_pct": (84.0, 95.0),
-    "called_hand_pct": (0.0, 15.0),
+    "called_hand_pct": (0.0, 3.0),
 }
 """Least and largest value of each figure, means over recordings and SEEDS. No three of 20 seeds
 leave them, and there is a margin for the floats of other processors: docs/lab/guards.md."""
