@@ -13,9 +13,10 @@ from typing import Any
 
 import numba
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
+from numba.np.arrayobj import _empty_nd_impl, _parse_shape
 
 from toftrack.compute.kernel_cache import KernelCache, can_be_kept
 from toftrack.compute.quick_typing import quick_typing
@@ -65,6 +66,41 @@ def take(typingctx, counter):
         return builder.atomic_rmw("add", at, ir.IntType(64)(1), "monotonic")
 
     return types.int64(counter), codegen
+
+
+@intrinsic
+def empty(typingctx, shape, dtype):
+    """np.empty of a shape, a number or a tuple.
+
+    numba compiles a function, and the texts of its errors, for each type of np.empty and np.zeros:
+    together with assignments of arrays to slices, a sixth of what all kernels take. Kernels
+    therefore use these two, and copy numbers in loops.
+    """
+    return _array_type(shape, dtype)(shape, dtype), _make_array
+
+
+@intrinsic
+def zeros(typingctx, shape, dtype):
+    """np.zeros, likewise."""
+
+    def codegen(context, builder, signature, args):
+        made = _make_array(context, builder, signature, args)
+        array = context.make_array(signature.return_type)(context, builder, made)
+        size = builder.mul(array.nitems, array.itemsize)
+        cgutils.memset(builder, array.data, size, 0)
+        return made
+
+    return _array_type(shape, dtype)(shape, dtype), codegen
+
+
+def _array_type(shape, dtype):
+    dimensions = len(shape) if isinstance(shape, types.BaseTuple) else 1
+    return types.Array(dtype.dtype, dimensions, "C")
+
+
+def _make_array(context, builder, signature, args):
+    lengths = _parse_shape(context, builder, signature.args[0], args[0])
+    return _empty_nd_impl(context, builder, signature.return_type, lengths)._getvalue()
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import announced, compiled, entry_point
+from toftrack.compute.compiling import announced, compiled, empty, entry_point, zeros
 from toftrack.compute.motions import Motions
 from toftrack.compute.rigid import PIVOT_M
 
@@ -193,7 +193,11 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
 
     frames_out: (N, 16, 3, 3) float32 for their frames, or (0, 16, 3, 3).
     """
-    frames, posed, state = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty(27)
+    frames, posed, state = (
+        empty((16, 3, 3), np.float64),
+        empty((21, 3), np.float64),
+        empty(27, np.float64),
+    )
     for i in range(len(states)):
         for j in range(27):
             state[j] = states[i, j]
@@ -202,13 +206,16 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
             for k in range(3):
                 joints[i, j, k] = posed[j, k]
         if i < len(frames_out):
-            frames_out[i] = frames
+            for j in range(16):
+                for row in range(3):
+                    for column in range(3):
+                        frames_out[i, j, row, column] = frames[j, row, column]
 
 
 @_cached
 def mean_of_rows(particles, weights, out):
     """See rigid.mean; particles: (N, 6 + d), out: (1, 6 + d), float32.  weights: (N,) float64."""
-    scatter, total = np.zeros((4, 4)), np.zeros(out.shape[1])
+    scatter, total = zeros((4, 4), np.float64), zeros(out.shape[1], np.float64)
     for n in range(len(particles)):
         p = particles[n]
         for j in range(len(total)):
@@ -231,7 +238,7 @@ def main_axis(symmetric):
 
     Golub and Van Loan, "Matrix computations", section 8.5.
     """
-    axes = np.zeros((4, 4))
+    axes = zeros((4, 4), np.float64)
     for i in range(4):
         axes[i, i] = 1.0
     for _ in range(_SWEEPS):

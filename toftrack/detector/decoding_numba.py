@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from toftrack.compute import rigid_numba
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, empty, entry_point, zeros
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rigid_numba import pose_hand, rotation_vector
 from toftrack.detector import crops, network, proposals
@@ -55,7 +55,7 @@ def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
     for j in range(JOINTS):
         p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
         _into_camera(p, turn, centre, mirror, joints[c, j])
-    of_finger = np.zeros(5)
+    of_finger = zeros(5, np.float64)
     length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
     add_overlaps(joints[c], length, of_finger)
     for finger in range(5):
@@ -69,15 +69,15 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
     """The likeliest hypotheses of a crop, in their order."""
     pivot, rotvec, angles, log_size, log_probability, error, joints, _, _, _, _ = out
     count = len(_ANCHORS)
-    chance = np.empty(count)
+    chance = empty(count, np.float64)
     for h in range(count):
         chance[h] = reported[h * EACH + EACH - 2]
     first, total = _largest(chance), 0.0
     top = chance[first]
     for h in range(count):
         total += math.exp(chance[h] - top)
-    matrix, state = np.empty((3, 3)), np.zeros(27)
-    frames, posed = np.empty((16, 3, 3)), np.empty((JOINTS, 3))
+    matrix, state = empty((3, 3), np.float64), zeros(27, np.float64)
+    frames, posed = empty((16, 3, 3), np.float64), empty((JOINTS, 3), np.float64)
     for kept in range(KEPT):
         h = _largest(chance)
         log_probability[c, kept] = chance[h] - top - math.log(total)
@@ -173,7 +173,7 @@ def _into_camera(p, turn, centre, mirror, out):
 def _decode_keypoints(keypoints, depth, joints, sigma):
     """Weighted means of the cells' keypoints (5 * JOINTS, 16, 16), see PoseNet._joints."""
     # Depth is predicted about the surface that the cell sees.
-    seen, block = np.zeros((CELLS, CELLS)), CROP // CELLS
+    seen, block = zeros((CELLS, CELLS), np.float64), CROP // CELLS
     for row in range(CROP):
         for column in range(CROP):
             seen[row // block, column // block] += depth[row, column]
@@ -191,7 +191,7 @@ def _decode_keypoints(keypoints, depth, joints, sigma):
                 total += weight
                 a += weight * (_cell(column) + JOINT_M * x[row, column])
                 b += weight * (_cell(row) + JOINT_M * y[row, column])
-                surface = seen[row, column] * (CROP_M / 2 / block**2)
+                surface = seen[row, column] * (CROP_M / 2 / (block * block))
                 d += weight * (surface + JOINT_M * z[row, column])
                 spread += weight * deviation[row, column]
         joints[j, 0], joints[j, 1], joints[j, 2] = a / total, b / total, d / total

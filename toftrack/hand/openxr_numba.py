@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from toftrack.compute import rigid_numba
-from toftrack.compute.compiling import announced, compiled, entry_point
+from toftrack.compute.compiling import announced, compiled, empty, entry_point, zeros
 from toftrack.compute.rigid_numba import pose_hand
 from toftrack.hand.openxr import OpenXRHand, OpenXRRig
 
@@ -37,9 +37,9 @@ def place(joints, state, base_frames, metacarpals, radius, mirror, position, ori
 
     mirror: -1 for a left hand, else 1.
     """
-    frames, none = np.empty((16, 3, 3)), np.zeros((21, 3))
+    frames, none = empty((16, 3, 3), np.float64), zeros((21, 3), np.float64)
     pose_hand(state, base_frames, none[:5], none[:5], mirror, frames, none)
-    way, nail, start = np.empty(3), np.empty(3), np.empty(3)
+    way, nail, start = empty(3, np.float64), empty(3, np.float64), empty(3, np.float64)
     for i in range(3):
         position[1, i] = joints[0, i]
     for finger in range(5):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute import rigid_numba
-from toftrack.compute.compiling import announced, compiled, entry_point, take
+from toftrack.compute.compiling import announced, compiled, empty, entry_point, take, zeros
 from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
 from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
@@ -128,13 +128,21 @@ def scratch(ellipsoids, points, seen):
     wrenches (16, 7, 6) of the frames, the twists (27, 6) of the degrees of freedom, and the normal
     equations, see assemble.
     """
-    hand = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty((21, 3))
-    posed = np.empty((ellipsoids, 12), np.float32)
-    distance, nearest = np.empty(points, np.float32), np.zeros(points, np.int32)
-    matched = np.empty((3, points), np.float32), distance, nearest
-    sums = np.empty((_FREE, _FREE)), np.empty(_FREE)
-    within = np.empty(seen + 1, np.int32)
-    return hand, posed, matched, within, np.empty((16, 7, 6)), np.empty((_FREE, 6)), sums
+    hand = empty((16, 3, 3), np.float64), empty((21, 3), np.float64), empty((21, 3), np.float64)
+    posed = empty((ellipsoids, 12), np.float32)
+    distance, nearest = empty(points, np.float32), zeros(points, np.int32)
+    matched = empty((3, points), np.float32), distance, nearest
+    sums = empty((_FREE, _FREE), np.float64), empty(_FREE, np.float64)
+    within = empty(seen + 1, np.int32)
+    return (
+        hand,
+        posed,
+        matched,
+        within,
+        empty((16, 7, 6), np.float64),
+        empty((_FREE, 6), np.float64),
+        sums,
+    )
 
 
 @_cached

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import called, entry_point
+from toftrack.compute.compiling import called, empty, entry_point, zeros
 from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
 from toftrack.refinement import penalty
@@ -45,9 +45,9 @@ _NONE, _NO_SIGMA = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
 @_cached
 def penalise(joints, hand_length_m, overlap_weight, points, sigma, keypoints_weight, out):
     """joints: (N, 21, 3), points: (21, 3) and sigma: (21,), or both empty, out: (N,); float32."""
-    hand = np.empty((21, 3))
+    hand = empty((21, 3), np.float64)
     for n in range(len(joints)):
-        of_finger, away = np.zeros(5), 0.0
+        of_finger, away = zeros(5, np.float64), 0.0
         for j in range(21):
             for i in range(3):
                 hand[j, i] = joints[n, j, i]

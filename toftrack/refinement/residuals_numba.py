@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled
+from toftrack.compute.compiling import compiled, zeros
 from toftrack.refinement.gauss_newton import (
     ALONG_BONE,
     FACING_M,
@@ -41,7 +41,7 @@ def choose_points(points, joints, count, within, chosen):
     points: (P, 3) float32.  joints: (21, 3).  within: (P + 1,) int32 scratch.
     chosen: (3, count), its first columns are set.
     """
-    middle = np.zeros(3, np.float32)
+    middle = zeros(3, np.float32)
     for i in range(3):
         total = 0.0
         for j in range(21):

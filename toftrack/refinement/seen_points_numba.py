@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from toftrack.compute.compiling import called, entry_point
+from toftrack.compute.compiling import called, entry_point, zeros
 
 _cached = entry_point(__file__)
 _COMPILING = "refine: compiling what reads points (once, about 1 s)"
@@ -65,7 +65,7 @@ def fill_points(depth, hand, top, left, k, edge, far, points, count):
 def fill_nearest(labels, solid, top, left, nearest):
     """nearest: (h, w, 2), written."""
     height, width = solid.shape
-    places = np.zeros((height * width + 1, 2), np.float32)
+    places = zeros((height * width + 1, 2), np.float32)
     for row in range(height):
         for column in range(width):
             if solid[row, column]:

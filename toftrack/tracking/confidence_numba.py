@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from toftrack.compute.compiling import called, compiled, entry_point
+from toftrack.compute.compiling import called, compiled, empty, entry_point
 
 _cached = entry_point(__file__)
 _COMPILING = "tracker: compiling what reads the image at joints (once, about 1 s)"
@@ -64,7 +64,7 @@ def count_joints(joints, depth, k, counts):
 def read_around(joints, nearest_m, step_m, depth, k, found):
     """found: (N, 3), written."""
     height, width = depth.shape
-    read = np.empty(_AROUND)
+    read = empty(_AROUND, np.float64)
     for joint in range(len(joints)):
         z = max(joints[joint, 2], nearest_m)
         inside = count = 0

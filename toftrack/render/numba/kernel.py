@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, entry_point, take
+from toftrack.compute.compiling import compiled, empty, entry_point, take, zeros
 from toftrack.render.numba.hand import (
     BOTTOM,
     DU,
@@ -76,7 +76,7 @@ def blocks(width):
 @compiled
 def _zeros(size):
     """A flat array of float32 that begins where a line of the cache does."""
-    numbers = np.zeros(size + BLOCK, np.float32)
+    numbers = zeros(size + BLOCK, np.float32)
     skip = (-numbers.ctypes.data >> 2) & (BLOCK - 1)
     return numbers[skip : skip + size]
 
@@ -198,7 +198,7 @@ def pack_evidence(low, high, occluder, hand):
     height, width = hand.shape
     pitch = blocks(width)
     images = _zeros(height * pitch * _IMAGES * BLOCK)
-    bits = np.zeros((((width + 63) >> 6) + 1, height + WORDS), np.uint64)
+    bits = zeros((((width + 63) >> 6) + 1, height + WORDS), np.uint64)
     for v in range(height):
         for block in range(pitch):
             at = (v * pitch + block) * _IMAGES * BLOCK
@@ -250,17 +250,17 @@ def score_hands(
     for i in range(steps.shape[0]):
         reach = max(reach, steps[i, 1])
     whole = max(states.shape[0] // LANES - 2, 0)
-    x = np.empty(27 * LANES, np.float32)
-    frames = np.empty((16, 12 * LANES), np.float32)
-    valid = np.empty(LANES, np.uint8)
-    conics = np.empty((index.shape[0], TERMS * LANES), np.float32)
-    boxes = np.empty(4 * LANES, np.float32)
+    x = empty(27 * LANES, np.float32)
+    frames = empty((16, 12 * LANES), np.float32)
+    valid = empty(LANES, np.uint8)
+    conics = empty((index.shape[0], TERMS * LANES), np.float32)
+    boxes = empty(4 * LANES, np.float32)
     tile = _zeros(0)
-    spans = np.empty(2 * (height + BLOCK), np.float32)
-    lines, places = np.empty(5 * _LISTED, np.float32), np.empty(_LISTED, np.int32)
-    model = np.empty((parts + 3, height + 2 * (reach + WORDS)), np.uint64)
-    wanted = np.empty((parts + 1, height + WORDS), np.uint64)
-    buffer = np.empty((2, (parts + 3) * WORDS), np.uint64)
+    spans = empty(2 * (height + BLOCK), np.float32)
+    lines, places = empty(5 * _LISTED, np.float32), empty(_LISTED, np.int32)
+    model = empty((parts + 3, height + 2 * (reach + WORDS)), np.uint64)
+    wanted = empty((parts + 1, height + WORDS), np.uint64)
+    buffer = empty((2, (parts + 3) * WORDS), np.uint64)
     while True:
         task, count = take(counter), LANES
         first = task * LANES
