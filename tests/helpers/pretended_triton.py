@@ -68,7 +68,7 @@ def _no_triton() -> Any:
     """What is used of the module but for running kernels."""
     module: Any = ModuleType("triton")
     module.language = module
-    module.jit = lambda function: function
+    module.jit = lambda function=None, **options: function or (lambda other: other)
     module.cdiv = lambda size, block: -(-size // block)
     module.next_power_of_2 = lambda size: 1 << (size - 1).bit_length()
     return module

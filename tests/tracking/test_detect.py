@@ -20,8 +20,11 @@ from helpers.rendered import (
 )
 
 from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
+from toftrack.refinement.shape_fit import first_shape, with_network_length
 from toftrack.tracking.detect import (
     detect,
     detection_due,
@@ -160,6 +163,22 @@ def test_the_detector_is_asked_where_a_hand_will_be(beside: bool) -> None:
     assert 0.2 * 0.8 * FRAME_S < moved[0] - here[0] <= 0.8 * FRAME_S
 
 
+@pytest.mark.parametrize("factor", [0.7, 1.2])
+def test_the_detector_is_asked_about_the_middle_of_a_palm_of_that_size(factor: float) -> None:
+    detector = FixedDetector()
+    model = replace(any_hand_model(), detector=detector)
+    track = track_of(hand_at(), model)
+    small = with_network_length(
+        first_shape(), factor * DEFAULT_HAND_LENGTH_M, model.fit, default_hand_shape()
+    )
+    hand = slot_of(track, model, shape=small)
+    detect(hand, track, IMAGE, model, FRAME_S)
+    joints = model.hand(hand.side, small).refiner.joints(track.pose)[0].numpy()
+    along = (joints[9] - joints[0]) / np.linalg.norm(joints[9] - joints[0])
+    off = detector.centres_m[0][0] - joints[0]
+    assert off @ along == pytest.approx(factor * -PIVOT_M[1], abs=0.01)
+
+
 def test_the_detector_is_asked_about_a_hand_at_the_lens_all_the_same() -> None:
     detector = FixedDetector()
     near = track_of(hand_at(z=0.01))
@@ -169,12 +188,13 @@ def test_the_detector_is_asked_about_a_hand_at_the_lens_all_the_same() -> None:
 
 def test_a_detection_is_elsewhere_where_its_palm_is_far_from_the_prediction() -> None:
     track, model = track_of(hand_at()), right_hand_model()
+    hand = slot_of(track)
 
     def elsewhere(x: float) -> bool:
-        return is_elsewhere(detection_of(hand_at(x)), track, model, FRAME_S)
+        return is_elsewhere(detection_of(hand_at(x)), hand, track, model, FRAME_S)
 
     assert [elsewhere(x * SAME_PLACE_M) for x in (0, 0.8, 1.2, -1.2)] == [False, False, True, True]
-    assert not is_elsewhere(NO_DETECTION, track, model, FRAME_S)
+    assert not is_elsewhere(NO_DETECTION, hand, track, model, FRAME_S)
 
 
 def test_what_is_expected_of_a_hand_that_is_not_tracked_yet() -> None:

@@ -180,11 +180,12 @@ def closed(
     handedness: HandednessEstimate | None = None,
     model: ConfidenceModel = PLAIN,
     seen: LastSeen = NOWHERE,
+    slot: int = 0,
     **features: float,
 ) -> tuple[Status, Track, HandState]:
     """After a frame that finds the hand 10 mm to the right."""
     frame = frame_of(image(), track, others=others, model=replace(right_hand_model(), lost=model))
-    frame = replace(frame, hand=replace(frame.hand, seen=seen))
+    frame = replace(frame, slot=slot, hand=replace(frame.hand, seen=seen))
     if handedness is not None:
         frame = replace(frame, hand=replace(frame.hand, handedness=handedness))
     moved = hand_at(0.01)
@@ -253,6 +254,19 @@ def test_beside_another_hand_a_new_one_must_be_surer_whether_that_is_reported_or
     assert not closed(track, between)[0].lost
     assert closed(track, between, (beside(watched),))[0].lost
     assert not closed(track, 0.97, (beside(watched),))[0].lost
+
+
+def test_the_second_of_two_hands_is_asked_for_less_than_a_first_one() -> None:
+    """Where one hand is, there is a person, whose other hand is no surprise."""
+    sooner = replace(PLAIN, second=0.4)
+    new = track_of(HERE, believed=False)
+
+    def lost(slot: int, *others: OtherHand) -> bool:
+        return closed(new, 0.5, others, model=sooner, slot=slot)[0].lost
+
+    assert not lost(1, beside(False))
+    assert lost(1, beside(True)), "it is beside one that nobody asked for"
+    assert lost(0, beside(False)) and lost(1), "the first hand is not"
 
 
 def test_what_lies_on_a_watched_hand_s_forearm_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,6 @@ from torch import Tensor
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.detector.parts import FOREARM_PART, HAND_PART, THING_PART
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import SeenPoints, seen_points
@@ -318,9 +317,8 @@ def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
 
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
     """(H, 27) the likeliest hypotheses as states of a hand; at least one, where there is any."""
-    ratio = fitted.shape.hand_length_m / DEFAULT_HAND_LENGTH_M
     likely = int((detection.log_probability > math.log(_UNLIKELY)).sum())
-    return detection.first(max(1, min(count, likely))).states(ratio)
+    return detection.first(max(1, min(count, likely))).states(fitted.ratio)
 
 
 def detected_poses(

@@ -348,7 +348,8 @@ class ConfidenceModel:
 
     confidence: estimates that are right with a lower probability are flagged lost.
     believe: likewise, until a track was believed for the first time (but see WholeHand).  again: or
-        of a hand that was believed before.  second: or while another hand is believed.
+        of a hand that was believed before.  second: or of the second of two hands that are asked
+        for while the first one is believed; any hand beside another one needs at least this.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
     joint_ok: joints of an estimate that are near with a lower probability are not ok.

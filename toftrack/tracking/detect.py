@@ -89,7 +89,8 @@ def detect(
     hand: HandState, track: Track, image: DepthImage, model: TrackerModel, dt_s: float
 ) -> Detection:
     """What the pose network says where a hand is predicted."""
-    centre, up = predicted_palm(track, dt_s, model)
+    fitted = model.hand(hand.side, hand.shape)
+    centre, up = predicted_palm(track, dt_s, fitted, model)
     return model.detector.detect(image.depth_m, image.k, centre, hand.side, up)[0]
 
 
@@ -97,15 +98,18 @@ def start_detection(
     hand: HandState, track: Track, image: DepthImage, model: TrackerModel, dt_s: float
 ) -> Callable[[], Detection]:
     """The same, begun beside whatever does not need it; what is returned waits for it."""
-    centre, up = predicted_palm(track, dt_s, model)
+    fitted = model.hand(hand.side, hand.shape)
+    centre, up = predicted_palm(track, dt_s, fitted, model)
     return model.detector.start(image.depth_m, image.k, centre[0], hand.side, up[0])
 
 
-def is_elsewhere(detection: Detection, track: Track, model: TrackerModel, dt_s: float) -> bool:
+def is_elsewhere(
+    detection: Detection, hand: HandState, track: Track, model: TrackerModel, dt_s: float
+) -> bool:
     """Whether a hand was detected at another place than where a track is predicted."""
     if detection.empty:
         return False
-    centre = predicted_palm(track, dt_s, model)[0][0]
+    centre = predicted_palm(track, dt_s, model.hand(hand.side, hand.shape), model)[0][0]
     return bool(np.linalg.norm(detection.centre_m.numpy() - centre) > SAME_PLACE_M)
 
 

@@ -40,11 +40,18 @@ def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Ten
     return track.velocity * (settings.velocity * reach_s)
 
 
-def predicted_palm(track: Track, dt_s: float, model: FilterModel) -> tuple[np.ndarray, np.ndarray]:
-    """(1, 3) middle of the palm, dt_s after the last frame, and (1, 3) where its fingers point."""
+def predicted_palm(
+    track: Track, dt_s: float, hand: FittedHand, model: FilterModel
+) -> tuple[np.ndarray, np.ndarray]:
+    """(1, 3) middle of a hand's palm, dt_s after the last frame, and (1, 3) where its fingers
+    point, as long as from the wrist to there.
+
+    Poses are the more exact the nearer the crop's centre is to the middle of the palm, so that a
+    small hand's is not where a large one's would be.
+    """
     moved = predicted_motion(track, dt_s, model.filter)[None]
     particle = model.backend.motions.compose(track.mean, moved).numpy()
-    up = pivot_offset(particle[:, 3:6])
+    up = np.float32(hand.ratio) * pivot_offset(particle[:, 3:6])
     centre: np.ndarray = particle[:, :3] + up
     centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
     return centre, up

@@ -192,7 +192,7 @@ def _detected(
         return hand, best
     if not detection_due(track, model.detector.settings, dt_s):
         return hand, NO_DETECTION
-    elsewhere = is_elsewhere(best, track, model, dt_s)
+    elsewhere = is_elsewhere(best, hand, track, model, dt_s)
     if elsewhere and not _stays_watched(hand, others):
         return _left_behind(hand, model), best
     there = detect(hand, track, image, model, dt_s)
@@ -224,10 +224,12 @@ def close(
     if frame.hand.seen.believed:
         new, as_whole = model.lost.again, math.inf
     seems = whose.seems(frame.hand.side) if whose.given else 1.0
-    if any(other.believed for other in frame.others):
-        new = max(new, model.lost.second)
     # Of two hands that are asked for, the one that is followed says which one comes.
     partner = any(other.believed and not other.watched for other in frame.others)
+    if partner and frame.slot:
+        new = model.lost.second
+    elif any(other.believed for other in frame.others):
+        new = max(new, model.lost.second)
     if whose.doubtful(frame.hand.side) and not partner:
         new = as_whole = math.inf
     side = whose.probability(frame.hand.side)

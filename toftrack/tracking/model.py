@@ -16,7 +16,7 @@ from toftrack.detector.hand_detector import HandDetector
 from toftrack.estimate import no_estimate
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand import make_hand_shape
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.pose_space.data.natural_poses import natural_poses
@@ -76,6 +76,11 @@ class FittedHand:
     refiner: Refiner
     first: HandShape
     applied: tuple[float, ...]
+
+    @cached_property
+    def ratio(self) -> float:
+        """How long it is, in lengths of the mean adult's."""
+        return self.shape.hand_length_m / DEFAULT_HAND_LENGTH_M
 
     @cached_property
     def derivatives(self) -> tuple[Tensor, Tensor]:

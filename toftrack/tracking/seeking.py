@@ -87,9 +87,11 @@ def start_seeking(
         hands = [replace(hand, seeking=None) if hand.seeking else hand for hand in state.hands]
         return replace(state, hands=tuple(hands)), None
     hand, detector = state.hands[slot], model.detector
-    other = state.hands[1 - slot].track
-    assert other is not None
-    likely = partial(reachable, hand, [predicted_palm(other, dt_s, model)[0][0]])
+    other = state.hands[1 - slot]
+    assert other.track is not None
+    fitted = model.hand(other.side, other.shape)
+    palm = predicted_palm(other.track, dt_s, fitted, model)[0][0]
+    likely = partial(reachable, hand, [palm])
     if hand.seeking is not None:
         if search_is_over(hand):
             return state, None
