@@ -54,7 +54,7 @@ def test_a_wrong_value_is_refused_in_one_sentence(override: str, words: str) -> 
         ("detector.merit=-4", "lost.intercept=-1", "lost.weights.log_score=-0.5"),
         ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
         ("experiment=paper", "start.pose=[0,0,0.4,0,0,0]", "detector=none", "start=rough"),
-        ("refine=none", "detector.candidates=0", "posterior.forearm=0", "hysteresis.exchanged=0"),
+        ("refine=none", "detector.candidates=0", "posterior.overlap=0", "hysteresis.exchanged=0"),
         ("+device.anything=-1",),
         ("~device.repeat",),
         ("gestures.file=mine.csv", "device.stop=5"),

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.configured import posterior_weights, refinement
+from helpers.configured import refinement
 from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
 
@@ -240,7 +240,7 @@ def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
     detection = detection_of(torch.cat((bent(hand_at(), 2, 0.8), truth, hand_at())))
     detection = replace(detection, keypoints=detection_of(truth).keypoints)
     frame = frame_of(image_of(truth), track_of(hand_at()), detection)
-    model = replace(frame.model, weights=posterior_weights(forearm=0.0))
+    model = frame.model
     posterior = posterior_of(frame.observation, frame.fitted, detection, (), model, frame.image)
     pose, value = best_start(detection, frame.observation, frame.fitted, posterior, model)
     assert value == pytest.approx(float(posterior(pose)), abs=1e-5)

@@ -15,7 +15,6 @@ from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.overlap import RADII_MM
-from toftrack.render.forearm import arm_sight, forearm_conflict
 from toftrack.tracking.candidates import HandFrame, keypoints_of, posterior_of
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.posterior import Posterior, touching
@@ -23,7 +22,7 @@ from toftrack.tracking.posterior import Posterior, touching
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 TRUTH = hand_at()
-NONE = {"keypoints": 0.0, "overlap": 0.0, "other_hand": 0.0, "forearm": 0.0}
+NONE = {"keypoints": 0.0, "overlap": 0.0, "other_hand": 0.0}
 
 
 def poses(count: int = 24) -> torch.Tensor:
@@ -160,20 +159,13 @@ def test_each_other_hand_costs_its_own() -> None:
     np.testing.assert_allclose(both, alone, atol=1e-5)
 
 
-def test_a_forearm_that_cannot_be_costs_what_is_set() -> None:
-    seen, states = frame(), poses().numpy()
-    conflict = forearm_conflict(states[:, :3], states[:, 3:6], arm_sight(seen.observation))
-    assert 0 == conflict.min() < conflict.max()
-    np.testing.assert_allclose(added(seen, forearm=0.4), -0.4 * conflict, atol=1e-5)
-
-
-ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0, "forearm": 0.6}
+ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0}
 
 
 def test_the_named_terms_add_up_to_the_posterior() -> None:
     whole = posterior(frame(other_hand()), **ALL)
     terms = whole.named(poses())
-    assert set(terms) == {"image", "joints", "other hand 0", "forearm"}
+    assert set(terms) == {"image", "joints", "other hand 0"}
     torch.testing.assert_close(sum(terms.values()), whole(poses()))
     assert all(value.shape == (len(poses()),) and bool(value.any()) for value in terms.values())
 
@@ -187,9 +179,9 @@ def test_terms_are_independent_of_one_another() -> None:
 @pytest.mark.parametrize(
     ("names", "left"),
     [
-        (("forearm",), {"joints", "other hand 0"}),
-        (("other_hand",), {"joints", "forearm"}),
-        (("keypoints", "overlap"), {"other hand 0", "forearm"}),
+        (("keypoints",), {"joints", "other hand 0"}),
+        (("other_hand",), {"joints"}),
+        (("keypoints", "overlap"), {"other hand 0"}),
         (tuple(ALL), set()),
     ],
 )

@@ -222,7 +222,7 @@ def test_a_mirrored_sequence_of_a_left_hand_gives_the_same_error(default: Run) -
         ("filter.exponent=0", "filter.exponent=0 is not possible; give a number above 0"),
         ("filter.spread.latent=-0.1", "filter.spread.latent=-0.1 is not possible"),
         ("filter.spread.depth_m=far", "filter.spread.depth_m=far is not possible"),
-        ("posterior.forearm=-1", "posterior.forearm=-1 is not possible"),
+        ("posterior.overlap=-1", "posterior.overlap=-1 is not possible"),
         ("lost.believe=60", "lost.believe=60 is not possible; give a number of at least 0 and at"),
         ("lost.patience=-1", "lost.patience=-1 is not possible"),
         ("hand.adapt.alike=2", "hand.adapt.alike=2 is not possible"),

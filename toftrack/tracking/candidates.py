@@ -23,13 +23,11 @@ from toftrack.detector.parts import FOREARM_PART, HAND_PART, THING_PART
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import SeenPoints, seen_points
-from toftrack.render.forearm import arm_sight
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import log_odds, out_of_sight
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
 from toftrack.tracking.posterior import (
-    ForearmTerm,
     ImageTerm,
     JointsTerm,
     OtherHandTerm,
@@ -152,7 +150,6 @@ class FilteredFrame:
             frame.others,
             frame.model,
             frame.image,
-            forearm=_is_elsewhere(detection, pose, frame),
         )
         keypoints = keypoints_of(detection, frame.model)
         seen = seen_points(frame.observation)
@@ -260,13 +257,11 @@ def posterior_of(
     others: Sequence[OtherHand],
     model: TrackerModel,
     image: ImageTerm,
-    forearm: bool = True,
     keypoints: float | None = None,
 ) -> Posterior:
     """The posterior of one hand in one frame; terms of weight 0 are left out.
 
     keypoints: the weight of these, instead of the posterior's own.
-    forearm: whether poses of different places are compared. Those of one place share a forearm.
     """
     weights, terms = model.weights, dict[str, Term]()
     keypoints = weights.keypoints if keypoints is None else keypoints
@@ -285,8 +280,6 @@ def posterior_of(
             f"other hand {n}": OtherHandTerm(joints, weights.other_hand)
             for n, joints in enumerate(touched)
         }
-    if weights.forearm and forearm:
-        terms["forearm"] = ForearmTerm(arm_sight(observation), weights.forearm)
     return Posterior(image, fitted.refiner.joints, terms)
 
 
@@ -298,14 +291,6 @@ def _emerges(detection: Detection, frame: HandFrame) -> bool:
     away = [float((other.joints_m - joints).norm(dim=1).mean()) for other in frame.others]
     in_sight = sum(frame.joints_out_of_sight(joints)) <= _UNSEEN
     return in_sight and all(one > _APART_M for one in away)
-
-
-def _is_elsewhere(detection: Detection, pose: Tensor, frame: HandFrame) -> bool:
-    """Whether a hypothesis of the detector is of another place than a hand (1, 27)."""
-    settings, joints = frame.model.detector.settings, frame.fitted.refiner.joints(pose)[0]
-    away = detection.joints_m[: settings.candidates].numpy() - joints.numpy()
-    mean = np.sqrt(np.square(away).sum(-1)).mean(-1)
-    return bool((mean >= frame.model.hysteresis.place_m).any())
 
 
 def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:

@@ -1,6 +1,6 @@
 """The posterior of a hand's pose: one definition for all who compare poses.
 
-    log p(pose | frame) = image + keypoints + overlap + other hand + forearm  (up to a constant)
+    log p(pose | frame) = image + keypoints + overlap + other hand  (up to a constant)
 
 A start, the candidates of a frame, exchanged fingers and the two sides of a hand are compared by
 it; the particle filter weighs its particles by the image alone, sharpened. Each term is a small
@@ -18,7 +18,6 @@ from torch import Tensor
 from toftrack.checks import check_number
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.render.forearm import ArmSight, forearm_conflict
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer
 
@@ -35,7 +34,6 @@ class PosteriorWeights:
     keypoints: float
     overlap: float
     other_hand: float
-    forearm: float
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -104,20 +102,6 @@ class OtherHandTerm:
     def __call__(self, poses: Tensor, joints_m: Tensor) -> Tensor:
         """See Term."""
         return -self.weight * touching(joints_m, self.other_m)
-
-
-@dataclass(frozen=True, eq=False)
-class ForearmTerm:
-    """A forearm where the image shows the background; see render/forearm.py."""
-
-    sight: ArmSight
-    weight: float
-
-    def __call__(self, poses: Tensor, joints_m: Tensor) -> Tensor:
-        """See Term."""
-        wrists = poses.numpy()
-        conflict = forearm_conflict(wrists[:, :3], wrists[:, 3:6], self.sight)
-        return torch.from_numpy(-self.weight * conflict)
 
 
 @dataclass(frozen=True, eq=False)
