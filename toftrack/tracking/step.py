@@ -311,21 +311,24 @@ def reconciled(
     """What a step returns; of two hands each in its slot, and vacant where none is followed."""
     hands = list(before.hands)
     infos: list[StepInfo | None] = [None] * len(hands)
-    estimates = [unseen(hand, before.watched, image, model) for hand in hands]
+    told: dict[int, Estimate] = {}
     for slot, hand, info, estimate in found:
-        hands[slot], estimates[slot] = hand, estimate
+        hands[slot], told[slot] = hand, estimate
         infos[slot] = replace(info, seconds=spans.seconds())
     second_s = since_search(before, [slot for slot, _, _, _ in found])
     after = replace(before, hands=tuple(hands), second_s=second_s)
     after, exchanged = reconcile(before, after, partial(_found_hand, model), dt_s)
     if before.watched:
         after = watched_over(after, model.configured.handedness)
-        first = first_estimate(estimates[0], after)
-        return after, tuple(infos[:1]), (first,)
+        first = told[0] if 0 in told else unseen(before.hands[0], image, model)
+        return after, tuple(infos[:1]), (first_estimate(first, after),)
+    slots = list(range(len(hands)))
     if exchanged:
-        infos, estimates = infos[::-1], estimates[::-1]
-    both = zip(after.hands, estimates, strict=True)
-    estimates = [vacant(image, model) if hand.track is None else one for hand, one in both]
+        infos, slots = infos[::-1], slots[::-1]
+    estimates = [
+        vacant(image, model) if hand.track is None or slot not in told else told[slot]
+        for slot, hand in zip(slots, after.hands, strict=True)
+    ]
     return after, tuple(infos), tuple(estimates)
 
 
@@ -401,10 +404,8 @@ def no_hand(absence: Absence, image: DepthImage, model: FilterModel) -> Conclude
     return absence.slot, replace(hand, gesture=gesture), info, _sided(estimate, hand)
 
 
-def unseen(hand: HandState, watched: bool, image: DepthImage, model: FilterModel) -> Estimate:
-    """The estimate of a slot that takes no part in a frame."""
-    if not watched:
-        return vacant(image, model)
+def unseen(hand: HandState, image: DepthImage, model: FilterModel) -> Estimate:
+    """The estimate of the hand that is asked for, of a frame in which it is not."""
     estimate = lost_estimate(hand.last, image.index, image.timestamp_s, math.nan)
     return _sided(tell_gesture(model.gestures, None, estimate, model.space)[1], hand)
 
