@@ -1,9 +1,9 @@
 """Before the first frame: kernels that were never compiled here are, by two processes at once.
 
 numba compiles one kernel after the other in a process, and keeps the code on the disk for all. The
-second process compiles the refinement's kernel, the largest one, and two small ones; the first
-process all others. What only some recordings need (the median of large images, handedness) is
-compiled when they do.
+second process compiles what poses a single hand (refinement, decoding, penalty, OpenXR), whose
+kernels have functions in common; the first process all others, which takes as long. What only some
+recordings need (the median of large images, handedness) is compiled when they do.
 """
 
 from __future__ import annotations
@@ -49,13 +49,12 @@ def ready_tracker(config: DictConfig) -> HandsTracker:
 
 def _compile_here(model: FilterModel) -> None:
     """What the second process leaves, the largest kernel first."""
-    from toftrack.detector.proposals_numba import compile_crops, compile_decoding
+    from toftrack.detector.proposals_numba import compile_crops
     from toftrack.refinement.seen_points_numba import nearest_of_labels, smooth_points
     from toftrack.render.numba.bands import evidence_images
     from toftrack.tracking.confidence_numba import count_out_of_sight, seen_around
 
     model.backend.make_scorer(model.configured.shape)
-    compile_decoding()
     compile_crops()
     pixel, hand = np.ones((1, 1), np.float32), np.ones((1, 1), bool)
     smooth_points(pixel, hand, (0, 0), np.eye(3, dtype=np.float32), 1.0, 1.0)
@@ -110,17 +109,19 @@ def _compile_beside() -> None:
     for standard in (1, 2):
         os.dup2(nowhere, standard)
     with small_operations():
-        compile_refinement()
+        compile_poses()
 
 
-def compile_refinement() -> None:
-    """The refinement's kernel and two small ones, so that both processes have as much to do."""
+def compile_poses() -> None:
+    """The kernels that pose a single hand, the largest one first."""
+    from toftrack.detector.proposals_numba import compile_decoding
     from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
     from toftrack.refinement.penalty_numba import joints_penalty
 
     shape = default_hand_shape()
     CompiledRefiner(shape)
+    compile_decoding()
     joints = forward_kinematics(torch.zeros(1, 27), shape).joints_m
     joints_penalty(joints, shape.hand_length_m, 1.0, None, 0.0)
     openxr_hand_compiled(joints[0].numpy(), np.zeros(27), openxr_rig(shape))
