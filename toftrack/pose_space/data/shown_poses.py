@@ -1,6 +1,6 @@
 """Poses that people show a camera or pass through, to train the detector on.
 
-KINDS and SHOWN say how often each is drawn; docs/lab/detector.md has them as a table. Poses of
+KINDS and SHOWN say how often each is drawn; docs/detector.md has them as a table. Poses of
 hands that hold things follow from the things: detector/grasps.py. The tracker's own set of natural
 poses (natural_poses.py) is another one and stays as it is.
 """
