@@ -50,7 +50,7 @@ def model_of(**changes: object) -> ConfidenceModel:
         "confidence": 0.5,
         "give_up": 0.1,
         "patience": 5,
-        "whole": WholeHand(0.0, 1.0, 0.0, {}),
+        "whole": WholeHand(0.0, 0.0, 0.0, 1.0, 0.0, {}),
     }
     return confidence_model(**(usual | numbers | changes))
 
@@ -167,7 +167,7 @@ def test_joints_out_of_sight_are_counted() -> None:
 
 
 def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:
-    whole = WholeHand(0.5, 1.0, 3.0, {"other_side": -2.0})
+    whole = WholeHand(0.5, 0.5, 0.0, 1.0, 3.0, {"other_side": -2.0})
     model = model_of(whole=whole)
     for other_side, lost in ((0.0, False), (1.4, False), (1.6, True)):
         found = judge(
@@ -176,13 +176,13 @@ def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are(
         assert found.lost == lost and found.whole_odds == pytest.approx(3.0 - 2.0 * other_side)
         assert found.confidence == pytest.approx(1 / (1 + math.exp(-4.0)))
     with pytest.raises(ToftrackError, match="lost.whole.weights.luck is unknown"):
-        WholeHand(0.5, 1.0, 0.0, {"luck": 1.0})
+        WholeHand(0.5, 0.5, 0.0, 1.0, 0.0, {"luck": 1.0})
     with pytest.raises(ToftrackError, match=r"lost\.whole\.least"):
-        WholeHand(1.5, 1.0, 0.0, {})
+        WholeHand(1.5, 0.5, 0.0, 1.0, 0.0, {})
 
 
 def test_odds_of_the_whole_hand_are_smoothed_like_the_others() -> None:
-    model = model_of(whole=WholeHand(0.0, 1.0, 0.0, {"other_side": -1.0}), memory=0.75)
+    model = model_of(whole=WholeHand(0.0, 0.0, 0.0, 1.0, 0.0, {"other_side": -1.0}), memory=0.75)
     track = replace(followed(), whole_odds=4.0)
     found = judge(track, with_odds(0.0, other_side=0.0), FRAME_S, 1.0, 0.0, 1.0, model)
     assert found.whole_odds == pytest.approx(3.0)

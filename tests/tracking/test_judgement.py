@@ -48,7 +48,7 @@ def image() -> DepthImage:
 
 
 LOST = confidence_model(memory=0.0, confidence=0.3, believe=0.6, second=0.8, give_up=0.1)
-WHOLE = WholeHand(0.0, 1.0, 0.0, {})
+WHOLE = WholeHand(0.0, 0.0, 0.0, 1.0, 0.0, {})
 PLAIN = replace(LOST, intercept=0.0, weights={"log_score": 1.0}, patience=5, whole=WHOLE)
 """Log odds are just the feature log_score."""
 HIDDEN = {"hidden": 0.5}
@@ -213,7 +213,7 @@ def test_a_track_is_believed_once_and_doubted_while_it_is_lost(
 def believed_as(probability: float, as_whole: float, seen: LastSeen = NOWHERE) -> bool:
     """Whether a new hand is believed that is right, and right as a whole, so probably."""
     odds = math.log(as_whole / (1 - as_whole))
-    whole = WholeHand(0.0, 0.9, 0.0, {"other_side": odds})
+    whole = WholeHand(0.0, 0.0, 0.0, 0.9, 0.0, {"other_side": odds})
     return not closed(
         track_of(HERE, believed=False),
         probability,
@@ -236,6 +236,19 @@ def test_one_that_was_believed_before_is_believed_sooner_but_not_one_that_was_on
     before = LastSeen(track_of(HERE).mean, 1.0)
     assert believed_as(between, 0.5, before)
     assert not believed_as(between, 0.5, replace(before, surest=-math.inf))
+
+
+@pytest.mark.parametrize(
+    ("flagged_s", "believed", "lost"), [(0.0, True, False), (0.5, True, True), (0.5, False, False)]
+)
+def test_after_a_hand_was_flagged_for_long_it_must_be_surer_as_a_whole(
+    flagged_s: float, believed: bool, lost: bool
+) -> None:
+    whole = WholeHand(0.5, 0.9, 0.4, 1.0, math.log(0.8 / 0.2), {})
+    track = track_of(HERE, believed=believed, flagged_s=flagged_s, doubted=flagged_s > 0)
+    status, after, _ = closed(track, 0.95, model=replace(PLAIN, whole=whole))
+    assert status.lost == lost
+    assert after.flagged_s == pytest.approx(flagged_s + FRAME_S if lost else 0.0)
 
 
 def beside(watched: bool) -> OtherHand:

@@ -107,6 +107,8 @@ def main(arguments: list[str] | None = None) -> None:
         "whole: # whether the hand as a whole is right: its mean joint error is below 40 mm",
         "  _target_: toftrack.tracking.confidence.WholeHand",
         f"  least: {settings.whole.least} # not fitted: what stands there may stay",
+        f"  again: {settings.whole.again} # likewise",
+        f"  after_s: {settings.whole.after_s} # likewise",
         f"  believe: {settings.whole.believe} # likewise",
         *("  " + line for line in whole_lines),
     ]

@@ -321,18 +321,24 @@ class WholeHand:
     same, but for that joint (`joint_ok`). A hand taken for another one, or turned round, is not.
 
     least: estimates that are right as a whole with a lower probability are flagged lost.
+    again: likewise after the hand was flagged for `after_s`, until one is not: a wrong pose that
+        has lasted is confirmed by a network that is asked about where it is.
     believe: a new hand that is right as a whole with this probability is believed, whatever the
         confidence: of a hand that holds a thing a joint is often far off.
     intercept, weights: of the features, by name.
     """
 
     least: float
+    again: float
+    after_s: float
     believe: float
     intercept: float
     weights: Mapping[str, float]
 
     def __post_init__(self) -> None:
         check_number("lost.whole.least", self.least, 0, 1)
+        check_number("lost.whole.again", self.again, 0, 1)
+        check_number("lost.whole.after_s", self.after_s, 0)
         check_number("lost.whole.believe", self.believe, 0, 1)
         _ = self.log_odds
 

@@ -259,6 +259,7 @@ def close(
         whole_odds=status.whole_odds,
         surest=max(track.surest, status.log_odds),
         doubted=status.lost,
+        flagged_s=track.flagged_s + dt_s if status.lost else 0.0,
         believed=track.believed or not status.lost,
         unseen_s=track.unseen_s + dt_s if frame.detection.empty else 0.0,
         features=features,
@@ -301,7 +302,9 @@ def judge(
     # Whether it is a hand at all does not depend on whose it is.
     probable = _probability(whole)
     believed = track.believed or confidence >= new or probable >= as_whole
-    lost = not believed or side * confidence < model.confidence or probable < model.whole.least
+    long = track.believed and track.flagged_s >= model.whole.after_s
+    least = model.whole.again if long else model.whole.least
+    lost = not believed or side * confidence < model.confidence or probable < least
     name = _state_name(features) if lost else "tracking"
     return Status(name, lost, ends, side * confidence, smooth, whole, doubtful)
 

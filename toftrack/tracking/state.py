@@ -42,6 +42,7 @@ class Track:
         below 40 mm, likewise.
     surest: the highest log odds so far.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
+    flagged_s: for how long estimates have been flagged without a break.
     unseen_s: how long ago the pose network was asked about it.
     features, joint_features: of the last estimate, (21, J); see confidence.py.
     nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
@@ -64,6 +65,7 @@ class Track:
     whole_odds: float = 0.0
     surest: float = -math.inf
     doubted: bool = False
+    flagged_s: float = 0.0
     believed: bool = False
     unseen_s: float = 0.0
     features: ConfidenceFeatures = NO_FEATURES

@@ -241,7 +241,8 @@ def conclude(
     pose, trend = choice.pose, track.trend
     if choice.moved:
         begun = new_track(pose, model, model.refinement.carry)
-        track, trend = replace(begun, believed=track.believed), begun.trend
+        track = replace(begun, believed=track.believed, flagged_s=track.flagged_s)
+        trend = begun.trend
     elif model.refinement.iterations:
         steadying, motions = model.refinement.steadying, model.backend.motions
         pose, trend = steadied(pose, track.pose, trend, dt_s, steadying, motions)
