@@ -312,22 +312,22 @@ def reconciled(
     """What a step returns; of two hands each in its slot, and vacant where none is followed."""
     hands = list(before.hands)
     infos: list[StepInfo | None] = [None] * len(hands)
-    told: dict[int, Estimate] = {}
+    seen: dict[int, Estimate] = {}
     for slot, hand, info, estimate in found:
-        hands[slot], told[slot] = hand, estimate
+        hands[slot], seen[slot] = hand, estimate
         infos[slot] = replace(info, seconds=spans.seconds())
     second_s = since_search(before, [slot for slot, _, _, _ in found])
     after = replace(before, hands=tuple(hands), second_s=second_s)
     after, exchanged = reconcile(before, after, partial(_found_hand, model), dt_s)
     if before.watched:
         after = watched_over(after, model.configured.handedness)
-        first = told[0] if 0 in told else unseen(before.hands[0], image, model)
+        first = seen[0] if 0 in seen else unseen(before.hands[0], image, model)
         return after, tuple(infos[:1]), (first_estimate(first, after),)
     slots = list(range(len(hands)))
     if exchanged:
         infos, slots = infos[::-1], slots[::-1]
     estimates = [
-        vacant(image, model) if hand.track is None or slot not in told else told[slot]
+        vacant(image, model) if hand.track is None or slot not in seen else seen[slot]
         for slot, hand in zip(slots, after.hands, strict=True)
     ]
     return after, tuple(infos), tuple(estimates)
