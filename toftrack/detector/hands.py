@@ -29,7 +29,7 @@ BACKGROUND, HAND, FOREARM, OTHER_FOREARM, OTHER_HAND, THING = range(6)
 FRONT, HEAD, ABOVE = range(3)
 """Where a camera is: before the person, on the head, above a table."""
 VIEW_SHARES = (0.68, 0.17, 0.15)
-HOLDING = 0.45
+HOLDING = 0.58
 """How many hands hold a thing, or try to."""
 FOREARM_PIECES = 6
 """Ellipsoids of a forearm, the last one a cuff over the back of the hand."""

@@ -43,7 +43,16 @@ _WHOLE = math.ceil(_SAMPLES * 2**0.5) + 1
 """Pixels of a picture of which a turned crop is read."""
 NEW_HANDS = 0.25
 """How many crops are as of new hands: as the camera is held, and less well centred."""
-_DIRECTION = 0.25
+_LEFT = 0.1
+"""How many hands are left ones, of which the network learns that they are, and where, but no pose."""
+_WRONG = 0.2
+"""How many hands that are followed are followed with a wrong pose, so that the crop is off."""
+_CENTRE_M = 0.009, 0.030
+"""By how much the middle of a crop of a hand that is followed is off along each axis: where its pose
+is right, and where it is wrong. Of right poses of recordings 90 % are off by less than 12 mm."""
+_NEW_CENTRE_M = 0.014, 0.036
+"""The same of new hands, half of which the finder placed well."""
+_DIRECTION = 0.15, 0.4
 """By how much it is uncertain where the fingers of a hand point that is followed, of 1 m."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
@@ -103,13 +112,15 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     distance = dice.uniform(n, low=math.log(0.27), high=math.log(1.1)).exp()
     centre = torch.stack((torch.zeros(n), torch.zeros(n), distance), 1)
     known = ~dice.chance(NEW_HANDS, n)
-    far = dice.chance(torch.where(known, 0.15, 0.5), n)
-    near = torch.where(far, 0.036, 0.014)[:, None] * dice.normal(n, 3)
+    off = dice.chance(torch.where(known, _WRONG, 0.5), n)
+    spread = torch.where(off, _CENTRE_M[1], _CENTRE_M[0])
+    spread = torch.where(known, spread, torch.where(off, _NEW_CENTRE_M[1], _NEW_CENTRE_M[0]))
+    near = spread[:, None] * dice.normal(n, 3)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.13, high=0.30)
     present = ~dice.chance(0.18, n)
     pivot = centre + torch.where(present[:, None], near.clamp(-0.09, 0.09), away)
-    left = dice.chance(0.25, n)
+    left = dice.chance(_LEFT, n)
     views = random_views(n, dice)
     hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
     labels = hands.labels.clone()
@@ -126,7 +137,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     scenes = moved(scenes, torch.where(gone[:, None], onto, 0.0))
     scenes = _with_furniture(scenes, centre, gone & ~alone, dice)
 
-    turned = torch.where(known, _upright_angles(hands, dice), 0.0)
+    turned = torch.where(known, _upright_angles(hands, off, dice), 0.0)
     pixels = (CROP_M / distance) * dice.uniform(n, low=math.log(110.0), high=math.log(600.0)).exp()
     side = pixels.round().clamp(36, _SAMPLES)
     whole = (side * (turned.cos().abs() + turned.sin().abs())).ceil()
@@ -159,12 +170,14 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     )
 
 
-def _upright_angles(hands: Hands, dice: Dice) -> Tensor:
+def _upright_angles(hands: Hands, wrong: Tensor, dice: Dice) -> Tensor:
     """(N,) turns of crops in which the fingers point up, as far as a tracker knows where they do:
-    well where they lie across, hardly where they point at the camera or away.
+    well where they lie across, hardly where they point at the camera or away, or where its pose is
+    wrong (N,).
     """
     up = hands.joints_m[:, 9] - hands.joints_m[:, 0]
-    up = torch.nn.functional.normalize(up, dim=1) + _DIRECTION * dice.normal(len(up), 3)
+    uncertain = torch.where(wrong, _DIRECTION[1], _DIRECTION[0])[:, None]
+    up = torch.nn.functional.normalize(up, dim=1) + uncertain * dice.normal(len(up), 3)
     return torch.atan2(up[:, 0], -up[:, 1])
 
 

@@ -21,15 +21,15 @@ from toftrack.detector.dice import Dice
 from toftrack.detector.hands import THING
 from toftrack.detector.scenes import Scenes
 from toftrack.detector.skin import PRIMITIVE
-from toftrack.detector.skin_numba import TILE, draw_skin
-from toftrack.detector.things_numba import draw_part
+from toftrack.detector.skin_numba import draw_skin
+from toftrack.detector.things_numba import TILE, draw_part
 
 _entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
     NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE,
 ) = range(12)  # fmt: skip
 SENSOR_TERMS = 12
-_ONE_SURFACE_M = 0.03
+_ONE_SURFACE_M = np.float32(0.03)
 """A camera's filter smooths over steps of less than this."""
 
 
@@ -186,29 +186,32 @@ def _draw(centre, axes, whiten, label, lens, depth, labels):
 
 
 @compiled
-def _smooth(reach, width, height, depth, scratch):
-    """Each reading becomes the mean of those about it that lie on the same surface."""
+def _smooth(reach, width, height, depth, scratch, total, count):
+    """Each reading becomes the mean of those about it that lie on the same surface; scratch: (H, W),
+    total and count: (W,), to work in. Along rows, so that the arithmetic is vectorised.
+    """
     for v in range(height):
         for u in range(width):
             scratch[v, u] = depth[v, u]
     for v in range(height):
         for u in range(width):
-            z = scratch[v, u]
-            if z <= 0:
-                continue
-            total, count = np.float32(0), 0
-            for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
-                for u2 in range(max(u - reach, 0), min(u + reach, width - 1) + 1):
-                    other = scratch[v2, u2]
-                    if other > 0 and abs(other - z) < _ONE_SURFACE_M:
-                        total += other
-                        count += 1
-            depth[v, u] = total / count
+            total[u] = np.float32(0)
+            count[u] = np.float32(0)
+        for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
+            for shift in range(-reach, reach + 1):
+                for u in range(max(-shift, 0), width - max(shift, 0)):
+                    other = scratch[v2, u + shift]
+                    near = (other > 0) & (abs(other - scratch[v, u]) < _ONE_SURFACE_M)
+                    total[u] += other if near else np.float32(0)
+                    count[u] += np.float32(1) if near else np.float32(0)
+        for u in range(width):
+            if scratch[v, u] > 0:
+                depth[v, u] = total[u] / count[u]
 
 
 @compiled
-def _sense(sensor, lens, state, depth, labels, clean, scratch):
-    """What a sensor makes of a picture: `depth` in place, from `clean`."""
+def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
+    """What a sensor makes of a picture: `depth` in place, from `clean`; rows: (2, W) to work in."""
     width, height = int(lens[3]), int(lens[4])
     blur, flying = sensor[BLUR] > 0, sensor[FLYING]
     shadow = int(sensor[SHADOW])
@@ -237,7 +240,7 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch):
                 z = math.floor(z / step + 0.5) * step
             depth[v, u] = max(z, 0.0)
     if sensor[SMOOTH] > 0:
-        _smooth(int(sensor[SMOOTH]), width, height, depth, scratch)
+        _smooth(int(sensor[SMOOTH]), width, height, depth, scratch, rows[0], rows[1])
     if sensor[COARSE] > 0:
         for v in range(height):
             for u in range(width):
@@ -286,6 +289,7 @@ def _take(
     six = np.empty((6, TILE * TILE), np.float32)
     rays = six[0], six[1], six[2], six[3], six[4], six[5]
     clean, scratch = np.zeros(depth.shape[1:], np.float32), np.empty(depth.shape[1:], np.float32)
+    rows = np.empty((2, depth.shape[2]), np.float32)
     for n in range(len(depth)):
         lens = lenses[n]
         state[0] = seeds[n]
@@ -324,4 +328,4 @@ def _take(
                 near,
                 rays,
             )
-        _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch)
+        _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch, rows)

@@ -13,11 +13,8 @@ import math
 import numpy as np
 
 from toftrack.compute.compiling import compiled
-from toftrack.detector.things_numba import ball_box
+from toftrack.detector.things_numba import CORNER, MIDDLE, TILE, ball_box
 
-TILE = 4
-_MIDDLE, _CORNER = np.float32(1.5), np.float32(2.13)
-"""Of a tile, pixels: its side, middle, and how far a corner is from that."""
 _STEPS = 12
 _NEAR_M = np.float32(0.001)
 """A ray that is so near has met the skin."""
@@ -97,11 +94,11 @@ def draw_skin(
         if counts[tile] > 0:
             top, left = tile // columns * TILE, tile % columns * TILE
             x, y = (
-                (np.float32(left) + _MIDDLE - lens[1]) / f,
-                (np.float32(top) + _MIDDLE - lens[2]) / f,
+                (np.float32(left) + MIDDLE - lens[1]) / f,
+                (np.float32(top) + MIDDLE - lens[2]) / f,
             )
             here = lists[tile, : counts[tile]]
-            apart = _CORNER / f
+            apart = CORNER / f
             count, first, last = _met_balls(balls, here, on, x, y, apart)
             if count == 0:
                 continue
