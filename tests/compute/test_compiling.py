@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 from numba.core.extending import _Intrinsic
@@ -72,3 +74,21 @@ def test_a_change_in_any_file_that_a_kernel_is_made_of_compiles_it_anew() -> Non
     for kernel, sources in kernels.items():
         files = {str(Path(inspect.getfile(part)).resolve()) for part in _made_of(kernel, set())}
         assert files <= sources, f"{kernel.__qualname__} is also made of {files - sources}"
+
+
+@pytest.mark.parametrize("shape", [5, (3, 4), (2, 0, 3)])
+@pytest.mark.parametrize("dtype", [np.float32, np.int64, np.uint8])
+def test_a_kernel_s_arrays_are_numpy_s_also_where_numba_lacks_what_makes_them_quickly(
+    shape: int | tuple[int, ...], dtype: type
+) -> None:
+    def made(empty: Callable, zeros: Callable) -> tuple[np.ndarray, np.ndarray]:
+        return numba.njit(lambda size: (empty(size, dtype), zeros(size, dtype)))(shape)
+
+    expected = np.zeros(shape, dtype)
+    for empty, zeros in (
+        made(compiling.empty, compiling.zeros),
+        made(compiling.plain_empty, compiling.plain_zeros),
+    ):
+        assert empty.shape == expected.shape and empty.dtype == expected.dtype
+        assert empty.flags.c_contiguous and zeros.flags.c_contiguous
+        np.testing.assert_array_equal(zeros, expected)

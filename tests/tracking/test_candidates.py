@@ -168,6 +168,17 @@ def test_a_hand_mostly_out_of_sight_is_not_compared_with_the_detector() -> None:
     assert len(table_of(far).of_source(Source.DETECTOR)) == 0
 
 
+def test_a_hand_that_comes_into_the_image_is_compared_with_it_until_it_is_believed() -> None:
+    detection = detection_of(bent(hand_at(0.35), 0, 0.4))
+    coming = filtered(0.35, believed=False)
+    assert not coming.detection.empty and len(table_of(coming).of_source(Source.DETECTOR))
+    assert filtered(0.35, believed=True).detection.empty
+    unsure, elsewhere = replace(detection, present=0.5), detection_of(hand_at(0.1))
+    for other in (unsure, elsewhere):
+        assert filtered(0.35, believed=False, detection=other).detection.empty
+    assert filtered(0.0, believed=False, covered=True).detection.empty, "something hides it"
+
+
 def test_fingers_are_exchanged_from_the_second_round_on_only() -> None:
     for hand in (filtered(-0.1, 1, exchanged=64), filtered(0.1, 2, exchanged=64)):
         table = table_of(hand)

@@ -210,13 +210,30 @@ def test_what_is_expected_of_a_hand_that_is_not_tracked_yet() -> None:
 
 def searched(found: list[Detection], any_side: bool = False, **changes: object) -> Detection:
     model = model_with(FixedDetector(found), any_side)
-    return search(slot_of(None, model, **changes), IMAGE, (), model)
+    return search(slot_of(None, model, **changes), IMAGE, (), model).best
 
 
 def test_the_best_of_all_places_is_taken() -> None:
     hands = [detection_of(hand_at(0.1)), detection_of(hand_at(-0.1, z=0.3))]
     assert searched(hands) is hands[0]
     assert searched([]).empty
+
+
+def test_the_likeliest_place_is_guessed_where_there_is_no_hand() -> None:
+    def place(x: float, heat: float, merit: float) -> Detection:
+        return replace(detection_of(hand_at(x)), heat=heat, merit=merit)
+
+    likely, likelier = place(0.1, 0.3, -9.0), place(-0.1, 0.4, -12.0)
+    unlikely, impossible = place(0.0, 0.1, -8.0), place(0.0, 0.9, -math.inf)
+    model = model_with(FixedDetector([likely, likelier, unlikely, impossible]))
+    found = search(slot_of(None, model), IMAGE, (), model)
+    assert found.best.empty and found.guess is likelier
+    model = model_with(FixedDetector([likely, place(0.2, 0.3, -1.0)]))
+    found = search(slot_of(None, model), IMAGE, (), model)
+    assert not found.best.empty and found.guess.empty
+    model = model_with(FixedDetector([unlikely, impossible]))
+    found = search(slot_of(None, model), IMAGE, (), model)
+    assert found.best.empty and found.guess.empty
 
 
 def test_a_hand_that_nobody_described_is_the_one_that_is_held_out() -> None:
@@ -237,10 +254,10 @@ def test_the_hand_that_is_held_out_is_found_whichever_side_it_is_of() -> None:
 
     detector = OneOfEachSide([near])
     model = model_with(detector, any_side=True)
-    assert search(slot_of(None, model), IMAGE, (), model) is not far
+    assert search(slot_of(None, model), IMAGE, (), model).best is not far
     np.testing.assert_allclose(detector.centres_m[0][0], near.centre_m.numpy(), atol=1e-6)
     given = model_with(detector, any_side=False)
-    assert search(slot_of(None, given), IMAGE, (), given) is far, "its side was given"
+    assert search(slot_of(None, given), IMAGE, (), given).best is far, "its side was given"
 
 
 def test_where_no_hand_of_a_side_is_found_one_of_the_other_side_may_be_it() -> None:
@@ -252,7 +269,7 @@ def test_where_no_hand_of_a_side_is_found_one_of_the_other_side_may_be_it() -> N
     for any_side, sides in ((True, ["right", "left"]), (False, ["right"])):
         detector = LeftHands([detection_of(hand_at(0.1), side="left")])
         model = model_with(detector, any_side)
-        found = search(slot_of(None, model), IMAGE, (), model)
+        found = search(slot_of(None, model), IMAGE, (), model).best
         assert detector.searched == sides and found.empty == (not any_side)
     assert len(detector.centres_m) == 0
 

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.compiler_lock import global_compiler_lock
-from numba.extending import intrinsic
-from numba.np.arrayobj import _empty_nd_impl, _parse_shape
+from numba.extending import intrinsic, register_jitable
+from numba.np import arrayobj
 
 from toftrack.compute.kernel_cache import KernelCache, can_be_kept
 from toftrack.compute.quick_typing import quick_typing
@@ -69,18 +70,13 @@ def take(typingctx, counter):
 
 
 @intrinsic
-def empty(typingctx, shape, dtype):
-    """np.empty of a shape, a number or a tuple.
-
-    numba compiles a function, and the texts of its errors, for each type of np.empty and np.zeros:
-    together with assignments of arrays to slices, a sixth of what all kernels take. Kernels
-    therefore use these two, and copy numbers in loops.
-    """
+def _quick_empty(typingctx, shape, dtype):
+    """np.empty of a shape, a number or a tuple."""
     return _array_type(shape, dtype)(shape, dtype), _make_array
 
 
 @intrinsic
-def zeros(typingctx, shape, dtype):
+def _quick_zeros(typingctx, shape, dtype):
     """np.zeros, likewise."""
 
     def codegen(context, builder, signature, args):
@@ -99,8 +95,29 @@ def _array_type(shape, dtype):
 
 
 def _make_array(context, builder, signature, args):
-    lengths = _parse_shape(context, builder, signature.args[0], args[0])
-    return _empty_nd_impl(context, builder, signature.return_type, lengths)._getvalue()
+    lengths = arrayobj._parse_shape(context, builder, signature.args[0], args[0])
+    return arrayobj._empty_nd_impl(context, builder, signature.return_type, lengths)._getvalue()
+
+
+@register_jitable
+def plain_empty(shape, dtype):
+    """The same by numba's own np.empty."""
+    return np.empty(shape, dtype)
+
+
+@register_jitable
+def plain_zeros(shape, dtype):
+    """Likewise."""
+    return np.zeros(shape, dtype)
+
+
+_is_quick = hasattr(arrayobj, "_parse_shape") and hasattr(arrayobj, "_empty_nd_impl")
+empty: Any = _quick_empty if _is_quick else plain_empty
+zeros: Any = _quick_zeros if _is_quick else plain_zeros
+"""What kernels use instead of np.empty and np.zeros, and they copy numbers in loops: numba compiles
+a function, and the texts of its errors, for each type of these and of each assignment of an array
+to a slice, a sixth of what all kernels take. Where numba lacks what this needs, they are its
+own."""
 
 
 @contextmanager

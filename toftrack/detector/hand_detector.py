@@ -67,6 +67,8 @@ class Detection:
     keypoints: the joints, each with its standard deviation.
     present, right_side: probabilities that there is a hand, and that it is of the side looked for.
     parts: which of the pixels are the hand, and which a thing's that it holds.
+    heat, merit: of a place of a search, the finder's probability, and how much speaks for a hand
+        there with all that is known, log scale.
     """
 
     pivot_m: Tensor
@@ -80,6 +82,8 @@ class Detection:
     present: float
     right_side: float
     parts: Parts = ALL_HAND
+    heat: float = 1.0
+    merit: float = math.inf
 
     def states(self, ratio: float) -> Tensor:
         """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
@@ -113,18 +117,15 @@ class Detection:
     def first(self, count: int) -> Detection:
         """With only so many hypotheses."""
         kept = slice(None, count)
-        return Detection(
-            self.pivot_m[kept],
-            self.rotvec[kept],
-            self.angles[kept],
-            self.joints_m[kept],
-            self.log_size[kept],
-            self.log_probability[kept],
-            self.error_m[kept],
-            self.keypoints,
-            self.present,
-            self.right_side,
-            self.parts,
+        return replace(
+            self,
+            pivot_m=self.pivot_m[kept],
+            rotvec=self.rotvec[kept],
+            angles=self.angles[kept],
+            joints_m=self.joints_m[kept],
+            log_size=self.log_size[kept],
+            log_probability=self.log_probability[kept],
+            error_m=self.error_m[kept],
         )
 
 
@@ -193,7 +194,8 @@ class HandDetector:
         side: str,
         likely: Callable[[np.ndarray], float] = lambda centre_m: 0.0,
     ) -> list[Detection]:
-        """Detection at all places where a hand may be, the best first; none where there is none.
+        """Detection at all places where a hand may be, the best first. There is one where `merit`
+        exceeds that of the settings.
 
         likely: what is known of places (3,) besides the image, log scale.
 
@@ -218,7 +220,10 @@ class HandDetector:
             detections[row] = detection
         second = merits()
         order = np.argsort(-second, kind="stable")
-        return [detections[row] for row in order if second[row] > cfg.merit]
+        return [
+            replace(detections[row], heat=float(heat[row]), merit=float(second[row]))
+            for row in order
+        ]
 
     def start_search(self, depth_m: np.ndarray, k: np.ndarray) -> Callable[[], Places]:
         """Where hands may be, the first part of a search; begun beside whatever can do without."""

@@ -44,12 +44,13 @@ _WHOLE = math.ceil(_SAMPLES * 2**0.5) + 1
 NEW_HANDS = 0.25
 """How many crops are as of new hands: as the camera is held, and less well centred."""
 _LEFT = 0.1
-"""How many hands are left ones, of which the network learns that they are, and where, but no pose."""
+"""How many hands are left ones: the network learns that and where they are, but not their poses."""
 _WRONG = 0.2
 """How many hands that are followed are followed with a wrong pose, so that the crop is off."""
 _CENTRE_M = 0.009, 0.030
-"""By how much the middle of a crop of a hand that is followed is off along each axis: where its pose
-is right, and where it is wrong. Of right poses of recordings 90 % are off by less than 12 mm."""
+"""By how much the middle of a crop of a hand that is followed is off along each axis: where its
+pose is right, and where it is wrong. Of right poses of recordings 90 % are off by less than 12 mm,
+all axes together."""
 _NEW_CENTRE_M = 0.014, 0.036
 """The same of new hands, half of which the finder placed well."""
 _DIRECTION = 0.15, 0.4

@@ -187,8 +187,10 @@ def _draw(centre, axes, whiten, label, lens, depth, labels):
 
 @compiled
 def _smooth(reach, width, height, depth, scratch, total, count):
-    """Each reading becomes the mean of those about it that lie on the same surface; scratch: (H, W),
-    total and count: (W,), to work in. Along rows, so that the arithmetic is vectorised.
+    """Each reading becomes the mean of those about it that lie on the same surface.
+
+    scratch: (H, W), total and count: (W,), to work in. It goes along rows, so that the arithmetic
+    is vectorised.
     """
     for v in range(height):
         for u in range(width):

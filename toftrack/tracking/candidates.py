@@ -140,7 +140,10 @@ class FilteredFrame:
     def of(cls, frame: HandFrame, mean: Tensor) -> FilteredFrame:
         """mean: (1, 6 + d) of the particles."""
         pose = frame.model.decode(mean, frame.track.offset)
-        unseen = sum(frame.out_of_sight(pose)) > _UNSEEN
+        outside, behind = frame.out_of_sight(pose)
+        unseen = outside + behind > _UNSEEN
+        if unseen and behind <= _UNSEEN:
+            unseen = not _comes_in(frame.detection, frame, pose)
         emerges = (unseen or frame.hidden) and _emerges(frame.detection, frame)
         detection = frame.detection if emerges or not unseen else NO_DETECTION
         posterior = posterior_of(
@@ -281,6 +284,16 @@ def posterior_of(
             for n, joints in enumerate(touched)
         }
     return Posterior(image, fitted.refiner.joints, terms)
+
+
+def _comes_in(detection: Detection, frame: HandFrame, pose: Tensor) -> bool:
+    """Whether the detector sees a hand that comes into the image at a border: one that was not
+    believed yet, where it is followed (1, 27).
+    """
+    if frame.track.believed or detection.empty or detection.present < _PRESENT:
+        return False
+    away = frame.fitted.refiner.joints(pose)[0].cpu() - detection.joints_m[0]
+    return float(away.norm(dim=1).mean()) < _APART_M
 
 
 def _emerges(detection: Detection, frame: HandFrame) -> bool:

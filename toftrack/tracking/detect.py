@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +29,8 @@ _STEP_M, _SPEED_M_S = 0.04, 0.25
 """How far a hand has moved since it was last believed: at once, and a second."""
 _ANYWHERE = -1.5
 """Log probability of a place if the hand was not where it was last believed."""
-_FORGOTTEN_S = 1.0
+FORGOTTEN_S = 1.0
+"""After so long nothing is known of where a hand is that was believed."""
 _OTHER_PLACE_M = 0.1
 """A hand that is so far from where the one that was believed was seen last may be another one."""
 _NEAR_M, _DEPTH_M, _MOST = 0.03, 0.05, 0.5
@@ -38,6 +40,19 @@ _ARM_M, _BENT = 0.05, 0.6
 """Half of a forearm's breadth, and the tangent of how far a wrist bends: the arm is the hand's."""
 _AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
 """What was taken for a hand and was none is left alone for so long, if it stays where it is."""
+_GUESSED = 0.2
+"""Probability of the finder from which on a place is guessed to be a hand that is hardly seen."""
+
+
+class Searched(NamedTuple):
+    """What a search has found.
+
+    best: the best hand that may be the one that is meant, or NO_DETECTION.
+    guess: where there is none, the likeliest place of one, which is too poorly seen to be followed.
+    """
+
+    best: Detection
+    guess: Detection = NO_DETECTION
 
 
 def search_due(hand: HandState, model: TrackerModel) -> bool:
@@ -57,27 +72,30 @@ def detection_due(track: Track, settings: DetectorSettings, dt_s: float) -> bool
 
 def search(
     hand: HandState, image: DepthImage, others: Sequence[OtherHand], model: TrackerModel
-) -> Detection:
-    """The best hand in the whole image that may be this one, or NO_DETECTION."""
-    detector, side = model.detector, hand.side
+) -> Searched:
+    """The hand in the whole image that may be this one."""
+    detector, side, least = model.detector, hand.side, model.detector.settings.merit
     likely = partial(reachable, hand, [other.centre_m for other in others])
-    found = detector.search(image.depth_m, image.k, side, likely)
+    places = detector.search(image.depth_m, image.k, side, likely)
+    found = [one for one in places if one.merit > least]
     undecided = not hand.handedness.given
     alone = hand.track is None and not any(other.believed for other in others)
     of_other: list[Detection] = []
     if undecided and alone and (not found or not hand.seen.ever):
         # A hand of the other side may be too unlike one of this to be found as such.
         mirrored = detector.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
+        mirrored = [one for one in mirrored if one.merit > least]
         of_other = [one for one in mirrored if not any(_same_place(one, seen) for seen in found)]
         found = [*found, *of_other]
     if undecided and not hand.seen.ever:
         found = held_out(found)
     if not found:
-        return NO_DETECTION
+        possible = [one for one in places if one.heat >= _GUESSED and one.merit > -np.inf]
+        return Searched(NO_DETECTION, max(possible, key=lambda one: one.heat, default=NO_DETECTION))
     if not any(found[0] is one for one in of_other):
-        return found[0]
+        return Searched(found[0])
     centre, up = found[0].centre_m.numpy()[None], np.asarray(found[0].up)[None]
-    return detector.detect(image.depth_m, image.k, centre, side, up)[0]
+    return Searched(detector.detect(image.depth_m, image.k, centre, side, up)[0])
 
 
 def _same_place(one: Detection, other: Detection) -> bool:
@@ -177,7 +195,7 @@ def reachable(hand: HandState, others_m: Sequence[np.ndarray], centre_m: np.ndar
     believed = hand.track if hand.believed else None
     if believed is not None and centre_m[2] < believed.nearest_m - _IN_FRONT_M:
         return -np.inf
-    if hand.seen.age_s >= _FORGOTTEN_S:
+    if hand.seen.age_s >= FORGOTTEN_S:
         return 0.0
     away = float(np.linalg.norm(hand.seen.centre_m - centre_m))
     near = -0.5 * (away / (_STEP_M + _SPEED_M_S * hand.seen.age_s)) ** 2

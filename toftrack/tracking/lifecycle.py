@@ -186,8 +186,8 @@ def _detected(
         best = detect_again(hand, hand.seeking, image, others, model)
         hand = replace(hand, seeking=None)
     elif search_due(hand, model):
-        best = search(hand, image, others, model)
-        hand = replace(hand, searched_s=0.0)
+        best, guess = search(hand, image, others, model)
+        hand = replace(hand, searched_s=0.0, guess=guess)
     if track is None:
         return hand, best
     if not detection_due(track, model.detector.settings, dt_s):

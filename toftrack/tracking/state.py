@@ -12,7 +12,7 @@ from torch import Tensor
 
 from toftrack.compute.pace import Duration, elapsed_s
 from toftrack.compute.rigid import pivot_offset
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import GestureState
@@ -141,6 +141,7 @@ class HandState:
     beside: it was believed while the first hand was, too, so that it is another one.
     seeking: the search for this hand that goes on beside the other one.
     tried: where a track ended last that was never believed.
+    guess: what the last search took for the likeliest place, where it found no hand.
     """
 
     side: str
@@ -155,6 +156,7 @@ class HandState:
     beside: bool = False
     seeking: Seeking | None = None
     tried: LastSeen = NOWHERE
+    guess: Detection = NO_DETECTION
 
     @property
     def believed(self) -> bool:

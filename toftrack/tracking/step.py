@@ -26,12 +26,14 @@ from toftrack.refinement.steadying import steadied
 from toftrack.tracking.candidates import (
     FilteredFrame,
     HandFrame,
+    hypotheses_of,
     keypoints_of,
     propose,
     with_parts,
 )
 from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
+from toftrack.tracking.detect import FORGOTTEN_S
 from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
 from toftrack.tracking.hands import Neighbour, PlacedHand, neighbours_of, partnered, seen_in
 from toftrack.tracking.lifecycle import (
@@ -396,13 +398,34 @@ def emitted(
 
 
 def no_hand(absence: Absence, image: DepthImage, model: FilterModel) -> Concluded:
-    """Nothing in the frame can be a hand: the last estimate stands, and is lost."""
+    """Nothing in the frame is surely a hand: the last estimate stands, and is lost. Where there is
+    none, or it was long ago, the likeliest place of a hand does.
+    """
     hand = absence.hand
     estimate = lost_estimate(hand.last, image.index, image.timestamp_s, math.nan)
+    if not hand.guess.empty and hand.seen.age_s >= FORGOTTEN_S:
+        estimate = guessed(hand, estimate, image, model)
     gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
     none = torch.zeros(0, 6 + model.space.dims, device=model.device)
     info = StepInfo(absence.observation, none, none[:, 0], {})
     return absence.slot, replace(hand, gesture=gesture), info, _sided(estimate, hand)
+
+
+def guessed(hand: HandState, estimate: Estimate, image: DepthImage, model: FilterModel) -> Estimate:
+    """An estimate of a frame without a hand with what the network says of the likeliest place."""
+    fitted = model.hand(hand.side, hand.shape)
+    pose = hypotheses_of(hand.guess, fitted, 1)
+    estimate = replace(
+        estimate,
+        joints_m=_host(fitted.refiner.joints(pose)[0]),
+        state=_host(pose[0]),
+        latent=_host(model.space.encode(pose[:, 6:])[0]),
+        covariance=np.full_like(estimate.covariance, np.nan),
+        effective_sample_size=0.0,
+        outside_rad=math.nan,
+    )
+    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
+    return in_all_conventions(_sided(estimate, hand), fitted.shape, image.k, size_px)
 
 
 def unseen(hand: HandState, image: DepthImage, model: FilterModel) -> Estimate:
