@@ -223,15 +223,17 @@ def test_the_likeliest_place_is_guessed_where_there_is_no_hand() -> None:
     def place(x: float, heat: float, merit: float) -> Detection:
         return replace(detection_of(hand_at(x)), heat=heat, merit=merit)
 
-    likely, likelier = place(0.1, 0.3, -9.0), place(-0.1, 0.4, -12.0)
-    unlikely, impossible = place(0.0, 0.1, -8.0), place(0.0, 0.9, -math.inf)
-    model = model_with(FixedDetector([likely, likelier, unlikely, impossible]))
+    cut = 0.35  # most of it is beside the image
+    likely, likelier = place(-cut, 0.3, -9.0), place(cut, 0.4, -12.0)
+    unlikely, impossible = place(cut, 0.1, -8.0), place(cut, 0.9, -math.inf)
+    in_view = place(0.0, 0.9, -6.0)
+    model = model_with(FixedDetector([in_view, likely, likelier, unlikely, impossible]))
     found = search(slot_of(None, model), IMAGE, (), model)
     assert found.best.empty and found.guess is likelier
     model = model_with(FixedDetector([likely, place(0.2, 0.3, -1.0)]))
     found = search(slot_of(None, model), IMAGE, (), model)
     assert not found.best.empty and found.guess.empty
-    model = model_with(FixedDetector([unlikely, impossible]))
+    model = model_with(FixedDetector([unlikely, impossible, in_view]))
     found = search(slot_of(None, model), IMAGE, (), model)
     assert found.best.empty and found.guess.empty
 

@@ -255,8 +255,8 @@ def test_a_filter_of_another_size_tracks_too() -> None:
 
 
 def test_a_hand_that_is_hardly_seen_is_guessed_where_none_was_seen_before() -> None:
-    """At the first place of a search that no hand is surely at."""
-    place = replace(detection_of(hand_at(0.1)), heat=0.3, merit=-9.0)
+    """Where the border of the image cuts off what is too little for a hand."""
+    place = replace(detection_of(hand_at(0.35)), heat=0.3, merit=-9.0)
     tracker = Tracker(replace(right_hand_model(), detector=FixedDetector([place])), seed=0)
     image = image_of(hand_at(0.1))
     found = tracker.step(image.depth_m, image.k, 0, 0.0)

@@ -7,6 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from toftrack.compute.pace import Duration
 from toftrack.compute.rigid import pivot_offset
@@ -14,7 +15,7 @@ from toftrack.detector.hand_detector import NO_DETECTION, Detection, DetectorSet
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Expected
-from toftrack.tracking.confidence import log_odds
+from toftrack.tracking.confidence import log_odds, out_of_sight
 from toftrack.tracking.filter import predicted_palm
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import OtherHand
@@ -40,15 +41,18 @@ _ARM_M, _BENT = 0.05, 0.6
 """Half of a forearm's breadth, and the tangent of how far a wrist bends: the arm is the hand's."""
 _AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
 """What was taken for a hand and was none is left alone for so long, if it stays where it is."""
-_GUESSED = 0.2
-"""Probability of the finder from which on a place is guessed to be a hand that is hardly seen."""
+_GUESSED, _CUT = 0.2, 0.3
+"""Probability of the finder from which on a place is guessed to be a hand that is hardly seen, as so
+many of its joints are outside of the image. One in full view that is none to the network is none.
+"""
 
 
 class Searched(NamedTuple):
     """What a search has found.
 
     best: the best hand that may be the one that is meant, or NO_DETECTION.
-    guess: where there is none, the likeliest place of one, which is too poorly seen to be followed.
+    guess: where there is none, the likeliest place of one that the image's border cuts off, which is
+        too poorly seen to be followed.
     """
 
     best: Detection
@@ -91,11 +95,18 @@ def search(
         found = held_out(found)
     if not found:
         possible = [one for one in places if one.heat >= _GUESSED and one.merit > -np.inf]
+        possible = [one for one in possible if _is_cut_off(one, image)]
         return Searched(NO_DETECTION, max(possible, key=lambda one: one.heat, default=NO_DETECTION))
     if not any(found[0] is one for one in of_other):
         return Searched(found[0])
     centre, up = found[0].centre_m.numpy()[None], np.asarray(found[0].up)[None]
     return Searched(detector.detect(image.depth_m, image.k, centre, side, up)[0])
+
+
+def _is_cut_off(detection: Detection, image: DepthImage) -> bool:
+    """Whether the border of the image cuts off much of a hand."""
+    depth, k = torch.from_numpy(image.depth_m), torch.from_numpy(image.k).float()
+    return out_of_sight(detection.joints_m[0], depth, k)[0] > _CUT
 
 
 def _same_place(one: Detection, other: Detection) -> bool:
