@@ -7,7 +7,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from toftrack.compute.pace import Duration
 from toftrack.compute.rigid import pivot_offset
@@ -15,7 +14,7 @@ from toftrack.detector.hand_detector import NO_DETECTION, Detection, DetectorSet
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Expected
-from toftrack.tracking.confidence import log_odds, out_of_sight
+from toftrack.tracking.confidence import log_odds
 from toftrack.tracking.filter import predicted_palm
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import OtherHand
@@ -42,17 +41,15 @@ _ARM_M, _BENT = 0.05, 0.6
 _AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
 """What was taken for a hand and was none is left alone for so long, if it stays where it is."""
 _GUESSED, _CUT = 0.2, 0.3
-"""Probability of the finder from which on a place is guessed to be a hand that is hardly seen, as so
-many of its joints are outside of the image. One in full view that is none to the network is none.
-"""
+"""Probability of the finder from which on a place is guessed to be a hand, where so many of its
+joints are outside of the image. What is in full view and no hand to the pose network is none."""
 
 
 class Searched(NamedTuple):
     """What a search has found.
 
     best: the best hand that may be the one that is meant, or NO_DETECTION.
-    guess: where there is none, the likeliest place of one that the image's border cuts off, which is
-        too poorly seen to be followed.
+    guess: where there is none, the likeliest place of one that the image's border cuts off.
     """
 
     best: Detection
@@ -105,8 +102,11 @@ def search(
 
 def _is_cut_off(detection: Detection, image: DepthImage) -> bool:
     """Whether the border of the image cuts off much of a hand."""
-    depth, k = torch.from_numpy(image.depth_m), torch.from_numpy(image.k).float()
-    return out_of_sight(detection.joints_m[0], depth, k)[0] > _CUT
+    joints = detection.joints_m[0].numpy()
+    place = joints[:, :2] / joints[:, 2:] * image.k[:2, :2].diagonal() + image.k[:2, 2]
+    size = np.array(image.depth_m.shape[::-1])
+    outside = ((place < -0.5) | (place > size - 0.5)).any(1)
+    return bool(outside.mean() > _CUT)
 
 
 def _same_place(one: Detection, other: Detection) -> bool:
