@@ -109,6 +109,8 @@ def step(
     found = followed(before, image, model, dt_s, generator, spans, beside)
     with spans("detector"):
         before = sought(before, seeking, model)
+    if seeking is not None:
+        found = [_still_sought(one, before) for one in found]
     before = replace(before, generator=generator.get_state())
     return reconciled(before, found, image, model, dt_s, spans)
 
@@ -333,6 +335,12 @@ def reconciled(
         for slot, hand in zip(slots, after.hands, strict=True)
     ]
     return after, tuple(infos), tuple(estimates)
+
+
+def _still_sought(found: Concluded, state: TrackerState) -> Concluded:
+    """A hand after a frame with what a search for it has found meanwhile."""
+    slot, hand, info, estimate = found
+    return slot, replace(hand, seeking=state.hands[slot].seeking), info, estimate
 
 
 def _found_hand(model: TrackerModel, hand: HandState, track: Track) -> PlacedHand:
