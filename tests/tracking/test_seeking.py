@@ -17,6 +17,7 @@ from toftrack.tracking.detect import reachable
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.seeking import detect_again, sought, start_seeking, taking_part
 from toftrack.tracking.state import LastSeen, Track, TrackerState
+from toftrack.tracking.tracker import HandsTracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -100,6 +101,18 @@ def test_a_search_without_a_hand_ends_and_waits_for_the_next() -> None:
     state = frames(followed(track_of(HERE), None), model, 2)[-1]
     assert state.hands[1].seeking is None and taking_part(state, 2.0) == [0]
     assert len(model.detector.searched) == 1
+
+
+def test_a_search_for_a_doubted_hand_goes_on_over_the_frames_that_it_is_followed_in() -> None:
+    tracker = HandsTracker(searching(THERE), 0, 2)
+    away = hand_at(-0.1)
+    tracker.state = followed(track_of(HERE), track_of(away, doubted=True))
+    kept = []
+    for frame in range(2):
+        tracker.step(IMAGE.depth_m, IMAGE.k, frame, frame * FRAME_S)
+        kept.append(tracker.state.hands[1].seeking)
+    assert kept[0] is not None and len(kept[0].centres_m) == 1
+    assert kept[1] is not None and len(kept[1].seen) == 1, "the next frame begins there"
 
 
 @pytest.mark.parametrize(("watched", "patience_s"), [(False, 1.5), (True, 6.0)])
