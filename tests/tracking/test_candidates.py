@@ -36,11 +36,10 @@ from toftrack.tracking.candidates import (
     posterior_of,
     propose,
     schedule,
-    with_own_arm,
-    without_things,
 )
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.pixels import with_own_arm, without_things
 from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import Track
 

@@ -12,14 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
-from toftrack.detector.parts import FOREARM_PART, HAND_PART, THING_PART
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import SeenPoints, seen_points
@@ -27,6 +25,7 @@ from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import log_odds, out_of_sight
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.pixels import with_own_arm, without_things
 from toftrack.tracking.posterior import (
     ImageTerm,
     JointsTerm,
@@ -40,11 +39,6 @@ from toftrack.tracking.state import HandState, Track
 _SURELY_PRESENT = 0.97
 """Probability of a hand from which on the network is believed which pixels are the hand's own: a
 chair's back was taken for a hand otherwise."""
-_LEAST_PARTS = 4
-"""Parts of a crop, of 9 mm, that a thing in the hand has at least."""
-_MOSTLY, _UNKNOWN = 0.5, 255
-"""Of a surface in front of the hand, so much must be its arm where the network sees it; and the
-class of what it does not see."""
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
 _COVERED = 0.6
@@ -186,60 +180,6 @@ def with_parts(frame: HandFrame) -> HandFrame:
     if seen is frame.observation:
         return frame
     return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
-
-
-def without_things(observation: Observation, detection: Detection) -> Observation:
-    """The same without the pixels of a thing in the hand, as the pose network tells them.
-
-    Else the best pose is one whose fingers explain the thing.
-    """
-    kind = detection.parts.kind
-    if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
-        return observation
-    thing = _pixels_of(observation.hand, observation, detection, THING_PART)
-    return replace(observation, hand=observation.hand & ~thing, thing=thing)
-
-
-def with_own_arm(observation: Observation, detection: Detection) -> Observation:
-    """The same with what the pose network calls the hand or its forearm told from what hides it.
-
-    Who sees their own hand has its arm nearer to the camera, and the back of a hand is before its
-    fingers: neither hides a hand as what passes in front does. A surface in front is the arm when
-    the network says so of most of it.
-    """
-    own = _pixels_of(observation.hand, observation, detection, HAND_PART, FOREARM_PART)
-    occluder = observation.occluder.cpu().numpy()
-    count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
-    row, column = np.nonzero(occluder)
-    kind = detection.parts.at(_points_of(row, column, observation), outside=_UNKNOWN)
-    of = surface[row, column]
-    known = np.bincount(of[kind != _UNKNOWN], minlength=count)
-    mine = np.bincount(of[kind == FOREARM_PART], minlength=count)
-    arm = torch.from_numpy((mine > _MOSTLY * known)[surface] & occluder).to(own.device)
-    return replace(
-        observation,
-        hand=observation.hand | arm,
-        occluder=observation.occluder & ~arm,
-        own=own | arm,
-    )
-
-
-def _pixels_of(
-    among: Tensor, observation: Observation, detection: Detection, *kinds: int
-) -> Tensor:
-    """(H, W) bool: those pixels of a mask that the pose network says are of some classes."""
-    row, column = np.nonzero(among.cpu().numpy())
-    chosen = np.isin(detection.parts.at(_points_of(row, column, observation)), kinds)
-    mask = np.zeros(among.shape, bool)
-    mask[row[chosen], column[chosen]] = True
-    return torch.from_numpy(mask).to(among.device)
-
-
-def _points_of(row: np.ndarray, column: np.ndarray, observation: Observation) -> np.ndarray:
-    """(P, 3) what is seen at pixels, camera frame."""
-    k, z = observation.k.cpu().numpy(), observation.depth_m.cpu().numpy()[row, column]
-    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
-    return np.stack((x, y, z), 1)
 
 
 def image_term(

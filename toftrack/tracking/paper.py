@@ -28,8 +28,9 @@ from toftrack.tracking.confidence import propagated_sigma
 from toftrack.tracking.filter import Found, predicted_depths, run_filter, velocity_after
 from toftrack.tracking.lifecycle import Absence, Status
 from toftrack.tracking.model import FilterModel, FittedHand
+from toftrack.tracking.reporting import emitted, estimate_of, no_hand
 from toftrack.tracking.state import StepInfo, Track, TrackerState
-from toftrack.tracking.step import Stepped, emitted, estimate_of, no_hand
+from toftrack.tracking.step import Stepped
 
 _WIDEST_PALM_M = 0.06
 """Half the breadth of the broadest hand's palm with the ball of the thumb."""

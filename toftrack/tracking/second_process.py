@@ -35,8 +35,9 @@ from toftrack.compute.quality import Quality
 from toftrack.compute.spans import Spans
 from toftrack.compute.threads import at_most, small_operations, threads
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.reporting import Concluded
 from toftrack.tracking.state import HandState
-from toftrack.tracking.step import Concluded, HandTask, follow_hand
+from toftrack.tracking.step import HandTask, follow_hand
 from toftrack.tracking.tracker import HandsTracker
 
 _log = logging.getLogger(__name__)

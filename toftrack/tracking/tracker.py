@@ -26,8 +26,9 @@ from toftrack.render.scoring import Scorer
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
+from toftrack.tracking.reporting import Concluded
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
-from toftrack.tracking.step import Beside, Concluded, HandTask, Stepped, step
+from toftrack.tracking.step import Beside, HandTask, Stepped, step
 
 AUTO = "auto"
 _RENDERED_PX = 72, 88
