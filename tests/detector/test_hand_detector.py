@@ -108,9 +108,9 @@ def test_a_search_detects_twice_at_the_places_that_were_found(
     assert (away > 0).all(), "about the palms that the first one found"
 
 
-def test_what_is_not_like_a_hand_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = found_at((0, 0, 0.4), (0.2, 0, 0.5))
-    assert searched(monkeypatch, found, merit=1e6)[0] == []
+def test_each_place_says_how_much_speaks_for_a_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    places, _ = searched(monkeypatch, found_at((0, 0, 0.4), (0.2, 0, 0.5)))
+    assert [one.merit for one in places] == pytest.approx([merit(one, one.heat) for one in places])
     assert searched(monkeypatch, found_at())[0] == []
 
 
