@@ -26,7 +26,8 @@ STATES = {
 @fields_in_help
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The hand in one frame, on the host. Arrays are NaN where there never was an estimate."""
+    """The hand in one frame, on the host. Arrays are NaN where there never was an estimate, nor
+    the guess of a hand that the border of the image cuts off, which is lost."""
 
     index: int
     """Number of the input frame."""
