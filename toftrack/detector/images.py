@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -67,6 +68,10 @@ _CUT = 0.45, 0.25
 """Those that are cut by a border of the image."""
 _MIDDLE = 0.6
 """Whole images whose hand is near the middle; of the others it is anywhere, also at the border."""
+_STRETCHED = 0.15, 0.3
+"""How many crops' depths are stretched or squeezed about the hand, and by how much, log scale: of
+images of which the scale is known roughly, as of those that were kept with 8 bits, and where light
+that is reflected between fingers makes hollows deeper."""
 _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
@@ -145,6 +150,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     middle = (whole - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, whole, whole)
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_WHOLE, _WHOLE), dice)
+    _stretch(depth, distance, dice)
     image, seen_parts = read_pictures(
         depth,
         which,
@@ -169,6 +175,16 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
         log_size=hands.log_size,
         joints_m=(hands.joints_m - centre[:, None]) @ back,
     )
+
+
+def _stretch(depth_m: np.ndarray, about_m: Tensor, dice: Dice) -> None:
+    """Some of the pictures (N, H, W) are stretched or squeezed along z about distances (N,)."""
+    n = len(depth_m)
+    factors = (_STRETCHED[1] * dice.normal(n)).clamp(-0.6, 0.6).exp()
+    for row in dice.chance(_STRETCHED[0], n).nonzero()[:, 0].tolist():
+        factor, about = float(factors[row]), float(about_m[row])
+        seen = depth_m[row] > 0
+        depth_m[row][seen] = np.maximum(factor * (depth_m[row][seen] - about) + about, 0.05)
 
 
 def _upright_angles(hands: Hands, wrong: Tensor, dice: Dice) -> Tensor:
@@ -292,10 +308,10 @@ def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
 
 
 def _other_hands(hands: Hands, bank: ShapeBank, dice: Dice) -> tuple[Hands, Tensor]:
-    """A second hand, mostly of the other side, 10 to 40 cm away, and which of them are left."""
+    """A second hand of either side, 6 to 40 cm away, so that some touch, and which are left."""
     n = len(hands.pivot_m)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
-    away = away * dice.uniform(n, 1, low=0.11, high=0.40)
+    away = away * dice.uniform(n, 1, low=0.06, high=0.40)
     away[:, 2] *= 0.6
     pivot = hands.pivot_m + away
     pivot[:, 2] = pivot[:, 2].clamp(min=0.22)
