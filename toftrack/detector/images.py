@@ -68,7 +68,7 @@ _CUT = 0.45, 0.25
 """Those that are cut by a border of the image."""
 _MIDDLE = 0.6
 """Whole images whose hand is near the middle; of the others it is anywhere, also at the border."""
-_STRETCHED = 0.15, 0.3
+_STRETCHED = 0.25, 0.35
 """How many crops' depths are stretched or squeezed about the hand, and by how much, log scale: of
 images of which the scale is known roughly, as of those that were kept with 8 bits, and where light
 that is reflected between fingers makes hollows deeper."""
