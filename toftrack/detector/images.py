@@ -150,7 +150,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     middle = (whole - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, whole, whole)
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_WHOLE, _WHOLE), dice)
-    _stretch(depth, distance, dice)
+    depth = stretched(depth, distance, dice)
     image, seen_parts = read_pictures(
         depth,
         which,
@@ -175,16 +175,6 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
         log_size=hands.log_size,
         joints_m=(hands.joints_m - centre[:, None]) @ back,
     )
-
-
-def _stretch(depth_m: np.ndarray, about_m: Tensor, dice: Dice) -> None:
-    """Some of the pictures (N, H, W) are stretched or squeezed along z about distances (N,)."""
-    n = len(depth_m)
-    factors = (_STRETCHED[1] * dice.normal(n)).clamp(-0.6, 0.6).exp()
-    for row in dice.chance(_STRETCHED[0], n).nonzero()[:, 0].tolist():
-        factor, about = float(factors[row]), float(about_m[row])
-        seen = depth_m[row] > 0
-        depth_m[row][seen] = np.maximum(factor * (depth_m[row][seen] - about) + about, 0.05)
 
 
 def _upright_angles(hands: Hands, wrong: Tensor, dice: Dice) -> Tensor:
@@ -289,6 +279,21 @@ def _furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
     middle = before_camera(len(there), dice)
     parts = torch.cat((scenes.parts, furniture(there, middle, dice)), 1)
     return replace(scenes, planes=planes, parts=parts)
+
+
+def stretched(depth_m: np.ndarray, about_m: Tensor, dice: Dice) -> np.ndarray:
+    """Pictures (N, H, W), some stretched or squeezed along z about distances (N,).
+
+    What has no reading has none then, and nothing comes nearer than 5 cm.
+    """
+    n = len(depth_m)
+    factors = (_STRETCHED[1] * dice.normal(n)).clamp(-0.6, 0.6).exp()
+    rows = dice.chance(_STRETCHED[0], n).numpy()
+    about = about_m.numpy()[rows, None, None]
+    some = factors.numpy()[rows, None, None] * (depth_m[rows] - about) + about
+    result = depth_m.copy()
+    result[rows] = np.where(depth_m[rows] > 0, np.maximum(some, 0.05), 0.0)
+    return result
 
 
 def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
