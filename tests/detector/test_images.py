@@ -19,7 +19,6 @@ from toftrack.detector.images import (
     WideImages,
     crop_images,
     poorly_read,
-    stretched,
     wide_images,
 )
 from toftrack.detector.images_numba import read_pictures
@@ -109,20 +108,6 @@ def test_what_is_far_is_read_in_part_and_nothing_else_changes() -> None:
     outside = torch.zeros(WIDE_SIZE, dtype=torch.bool)
     outside[70:], outside[:, 90:] = True, True
     assert not (seen[:, outside & (taken[0] == 0)] > 0).any()
-
-
-def test_stretched_pictures_keep_the_hand_s_distance_and_what_is_not_read() -> None:
-    n, about = 400, torch.full((400,), 0.5)
-    taken = np.full((n, 3, 4), 0.5, np.float32)
-    taken[:, 0], taken[:, 1, 0], taken[:, 2] = 0.6, 0.0, 0.45
-    seen = stretched(taken, about, Dice(torch.Generator().manual_seed(0)))
-    assert (seen[:, 1, 0] == 0).all() and np.allclose(seen[:, 1, 1:], 0.5)
-    behind, before = seen[:, 0, 0] - 0.5, 0.5 - seen[:, 2, 0]
-    assert np.allclose(behind, 2 * before, atol=1e-5), "about the hand, both ways alike"
-    changed = np.abs(behind - 0.1) > 1e-6
-    # Binomial, four standard deviations.
-    assert abs(changed.mean() - 0.25) < 4 * math.sqrt(0.25 * 0.75 / n)
-    assert 0.5 < behind.min() / 0.1 < 0.8 and 1.25 < behind.max() / 0.1 < 1.9
 
 
 def test_hands_are_seen_where_it_is_said(images: WideImages) -> None:

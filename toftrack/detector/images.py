@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -68,10 +67,6 @@ _CUT = 0.45, 0.25
 """Those that are cut by a border of the image."""
 _MIDDLE = 0.6
 """Whole images whose hand is near the middle; of the others it is anywhere, also at the border."""
-_STRETCHED = 0.25, 0.35
-"""How many crops' depths are stretched or squeezed about the hand, and by how much, log scale: of
-images of which the scale is known roughly, as of those that were kept with 8 bits, and where light
-that is reflected between fingers makes hollows deeper."""
 _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
@@ -150,7 +145,6 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     middle = (whole - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, whole, whole)
     depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_WHOLE, _WHOLE), dice)
-    depth = stretched(depth, distance, dice)
     image, seen_parts = read_pictures(
         depth,
         which,
@@ -281,21 +275,6 @@ def _furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
     return replace(scenes, planes=planes, parts=parts)
 
 
-def stretched(depth_m: np.ndarray, about_m: Tensor, dice: Dice) -> np.ndarray:
-    """Pictures (N, H, W), some stretched or squeezed along z about distances (N,).
-
-    What has no reading has none then, and nothing comes nearer than 5 cm.
-    """
-    n = len(depth_m)
-    factors = (_STRETCHED[1] * dice.normal(n)).clamp(-0.6, 0.6).exp()
-    rows = dice.chance(_STRETCHED[0], n).numpy()
-    about = about_m.numpy()[rows, None, None]
-    some = factors.numpy()[rows, None, None] * (depth_m[rows] - about) + about
-    result = depth_m.copy()
-    result[rows] = np.where(depth_m[rows] > 0, np.maximum(some, 0.05), 0.0)
-    return result
-
-
 def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
     """Images (N, H, W) as some cameras take them: of what is far few pixels are read, and some
     where there is nothing.
@@ -313,10 +292,10 @@ def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
 
 
 def _other_hands(hands: Hands, bank: ShapeBank, dice: Dice) -> tuple[Hands, Tensor]:
-    """A second hand of either side, 6 to 40 cm away, so that some touch, and which are left."""
+    """A second hand, mostly of the other side, 10 to 40 cm away, and which of them are left."""
     n = len(hands.pivot_m)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
-    away = away * dice.uniform(n, 1, low=0.06, high=0.40)
+    away = away * dice.uniform(n, 1, low=0.11, high=0.40)
     away[:, 2] *= 0.6
     pivot = hands.pivot_m + away
     pivot[:, 2] = pivot[:, 2].clamp(min=0.22)
