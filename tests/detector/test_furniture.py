@@ -12,7 +12,7 @@ from toftrack.detector.furniture import PIECES, before_camera, furniture, on_a_p
 from toftrack.detector.hands import HAND, OTHER_HAND
 from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
 from toftrack.detector.scenes import Scenes
-from toftrack.detector.things_numba import PART, part_distance
+from toftrack.detector.things_numba import BALL, BOX, CONE, PART, part_distance
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,7 +36,17 @@ def test_where_there_is_furniture_there_are_two_pieces_or_more() -> None:
     count = (made[..., 0] >= 0).sum(1)
     assert (count[there] >= 2).all() and (count[~there] == 0).all()
     assert len(count.unique()) > 4
+    assert made[..., 0].unique().tolist() == [-1, BOX, CONE, BALL], "of all kinds"
     assert torch.equal(made, pieces(there)) and not torch.equal(made, pieces(there, 1))
+
+
+def test_pieces_stand_together() -> None:
+    made = pieces(torch.ones(N, dtype=torch.bool))
+    shown = made[..., 0] >= 0
+    middle = (made[..., 1:4] * shown[..., None]).sum(1) / shown.sum(1, keepdim=True)
+    away = (made[..., 1:4] - middle[:, None]).norm(dim=-1)[shown]
+    assert away.median() < 0.2 and away.max() < 1.5
+    assert (made[..., 13:16][shown] >= 0).all() and (made[..., 18][shown] < 1.0).all()
 
 
 def test_a_place_on_a_piece_is_in_it_or_nearly() -> None:

@@ -1,6 +1,7 @@
-"""What stands about in rooms and is no hand: bars side by side, boards, clutter and leaves.
+"""What stands about in rooms and is no hand: bars side by side, boards, clutter, leaves, branches,
+and heads.
 
-Nothing else in a room looks so much like fingers and palms at a finder's resolution.
+Nothing else in a room looks so much like fingers, palms and fists.
 """
 
 from __future__ import annotations
@@ -19,6 +20,10 @@ PIECES = 9
 """Parts of the furniture in an image."""
 
 
+_OFTEN = 2.0, 2.0, 2.0, 2.0, 1.0, 3.0
+"""How often each kind of furniture stands there, in parts of their sum."""
+
+
 def before_camera(n: int, dice: Dice) -> Tensor:
     """(N, 3) where furniture may stand, in metres in the camera frame."""
     z = dice.uniform(n, low=0.4, high=1.2)
@@ -29,8 +34,11 @@ def before_camera(n: int, dice: Dice) -> Tensor:
 def furniture(there: Tensor, middle: Tensor, dice: Dice) -> Tensor:
     """(N, PIECES, PART) of one kind each about (N, 3); there: (N,) where there is any."""
     n = len(there)
-    kinds = torch.stack([make(middle, dice) for make in (_bars, _boards, _clutter, _leaves)])
-    pieces = kinds[dice.rows(len(kinds), n), torch.arange(n)]
+    makers = (_bars, _boards, _clutter, _leaves, _branches, _heads)
+    kinds = torch.stack([make(middle, dice) for make in makers])
+    often = torch.tensor(_OFTEN).expand(n, -1)
+    which = torch.multinomial(often, 1, generator=dice.generator)[:, 0]
+    pieces = kinds[which, torch.arange(n)]
     some = dice.uniform(n, 1, low=2, high=PIECES + 1).floor()
     pieces[..., 0] = torch.where(
         (torch.arange(PIECES) < some) & there[:, None], pieces[..., 0], -1.0
@@ -126,3 +134,56 @@ def _leaves(middle: Tensor, dice: Dice) -> Tensor:
         place = middle + reach * dice.normal(n, 3)
         leaves.append(make_part(BOX, place, dice.rotations(n), half, zero, zero))
     return torch.stack(leaves, 1)
+
+
+def _branches(middle: Tensor, dice: Dice) -> Tensor:
+    """As of toys, twigs or taps: round limbs from one place in all directions."""
+    n, zero = len(middle), torch.zeros(len(middle))
+    flat = torch.where(dice.chance(0.5, n, 1), 0.3, 1.0)
+    thick, long = dice.uniform(n, low=0.004, high=0.018), dice.uniform(n, low=0.03, high=0.14)
+    plane = dice.rotations(n)
+    core = thick * dice.uniform(n, low=1.0, high=3.0)
+    pieces = [make_part(BALL, middle, plane, torch.stack((core, zero, zero), 1), zero, zero)]
+    for _ in range(PIECES - 1):
+        squeezed = torch.cat((dice.normal(n, 2), flat * dice.normal(n, 1)), 1)
+        along = torch.nn.functional.normalize((squeezed[:, None] @ plane)[:, 0], dim=1)
+        half = 0.5 * long * dice.uniform(n, low=0.5, high=1.0) + thick
+        radius = thick * dice.uniform(n, low=0.8, high=1.2)
+        other = dice.rotations(n)[:, 0]
+        x = torch.nn.functional.normalize(torch.linalg.cross(along, other), dim=1)
+        rows = torch.stack((x, along, torch.linalg.cross(x, along)), 1)
+        sizes = torch.stack((radius, radius * dice.uniform(n, low=0.6, high=1.0), half), 1)
+        place = middle + along * (half + 0.5 * core)[:, None]
+        pieces.append(make_part(CONE, place, rows, sizes, 0.55 * radius, zero))
+    return torch.stack(pieces, 1)
+
+
+_HEAD = (
+    (CONE, (0, 0.020, -0.020), (0.070, 0.050, 0.105), 0.045),  # the face
+    (BALL, (0, -0.035, 0.025), (0.088, 0, 0), 0),  # the back of the skull
+    (CONE, (0, 0.020, -0.088), (0.006, 0.016, 0.026), 0.005),  # the nose
+    (BOX, (0, -0.018, -0.080), (0.055, 0.010, 0.012), 0.008),  # the brows
+    (BALL, (0, 0.105, -0.055), (0.028, 0, 0), 0),  # the chin
+    (BOX, (0.078, 0.020, 0.010), (0.008, 0.030, 0.018), 0.006),  # the ears
+    (BOX, (-0.078, 0.020, 0.010), (0.008, 0.030, 0.018), 0.006),
+    (BALL, (0, -0.055, 0.035), (0.098, 0, 0), 0),  # hair
+    (CONE, (0, 0.170, 0.020), (0.052, 0.060, 0.070), 0.010),  # the neck
+)
+"""Kind, place, sizes and the radius of the edges of a mean head's parts, in metres: x to its left,
+y down, z to its back."""
+
+
+def _heads(middle: Tensor, dice: Dice) -> Tensor:
+    """Heads, mostly upright, that look anywhere."""
+    n, zero = len(middle), torch.zeros(len(middle))
+    lean = torch.tensor([0.2, 0.0, 0.2]) * dice.normal(n, 3)
+    yaw = torch.tensor([0.0, 1.0, 0.0]) * dice.uniform(n, 1, low=-math.pi, high=math.pi)
+    rows = roma.rotvec_to_rotmat(yaw) @ roma.rotvec_to_rotmat(lean)
+    size = torch.exp(0.08 * dice.normal(n, 1))
+    pieces = []
+    for kind, place, sizes, edge in _HEAD:
+        at = size * torch.tensor(place) + 0.006 * dice.normal(n, 3)
+        sized = size * torch.tensor(sizes) * torch.exp(0.12 * dice.normal(n, 1))
+        offset = (at[:, None] @ rows)[:, 0]
+        pieces.append(make_part(kind, middle + offset, rows, sized, zero + 0.8 * edge, zero))
+    return torch.stack(pieces, 1)

@@ -57,10 +57,12 @@ _DIRECTION = 0.15, 0.4
 """By how much it is uncertain where the fingers of a hand point that is followed, of 1 m."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
+_ELSEWHERE = 0.26
+"""Crops about something else than a hand."""
 _EMPTY = 0.25
 """Whole images without a raised hand."""
-_FURNISHED = 0.3, 0.8
-"""Those with a hand, and those without one, that show furniture."""
+FURNISHED = 0.3, 0.8
+"""Images with a hand, and those without one, that show furniture."""
 _FURNISHED_CROPS = 0.6, 0.12
 """Crops about something else, and crops of hands, that show furniture."""
 _CUT = 0.45, 0.25
@@ -119,7 +121,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     near = spread[:, None] * dice.normal(n, 3)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.13, high=0.30)
-    present = ~dice.chance(0.18, n)
+    present = ~dice.chance(_ELSEWHERE, n)
     pivot = centre + torch.where(present[:, None], near.clamp(-0.09, 0.09), away)
     left = dice.chance(_LEFT, n)
     views = random_views(n, dice)
@@ -227,7 +229,7 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     scenes = random_scenes(
         hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there), views=views
     )
-    scenes = _furnished(scenes, dice.chance(torch.where(raised, *_FURNISHED), n), dice)
+    scenes = furnished(scenes, dice.chance(torch.where(raised, *FURNISHED), n), dice)
     taken, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
     depth = poorly_read(torch.from_numpy(taken), lens, dice)
 
@@ -265,7 +267,7 @@ def _with_furniture(scenes: Scenes, centre_m: Tensor, gone: Tensor, dice: Dice) 
     return replace(scenes, planes=planes, parts=torch.cat((scenes.parts, pieces), 1))
 
 
-def _furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
+def furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
     """Scenes with furniture, and mostly without walls before it; there: (N,) where there is any."""
     planes = scenes.planes.clone()
     without_walls = there & dice.chance(0.7, len(there))
@@ -292,7 +294,7 @@ def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
 
 
 def _other_hands(hands: Hands, bank: ShapeBank, dice: Dice) -> tuple[Hands, Tensor]:
-    """A second hand, mostly of the other side, 10 to 40 cm away, and which of them are left."""
+    """A second hand of either side, 10 to 40 cm away, and which of them are left."""
     n = len(hands.pivot_m)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.11, high=0.40)

@@ -18,7 +18,7 @@ from torch import Tensor
 from toftrack.archives import read_archive
 from toftrack.detector.dice import Dice
 from toftrack.detector.hands import HAND, posed_hands, random_rotations, random_views
-from toftrack.detector.images import random_scenes
+from toftrack.detector.images import FURNISHED, furnished, random_scenes
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
 from toftrack.detector.shapes import ShapeBank
 from toftrack.errors import ToftrackError
@@ -29,6 +29,7 @@ CAMERAS = ((176, 144, 200.0), (176, 144, 200.0), (320, 240, 280.0), (512, 424, 3
 """Columns, rows and focal length in pixels."""
 _KEY = 14
 """Frames between two poses that are drawn."""
+_EMPTY_SHARE = 0.25
 _STILL_SHARE = 0.55
 """Scenes in which the fingers do not move; in hands.HOLDING of them the hand holds a thing."""
 
@@ -51,17 +52,20 @@ class Sequence:
 def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) -> Sequence:
     """One random scene: `frames` images at 25 frames/s of one hand in its surroundings.
 
-    In an eighth of the scenes there is no hand at all; in some a hand holds a thing.
+    In a quarter of the scenes there is no hand at all, and in most of these furniture; in some a
+    hand holds a thing.
     """
     dice = Dice(generator)
     width, height, focal = CAMERAS[int(dice.rows(len(CAMERAS), 1))]
     keys = frames // _KEY + 2
-    left, empty = dice.chance(0.5, 1), bool(dice.chance(0.125, 1))
+    left, empty = dice.chance(0.5, 1), bool(dice.chance(_EMPTY_SHARE, 1))
     still = bool(dice.chance(_STILL_SHARE, 1))
     place = _places(keys, width / focal, height / focal, dice)
     views = random_views(1, dice)
     rotations = _rotations(keys, dice, views)
     angles = _held(shown_poses(keys, generator), dice)
+    there = dice.chance(torch.tensor(FURNISHED[1] if empty else FURNISHED[0]), 1)
+    others = 0.0 if empty else 0.2  # which may be as right a hand as the missing one
     scene = int(torch.randint(2**31 - 1, (1,), generator=generator))
     sensor = random_sensors(1, dice)
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]])
@@ -83,7 +87,8 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         same = Dice(torch.Generator().manual_seed(scene))
         hands = posed_hands(bank, pivot[None], left, same, HAND, turn[None], pose)
         labels = torch.where(hands.labels == HAND, -1, hands.labels) if empty else hands.labels
-        scenes = random_scenes(hands, labels, bank, same, others=0.2, objects=0.06, views=views)
+        scenes = random_scenes(hands, labels, bank, same, others, objects=0.06, views=views)
+        scenes = furnished(scenes, there, same)
         depth, which = take_pictures(scenes, lens, sensor, (height, width), dice)
         images.append(depth[0])
         joints.append(hands.joints_m[0])

@@ -68,7 +68,7 @@ def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
         description="Fit lost=calibrated: prints what is fitted of its configuration.",
     )
     parser.add_argument("overrides", nargs="*", default=[], help="of the tracker, as for track.py")
-    parser.add_argument("--sequences", type=int, default=150, help="how many are rendered (150)")
+    parser.add_argument("--sequences", type=int, default=200, help="how many are rendered (200)")
     parser.add_argument("--frames", type=int, default=50, help="of each (50)")
     parser.add_argument("--seed", type=int, default=1, help="of everything random (1)")
     parser.add_argument(
