@@ -39,11 +39,6 @@ ALLOWED_SKIPS = (
 )
 
 
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: a third of the time, tests wait for programs and sockets."""
-    return 1 + (os.cpu_count() or 1)
-
-
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
 
