@@ -52,6 +52,7 @@ def test_a_wrong_value_is_refused_in_one_sentence(override: str, words: str) -> 
         ("experiment=paper", "filter.particles=10"),
         ("segmentation.reach_m=inf",),
         ("detector.merit=-4", "lost.intercept=-1", "lost.weights.log_score=-0.5"),
+        ("lost.whole.intercept=-1", "lost.whole.weights.keypoints_off=-0.5"),
         ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
         ("experiment=paper", "start.pose=[0,0,0.4,0,0,0]", "detector=none", "start=rough"),
         ("refine=none", "detector.candidates=0", "posterior.overlap=0", "hysteresis.exchanged=0"),

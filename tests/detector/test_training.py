@@ -46,6 +46,8 @@ def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -
         ({"batch": 2.5}, "batch of a network must be"),
         ({"width": -1}, "width of a network must be"),
         ({"rate": 1.5}, "rate of a network must be between 0 and 1"),
+        ({"start": "w.npz", "start_share": 1.0}, "start_share of a network must be at least 0"),
+        ({"start_share": 0.5}, "start_share of a network needs weights to start from"),
     ],
 )
 def test_a_schedule_that_cannot_be_is_refused(change: dict, words: str) -> None:
@@ -62,6 +64,22 @@ def test_no_images_leave_the_weights_of_a_start_as_they_are(tmp_path: Path) -> N
     assert course == []
     for key, value in finder.state_dict().items():
         torch.testing.assert_close(same.state_dict()[key], value, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_share_of_the_start_makes_the_mean_of_both(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    begun = Finder(4)
+    save_weights(tmp_path / "w.npz", PoseNet(4), begun, {})
+    schedule = Schedule(24, 8, 0.002, 4, str(tmp_path / "w.npz"))
+    trained, _ = train_finder(schedule, shapes=6, seed=0)
+    mean, _ = train_finder(replace(schedule, start_share=0.25), shapes=6, seed=0)
+    start, end = begun.state_dict(), trained.state_dict()
+    for key, value in mean.state_dict().items():
+        if value.is_floating_point():
+            torch.testing.assert_close(
+                value, 0.25 * start[key] + 0.75 * end[key], atol=1e-3, rtol=1e-3
+            )
 
 
 def test_the_rate_rises_stays_and_falls_to_nothing() -> None:

@@ -56,7 +56,14 @@ _AT_MOST = {"hands": 2, "filter.particles": 100_000, "filter.passes": 1000, "see
 """More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""
-_LOG_ODDS = ("lost.intercept", "lost.weights.", "lost.joints.odds", "detector.merit")
+_LOG_ODDS = (
+    "lost.intercept",
+    "lost.weights.",
+    "lost.whole.intercept",
+    "lost.whole.weights.",
+    "lost.joints.odds",
+    "detector.merit",
+)
 """How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
 _OF_NETWORKS = {

@@ -62,6 +62,9 @@ class Schedule:
     the highest learning rate, see rate_at.
     width: channels of the network's first layer.
     start: a file of weights to go on from; None begins from nothing.
+    start_share: of these weights in the result, which is the mean of both, weight by weight: what
+        the start knew of images unlike those it now learns from is kept so (Wortsman et al.,
+        "Robust fine-tuning of zero-shot models", CVPR 2022).
     """
 
     images: int
@@ -69,6 +72,7 @@ class Schedule:
     rate: float
     width: int
     start: str | None = None
+    start_share: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("images", "batch", "width"):
@@ -78,6 +82,12 @@ class Schedule:
                 raise ToftrackError(f"{name} of a network must be a whole number above 0{more}")
         if not 0 < self.rate < 1:
             raise ToftrackError("rate of a network must be between 0 and 1")
+        if not 0 <= self.start_share < 1:
+            raise ToftrackError("start_share of a network must be at least 0 and less than 1")
+        if self.start_share > 0 and self.start is None:
+            raise ToftrackError(
+                "start_share of a network needs weights to start from: give start, too, or 0"
+            )
 
     @property
     def steps(self) -> int:
@@ -153,6 +163,7 @@ def _train(
 ) -> tuple[Network, Course]:
     _keep_memory()
     steps = schedule.steps
+    begun = deepcopy(network) if schedule.start_share > 0 else None
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     averaged = deepcopy(network)
     progress = Progress(network, averaged, optimiser, schedule.images)
@@ -191,6 +202,8 @@ def _train(
                 seconds = round(progress.seconds, 1)
                 course.append({"images": images, "seconds": seconds} | recent)
             stepped()
+    if begun is not None and steps > 0:
+        _average(averaged, begun, 1 - schedule.start_share)
     return averaged, course
 
 
@@ -221,7 +234,7 @@ def _keep_memory() -> None:
 
 @torch.no_grad()
 def _average(averaged: nn.Module, network: nn.Module, kept: float) -> None:
-    """Exponential moving average of all weights and statistics."""
+    """Move all weights and statistics towards another network's, of which `kept` stays."""
     for old, new in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
         if old.is_floating_point():
             old.lerp_(new, 1 - kept)
