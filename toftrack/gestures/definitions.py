@@ -95,8 +95,9 @@ def _define(name: str, fingers: str, tips: _Features) -> Definition:
 
 
 # What is near a gesture and none: a hooked hand is no fist, one bent at the knuckles not relaxed,
-# and neither is one with the little finger up, alone or with the index finger.
-_NONE = tuple(_define(OTHER, fingers, _ANY) for fingers in ("HHHH", "FFFF", "CCCS", "SCCS"))
+# and neither is one with the little finger up, alone or with the index finger, however loosely the
+# others are curled.
+_NONE = tuple(_define(OTHER, fingers, _ANY) for fingers in ("HHHH", "FFFF", "LLLS", "SLLS"))
 _ALL = (
     _define("palm", "SSSS", _OPEN),
     _define("palm", "SSSS", _BESIDE),

@@ -82,6 +82,7 @@ def train(config: DictConfig) -> float:
     for name, schedule in (("pose", poses), ("finder", finder)):
         if schedule.start is not None:
             about[f"{name}_start"] = load_weights(schedule.start).about
+            about[f"{name}_start_share"] = schedule.start_share
     save_weights(path, pose_network, finder_network, about)
     pictures = ["images.png"]
     if pose_course:

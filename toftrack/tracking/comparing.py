@@ -30,7 +30,7 @@ from toftrack.tracking.state import HandState, Track
 
 _GONE_S = 1.0
 """A hand that was believed so long ago may have made way for another one."""
-_SWITCHED = 0.4
+_SWITCHED = 0.45
 """The side is changed when it has become less probable than this, so that it does not flicker."""
 _LEAST_PRESENT = 0.5
 """Where a hand is less probable than this, its sides are not compared."""

@@ -22,7 +22,9 @@ from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import HandState, LastSeen, Track
 
 _AS_WELL = 1.3
-"""Hands are seen about as well when their expected errors differ by less than this factor."""
+"""Hands are seen about as well when their expected errors differ by less than this factor ..."""
+_WELL_M = 0.02
+"""... or are both smaller than this."""
 _IN_FRONT_M = 0.03
 """What is so much nearer than a hidden hand is what hides it."""
 _STEP_M, _SPEED_M_S = 0.04, 0.25
@@ -183,7 +185,7 @@ def held_out(found: Sequence[Detection]) -> list[Detection]:
     """
     if not found:
         return []
-    most = _AS_WELL * min(float(one.error_m[0]) for one in found)
+    most = max(_WELL_M, _AS_WELL * min(float(one.error_m[0]) for one in found))
     alike = [one for one in found if float(one.error_m[0]) < most]
     return [min(alike, key=lambda one: float(one.centre_m[2]))]
 

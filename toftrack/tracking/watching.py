@@ -124,11 +124,15 @@ def _passed_on(first: HandState, other: HandState, track: Track) -> HandState:
 
 def _is_first(first: HandState, other: HandState) -> bool:
     """Whether the hand that is watched is the one that was asked for."""
+    probable = other.handedness.probability(first.side)
     if not first.handedness.given:
-        return first.track is None and other.believed and not first.seen.age_s < _GONE_S
+        if first.track is not None or not other.believed:
+            return False
+        # Of the same side, and never seen beside it: the first hand has come back.
+        alike = not other.beside and other.side == first.side and probable > _RATHER
+        return alike or not first.seen.age_s < _GONE_S
     if other.side != first.side:
         return False
-    probable = other.handedness.probability(first.side)
     if first.track is None:
         return probable > _BACK and not other.beside
     if not _as_sure(first, other):
