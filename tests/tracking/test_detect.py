@@ -241,7 +241,9 @@ def test_the_likeliest_place_is_guessed_where_there_is_no_hand() -> None:
 def test_a_hand_that_nobody_described_is_the_one_that_is_held_out() -> None:
     far, near = detection_of(hand_at(0.1, z=0.7)), detection_of(hand_at(-0.1, z=0.4))
     assert searched([far, near], any_side=True) is near
-    unsure = replace(near, error_m=2 * near.error_m)
+    less_sure = replace(near, error_m=1.9 * near.error_m)
+    assert searched([far, less_sure], any_side=True) is less_sure, "both are seen well"
+    unsure = replace(near, error_m=2.5 * near.error_m)
     assert searched([far, unsure], any_side=True) is far, "not seen as well"
     known = seen_at(hand_at(0.1, z=0.7), 5.0)
     assert searched([far, near], any_side=True, seen=known) is far, "the best is the same hand"

@@ -110,6 +110,30 @@ def test_only_a_hand_that_was_never_beside_the_first_one_can_be_it_after_all() -
     assert after.hands[0].track is None and after.hands[1].track is not None
 
 
+@pytest.mark.parametrize(
+    ("fits", "beside", "away_s", "back"),
+    [
+        (2.0, False, 0.5, True),
+        (0.0, False, 0.5, False),
+        (2.0, True, 0.5, False),
+        (0.0, True, 3, True),
+    ],
+    ids=["of the same side", "perhaps of the other", "beside the first one before", "long after"],
+)
+def test_where_no_side_was_given_a_hand_that_comes_back_is_the_first_one_again(
+    fits: float, beside: bool, away_s: float, back: bool
+) -> None:
+    state = with_evidence(watching(False, True), 1, fits=fits)
+    first, other = state.hands
+    assert other.track is not None
+    seen = replace(first.seen, age_s=away_s)
+    first = replace(first, handedness=HandednessEstimate(given=False), seen=seen)
+    track = replace(other.track, believed=True)
+    other = replace(other, side=first.side, beside=beside, track=track)
+    after = watched_over(replace(state, hands=(first, other)), handedness_settings())
+    assert (after.hands[0].track is track) == back
+
+
 def test_of_two_hands_the_one_that_rather_is_of_the_given_side_is_the_first() -> None:
     settings = handedness_settings()
     state = with_evidence(watching(True, True), 0, fits=-0.6)
