@@ -205,6 +205,18 @@ def test_poses_that_are_none_of_the_classes_are_other(curled: tuple[int, ...]) -
     assert label_of(fingers(*curled), PAPER) == "other"
 
 
+@pytest.mark.parametrize(
+    ("curled", "share"), [((0, 1, 2), 0.68), ((1, 2), 0.62)], ids=["alone", "with the index finger"]
+)
+def test_a_little_finger_that_is_up_beside_loosely_curled_ones_is_other(
+    curled: tuple[int, ...], share: float
+) -> None:
+    """As a real camera shows it: the others bent by two thirds, and the little one not straight."""
+    loose = fingers() + share * (fingers(*curled) - fingers())
+    loose[[18, 19]] = math.radians(8)
+    assert label_of(loose) == "other"
+
+
 def test_noise_leaves_a_gesture_what_it_is() -> None:
     rng = np.random.default_rng(0)
     for label, angles, thumbs in SHOWN[:6]:

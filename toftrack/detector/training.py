@@ -202,7 +202,7 @@ def _train(
                 seconds = round(progress.seconds, 1)
                 course.append({"images": images, "seconds": seconds} | recent)
             stepped()
-    if begun is not None and steps > 0:
+    if begun is not None:
         _average(averaged, begun, 1 - schedule.start_share)
     return averaged, course
 
