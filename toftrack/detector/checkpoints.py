@@ -1,7 +1,8 @@
 """The state of a training, written while it goes on, so that it can be gone on with exactly.
 
 Arrays and JSON, as everything here. What is read must be of the same training: the batch,
-the rate, the width, the seed and the number of hands; it continues where it was.
+the rate, the width, the seed, the number of hands and the weights that it began from, by their
+checksum; it continues where it was.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from toftrack.json_text import parse_json
 from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-detector-training"
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass

@@ -110,8 +110,6 @@ def train_poses(
     """Train the pose network; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
     network = PoseNet(schedule.width)
-    if schedule.start is not None:
-        go_on_from(schedule.start, "pose", network, schedule.width)
     network.train().to(memory_format=torch.channels_last)
 
     def step(crops: Crops) -> tuple[Tensor, dict[str, float]]:
@@ -137,8 +135,6 @@ def train_finder(
     """Train the finder; returns the average of its weights, and the course."""
     torch.manual_seed(seed)
     network = Finder(schedule.width)
-    if schedule.start is not None:
-        go_on_from(schedule.start, "finder", network, schedule.width)
     network.train().to(memory_format=torch.channels_last)
 
     def step(images: WideImages) -> tuple[Tensor, dict[str, float]]:
@@ -163,12 +159,16 @@ def _train(
 ) -> tuple[Network, Course]:
     _keep_memory()
     steps = schedule.steps
+    start = None
+    if schedule.start is not None:
+        kind = "pose" if isinstance(network, PoseNet) else "finder"
+        start = go_on_from(schedule.start, kind, network, schedule.width)
     begun = deepcopy(network) if schedule.start_share > 0 else None
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     averaged = deepcopy(network)
     progress = Progress(network, averaged, optimiser, schedule.images)
     settings = {"batch": schedule.batch, "rate": schedule.rate, "width": schedule.width}
-    settings |= {"shapes": shapes, "seed": seed}
+    settings |= {"shapes": shapes, "seed": seed, "start": start}
     writing: Any = contextlib.nullcontext(lambda: None)
     if checkpoints is not None:
         checkpoints.restore(name, progress, settings)

@@ -90,13 +90,14 @@ def load_weights(path: str | Path | None = None) -> Weights:
     return Weights(pose, finder, metadata.get("about", {}), path, metadata["sha256"])
 
 
-def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> None:
+def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> str:
     """Give a new network, "pose" or "finder" of a width, the weights of a file to train on from.
 
     What the file's network lacks begins without effect on what is there: channels of the crop,
     classes of parts, and a wider network's channels (as Chen et al., "Net2Net: accelerating
     learning via knowledge transfer", ICLR 2016, with new channels instead of copies).
-    Raises ToftrackError as load_weights does, and for a narrower network.
+    Returns the checksum of the file's arrays. Raises ToftrackError as load_weights does, and for a
+    narrower network.
     """
     arrays, metadata = _read(Path(path))
     try:
@@ -112,6 +113,7 @@ def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> N
         network.load_state_dict(_widened(tensors, network.state_dict()))
     except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
+    return str(metadata["sha256"])
 
 
 def _with_package_finder(
