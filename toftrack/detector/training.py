@@ -167,8 +167,8 @@ def _train(
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     averaged = deepcopy(network)
     progress = Progress(network, averaged, optimiser, schedule.images)
-    settings = {"batch": schedule.batch, "rate": schedule.rate, "width": schedule.width}
-    settings |= {"shapes": shapes, "seed": seed, "start": start}
+    settings: dict[str, Any] = {"batch": schedule.batch, "rate": schedule.rate}
+    settings |= {"width": schedule.width, "shapes": shapes, "seed": seed, "start": start}
     writing: Any = contextlib.nullcontext(lambda: None)
     if checkpoints is not None:
         checkpoints.restore(name, progress, settings)
