@@ -6,9 +6,9 @@ import math
 
 import pytest
 import torch
-from helpers.detection import small_bank
+from helpers.detection import dice, small_bank
 
-from toftrack.detector.shapes import shape_bank
+from toftrack.detector.shapes import cupped, shape_bank
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
@@ -69,3 +69,36 @@ def test_a_seed_gives_the_same_hands() -> None:
     one, two = (shape_bank(3, torch.Generator().manual_seed(7)) for _ in range(2))
     assert torch.equal(one.shape.base_m, two.shape.base_m)
     assert torch.equal(one.surface.axes_m, two.surface.axes_m)
+
+
+def _hollow(curled: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of hands whose fingers are bent by a share of a fist's: by how much cupping moves the joints
+    (N, 21, 3), and how far thenar and hypothenar stand out before the palm's middle (N, 2), m.
+    """
+    n = 200
+    rows = torch.arange(n) % 12
+    bank = small_bank()
+    state = torch.zeros(n, 27)
+    for joint in (1, 2):
+        state[:, 11 + joint :: 4] = curled * math.radians(95.0)
+    before, _ = bank.rows(rows)
+    shape, surface = cupped(*bank.rows(rows), state[:, 6:], bank.log_size[rows], dice(3))
+    pose = forward_kinematics(state, shape)
+    moved = pose.joints_m - forward_kinematics(state, before).joints_m
+    pads = surface.pose(pose)
+    nearest = (pads.centres_m - pads.axes_m.norm(dim=3))[:, 20:29, 2]  # towards the palm, -z
+    middle = nearest[:, 1:3].mean(1)
+    return moved, middle[:, None] - nearest[:, 5:7]
+
+
+def test_a_hand_that_closes_cups_and_a_flat_one_hardly_does() -> None:
+    flat, fist = _hollow(0.0), _hollow(1.0)
+    knuckles = [moved[:, 17, 2] for moved, _ in (flat, fist)]
+    assert float(knuckles[0].abs().mean()) < 0.003
+    # Towards the palm, as the fifth metacarpal gives way: 6 mm on average.
+    assert float(knuckles[1].mean()) < -0.006
+    for moved, _ in (flat, fist):
+        assert moved[:, :13].abs().max() < 1e-5, "thumb, index and middle finger stay"
+        assert (moved[:, 13:].norm(dim=2) < 0.05).all()
+    relief = [stands_out.mean(0) for _, stands_out in (flat, fist)]
+    assert (relief[1] > relief[0] + 0.008).all()

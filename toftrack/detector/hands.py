@@ -16,7 +16,7 @@ from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector.dice import Dice
 from toftrack.detector.grasps import random_grasps
 from toftrack.detector.held_things import PARTS_OF_A_THING
-from toftrack.detector.shapes import ShapeBank
+from toftrack.detector.shapes import ShapeBank, cupped
 from toftrack.detector.skin import Skins, random_skins
 from toftrack.detector.things_numba import PART
 from toftrack.hand.shape import HandShape
@@ -140,8 +140,11 @@ def posed_hands(
     shape, surface = bank.rows(rows)
     size = bank.log_size[rows].exp()
     parts = torch.zeros(n, 0, PART)
-    if angles is None:
-        angles, parts = _posed(shape, surface, size, dice)
+    known = angles is not None
+    angles = shown_poses(n, dice.generator) if angles is None else angles
+    shape, surface = cupped(shape, surface, angles, bank.log_size[rows], dice)
+    if not known:
+        angles, parts = _holding(angles, shape, surface, size, dice)
     if rotation is None:
         raised = thumb_is_up(angles) & dice.chance(UPRIGHT_THUMBS, n)
         rotation = random_rotations(n, dice, views)
@@ -180,12 +183,14 @@ def posed_hands(
     )
 
 
-def _posed(
-    shape: HandShape, surface: HandSurface, size: Tensor, dice: Dice
+def _holding(
+    angles: Tensor, shape: HandShape, surface: HandSurface, size: Tensor, dice: Dice
 ) -> tuple[Tensor, Tensor]:
-    """Poses (N, 21) and what the hands hold (N, Q, PART), in the hands' frames."""
+    """Poses (N, 21), some of which hold a thing now, and what they hold (N, Q, PART), in the
+    hands' frames.
+    """
     n = len(size)
-    angles = shown_poses(n, dice.generator)
+    angles = angles.clone()
     some = dice.chance(HOLDING, n).nonzero()[:, 0]
     shape = HandShape(shape.base_m[some], shape.base_frames[some], shape.bone_lengths_m[some])
     surface = HandSurface(surface.frame_index, surface.centres_m[some], surface.axes_m[some])
