@@ -38,7 +38,8 @@ def straight_mm(one_thread: None) -> float:
 def test_as_a_ros_bag_in_millimetres(tmp_path: Path, straight_mm: float) -> None:
     frames = [frame.depth for frame in Sample(stop=FRAMES)]
     bag = write_bag(tmp_path, "bag", recording(frames, Sample().camera))
-    assert error_mm(Bag(bag)) == pytest.approx(straight_mm, abs=0.3)
+    # Rounded depth leads to other poses of the same quality; a wrong unit or frame, to none.
+    assert error_mm(Bag(bag)) == pytest.approx(straight_mm, abs=0.6)
 
 
 def test_as_a_kinects_recording_through_a_rational_lens(tmp_path: Path, straight_mm: float) -> None:
