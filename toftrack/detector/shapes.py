@@ -19,7 +19,7 @@ _LONGEST_TIP = 0.42
 _CUPPED_FINGERS = (0.0, 0.0, 0.0, 0.45, 1.0)
 """Of the turn of the palm's ulnar edge as a hand closes, each finger's share."""
 _CUPPED_PADS = (0.0, 0.0, 0.45, 1.0, 0.0, -0.6, 1.0, 0.0, 0.3)
-"""The same of the palm's ellipsoids, in the order of hand/surface.py; the thenar turns back."""
+"""The same of the palm's ellipsoids, in the order of hand/surface.py; the thenar the other way."""
 _METACARPALS, _MUSCLES = slice(0, 4), slice(5, 7)
 """Of the palm's ellipsoids: the flesh over the metacarpals, and thenar and hypothenar."""
 _HINGE_M = (-0.003, 0.0, -0.004)
