@@ -120,7 +120,8 @@ class FixedDetector:
     """In the networks' place: finds what it is given, and records the places it was asked about.
 
     found: what a search of the whole image finds, whichever side is searched for.
-    searched: the sides of all searches, "either" of those that are spread over frames.
+    searched: the sides of all searches, "either" of those that are spread over frames, whose
+        images are kept.
     likely: of the last one, None before any.
     centres_m: (C, 3) of all calls of `detect` and `start`.
     """
@@ -129,6 +130,7 @@ class FixedDetector:
         self.settings = detector_settings(**settings)
         self.found = list(found)
         self.searched: list[str] = []
+        self.images: list[np.ndarray] = []
         self.centres_m: list[np.ndarray] = []
         self.likely: Callable[[np.ndarray], float] | None = None
 
@@ -139,6 +141,7 @@ class FixedDetector:
 
     def start_search(self, depth_m, k) -> Callable[[], Places]:
         self.searched.append("either")
+        self.images.append(depth_m)
         centres = np.array([one.centre_m.numpy() for one in self.found]).reshape(-1, 3)
         return lambda: Places(centres, np.full(len(centres), 0.9, np.float32))
 

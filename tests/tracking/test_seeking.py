@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
-from helpers.rendered import hand_at, image_of, right_hand_model, track_of
+from helpers.rendered import WALL_M, hand_at, image_of, right_hand_model, track_of
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.proposals import SAME_PLACE_M
@@ -101,6 +101,32 @@ def test_a_search_without_a_hand_ends_and_waits_for_the_next() -> None:
     state = frames(followed(track_of(HERE), None), model, 2)[-1]
     assert state.hands[1].seeking is None and taking_part(state, 2.0) == [0]
     assert len(model.detector.searched) == 1
+
+
+@pytest.mark.parametrize(
+    ("last_m", "watched", "again"),
+    [(0.06, False, True), (0.12, False, False), (None, False, False), (0.06, True, False)],
+    ids=["touching", "apart", "never seen", "watched"],
+)
+def test_a_hand_that_touched_the_other_is_searched_for_without_the_other(
+    last_m: float | None, watched: bool, again: bool
+) -> None:
+    model = searching(HERE)  # the finder sees nothing but the first hand
+    before = followed(track_of(HERE), None, watched=watched, second_s=10.0)
+    hand = before.hands[1]
+    if last_m is not None:
+        hand = replace(hand, seen=LastSeen(track_of(hand_at(last_m)).mean, 0.2))
+    before = replace(before, hands=(before.hands[0], hand))
+    first, second = frames(before, model, 2)
+    assert (first.hands[1].seeking is not None) == again
+    assert taking_part(first, 2.0) == [0]
+    assert second.hands[1].seeking is None, "it is over"
+    images = model.detector.images
+    assert len(images) == 1 + again
+    np.testing.assert_array_equal(images[0], IMAGE.depth_m)
+    if again:
+        gone, hand = images[1] > WALL_M, image_of(HERE).depth_m < WALL_M
+        assert gone[hand].mean() > 0.9 and not gone[image_of(THERE).depth_m < WALL_M].any()
 
 
 def test_a_search_for_a_doubted_hand_goes_on_over_the_frames_that_it_is_followed_in() -> None:

@@ -190,15 +190,20 @@ def held_out(found: Sequence[Detection]) -> list[Detection]:
     return [min(alike, key=lambda one: float(one.centre_m[2]))]
 
 
-def reachable(hand: HandState, others_m: Sequence[np.ndarray], centre_m: np.ndarray) -> float:
+def reachable(
+    hand: HandState,
+    others_m: Sequence[np.ndarray],
+    centre_m: np.ndarray,
+    apart_m: float = SAME_PLACE_M,
+) -> float:
     """How likely a hand has come to a place from where it was last believed, log scale.
 
     Another hand, or the thing that hides the hand, is no place that it has jumped to; nor what was
     just taken for it and was none.
 
-    others_m: (3,) each, the middles of other hands.
+    others_m: (3,) each, the middles of other hands.  apart_m: nearer to one, it is that hand.
     """
-    if any(np.linalg.norm(other - centre_m) < SAME_PLACE_M for other in others_m):
+    if any(np.linalg.norm(other - centre_m) < apart_m for other in others_m):
         return -np.inf
     patience = _WATCHED_AGAIN_S if hand.watched else _AGAIN_S
     tried = hand.tried.age_s < patience

@@ -36,7 +36,7 @@ _KNOWN = 0.5
 _ARM_M, _THROUGH_M, _OPPOSITE = 0.16, 0.075, -0.5
 """A forearm is seen so far from the wrist; it goes through a palm whose middle is so near to its
 axis; the cosine below which two hands point away from each other."""
-_ONE_M, _ONE = 0.045, 0.3
+ONE_HAND_M, _ONE = 0.045, 0.3
 """Two tracks are of one hand where their palms are so near, and so much of one is in the other."""
 _SAME_PALM_M = 0.022
 """Or where the middles of their palms are nearer than a palm is thick."""
@@ -249,7 +249,7 @@ def on_one_hand(first: PlacedHand, second: PlacedHand) -> bool:
     apart = float(np.linalg.norm(first.centre_m - second.centre_m))
     if apart < _SAME_PALM_M:
         return True
-    if apart > _ONE_M:
+    if apart > ONE_HAND_M:
         return False
     return float(touching(first.joints_m[None], second.joints_m)) > _ONE
 

@@ -12,12 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from toftrack.detector.hand_detector import NO_DETECTION, Detection, merit
-from toftrack.detector.proposals import Places
+from toftrack.detector.proposals import SAME_PLACE_M, Places
 from toftrack.frames import DepthImage
+from toftrack.render.segmentation import reduce_image
 from toftrack.tracking.detect import held_out, reachable, search_due
 from toftrack.tracking.filter import predicted_palm
-from toftrack.tracking.hands import OtherHand, sureness
+from toftrack.tracking.hands import ONE_HAND_M, Neighbour, OtherHand, placed, sureness, without
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import HandState, LastSeen, Seeking, TrackerState
 from toftrack.tracking.watching import watched_slots
@@ -28,6 +31,8 @@ _AT_ONCE = 2
 """Places that are looked at in a frame."""
 _NEARLY = 3.0
 """The first look may be so much worse than what a hand needs: the second one is more exact."""
+_TOUCHING_M = 0.08
+"""Palms whose middles are nearer may belong to hands that touch."""
 Sought = Callable[[], Seeking]
 
 
@@ -63,8 +68,7 @@ def searched_beside(state: TrackerState) -> int | None:
     """The slot whose hand is searched for beside the other one, as it is not there or doubted; None
     where nothing else is followed, or it is known where to look.
     """
-    tracks = [hand.track for hand in state.hands]
-    sure = [track is not None and track.believed and not track.doubted for track in tracks]
+    sure = [_is_sure(hand) for hand in state.hands]
     if len(sure) < 2 or sum(sure) != 1 or state.second_s == math.inf:
         return None
     return sure.index(False)
@@ -72,7 +76,7 @@ def searched_beside(state: TrackerState) -> int | None:
 
 def search_is_over(hand: HandState) -> bool:
     """Whether all places have been looked at, and something was found."""
-    return hand.seeking is not None and not len(hand.seeking.centres_m)
+    return hand.seeking is not None and hand.seeking.over
 
 
 def start_seeking(
@@ -95,6 +99,12 @@ def start_seeking(
     if hand.seeking is not None:
         if search_is_over(hand):
             return state, None
+        if hand.seeking.alone:
+            image = _alone(other, image, model, dt_s)
+        if hand.seeking.anew:
+            wait = detector.start_search(image.depth_m, image.k)
+            likely = partial(likely, apart_m=ONE_HAND_M)
+            return state, partial(_found, wait, likely, alone=True)
         at = hand.seeking.centres_m[:_AT_ONCE]
         pending = [detector.start(image.depth_m, image.k, one, hand.side) for one in at]
         return state, partial(_after_detecting, hand.seeking, pending)
@@ -108,18 +118,51 @@ def start_seeking(
     return replace(state, hands=tuple(hands), second_s=second_s), partial(_found, wait, likely)
 
 
-def _found(wait: Callable[[], Places], likely: Callable[..., float]) -> Seeking:
+def _is_sure(hand: HandState) -> bool:
+    """Whether a hand is followed and believed."""
+    return hand.track is not None and hand.track.believed and not hand.track.doubted
+
+
+def _touches(hand: HandState, other: HandState) -> bool:
+    """Whether a hand was last seen where it touches another one that is surely followed: of such
+    hands the finder may see one place, between them.
+    """
+    if other.track is None or not _is_sure(other) or not hand.seen.ever:
+        return False
+    beside = LastSeen(other.track.mean, 0.0).centre_m
+    return float(np.linalg.norm(hand.seen.centre_m - beside)) < _TOUCHING_M
+
+
+def _alone(other: HandState, image: DepthImage, model: TrackerModel, dt_s: float) -> DepthImage:
+    """The image without the pixels that the other hand, if it is surely followed, explains."""
+    if other.track is None or not _is_sure(other):
+        return image
+    depth_m, k = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
+    size = (depth_m.shape[0], depth_m.shape[1])
+    theirs = placed(other, other.track, model, k, size, dt_s)
+    seen = Neighbour(theirs, None, True, True, other.watched).seen(depth_m)
+    return without(image, [replace(seen, beside=seen.pixels)])
+
+
+def _found(
+    wait: Callable[[], Places], likely: Callable[..., float], alone: bool = False
+) -> Seeking:
     """A search after the finder's part; places where the hand cannot be are none."""
     places = wait()
     possible = [row for row, at in enumerate(places.centre_m) if likely(at) > -math.inf]
-    return Seeking(places.centre_m[possible], places.probability[possible])
+    return Seeking(places.centre_m[possible], places.probability[possible], alone=alone)
 
 
 def _after_detecting(seeking: Seeking, pending: Sequence[Callable[[], Detection]]) -> Seeking:
     """A search after the pose network was asked about some places more."""
     seen = [(wait(), float(heat)) for wait, heat in zip(pending, seeking.heat, strict=False)]
     rest = slice(len(pending), None)
-    return Seeking(seeking.centres_m[rest], seeking.heat[rest], (*seeking.seen, *seen))
+    return replace(
+        seeking,
+        centres_m=seeking.centres_m[rest],
+        heat=seeking.heat[rest],
+        seen=(*seeking.seen, *seen),
+    )
 
 
 def sought(state: TrackerState, wait: Sought | None, model: TrackerModel) -> TrackerState:
@@ -129,9 +172,13 @@ def sought(state: TrackerState, wait: Sought | None, model: TrackerModel) -> Tra
     slot = searched_beside(state)
     assert slot is not None
     hand, seeking = state.hands[slot], wait()
-    over = not len(seeking.centres_m)
+    nowhere = seeking.over and not seeking.seen and not seeking.alone
+    if nowhere and not state.watched and _touches(hand, state.hands[1 - slot]):
+        so_far: Seeking | None = Seeking.anew_alone()
+    else:
+        so_far = _best(hand, seeking, model) if seeking.over else seeking
     hands = list(state.hands)
-    hands[slot] = replace(hand, seeking=_best(hand, seeking, model) if over else seeking)
+    hands[slot] = replace(hand, seeking=so_far)
     return replace(state, hands=tuple(hands))
 
 
@@ -162,8 +209,14 @@ def detect_again(
     About the palm that was found, with its fingers upright, poses are more exact.
     """
     detector, (seen, heat) = model.detector, seeking.seen[0]
+    apart_m = SAME_PLACE_M
+    if seeking.alone:
+        certain = [other for other in others if other.certain]
+        image = without(image, [replace(other, beside=other.pixels) for other in certain])
+        apart_m = ONE_HAND_M
     centre, up = seen.centre_m.numpy()[None], seen.up[None]
     found = detector.detect(image.depth_m, image.k, centre, hand.side, up)[0]
-    likely = reachable(hand, [other.centre_m for other in others], found.centre_m.numpy())
+    known = [other.centre_m for other in others]
+    likely = reachable(hand, known, found.centre_m.numpy(), apart_m)
     better = merit(found, heat) + likely > detector.settings.merit
     return found if better else NO_DETECTION

@@ -115,11 +115,25 @@ class Seeking:
 
     centres_m: (P, 3) places that were not looked at yet.  heat: (P,) how likely the finder has a
     hand there.  seen: what the pose network said of the others, and the finder's probability.
+    alone: the image is searched without the pixels of the other hand.  anew: ... from the next
+        frame on, for with them there was no place but that hand's.
     """
 
     centres_m: np.ndarray
     heat: np.ndarray
     seen: tuple[tuple[Detection, float], ...] = ()
+    alone: bool = False
+    anew: bool = False
+
+    @classmethod
+    def anew_alone(cls) -> Seeking:
+        """A search that begins once more, without the pixels of the other hand."""
+        return cls(np.zeros((0, 3)), np.zeros(0), alone=True, anew=True)
+
+    @property
+    def over(self) -> bool:
+        """Whether all places have been looked at."""
+        return not len(self.centres_m) and not self.anew
 
 
 NOWHERE = LastSeen(torch.zeros(1, 6), math.inf)
