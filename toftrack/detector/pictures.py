@@ -3,7 +3,7 @@
 An ellipsoid {c + F u : |u| <= 1} is met by the ray z (x, y, 1) where |z W d - W c| = 1, W = F^-1: a
 quadratic in z. For skin and things see skin_numba and things_numba. Then the sensor: noise that
 grows with the square of the distance, pixels on depth edges that mix both depths, readings that are
-missing, steps, shadows beside near things, hollows that seem deeper than they are.
+missing, steps, shadows beside near things.
 """
 
 from __future__ import annotations
@@ -26,15 +26,11 @@ from toftrack.detector.things_numba import TILE, draw_part
 
 _entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
-    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE, HOLLOW,
-) = range(13)  # fmt: skip
-SENSOR_TERMS = 13
+    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE,
+) = range(12)  # fmt: skip
+SENSOR_TERMS = 12
 _ONE_SURFACE_M = np.float32(0.03)
 """A camera's filter smooths over steps of less than this."""
-_HOLLOW_M, _HOLLOW_DEPTH_M = np.float32(0.05), np.float32(0.06)
-"""Hollows are at most so wide and so deep; what lies farther back is another surface."""
-_LATEST = 1.5
-"""By what part of its depth a hollow seems deeper, at most."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +53,7 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     BLUR: 1 mixes with neighbours on one surface.  DARK: 1 = the forearm is not read.
     SMOOTH: pixels to each side over which the camera's own filter averages one surface; the folds
     of a fist are lost in it.  COARSE: step of the readings at any distance, as of images that were
-    kept with 8 bits.  HOLLOW: by what part of their depth hollows seem deeper, as light that goes
-    from one of their walls to the other comes late (Fuchs, Multipath interference compensation in
-    time-of-flight camera images, ICPR 2010).
+    kept with 8 bits.
     """
     light = dice.chance(0.25, n)
     terms = torch.zeros(n, SENSOR_TERMS)
@@ -78,8 +72,6 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     wide = dice.uniform(n, low=1.0, high=3.5).floor()
     terms[:, SMOOTH] = torch.where(dice.chance(0.3, n), wide, 0.0)
     terms[:, COARSE] = torch.where(dice.chance(0.1, n), dice.uniform(n, low=0.003, high=0.012), 0.0)
-    late = ~light & dice.chance(0.5, n)
-    terms[:, HOLLOW] = torch.where(late, dice.uniform(n, high=_LATEST), 0.0)
     return terms
 
 
@@ -220,45 +212,6 @@ def _smooth(reach, width, height, depth, scratch, total, count):
 
 
 @compiled
-def _deepen(part, lens, depth, around, scratch):
-    """Hollows of `depth` become deeper by a part of their depth.
-
-    around, scratch: (H, W) to work in. A hollow lies behind the opening of the depths: the farthest
-    of the nearest ones about each pixel.
-    """
-    width, height = int(lens[3]), int(lens[4])
-    nearest = np.float32(8.0)
-    for v in range(height):
-        for u in range(width):
-            nearest = min(nearest, depth[v, u])
-    reach = int(np.float32(0.5) * _HOLLOW_M * lens[0] / (nearest + _HOLLOW_DEPTH_M))
-    for v in range(height):
-        for u in range(width):
-            around[v, u] = depth[v, u]
-    for sign in (np.float32(1.0), np.float32(-1.0)):
-        for v in range(height):
-            for u in range(width):
-                scratch[v, u] = around[v, u]
-            for shift in range(-reach, reach + 1):
-                for u in range(max(-shift, 0), width - max(shift, 0)):
-                    other = around[v, u + shift]
-                    closer = sign * other < sign * scratch[v, u]
-                    scratch[v, u] = other if closer else scratch[v, u]
-        for v in range(height):
-            for u in range(width):
-                around[v, u] = scratch[v, u]
-            for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
-                for u in range(width):
-                    closer = sign * scratch[v2, u] < sign * around[v, u]
-                    around[v, u] = scratch[v2, u] if closer else around[v, u]
-    for v in range(height):
-        for u in range(width):
-            hollow = depth[v, u] - around[v, u]
-            if hollow < _HOLLOW_DEPTH_M:
-                depth[v, u] += part * hollow
-
-
-@compiled
 def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
     """What a sensor makes of a picture: `depth` in place, from `clean`; rows: (2, W) to work in."""
     width, height = int(lens[3]), int(lens[4])
@@ -338,7 +291,6 @@ def _take(
     six = np.empty((6, TILE * TILE), np.float32)
     rays = six[0], six[1], six[2], six[3], six[4], six[5]
     clean, scratch = np.zeros(depth.shape[1:], np.float32), np.empty(depth.shape[1:], np.float32)
-    around = np.empty(depth.shape[1:], np.float32)
     rows = np.empty((2, depth.shape[2]), np.float32)
     for n in range(len(depth)):
         lens = lenses[n]
@@ -378,6 +330,4 @@ def _take(
                 near,
                 rays,
             )
-        if sensors[n, HOLLOW] > 0:
-            _deepen(sensors[n, HOLLOW], lens, clean, around, scratch)
         _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch, rows)
