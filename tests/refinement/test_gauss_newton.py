@@ -214,7 +214,7 @@ def test_points_of_nothing_near_are_left_alone() -> None:
     start, prior = disturbed(0, 0), true_states()[:1, 6:]
     found = refine(start, prior, beside(start, 0.14), shape, hand_surface(shape), settings)
     torch.testing.assert_close(found[:, :6], start[:, :6], atol=1e-6, rtol=0)
-    torch.testing.assert_close(found[:, 6:], clamp_to_joint_limits(prior), atol=1e-4, rtol=0)
+    torch.testing.assert_close(found[:, 6:], clamp_to_joint_limits(prior), atol=1e-5, rtol=0)
 
 
 def test_hypotheses_do_not_know_of_each_other() -> None:
@@ -228,7 +228,7 @@ def test_hypotheses_do_not_know_of_each_other() -> None:
     assert torch.equal(found[3], states[3]) and found[1].isnan().all()
     for row in (0, 2, 4):
         alone = refiner(states[row][None], states[row, None, 6:], seen_in(0), SETTINGS)
-        torch.testing.assert_close(found[row], alone[0], atol=1e-4, rtol=0)
+        torch.testing.assert_close(found[row], alone[0], atol=1e-5, rtol=0)
         assert not torch.equal(found[row], states[row])
     assert refiner(states[:0], states[:0, 6:], seen_in(0), SETTINGS).shape == (0, 27)
 
@@ -266,17 +266,17 @@ def test_unknown_landmarks_count_as_none_and_a_wrong_one_little() -> None:
     start, seen = disturbed(0, 0), seen_in(0)
     plain = refiner(start, start[:, 6:], seen, SETTINGS)
     points, sigma = joints_of(start)[0] + 0.05, torch.full((21,), torch.inf)
-    assert torch.equal(
-        refiner(start, start[:, 6:], seen, SETTINGS, Keypoints(points, sigma)), plain
-    )
+
+    def with_landmarks() -> torch.Tensor:
+        return refiner(start, start[:, 6:], seen, SETTINGS, Keypoints(points, sigma))
+
+    # Rows of zeros may be summed in another order than none.
+    torch.testing.assert_close(with_landmarks(), plain, atol=1e-5, rtol=0)
     sigma[3] = 0.005
     points[3] = torch.nan
-    assert torch.equal(
-        refiner(start, start[:, 6:], seen, SETTINGS, Keypoints(points, sigma)), plain
-    )
+    torch.testing.assert_close(with_landmarks(), plain, atol=1e-5, rtol=0)
     points[3] = 0.3
-    wrong = refiner(start, start[:, 6:], seen, SETTINGS, Keypoints(points, sigma))
-    assert (off_mm(wrong, joints_of(plain)[0]) < 1).all()
+    assert (off_mm(with_landmarks(), joints_of(plain)[0]) < 1).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
