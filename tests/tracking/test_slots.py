@@ -17,7 +17,7 @@ from helpers.rendered import (
 )
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.tracking.handedness import HandednessEstimate
+from toftrack.tracking.handedness import OTHER_SIDE, HandednessEstimate
 from toftrack.tracking.hands import PlacedHand
 from toftrack.tracking.lifecycle import reconcile
 from toftrack.tracking.seeking import due_slots, since_search
@@ -220,3 +220,19 @@ def test_a_hand_that_comes_back_comes_into_its_slot(
     assert [hand.track is not None for hand in after.hands] == [slot == 0, slot == 1]
     assert after.hands[slot].side == side
     assert after.hands[slot].last is before.hands[slot].last, "what the slot's hand was"
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_where_a_side_is_given_no_hand_of_the_other_side_comes_into_the_first_slot(
+    lost: bool,
+) -> None:
+    before = two(None, None)
+    first = before.hands[0]
+    given = replace(first.handedness, given=True)
+    first = replace(first, handedness=given, last=replace(first.last, lost=lost))
+    second = replace(before.hands[1], side=OTHER_SIDE[first.side])
+    before = replace(before, hands=(first, second))
+    came = replace(second, track=known_tracks()["sure"])
+    after, swapped = afterwards(before, replace(before, hands=(first, came)))
+    assert not swapped and after.hands[0] is first
+    assert after.hands[1].track is not None

@@ -280,14 +280,17 @@ def in_wrong_slot(before: Sequence[HandState], hands: Sequence[HandState]) -> bo
     """Whether a hand that began where both slots were vacant belongs into the other one.
 
     A slot keeps to a hand, also when both were away: whose it is tells which one came back. One
-    that nobody knows comes into the first slot.
+    that nobody knows comes into the first slot; but where a side is given, that is the first
+    slot's, and a hand of the other side does not come into it.
     """
     began = [hand.track is not None for hand in hands]
     if any(hand.track is not None for hand in before) or sum(began) != 1:
         return False
     new = began.index(True)
-    known = [known_side(hand) for hand in before]
     side = hands[new].side
+    if before[0].handedness.given:
+        return new != (0 if side == before[0].side else 1)
+    known = [known_side(hand) for hand in before]
     first = 0 if known[0] == side or known[1] != side else 1
     return new != first
 
