@@ -22,7 +22,7 @@ from toftrack.tracking.detect import held_out, reachable, search_due
 from toftrack.tracking.filter import predicted_palm
 from toftrack.tracking.hands import ONE_HAND_M, Neighbour, OtherHand, placed, sureness, without
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.state import HandState, LastSeen, Seeking, TrackerState
+from toftrack.tracking.state import HandState, LastSeen, Seeking, Track, TrackerState
 from toftrack.tracking.watching import watched_slots
 
 _SECOND_S = 0.12
@@ -68,7 +68,8 @@ def searched_beside(state: TrackerState) -> int | None:
     """The slot whose hand is searched for beside the other one, as it is not there or doubted; None
     where nothing else is followed, or it is known where to look.
     """
-    sure = [_is_sure(hand) for hand in state.hands]
+    tracks = [hand.track for hand in state.hands]
+    sure = [track is not None and track.believed and not track.doubted for track in tracks]
     if len(sure) < 2 or sum(sure) != 1 or state.second_s == math.inf:
         return None
     return sure.index(False)
@@ -118,25 +119,17 @@ def start_seeking(
     return replace(state, hands=tuple(hands), second_s=second_s), partial(_found, wait, likely)
 
 
-def _is_sure(hand: HandState) -> bool:
-    """Whether a hand is followed and believed."""
-    return hand.track is not None and hand.track.believed and not hand.track.doubted
-
-
-def _touches(hand: HandState, other: HandState) -> bool:
-    """Whether a hand was last seen where it touches another one that is surely followed: of such
-    hands the finder may see one place, between them.
+def _touches(hand: HandState, other: Track) -> bool:
+    """Whether a hand was last seen where it touches the one that is surely followed: of such hands
+    the finder may see one place, between them.
     """
-    if other.track is None or not _is_sure(other) or not hand.seen.ever:
-        return False
-    beside = LastSeen(other.track.mean, 0.0).centre_m
-    return float(np.linalg.norm(hand.seen.centre_m - beside)) < _TOUCHING_M
+    beside = LastSeen(other.mean, 0.0).centre_m
+    return hand.seen.ever and float(np.linalg.norm(hand.seen.centre_m - beside)) < _TOUCHING_M
 
 
 def _alone(other: HandState, image: DepthImage, model: TrackerModel, dt_s: float) -> DepthImage:
-    """The image without the pixels that the other hand, if it is surely followed, explains."""
-    if other.track is None or not _is_sure(other):
-        return image
+    """The image without the pixels that the other hand, which is surely followed, explains."""
+    assert other.track is not None
     depth_m, k = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
     size = (depth_m.shape[0], depth_m.shape[1])
     theirs = placed(other, other.track, model, k, size, dt_s)
@@ -171,9 +164,10 @@ def sought(state: TrackerState, wait: Sought | None, model: TrackerModel) -> Tra
         return state
     slot = searched_beside(state)
     assert slot is not None
-    hand, seeking = state.hands[slot], wait()
+    hand, other, seeking = state.hands[slot], state.hands[1 - slot].track, wait()
+    assert other is not None
     nowhere = seeking.over and not seeking.seen and not seeking.alone
-    if nowhere and not state.watched and _touches(hand, state.hands[1 - slot]):
+    if nowhere and not state.watched and _touches(hand, other):
         so_far: Seeking | None = Seeking.anew_alone()
     else:
         so_far = _best(hand, seeking, model) if seeking.over else seeking
