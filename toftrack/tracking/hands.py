@@ -213,15 +213,17 @@ def pixels_of(others: Sequence[OtherHand]) -> np.ndarray | None:
     return np.logical_or.reduce(masks) if masks else None
 
 
-def without(image: DepthImage, others: Sequence[OtherHand]) -> DepthImage:
+def without(image: DepthImage, others: Sequence[OtherHand], wholly: bool = False) -> DepthImage:
     """The image as the detector is to see it: with nothing where other hands are, or its keypoints
-    lie on their fingers as well. What may hide a hand stays, for it knows things that hide hands.
+    lie on their fingers as well. What may hide a hand stays, for it knows things that hide hands,
+    unless the others are to be gone wholly.
     """
     for other in others:
-        if other.beside.any():
+        pixels = other.pixels if wholly else other.beside
+        if pixels.any():
             height, width = image.depth_m.shape
-            beside = other.beside.view(np.uint8)
-            gone = cv2.resize(beside, (width, height), interpolation=cv2.INTER_NEAREST)
+            mask = pixels.view(np.uint8)
+            gone = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
             image = replace(image, depth_m=np.where(gone, np.float32(_FAR_M), image.depth_m))
     return image
 

@@ -134,7 +134,7 @@ def _alone(other: HandState, image: DepthImage, model: TrackerModel, dt_s: float
     size = (depth_m.shape[0], depth_m.shape[1])
     theirs = placed(other, other.track, model, k, size, dt_s)
     seen = Neighbour(theirs, None, True, True, other.watched).seen(depth_m)
-    return without(image, [replace(seen, beside=seen.pixels)])
+    return without(image, [seen], wholly=True)
 
 
 def _found(
@@ -205,8 +205,7 @@ def detect_again(
     detector, (seen, heat) = model.detector, seeking.seen[0]
     apart_m = SAME_PLACE_M
     if seeking.alone:
-        certain = [other for other in others if other.certain]
-        image = without(image, [replace(other, beside=other.pixels) for other in certain])
+        image = without(image, others, wholly=True)
         apart_m = ONE_HAND_M
     centre, up = seen.centre_m.numpy()[None], seen.up[None]
     found = detector.detect(image.depth_m, image.k, centre, hand.side, up)[0]
