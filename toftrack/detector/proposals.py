@@ -29,6 +29,9 @@ from toftrack.hand.skeleton import forward_kinematics
 
 SAME_PLACE_M = 0.06
 """Places that lie closer together are one."""
+_ONE_PALM_M = 0.035
+"""Places of the finder that lie closer together are one palm; those of hands that touch do not,
+though less far from each other than the palms are."""
 KEPT = 12
 """Hypotheses of a crop that are used further."""
 DOUBT_M = 0.06
@@ -130,7 +133,7 @@ def _apart(centres_m: np.ndarray, most: int) -> list[int]:
     for row, centre in enumerate(centres_m):
         if len(kept) == most:
             break
-        if all(np.linalg.norm(centre - centres_m[other]) > SAME_PLACE_M for other in kept):
+        if all(np.linalg.norm(centre - centres_m[other]) > _ONE_PALM_M for other in kept):
             kept.append(row)
     return kept
 
