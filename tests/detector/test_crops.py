@@ -22,7 +22,7 @@ from toftrack.detector.crops import (
     crop_rotation,
     wide,
 )
-from toftrack.detector.network import STRIDE, Found, PoseNet
+from toftrack.detector.network import STRIDE, Finder, Found, PoseNet
 from toftrack.detector.proposals import NetworkOutput, find_hands, mirrored
 from toftrack.detector.weights import load_weights, make_ready
 
@@ -248,19 +248,25 @@ def test_of_any_image_something_finite_is_said(name: str, side: str) -> None:
         assert value.isfinite().all(), what
 
 
-@pytest.mark.parametrize(("apart_m", "places"), [(0.042, 2), (0.03, 1)])
-def test_palms_of_hands_that_touch_are_two_places(apart_m: float, places: int) -> None:
-    z, cells = 0.5, 3  # between two peaks; the finder says more exactly where each is
+class SeesTwoPalms(Finder):
+    """Says of any image that two palms are so far apart, both at 0.5 m."""
 
-    def finder(image: torch.Tensor) -> Found:
+    def __init__(self, apart_m: float) -> None:
+        super().__init__()
+        self.apart_m = apart_m
+
+    def forward(self, image: torch.Tensor) -> Found:
         height, width = (side // STRIDE for side in image.shape[-2:])
+        z, cells = 0.5, 3  # between two peaks; the offset says more exactly where the second is
         heat, column = torch.full((1, height, width), -9.0), torch.zeros(1, height, width)
         heat[0, 10, 10], heat[0, 10, 10 + cells] = 1.0, 0.0
-        column[0, 10, 10 + cells] = apart_m / z * WIDE_F_PX / STRIDE - cells
+        column[0, 10, 10 + cells] = self.apart_m / z * WIDE_F_PX / STRIDE - cells
         return Found(heat, column, torch.zeros_like(heat), torch.full_like(heat, math.log(z)))
 
-    finder.device = torch.device("cpu")  # type: ignore[attr-defined]
-    found = find_hands(finder, sample().depth_m[0], sample().k, 3, 0.1)  # type: ignore[arg-type]
+
+@pytest.mark.parametrize(("apart_m", "places"), [(0.042, 2), (0.03, 1)])
+def test_palms_of_hands_that_touch_are_two_places(apart_m: float, places: int) -> None:
+    found = find_hands(SeesTwoPalms(apart_m), sample().depth_m[0], sample().k, 3, 0.1)
     assert len(found.probability) == places
     if places == 2:
         assert np.linalg.norm(found.centre_m[1] - found.centre_m[0]) == pytest.approx(apart_m)
