@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from toftrack.compute.transfer import table
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
@@ -22,6 +23,8 @@ from toftrack.render.scoring import Counts, Evidence
 
 _BITS = 62
 """Pixels to an int64 word: shifts never touch the sign."""
+_POWERS = tuple(float(1 << bit) for bit in range(_BITS // 2))
+"""Exact ones: a GPU's pow is not, 2.0 ** 21 was less than 1 << 21 on one."""
 _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 27}
 """Pixels of a chunk of particles: small enough for the cache, large enough for a GPU."""
 
@@ -97,7 +100,7 @@ def pack_bits(mask: Tensor) -> Tensor:
     half = _BITS // 2
     parts = F.pad(mask, (0, pad)).unflatten(-1, (-1, 2, half))
     # Halves of a word fit a double exactly, and a product with powers of two is the fastest sum.
-    powers = 2.0 ** torch.arange(half, device=mask.device, dtype=torch.float64)
+    powers = table(_POWERS, torch.float64, mask.device)
     halves = (parts.to(torch.float64) @ powers).long()
     return halves[..., 0] | (halves[..., 1] << half)
 
