@@ -176,7 +176,7 @@ def compute_device(name: str) -> torch.device:
             f"compute={name}: the process that this one was forked from has used the GPU, which "
             "CUDA does not allow; start it by multiprocessing's spawn, or give compute=cpu"
         )
-    if name == "auto":  # until a GPU was measured to be right and faster, see docs/lab/gpu.md
+    if name == "auto":  # a GPU is right, and not faster: docs/lab/gpu.md
         return torch.device("cpu")
     if name == "cuda" and not torch.cuda.is_available():
         raise ToftrackError("compute=cuda, but torch finds no CUDA GPU here; give compute=cpu")

@@ -120,6 +120,26 @@ def test_the_terms_of_a_sensor_do_what_they_say() -> None:
     assert shadow.any() and (clean[shadow] > 0.79).mean() > 0.8, "cast on what lies behind"
 
 
+def test_narrow_hollows_seem_deeper_and_nothing_else_does() -> None:
+    # Two ridges 4 cm apart before a floor that lies 3 cm behind them, and 40 cm before the wall.
+    floor, ridges = 0.5, (-0.02, 0.02)
+    centres = torch.tensor([[[0.0, 0.0, floor + 0.02], *[[x, 0.0, 0.49] for x in ridges]]])
+    flat = [torch.tensor([0.2, 0.2, 0.02]), *[torch.tensor([0.01, 0.2, 0.02])] * 2]
+    axes = torch.stack([axis.diag() for axis in flat])[None]
+    scene = plain_scenes(centres, axes, torch.full((1, 3), HAND), plate(0.9).planes)
+    clean, late = sensed(scene), sensed(scene, HOLLOW=1.0)
+    deeper = late - clean
+    middle = HEIGHT // 2, WIDTH // 2
+    depth = clean[middle] - clean[HEIGHT // 2].min()
+    assert depth == pytest.approx(0.03, abs=2e-3)
+    assert deeper[middle] == pytest.approx(depth, abs=2e-3), "twice as deep"
+    assert sensed(scene, HOLLOW=0.5)[middle] - clean[middle] == pytest.approx(depth / 2, abs=2e-3)
+    # The floor outside is no hollow, nor is the wall far behind one.
+    outside = np.abs(np.arange(WIDTH) - WIDTH / 2) > 0.08 * 180 / 0.5
+    assert np.abs(deeper[HEIGHT // 2][outside]).max() < 2e-3
+    assert np.abs(deeper[clean > 0.85]).max() == 0
+
+
 def test_a_dark_sleeve_is_not_read_and_the_hand_is() -> None:
     hands = posed_hands(
         small_bank(), torch.tensor([[0.0, 0.0, 0.5]]), torch.tensor([False]), dice(2), HAND
@@ -155,6 +175,7 @@ def test_sensors_are_within_what_cameras_do() -> None:
     light = terms[:, pictures.SHADOW] > 0
     assert 0.2 < light.float().mean() < 0.3
     assert not terms[light][:, pictures.FLYING].any()
+    assert not terms[light][:, pictures.HOLLOW].any(), "they measure no time"
 
 
 def test_most_things_are_in_front_of_the_hand_and_none_is_in_it() -> None:

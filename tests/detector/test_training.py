@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import pickle
 import subprocess
 import sys
+import threading
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.detection import small_bank
 from helpers.tracking import ROOT
 
-from toftrack.detector import checkpoints, training
-from toftrack.detector.checkpoints import Checkpoints, Progress, save
+from toftrack.detector import checkpoints, images, training
+from toftrack.detector.checkpoints import Checkpoints, Progress, RunningMeans, save
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
-from toftrack.detector.training import Schedule, train_finder, train_poses
+from toftrack.detector.training import Schedule, tensors_of, train_finder, train_poses
 from toftrack.detector.weights import load_weights, save_weights
 from toftrack.errors import ToftrackError
 
@@ -92,6 +97,52 @@ def test_a_share_of_the_start_makes_the_mean_of_both(tmp_path: Path) -> None:
             torch.testing.assert_close(
                 value, 0.25 * start[key] + 0.75 * end[key], atol=1e-3, rtol=1e-3
             )
+
+
+def test_batches_come_in_order_from_a_thread_that_ends_with_whoever_asks() -> None:
+    def numbers() -> Generator[int]:
+        try:
+            yield from range(100)
+        finally:
+            ended.set()
+
+    for asked in (3, 100):
+        ended = threading.Event()
+        with training._ahead(numbers(), lambda number: 2 * number) as batches:
+            found = list(itertools.islice(batches, asked))
+        assert found == list(range(0, 2 * asked, 2))
+        assert ended.wait(5), "what makes the batches is told to end"
+
+
+def test_what_goes_wrong_while_batches_are_made_is_told_to_whoever_asks() -> None:
+    def numbers() -> Generator[int]:
+        yield 1
+        raise ToftrackError("no memory")
+
+    with training._ahead(numbers(), None) as batches:
+        assert next(batches) == 1
+        with pytest.raises(ToftrackError, match="no memory"):
+            next(batches)
+
+
+def test_scenes_that_were_sent_to_another_process_give_the_same_crops() -> None:
+    """On a CUDA device processes make scenes, and their pictures are taken beside the training."""
+    crops = images.crop_images(8, small_bank(), torch.Generator().manual_seed(0))
+    scenes = images.crop_scenes(8, small_bank(), torch.Generator().manual_seed(0))
+    sent = training._tensors(pickle.loads(pickle.dumps(training._arrays(scenes))))
+    for one, other in zip(tensors_of(crops), tensors_of(images.crops_of(sent)), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_running_means_are_kept_by_a_checkpoint(tmp_path: Path) -> None:
+    means = RunningMeans()
+    for value in (1.0, 2.0):
+        means.add({"a": torch.tensor(value), "b": torch.tensor(-value)})
+    assert means.numbers() == pytest.approx({"a": 1.01, "b": -1.01})
+    again = RunningMeans()
+    again.set(means.numbers())
+    again.add({"a": torch.tensor(2.01), "b": torch.tensor(0.0)})
+    assert again.numbers() == pytest.approx({"a": 1.02, "b": -0.9999})
 
 
 def test_the_rate_rises_stays_and_falls_to_nothing() -> None:

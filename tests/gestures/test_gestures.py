@@ -142,6 +142,13 @@ def test_a_thumb_is_up_over_loosely_curled_fingers_which_make_no_fist() -> None:
     assert label_of(of_thumb(angles, "across")) != "fist"
 
 
+def test_a_thumb_is_up_over_fingers_that_roll_up_with_their_knuckles_hardly_bent() -> None:
+    angles = fingers(0, 1, 2, 3)
+    for finger in range(4):
+        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians([35, 95, 55])
+    assert label_of(of_thumb(angles, "up")) == label_of(of_thumb(angles, "out")) == "thumb_up"
+
+
 def test_a_half_closed_hand_is_relaxed_and_a_pinch_with_straight_fingers_ok() -> None:
     assert label_of((pose("palm") + pose("fist", "out")) / 2) == "relaxed"
     angles = fingers()

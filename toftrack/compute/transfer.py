@@ -28,8 +28,8 @@ def on_host(*tensors: Tensor) -> tuple[Tensor, ...]:
 
 
 def on_device(tensor: Tensor, device: torch.device) -> Tensor:
-    """A tensor of the CPU on a device; on the CPU itself it is given back."""
-    if device.type == "cpu":
+    """A tensor of the CPU on a device; one that is there already is given back."""
+    if device.type == tensor.device.type:
         return tensor
     return tensor.pin_memory().to(device, non_blocking=True)
 

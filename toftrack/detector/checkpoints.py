@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
@@ -25,7 +25,34 @@ from toftrack.json_text import parse_json
 from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-detector-training"
-_VERSION = 4
+_VERSION = 5
+_NEWEST = 0.01
+"""Weight of a step in the running means."""
+
+
+class RunningMeans:
+    """Means over about the last hundred steps of what they report, kept where that is computed."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._values = torch.zeros(0)
+
+    def add(self, reported: dict[str, Tensor]) -> None:
+        """What a step reports: () tensors. Nobody waits for them."""
+        values = torch.stack(list(reported.values())).detach()
+        if not self._names:
+            self._names, self._values = list(reported), values
+        else:
+            self._values = self._values.to(values.device).lerp(values, _NEWEST)
+
+    def numbers(self) -> dict[str, float]:
+        """The means; waits for the device."""
+        return dict(zip(self._names, self._values.tolist(), strict=True))
+
+    def set(self, numbers: dict[str, float]) -> None:
+        """As they were."""
+        self._names = list(numbers)
+        self._values = torch.tensor(list(numbers.values()), dtype=torch.float32)
 
 
 @dataclass
@@ -43,7 +70,7 @@ class Progress:
     images: int
     step: int = 0
     seconds: float = 0.0
-    recent: dict[str, float] = field(default_factory=dict)
+    recent: RunningMeans = field(default_factory=RunningMeans)
     course: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -108,7 +135,7 @@ def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
         "images": progress.images,
         "step": progress.step,
         "seconds": progress.seconds,
-        "recent": progress.recent,
+        "recent": progress.recent.numbers(),
         "course": progress.course,
     }
     content: dict[str, Any] = {"metadata": np.array(json.dumps(metadata)), **arrays}
@@ -143,7 +170,8 @@ def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
         )
         progress.images, progress.step = int(metadata["images"]), int(metadata["step"])
         progress.seconds = float(metadata["seconds"])
-        progress.recent, progress.course = dict(metadata["recent"]), list(metadata["course"])
+        progress.recent.set({name: float(mean) for name, mean in metadata["recent"].items()})
+        progress.course = list(metadata["course"])
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ToftrackError(f"{broken} ({error})") from None
 

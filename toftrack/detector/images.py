@@ -27,7 +27,7 @@ from toftrack.detector.hands import (
 )
 from toftrack.detector.images_numba import read_pictures
 from toftrack.detector.network import SEGMENTS, STRIDE
-from toftrack.detector.pictures import Lens, random_sensors, take_pictures
+from toftrack.detector.pictures import Lens, Shots, random_sensors, shots, take, take_pictures
 from toftrack.detector.scenes import (
     Scenes,
     background_behind,
@@ -45,7 +45,7 @@ NEW_HANDS = 0.25
 """How many crops are as of new hands: as the camera is held, and less well centred."""
 _LEFT = 0.1
 """How many hands are left ones: the network learns that and where they are, but not their poses."""
-_WRONG = 0.2
+_WRONG = 0.25
 """How many hands that are followed are followed with a wrong pose, so that the crop is off."""
 _CENTRE_M = 0.009, 0.030
 """By how much the middle of a crop of a hand that is followed is off along each axis: where its
@@ -53,11 +53,12 @@ pose is right, and where it is wrong. Of right poses of recordings 90 % are off 
 all axes together."""
 _NEW_CENTRE_M = 0.014, 0.036
 """The same of new hands, half of which the finder placed well."""
-_DIRECTION = 0.15, 0.4
-"""By how much it is uncertain where the fingers of a hand point that is followed, of 1 m."""
+_DIRECTION = 0.15, 0.8
+"""By how much it is uncertain where the fingers of a hand point that is followed, of 1 m: where its
+pose is right, and where it is wrong, which turns crops by half a right angle."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
-_ELSEWHERE = 0.26
+_ELSEWHERE = 0.28
 """Crops about something else than a hand."""
 _EMPTY = 0.25
 """Whole images without a raised hand."""
@@ -96,6 +97,30 @@ class Crops:
 
 
 @dataclass(frozen=True)
+class CropScenes:
+    """What crops show, before they are taken; N of each.
+
+    shots: the pictures that crops are read of.  side: (N, 2) int32 pixels of such a picture and, in
+    its middle, of the crop.  distance_m: of the crops' centres.  turned: by how much crops are
+    turned, radians.  borders: (N, 2, 3) what lies in the image, see images_numba.
+    present: there is a hand near the centre, seen or not.  The rest: as in Crops.
+    """
+
+    shots: Shots
+    side: Tensor
+    distance_m: Tensor
+    turned: Tensor
+    borders: Tensor
+    present: Tensor
+    right: Tensor
+    pivot_m: Tensor
+    rotation: Tensor
+    angles: Tensor
+    log_size: Tensor
+    joints_m: Tensor
+
+
+@dataclass(frozen=True)
 class WideImages:
     """Whole images and the hands in them: the first is raised, the second another's.
 
@@ -111,6 +136,53 @@ class WideImages:
 
 def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     """n crops: most about a hand's middle, more or less; some about something else."""
+    return crops_of(crop_scenes(n, bank, generator))
+
+
+def crops_of(scenes: CropScenes) -> Crops:
+    """The crops of scenes on the CPU."""
+    depth, which = take(scenes.shots, (_WHOLE, _WHOLE))
+    image, parts = read_pictures(
+        depth,
+        which,
+        scenes.side.numpy(),
+        scenes.distance_m.numpy(),
+        scenes.turned.numpy(),
+        scenes.borders.numpy(),
+    )
+    return _crops(scenes, torch.from_numpy(image), torch.from_numpy(parts).long())
+
+
+def crops_on_device(scenes: CropScenes, seed: int) -> Crops:
+    """The crops of scenes that are on a CUDA device; seed: of the sensors' noise, with theirs."""
+    from toftrack.detector import pictures_triton
+
+    depth, which = pictures_triton.take(scenes.shots, (_WHOLE, _WHOLE), seed)
+    image, parts = pictures_triton.read_pictures(
+        depth, which, scenes.side, scenes.distance_m, scenes.turned, scenes.borders
+    )
+    return _crops(scenes, image, parts)
+
+
+def _crops(scenes: CropScenes, image: Tensor, parts: Tensor) -> Crops:
+    parts = torch.where(parts == OTHER_HAND, OTHER_FOREARM, parts)
+    parts = torch.where(parts == THING, SEGMENTS - 1, parts)
+    visible = (parts == HAND).sum((1, 2)) >= 12
+    return Crops(
+        image=image,
+        parts=parts,
+        present=scenes.present & visible,
+        right=scenes.right,
+        pivot_m=scenes.pivot_m,
+        rotation=scenes.rotation,
+        angles=scenes.angles,
+        log_size=scenes.log_size,
+        joints_m=scenes.joints_m,
+    )
+
+
+def crop_scenes(n: int, bank: ShapeBank, generator: torch.Generator) -> CropScenes:
+    """What n crops show, see crop_images."""
     dice = Dice(generator)
     distance = dice.uniform(n, low=math.log(0.27), high=math.log(1.1)).exp()
     centre = torch.stack((torch.zeros(n), torch.zeros(n), distance), 1)
@@ -146,24 +218,15 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     whole = (side * (turned.cos().abs() + turned.sin().abs())).ceil()
     middle = (whole - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, whole, whole)
-    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_WHOLE, _WHOLE), dice)
-    image, seen_parts = read_pictures(
-        depth,
-        which,
-        torch.stack((whole, side), 1).int().numpy(),
-        distance.numpy(),
-        turned.numpy(),
-        _borders(torch.where(gone, *_CUT), dice).numpy(),
-    )
-    parts = torch.from_numpy(seen_parts).long()
-    parts[parts == OTHER_HAND] = OTHER_FOREARM
-    parts[parts == THING] = SEGMENTS - 1
-    visible = (parts == HAND).sum((1, 2)) >= 12
+    to_take = shots(scenes, lens, random_sensors(n, dice), dice)
     back = turn(turned, 2)  # from the crop's frame
-    return Crops(
-        image=torch.from_numpy(image),
-        parts=parts,
-        present=present & visible,
+    return CropScenes(
+        shots=to_take,
+        side=torch.stack((whole, side), 1).int(),
+        distance_m=distance,
+        turned=turned,
+        borders=_borders(torch.where(gone, *_CUT), dice),
+        present=present,
         right=~left,
         pivot_m=((pivot - centre)[:, None] @ back)[:, 0],
         rotation=back.mT @ hands.rotation,

@@ -28,8 +28,13 @@ _BETAS, _EPS = (0.9, 0.999), 1e-8
 class Muon(torch.optim.Optimizer):
     """Muon for inner matrices, AdamW for all else, with one learning rate and weight decay."""
 
-    def __init__(self, network: nn.Module, last: Iterable[Tensor], rate: float, decay: float):
-        """last: weights that make the network's outputs or see its inputs, left to AdamW."""
+    def __init__(
+        self, network: nn.Module, last: Iterable[Tensor], rate: float | Tensor, decay: float
+    ):
+        """last: weights that make the network's outputs or see its inputs, left to AdamW.
+
+        rate: may be a () tensor on the network's device, and is read in each step.
+        """
         others = {id(weight) for weight in last}
         inner = [p for p in network.parameters() if p.ndim >= 2 and id(p) not in others]
         chosen = {id(p) for p in inner}
@@ -39,36 +44,59 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
-        """One step along the gradients that are there; `closure` is not asked for."""
+        """One step along the gradients that are there; `closure` is not asked for.
+
+        What is done to many weights is one operation of torch's for all of them, and nothing is
+        read back: on a GPU, telling it what to do takes longer than doing it.
+        """
         for group in self.param_groups:
-            for weight in group["params"]:
-                if weight.grad is None:
-                    continue
-                weight.mul_(1 - group["lr"] * group["weight_decay"])
-                along = (self._inner if group["inner"] else self._adam)(weight, weight.grad)
-                weight.add_(along, alpha=-group["lr"])
+            weights = [weight for weight in group["params"] if weight.grad is not None]
+            if not weights:
+                continue
+            along = self._inner(weights) if group["inner"] else self._adam(weights)
+            torch._foreach_mul_(weights, 1 - group["lr"] * group["weight_decay"])
+            torch._foreach_mul_(along, group["lr"])
+            torch._foreach_sub_(weights, along)
 
-    def _inner(self, weight: Tensor, gradient: Tensor) -> Tensor:
-        state = self.state[weight]
-        if not state:
-            state["exp_avg"] = torch.zeros_like(weight)
-        average = state["exp_avg"].lerp_(gradient, 1 - _MOMENTUM)
-        nesterov = gradient.lerp(average, _MOMENTUM)
-        matrix = orthogonal(nesterov.flatten(1))
-        return matrix.view_as(weight) * (_ADAM_SIZE * math.sqrt(max(matrix.shape)))
+    def _inner(self, weights: list[Tensor]) -> list[Tensor]:
+        gradients = [_gradient(weight) for weight in weights]
+        averages = self._kept(weights, "exp_avg")
+        torch._foreach_lerp_(averages, gradients, 1 - _MOMENTUM)
+        nesterov = torch._foreach_lerp(gradients, averages, _MOMENTUM)
+        return [_along(one) for one in nesterov]
 
-    def _adam(self, weight: Tensor, gradient: Tensor) -> Tensor:
-        state = self.state[weight]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["exp_avg"] = torch.zeros_like(weight)
-            state["exp_avg_sq"] = torch.zeros_like(weight)
-        state["step"] += 1
-        count = float(state["step"])
-        mean = state["exp_avg"].lerp_(gradient, 1 - _BETAS[0])
-        square = state["exp_avg_sq"].lerp_(gradient.square(), 1 - _BETAS[1])
-        size = (square / (1 - _BETAS[1] ** count)).sqrt_().add_(_EPS)
-        return mean / (1 - _BETAS[0] ** count) / size
+    def _adam(self, weights: list[Tensor]) -> list[Tensor]:
+        gradients = [_gradient(weight) for weight in weights]
+        means = self._kept(weights, "exp_avg")
+        squares = self._kept(weights, "exp_avg_sq")
+        count = self.state[weights[0]].setdefault("count", weights[0].new_zeros(()))
+        count.add_(1)
+        torch._foreach_lerp_(means, gradients, 1 - _BETAS[0])
+        torch._foreach_mul_(squares, _BETAS[1])
+        torch._foreach_addcmul_(squares, gradients, gradients, 1 - _BETAS[1])
+        sizes = torch._foreach_div(squares, 1 - torch.pow(_BETAS[1], count))
+        torch._foreach_sqrt_(sizes)
+        torch._foreach_add_(sizes, _EPS)
+        along = torch._foreach_div(means, 1 - torch.pow(_BETAS[0], count))
+        torch._foreach_div_(along, sizes)
+        return list(along)
+
+    def _kept(self, weights: list[Tensor], name: str) -> list[Tensor]:
+        """A state of each weight, 0 at first."""
+        for weight in weights:
+            if name not in self.state[weight]:
+                self.state[weight][name] = torch.zeros_like(weight)
+        return [self.state[weight][name] for weight in weights]
+
+
+def _gradient(weight: Tensor) -> Tensor:
+    assert weight.grad is not None
+    return weight.grad
+
+
+def _along(gradient: Tensor) -> Tensor:
+    matrix = orthogonal(gradient.flatten(1))
+    return matrix.view_as(gradient) * (_ADAM_SIZE * math.sqrt(max(matrix.shape)))
 
 
 def orthogonal(matrix: Tensor) -> Tensor:

@@ -3,13 +3,13 @@
 An ellipsoid {c + F u : |u| <= 1} is met by the ray z (x, y, 1) where |z W d - W c| = 1, W = F^-1: a
 quadratic in z. For skin and things see skin_numba and things_numba. Then the sensor: noise that
 grows with the square of the distance, pixels on depth edges that mix both depths, readings that are
-missing, steps, shadows beside near things.
+missing, steps, shadows beside near things, hollows that seem deeper than they are.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -26,11 +26,15 @@ from toftrack.detector.things_numba import TILE, draw_part
 
 _entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
-    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE,
-) = range(12)  # fmt: skip
-SENSOR_TERMS = 12
-_ONE_SURFACE_M = np.float32(0.03)
+    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE, HOLLOW,
+) = range(13)  # fmt: skip
+SENSOR_TERMS = 13
+ONE_SURFACE_M = np.float32(0.03)
 """A camera's filter smooths over steps of less than this."""
+HOLLOW_M, HOLLOW_DEPTH_M = np.float32(0.05), np.float32(0.06)
+"""Hollows are at most so wide and so deep; what lies farther back is another surface."""
+_LATEST = 1.2
+"""By what part of its depth a hollow seems deeper, at most."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,9 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     BLUR: 1 mixes with neighbours on one surface.  DARK: 1 = the forearm is not read.
     SMOOTH: pixels to each side over which the camera's own filter averages one surface; the folds
     of a fist are lost in it.  COARSE: step of the readings at any distance, as of images that were
-    kept with 8 bits.
+    kept with 8 bits.  HOLLOW: by what part of their depth hollows seem deeper, as light that goes
+    from one of their walls to the other comes late (Fuchs, Multipath interference compensation in
+    time-of-flight camera images, ICPR 2010).
     """
     light = dice.chance(0.25, n)
     terms = torch.zeros(n, SENSOR_TERMS)
@@ -72,56 +78,94 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     wide = dice.uniform(n, low=1.0, high=3.5).floor()
     terms[:, SMOOTH] = torch.where(dice.chance(0.3, n), wide, 0.0)
     terms[:, COARSE] = torch.where(dice.chance(0.1, n), dice.uniform(n, low=0.003, high=0.012), 0.0)
+    late = ~light & dice.chance(0.4, n)
+    terms[:, HOLLOW] = torch.where(late, dice.uniform(n, high=_LATEST), 0.0)
     return terms
+
+
+@dataclass(frozen=True)
+class Shots:
+    """All that pictures of N scenes are made of, as float32 but for what is said.
+
+    centres: (N, M, 3).  axes: (N, M, 3, 3).  whiten: their inverses.  which: (N, M) int8 labels of
+    ellipsoids, -1 = not drawn.  planes: (N, P, 4).
+    primitives: (N, S, K, PRIMITIVE) of S hands' skins.  whose: (N, S, K) int8 labels.
+    widths: (N, S, 2) how far a skin blends and lies outside.  parts: (N, Q, PART).
+    lens: (N, 5), see Lens.  sensors: (N, SENSOR_TERMS).  seeds: (N,) int64, of the sensors' noise.
+    """
+
+    centres: Tensor
+    axes: Tensor
+    whiten: Tensor
+    which: Tensor
+    planes: Tensor
+    primitives: Tensor
+    whose: Tensor
+    widths: Tensor
+    parts: Tensor
+    lens: Tensor
+    sensors: Tensor
+    seeds: Tensor
+
+
+def shots(scenes: Scenes, lens: Lens, sensors: Tensor, dice: Dice) -> Shots:
+    """Pictures to take of scenes, on the CPU by `take`, or on a device by pictures_triton."""
+    n = len(sensors)
+    primitives, whose, widths = _skins(scenes)
+    return Shots(
+        _plain(scenes.centres_m),
+        _plain(scenes.axes_m),
+        _plain(torch.linalg.inv(scenes.axes_m)),
+        torch.where(scenes.skinned, -1, scenes.labels).to(torch.int8),
+        _plain(scenes.planes),
+        primitives,
+        whose,
+        widths,
+        _plain(scenes.parts),
+        _plain(torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)),
+        _plain(sensors),
+        torch.randint(1, 2**31 - 1, (n,), generator=dice.generator),
+    )
 
 
 def take_pictures(
     scenes: Scenes, lens: Lens, sensors: Tensor, size: tuple[int, int], dice: Dice
 ) -> tuple[np.ndarray, np.ndarray]:
+    """`take` of `shots`."""
+    return take(shots(scenes, lens, sensors, dice), size)
+
+
+def take(shots: Shots, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Depth (N, H, W) float32, 0 = no reading, and labels (N, H, W) int8, -1 = not seen.
 
     size: H, W of the arrays; each picture fills its own width and height of them.
     """
-    n = len(sensors)
+    n = len(shots.sensors)
     depth = np.zeros((n, *size), np.float32)
     labels = np.full((n, *size), -1, np.int8)
-    seeds = torch.randint(1, 2**31 - 1, (n,), generator=dice.generator)
-    whiten = torch.linalg.inv(scenes.axes_m)
+    arrays = {field.name: getattr(shots, field.name).numpy() for field in fields(shots)}
+    seeds = arrays.pop("seeds").astype(np.uint32)
     with announced("detector: compiling the training pictures' kernel (once, about 5 s)"):
-        _take(
-            _array(scenes.centres_m),
-            _array(scenes.axes_m),
-            _array(whiten),
-            torch.where(scenes.skinned, -1, scenes.labels).to(torch.int8).numpy(),
-            _array(scenes.planes),
-            *_skin_arrays(scenes),
-            _array(scenes.parts),
-            _array(torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)),
-            _array(sensors),
-            seeds.numpy().astype(np.uint32),
-            depth,
-            labels,
-        )
+        _take(*arrays.values(), seeds, depth, labels)
     return depth, labels
 
 
-def _skin_arrays(scenes: Scenes) -> tuple[np.ndarray, ...]:
-    """Primitives (N, S, P, PRIMITIVE), labels (N, S, P) and (N, S, 2) widths of S hands' skins."""
-    skins = scenes.skins
+def _skins(scenes: Scenes) -> tuple[Tensor, Tensor, Tensor]:
+    """Primitives, labels and widths of the hands' skins, see Shots."""
+    n, skins = len(scenes.labels), scenes.skins
     if not skins:
-        n = len(scenes.labels)
-        none = np.zeros((n, 0, 1, PRIMITIVE), np.float32), np.zeros((n, 0, 1), np.int8)
-        return *none, np.zeros((n, 0, 2), np.float32)
+        none = torch.zeros(n, 0, 1, PRIMITIVE), torch.zeros(n, 0, 1, dtype=torch.int8)
+        return *none, torch.zeros(n, 0, 2)
     widths = [torch.stack((skin.blend_m, skin.outside_m), 1) for skin, _ in skins]
     return (
-        _array(torch.stack([skin.primitives for skin, _ in skins], 1)),
-        torch.stack([labels for _, labels in skins], 1).to(torch.int8).contiguous().numpy(),
-        _array(torch.stack(widths, 1)),
+        _plain(torch.stack([skin.primitives for skin, _ in skins], 1)),
+        torch.stack([labels for _, labels in skins], 1).to(torch.int8).contiguous(),
+        _plain(torch.stack(widths, 1)),
     )
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().to(torch.float32).contiguous().numpy()
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.detach().to(torch.float32).contiguous()
 
 
 @compiled
@@ -203,12 +247,51 @@ def _smooth(reach, width, height, depth, scratch, total, count):
             for shift in range(-reach, reach + 1):
                 for u in range(max(-shift, 0), width - max(shift, 0)):
                     other = scratch[v2, u + shift]
-                    near = (other > 0) & (abs(other - scratch[v, u]) < _ONE_SURFACE_M)
+                    near = (other > 0) & (abs(other - scratch[v, u]) < ONE_SURFACE_M)
                     total[u] += other if near else np.float32(0)
                     count[u] += np.float32(1) if near else np.float32(0)
         for u in range(width):
             if scratch[v, u] > 0:
                 depth[v, u] = total[u] / count[u]
+
+
+@compiled
+def _deepen(part, lens, depth, around, scratch):
+    """Hollows of `depth` become deeper by a part of their depth.
+
+    around, scratch: (H, W) to work in. A hollow lies behind the opening of the depths: the farthest
+    of the nearest ones about each pixel.
+    """
+    width, height = int(lens[3]), int(lens[4])
+    nearest = np.float32(8.0)
+    for v in range(height):
+        for u in range(width):
+            nearest = min(nearest, depth[v, u])
+    reach = int(np.float32(0.5) * HOLLOW_M * lens[0] / (nearest + HOLLOW_DEPTH_M))
+    for v in range(height):
+        for u in range(width):
+            around[v, u] = depth[v, u]
+    for sign in (np.float32(1.0), np.float32(-1.0)):
+        for v in range(height):
+            for u in range(width):
+                scratch[v, u] = around[v, u]
+            for shift in range(-reach, reach + 1):
+                for u in range(max(-shift, 0), width - max(shift, 0)):
+                    other = around[v, u + shift]
+                    closer = sign * other < sign * scratch[v, u]
+                    scratch[v, u] = other if closer else scratch[v, u]
+        for v in range(height):
+            for u in range(width):
+                around[v, u] = scratch[v, u]
+            for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
+                for u in range(width):
+                    closer = sign * scratch[v2, u] < sign * around[v, u]
+                    around[v, u] = scratch[v2, u] if closer else around[v, u]
+    for v in range(height):
+        for u in range(width):
+            hollow = depth[v, u] - around[v, u]
+            if hollow < HOLLOW_DEPTH_M:
+                depth[v, u] += part * hollow
 
 
 @compiled
@@ -281,7 +364,7 @@ def _take(
     depth,
     labels,
 ):
-    """All pictures of a batch, see take_pictures; skins as _skin_arrays has them."""
+    """All pictures of a batch, see Shots."""
     state = np.zeros(1, np.uint32)
     tiles = (depth.shape[1] // TILE + 1) * (depth.shape[2] // TILE + 1)
     count = skins.shape[2]
@@ -291,6 +374,7 @@ def _take(
     six = np.empty((6, TILE * TILE), np.float32)
     rays = six[0], six[1], six[2], six[3], six[4], six[5]
     clean, scratch = np.zeros(depth.shape[1:], np.float32), np.empty(depth.shape[1:], np.float32)
+    around = np.empty(depth.shape[1:], np.float32)
     rows = np.empty((2, depth.shape[2]), np.float32)
     for n in range(len(depth)):
         lens = lenses[n]
@@ -330,4 +414,6 @@ def _take(
                 near,
                 rays,
             )
+        if sensors[n, HOLLOW] > 0:
+            _deepen(sensors[n, HOLLOW], lens, clean, around, scratch)
         _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch, rows)

@@ -3,7 +3,9 @@
 The rate stays where it is for two thirds of the images and then falls to nothing along a line
 (Hägele et al., "Scaling laws and compute-optimal training beyond fixed training durations",
 NeurIPS 2024), so that a training can still be made longer or shorter while the rate has not begun
-to fall. Each batch is drawn by a generator of its own, of the seed and the batch's number, so that
+to fall. On a GPU the processes that make images set the pace, one on each core.
+
+Each batch is drawn by a generator of its own, of the seed and the batch's number, so that
 an interrupted training goes on with the batches that it would have seen (checkpoints.py).
 """
 
@@ -17,20 +19,30 @@ import multiprocessing
 import os
 import queue as queues
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from copy import deepcopy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from toftrack.compute.threads import threads
+from toftrack.compute.transfer import on_device
 from toftrack.detector.checkpoints import Checkpoints, Progress
-from toftrack.detector.images import Crops, WideImages, crop_images, wide_images
+from toftrack.detector.crops import CROP
+from toftrack.detector.images import (
+    Crops,
+    CropScenes,
+    WideImages,
+    crop_images,
+    crop_scenes,
+    crops_on_device,
+    wide_images,
+)
 from toftrack.detector.losses import finder_loss, pose_losses
 from toftrack.detector.muon import Muon
 from toftrack.detector.network import Finder, PoseNet
@@ -40,8 +52,10 @@ from toftrack.errors import ToftrackError
 
 _READY = 6
 """Batches of each process that wait to be trained on."""
+_WAITING = 2
+"""Batches that are here and wait to be trained on."""
 _MAKERS = 8
-"""At most so many processes make images: one that trains takes no more."""
+"""At most so many processes make images: one that trains on the CPU takes no more."""
 _NICE = 19
 """By how much the processes that make images give way to the one that trains."""
 _WARM = 300
@@ -49,6 +63,7 @@ _WARM = 300
 _STEADY = 2 / 3
 """Share of the images after which it falls."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_CPU = torch.device("cpu")
 _DECAY = 0.02
 """Of the weights, times the learning rate, in each step."""
 Network = TypeVar("Network", PoseNet, Finder)
@@ -105,57 +120,176 @@ Course = list[dict[str, Any]]
 
 
 def train_poses(
-    schedule: Schedule, shapes: int, seed: int, checkpoints: Checkpoints | None = None
+    schedule: Schedule,
+    shapes: int,
+    seed: int,
+    checkpoints: Checkpoints | None = None,
+    device: torch.device = _CPU,
 ) -> tuple[PoseNet, Course]:
-    """Train the pose network; returns the average of its weights, and the course."""
+    """Train the pose network on a device; returns the average of its weights, on the CPU, and the
+    course.
+
+    On a CUDA device the pictures are taken there, and each step is a replay of the first one.
+    """
     torch.manual_seed(seed)
     network = PoseNet(schedule.width)
-    network.train().to(memory_format=torch.channels_last)
 
-    def step(crops: Crops) -> tuple[Tensor, dict[str, float]]:
-        image = crops.image.to(memory_format=torch.channels_last)
-        with torch.autocast("cpu", torch.bfloat16):
+    def losses(crops: Crops) -> tuple[Tensor, dict[str, Tensor]]:
+        image = _image(crops.image, device)
+        with torch.autocast(device.type, torch.bfloat16, cache_enabled=False):
             outputs = network.features(image)
-        losses = pose_losses(network.decode(image, *outputs), crops, network.anchors)
+        found = pose_losses(network.decode(image, *outputs), crops, network.anchors)
         reported = {
-            "joints_mm": losses.hypothesis_mm,
-            "keypoints_mm": losses.keypoints_mm,
-            "within_20_mm": losses.within_20,
-            "side": losses.side,
-            "present": losses.present,
+            "joints_mm": found.hypothesis_mm,
+            "keypoints_mm": found.keypoints_mm,
+            "within_20_mm": found.within_20,
+            "side": found.side,
+            "present": found.present,
         }
-        return losses.total, reported
+        return found.total, reported
 
-    return _train(network, "poses", crop_images, step, schedule, shapes, seed, checkpoints)
+    on_cpu = device.type == "cpu"
+    images: Images = Images(crop_images) if on_cpu else Images(crop_scenes, _Taken(device, seed))
+    task = Task("poses", images, losses, replayed=not on_cpu)
+    return _train(network, task, schedule, shapes, seed, checkpoints, device)
 
 
 def train_finder(
-    schedule: Schedule, shapes: int, seed: int, checkpoints: Checkpoints | None = None
+    schedule: Schedule,
+    shapes: int,
+    seed: int,
+    checkpoints: Checkpoints | None = None,
+    device: torch.device = _CPU,
 ) -> tuple[Finder, Course]:
-    """Train the finder; returns the average of its weights, and the course."""
+    """Train the finder on a device; returns the average of its weights, on the CPU, and the
+    course.
+    """
     torch.manual_seed(seed)
     network = Finder(schedule.width)
-    network.train().to(memory_format=torch.channels_last)
 
-    def step(images: WideImages) -> tuple[Tensor, dict[str, float]]:
-        image = images.image.to(memory_format=torch.channels_last)
-        with torch.autocast("cpu", torch.bfloat16):
+    def losses(images: WideImages) -> tuple[Tensor, dict[str, Tensor]]:
+        image = _image(images.image, device)
+        with torch.autocast(device.type, torch.bfloat16):
             found = network(image)
         loss = finder_loss(found, images)
-        return loss, {"loss": float(loss.detach())}
+        return loss, {"loss": loss.detach()}
 
-    return _train(network, "finder", wide_images, step, schedule, shapes, seed + 1, checkpoints)
+    task = Task("finder", Images(wide_images), losses)
+    return _train(network, task, schedule, shapes, seed + 1, checkpoints, device)
+
+
+def _image(image: Tensor, device: torch.device) -> Tensor:
+    """A batch's images as a network takes them."""
+    return on_device(image, device).to(torch.float32, memory_format=torch.channels_last)
+
+
+@dataclass(frozen=True)
+class Images:
+    """make: what processes make of (batch, shapes, generator).  taken: what becomes of it here."""
+
+    make: Callable[..., Any]
+    taken: Callable[[Any], Any] | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a network is trained on.
+
+    losses: of a batch, and what is reported; () tensors.  replayed: on a CUDA device, a step is
+    recorded once and replayed, as all its sizes are the same each time.
+    """
+
+    name: str
+    images: Images
+    losses: Callable[[Any], tuple[Tensor, dict[str, Tensor]]]
+    replayed: bool = False
+
+
+class _Taken:
+    """Crops of scenes on a CUDA device, beside the training there."""
+
+    def __init__(self, device: torch.device, seed: int) -> None:
+        self._device, self._seed = device, seed
+        self._stream: torch.cuda.Stream | None = None
+
+    def __call__(self, scenes: CropScenes) -> Crops:
+        if self._stream is None:
+            self._stream = torch.cuda.Stream(self._device)
+        self._seed += 1
+        with torch.cuda.stream(self._stream):
+            there = mapped(scenes, lambda one: on_device(one, self._device))
+            crops = crops_on_device(there, self._seed)
+        # Whoever trains waits for nothing: these are ready before they are asked for.
+        self._stream.synchronize()
+        return crops
+
+
+class _Step:
+    """One step of a training: losses, gradients, new weights and their average."""
+
+    def __init__(
+        self,
+        task: Task,
+        network: nn.Module,
+        averaged: nn.Module,
+        optimiser: Muon,
+        device: torch.device,
+    ) -> None:
+        self._task, self._network, self._averaged = task, network, averaged
+        self._optimiser = optimiser
+        self._rate, self._share = torch.zeros((), device=device), torch.ones((), device=device)
+        for group in optimiser.param_groups:
+            group["lr"] = self._rate
+        self._graph: Any = None
+
+    def __call__(self, batch: Any, rate: float, share: float) -> dict[str, Tensor]:
+        """share: of the new weights in the average. Returns what is reported."""
+        if not self._task.replayed:
+            self._rate.fill_(rate)
+            self._share.fill_(share)
+            return self._eager(batch)
+        if self._graph is None:
+            self._record(batch)
+        self._rate.fill_(rate)
+        self._share.fill_(share)
+        for kept, new in zip(tensors_of(self._batch), tensors_of(batch), strict=True):
+            new.record_stream(torch.cuda.current_stream())
+            kept.copy_(new)
+        self._graph.replay()
+        return self._reported
+
+    def _eager(self, batch: Any) -> dict[str, Tensor]:
+        loss, reported = self._task.losses(batch)
+        self._optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self._network.parameters(), 5.0)
+        self._optimiser.step()
+        _average(self._averaged, self._network, self._share)
+        return reported
+
+    def _record(self, batch: Any) -> None:
+        """As torch.cuda.graph wants it: some steps, here at a rate of 0, then the one to replay."""
+        self._batch = mapped(batch, Tensor.clone)
+        self._share.fill_(0)
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(3):
+                self._eager(self._batch)
+        torch.cuda.current_stream().wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+            self._reported = self._eager(self._batch)
 
 
 def _train(
     network: Network,
-    name: str,
-    make: Callable[..., Any],
-    step: Callable[[Any], tuple[Tensor, dict[str, float]]],
+    task: Task,
     schedule: Schedule,
     shapes: int,
     seed: int,
     checkpoints: Checkpoints | None,
+    device: torch.device,
 ) -> tuple[Network, Course]:
     _keep_memory()
     steps = schedule.steps
@@ -163,6 +297,7 @@ def _train(
     if schedule.start is not None:
         kind = "pose" if isinstance(network, PoseNet) else "finder"
         start = go_on_from(schedule.start, kind, network, schedule.width)
+    network.train().to(device, memory_format=torch.channels_last)
     begun = deepcopy(network) if schedule.start_share > 0 else None
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     averaged = deepcopy(network)
@@ -171,40 +306,36 @@ def _train(
     settings |= {"width": schedule.width, "shapes": shapes, "seed": seed, "start": start}
     writing: Any = contextlib.nullcontext(lambda: None)
     if checkpoints is not None:
-        checkpoints.restore(name, progress, settings)
-        _check_length(name, progress, schedule)
-        writing = checkpoints.writing(name, progress, settings)
-    recent, course = progress.recent, progress.course
+        checkpoints.restore(task.name, progress, settings)
+        _check_length(task.name, progress, schedule)
+        writing = checkpoints.writing(task.name, progress, settings)
+    course = progress.course
     before, began = progress.seconds, time.perf_counter()
     done = progress.step * schedule.batch
     bar = tqdm(
-        total=steps * schedule.batch, initial=done, unit=" images", desc=name, file=sys.stderr
+        total=steps * schedule.batch, initial=done, unit=" images", desc=task.name, file=sys.stderr
     )
-    with bar, writing as stepped:
-        for batch in _batches(make, schedule.batch, range(progress.step, steps), shapes, seed):
+    numbers = range(progress.step, steps)
+    made = _made(task.images.make, schedule.batch, numbers, shapes, seed, _makers(device))
+    step = _Step(task, network, averaged, optimiser, device)
+    with bar, writing as stepped, _ahead(made, task.images.taken) as batches:
+        for batch in batches:
             number = progress.step
-            for group in optimiser.param_groups:
-                group["lr"] = schedule.rate_at(number)
-            loss, reported = step(batch)
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-            optimiser.step()
-            _average(averaged, network, min(0.998, (number + 1) / (number + 10)))
-            for key, value in reported.items():
-                recent[key] = 0.99 * recent.get(key, value) + 0.01 * value
+            share = 1 - min(0.998, (number + 1) / (number + 10))
+            progress.recent.add(step(batch, schedule.rate_at(number), share))
             bar.update(schedule.batch)
             progress.step = number + 1
             progress.seconds = before + time.perf_counter() - began
             if (number + 1) % 100 == 0 or number + 1 == steps:
+                recent = progress.recent.numbers()
                 bar.set_postfix({k: f"{v:.3g}" for k, v in recent.items()}, refresh=False)
                 images = (number + 1) * schedule.batch
                 seconds = round(progress.seconds, 1)
                 course.append({"images": images, "seconds": seconds} | recent)
             stepped()
     if begun is not None:
-        _average(averaged, begun, 1 - schedule.start_share)
-    return averaged, course
+        _average(averaged, begun, torch.tensor(schedule.start_share, device=device))
+    return averaged.cpu(), course
 
 
 def _check_length(name: str, progress: Progress, schedule: Schedule) -> None:
@@ -233,24 +364,79 @@ def _keep_memory() -> None:
 
 
 @torch.no_grad()
-def _average(averaged: nn.Module, network: nn.Module, kept: float) -> None:
-    """Move all weights and statistics towards another network's, of which `kept` stays."""
-    for old, new in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
-        if old.is_floating_point():
-            old.lerp_(new, 1 - kept)
-        else:
+def _average(averaged: nn.Module, network: nn.Module, share: Tensor) -> None:
+    """Move all weights and statistics towards another network's by a () share of the way."""
+    pairs = list(zip(averaged.state_dict().values(), network.state_dict().values(), strict=True))
+    for old, new in pairs:
+        if not old.is_floating_point():
             old.copy_(new)
+    olds = [old for old, _ in pairs if old.is_floating_point()]
+    news = [new for _, new in pairs if new.is_floating_point()]
+    away = torch._foreach_sub(news, olds)
+    torch._foreach_mul_(away, share)
+    torch._foreach_add_(olds, away)
 
 
-def _batches(
-    make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int
-) -> Iterator[Any]:
-    """The batches of these numbers, made by other processes, in order."""
+def _makers(device: torch.device) -> int:
+    """How many processes make images: where a GPU trains, all cores but one."""
+    if device.type == "cpu":
+        return min(threads(), _MAKERS)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return max(1, (cores or 1) - 1)
+
+
+@contextlib.contextmanager
+def _ahead(batches: Generator[Any], taken: Callable[[Any], Any] | None) -> Iterator[Iterator[Any]]:
+    """The same batches, fetched, and `taken`, by a thread beside the training."""
+    ready: queues.Queue[Any] = queues.Queue(_WAITING)
+    ended = threading.Event()
+
+    def put(one: Any) -> bool:
+        while not ended.is_set():
+            with contextlib.suppress(queues.Full):
+                ready.put(one, timeout=0.2)
+                return True
+        return False
+
+    def fetch() -> None:
+        last: Any = None
+        try:
+            for batch in batches:
+                if not put((batch if taken is None else taken(batch), None)):
+                    break
+        except BaseException as error:
+            last = error
+        finally:
+            batches.close()
+        put((None, last))
+
+    def all_of_them() -> Iterator[Any]:
+        while True:
+            batch, error = ready.get()
+            if error is not None:
+                raise error
+            if batch is None:
+                return
+            yield batch
+
+    thread = threading.Thread(target=fetch, name="toftrack-batches", daemon=True)
+    thread.start()
+    try:
+        yield all_of_them()
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _made(
+    make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int, makers: int
+) -> Generator[Any]:
+    """The batches of these numbers, made by so many other processes, in order."""
     if len(numbers) == 0:
         return
     context = multiprocessing.get_context("spawn")
-    makers: list[tuple[Any, Any]] = []
-    count = min(threads(), len(numbers), _MAKERS)
+    working: list[tuple[Any, Any]] = []
+    count = min(makers, len(numbers))
     try:
         for first in range(count):
             queue, mine = context.Queue(_READY), numbers[first::count]
@@ -258,11 +444,11 @@ def _batches(
                 target=_make_batches, args=(queue, make, batch, mine, shapes, seed), daemon=True
             )
             worker.start()
-            makers.append((queue, worker))
-        for _, (queue, worker) in zip(numbers, itertools.cycle(makers), strict=False):
+            working.append((queue, worker))
+        for _, (queue, worker) in zip(numbers, itertools.cycle(working), strict=False):
             while True:
                 try:
-                    yield _tensors(*queue.get(timeout=10))
+                    yield _tensors(queue.get(timeout=10))
                     break
                 except queues.Empty:
                     if not worker.is_alive():
@@ -271,7 +457,7 @@ def _batches(
                             " memory?"
                         ) from None
     finally:
-        for _, worker in makers:
+        for _, worker in working:
             worker.terminate()
             worker.join()
 
@@ -291,14 +477,35 @@ def _make_batches(
         queue.put(_arrays(make(batch, bank, generator)))
 
 
-def _arrays(batch: Any) -> tuple[type, list[np.ndarray]]:
+def _arrays(batch: Any) -> Any:
     """A batch as arrays, which travel by themselves: torch would share memory through a helper that
     a busy machine may starve. Images in half precision, which is more than a sensor's.
     """
-    values = [getattr(batch, field.name).numpy() for field in fields(batch)]
-    return type(batch), [v.astype(np.float16) if v.ndim == 4 else v for v in values]
+    return mapped(batch, lambda one: (one.half() if _is_image(one) else one).numpy())
 
 
-def _tensors(kind: type, arrays: list[np.ndarray]) -> Any:
-    """The batch again."""
-    return kind(*(torch.from_numpy(a.astype(np.float32) if a.ndim == 4 else a) for a in arrays))
+def _tensors(batch: Any) -> Any:
+    """The batch again, its images in half precision."""
+    return mapped(batch, torch.from_numpy)
+
+
+def _is_image(one: Tensor) -> bool:
+    return one.ndim == 4 and one.shape[-1] >= CROP
+
+
+def mapped(batch: Any, function: Callable[[Any], Any]) -> Any:
+    """The same dataclass with a function's results in place of its tensors."""
+    values = {field.name: getattr(batch, field.name) for field in fields(batch)}
+    return type(batch)(
+        **{
+            name: mapped(one, function) if is_dataclass(one) else function(one)
+            for name, one in values.items()
+        }
+    )
+
+
+def tensors_of(batch: Any) -> list[Tensor]:
+    """All of a dataclass."""
+    found: list[Tensor] = []
+    mapped(batch, found.append)
+    return found

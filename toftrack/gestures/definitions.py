@@ -48,6 +48,7 @@ class _Finger(NamedTuple):
 _STRAIGHT = _Finger((-30, 30), (-25, 25))
 _CURLED = _Finger((205, 270), (20, 100))
 _LOOSELY_CURLED = _Finger((150, 270), (-5, 100))
+_ROLLED_UP = _Finger((172, 225), (80, 128))
 _RESTING = _Finger((55, 130), (-5, 60))
 _HOOKED = _Finger((120, 190), (100, 180))
 _FLAT_BENT = _Finger((60, 110), (-110, -40))
@@ -68,12 +69,14 @@ _APART: _Features = {features.APART: (0.42, 0.80)}
 
 
 def _define(name: str, fingers: str, tips: _Features) -> Definition:
-    """fingers: a letter each, index to little: Straight, Curled, Loosely curled, Resting, Hooked,
-    Flat and bent at the knuckle, Pinching, Nearly straight."""
+    """fingers: a letter each, index to little: Straight, Curled, Loosely curled, rolled Up over a
+    knuckle that is hardly bent, Resting, Hooked, Flat and bent at the knuckle, Pinching, Nearly
+    straight."""
     states = {
         "S": _STRAIGHT,
         "C": _CURLED,
         "L": _LOOSELY_CURLED,
+        "U": _ROLLED_UP,
         "R": _RESTING,
         "H": _HOOKED,
         "F": _FLAT_BENT,
@@ -107,8 +110,9 @@ _ALL = (
     # Two fingers side by side point as well; in a V they are a number.
     _define(POINTING, "SSCC", _NOT_STRETCHED | _TOGETHER),
     _define(POINTING_THUMB, "SSCC", _STRETCHED | _TOGETHER),
-    # Who puts a thumb up need not make a fist of the rest.
+    # Who puts a thumb up need not make a fist of the rest, and some hardly bend their knuckles.
     _define("thumb_up", "LLLL", _STRETCHED),
+    _define("thumb_up", "UUUU", _STRETCHED),
     _define("victory", "SSCC", _NOT_STRETCHED | _APART),
     # Three is counted from the index finger on, or from the thumb on.
     _define("three", "SSSC", _ANY),

@@ -43,6 +43,7 @@ def train(config: DictConfig) -> float:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     import torch
 
+    from toftrack.api import compute_device
     from toftrack.detector.checkpoints import Checkpoints
     from toftrack.detector.onnx_export import export_networks, missing_packages, needed
     from toftrack.detector.training import train_finder, train_poses
@@ -58,6 +59,8 @@ def train(config: DictConfig) -> float:
             f"{needed(missing)}; otherwise training ends with {config.output} alone, and they are"
             f" made later by python -m toftrack.programs.export_detector {path}"
         )
+    found = "cuda" if torch.cuda.is_available() else "cpu"
+    device = compute_device(found if config.compute == "auto" else config.compute)
     poses = hydra.utils.instantiate(config.poses)
     finder = hydra.utils.instantiate(config.finder)
     if not (isinstance(config.shapes, int) and config.shapes > 0):
@@ -66,7 +69,7 @@ def train(config: DictConfig) -> float:
     resume = None if config.resume is None else Path(to_absolute_path(config.resume))
     checkpoints = Checkpoints(folder, config.checkpoint_minutes, resume)
     write_picture(folder / "images.png", images_figure(config.seed))
-    each = (config.shapes, config.seed, checkpoints)
+    each = (config.shapes, config.seed, checkpoints, device)
     finder_network, finder_course = train_finder(finder, *each)
     pose_network, pose_course = train_poses(poses, *each)
     courses = [course for course in (finder_course, pose_course) if course]
@@ -77,6 +80,7 @@ def train(config: DictConfig) -> float:
         "pose_images": poses.images,
         "finder_images": finder.images,
         "torch": torch.__version__,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "minutes": minutes,
     }
     for name, schedule in (("pose", poses), ("finder", finder)):

@@ -38,6 +38,7 @@ _STATES = {
     "back": ((-14, 4, 0), (8, 5, 5)),  # bent backwards a little, as of a hand stretched out
     "tight": ((86, 105, 65), (5, 6, 8)),  # as a fist closes: the tip is 26 to 37 mm off the knuckle
     "loose": ((74, 92, 45), (11, 12, 14)),
+    "folded": ((32, 98, 58), (22, 9, 12)),  # as tight, over knuckles that are bent half or less
     "hooked": ((5, 92, 55), (12, 14, 16)),
     "claw": ((-8, 52, 38), (9, 14, 13)),
     "half": ((35, 40, 20), (18, 20, 13)),
@@ -85,10 +86,12 @@ SHOWN = (
     Shown("stretched palm", ("out", "up"), _four("back"), _APART, 5),
     Shown("flat", ("beside", "out", "folded"), _four("straight"), _TOGETHER, 8),
     Shown("flat, thumb away", ("up", "out"), _four("straight"), _TOGETHER, 4),
-    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 9),
+    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 10),
     Shown("fist about the thumb", ("tucked", "folded"), _four("over"), _TOGETHER, 2),
+    Shown("fist, flat knuckles", ("across", "beside", "hooked"), _four("folded"), _TOGETHER, 4),
     Shown("loose fist", _CLOSED, _four("loose"), _ANY, 3),
     Shown("thumb up", ("up", "out", "up"), _four("tight"), _TOGETHER, 9),
+    Shown("thumb up, flat knuckles", ("up", "out", "up"), _four("folded"), _TOGETHER, 6),
     Shown("thumb up, loose", ("up", "out"), _four("loose"), _ANY, 2),
     Shown("point", _CLOSED, ("straight", "tight", "tight", "tight"), _ANY, 7),
     Shown("point, loose", _CLOSED, ("straight", "loose", "loose", "loose"), _ANY, 3),
