@@ -108,18 +108,18 @@ def test_batches_come_in_order_from_a_thread_that_ends_with_whoever_asks() -> No
 
     for asked in (3, 100):
         ended = threading.Event()
-        with training._ahead(numbers(), lambda number: 2 * number) as batches:
+        with training._prefetched(numbers(), lambda number: 2 * number) as batches:
             found = list(itertools.islice(batches, asked))
         assert found == list(range(0, 2 * asked, 2))
         assert ended.wait(5), "what makes the batches is told to end"
 
 
-def test_what_goes_wrong_while_batches_are_made_is_told_to_whoever_asks() -> None:
+def test_what_goes_wrong_while_batches_are_made_reaches_whoever_asks() -> None:
     def numbers() -> Generator[int]:
         yield 1
         raise ToftrackError("no memory")
 
-    with training._ahead(numbers(), None) as batches:
+    with training._prefetched(numbers(), None) as batches:
         assert next(batches) == 1
         with pytest.raises(ToftrackError, match="no memory"):
             next(batches)

@@ -428,7 +428,7 @@ def _sampled(x, y, border, cosine, sine, middle, each, last):
 
 @triton.jit
 def _read_kernel(
-    depth, sides, distances, turns, borders, image, height_all, width_all,
+    depth, sides, distances, angles, borders, image, height_all, width_all,
     SCALE: tl.constexpr, CROP: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Crops of pictures, see images_numba._read."""
@@ -436,7 +436,7 @@ def _read_kernel(
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     row, column = place // CROP, place % CROP
     whole, each = tl.load(sides + n * 2), tl.load(sides + n * 2 + 1)
-    cosine, sine = tl.cos(tl.load(turns + n)), tl.sin(tl.load(turns + n))
+    cosine, sine = tl.cos(tl.load(angles + n)), tl.sin(tl.load(angles + n))
     border, distance = borders + n * 6, tl.load(distances + n)
     out = image + n * CHANNELS * CROP * CROP + place
     total = tl.zeros([BLOCK], tl.float32)
@@ -465,7 +465,7 @@ def _read_kernel(
 
 @triton.jit
 def _parts_kernel(
-    labels, sides, turns, borders, image, parts, height_all, width_all,
+    labels, sides, angles, borders, image, parts, height_all, width_all,
     CROP: tl.constexpr, CHANNELS: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """What the crop shows in each of PARTS x PARTS places, -1 = not in the image."""
@@ -475,7 +475,7 @@ def _parts_kernel(
     line = 2 * each_part * (place // PARTS) + each_part
     sample = 2 * each_part * (place % PARTS) + each_part
     whole, each = tl.load(sides + n * 2), tl.load(sides + n * 2 + 1)
-    cosine, sine = tl.cos(tl.load(turns + n)), tl.sin(tl.load(turns + n))
+    cosine, sine = tl.cos(tl.load(angles + n)), tl.sin(tl.load(angles + n))
     y, x = (line + 0.5) / (2 * CROP) - 0.5, (sample + 0.5) / (2 * CROP) - 0.5
     v, u, inside = _sampled(x, y, borders + n * 6, cosine, sine, 0.5 * whole, each, whole - 1)
     at = labels + n * height_all * width_all + v * width_all + u

@@ -318,7 +318,7 @@ def _train(
     numbers = range(progress.step, steps)
     made = _made(task.images.make, schedule.batch, numbers, shapes, seed, _makers(device))
     step = _Step(task, network, averaged, optimiser, device)
-    with bar, writing as stepped, _ahead(made, task.images.taken) as batches:
+    with bar, writing as stepped, _prefetched(made, task.images.taken) as batches:
         for batch in batches:
             number = progress.step
             share = 1 - min(0.998, (number + 1) / (number + 10))
@@ -386,7 +386,9 @@ def _makers(device: torch.device) -> int:
 
 
 @contextlib.contextmanager
-def _ahead(batches: Generator[Any], taken: Callable[[Any], Any] | None) -> Iterator[Iterator[Any]]:
+def _prefetched(
+    batches: Generator[Any], taken: Callable[[Any], Any] | None
+) -> Iterator[Iterator[Any]]:
     """The same batches, fetched, and `taken`, by a thread beside the training."""
     ready: queues.Queue[Any] = queues.Queue(_WAITING)
     ended = threading.Event()
