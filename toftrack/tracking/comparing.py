@@ -34,6 +34,8 @@ _SWITCHED = 0.45
 """The side is changed when it has become less probable than this, so that it does not flicker."""
 _LEAST_PRESENT = 0.5
 """Where a hand is less probable than this, its sides are not compared."""
+_LEAST_SIDE = 1e-4
+"""The network is never surer of a side than by this."""
 _LEAST_LOG_ODDS = -1.0
 """Nor are those of a given side's track that is less surely right than this: neither pose is the
 hand's, and which one explains more of the image is chance."""
@@ -74,6 +76,7 @@ def compared(
     mirrored = model.detector.detect(image.depth_m, image.k, centre[None], other, up)[0]
     gain = _best_log_posterior(hand, detection, hand.side, others, image, model)
     gain -= _best_log_posterior(hand, mirrored, other, others, image, model)
+    gain += settings.network * _said(detection, mirrored, hand.side, image, model)
     hand = _after(replace(hand, handedness=before), gain, detection, image, model)
     return hand, detection if hand.side != other else mirrored
 
@@ -89,6 +92,8 @@ def compared_beside(frame: HandFrame, mirrored: Detection, image: DepthImage) ->
         return frame
     gain = _best_of_side(frame, detection, hand.side)
     gain -= _best_of_side(frame, mirrored, OTHER_SIDE[hand.side])
+    weight = model.configured.handedness.network
+    gain += weight * _said(detection, mirrored, hand.side, image, model)
     after = _after(hand, gain, detection, without(image, frame.others), model)
     if after.side == hand.side:
         return replace(frame, hand=after)
@@ -109,6 +114,34 @@ def compared_beside(frame: HandFrame, mirrored: Detection, image: DepthImage) ->
         detection=mirrored,
         image=image_term(observation, fitted, model),
     )
+
+
+def _said(
+    detection: Detection, mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
+) -> float:
+    """How much surer the network is of a side than of the other one, log odds.
+
+    It is asked about the crop of either side's pose, for a crop that is turned as a pose has it
+    makes that pose's side the likelier one.
+    """
+    said = _side_log_odds(detection) - _side_log_odds(mirrored)
+    if mirrored.empty:
+        return said
+    centre, up = mirrored.centre_m.numpy()[None], mirrored.up[None]
+    own, other = (
+        model.detector.detect(image.depth_m, image.k, centre, one, up)[0]
+        for one in (side, OTHER_SIDE[side])
+    )
+    return 0.5 * (said + _side_log_odds(own) - _side_log_odds(other))
+
+
+def _side_log_odds(detection: Detection) -> float:
+    """That a hand is of the side that was looked for, by the network; 0 where it was not asked.
+
+    Most hands that it was trained on are of that side, which cancels in the difference of both.
+    """
+    p = min(max(detection.right_side, _LEAST_SIDE), 1 - _LEAST_SIDE)
+    return math.log(p / (1 - p))
 
 
 def _after(

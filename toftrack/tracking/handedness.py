@@ -41,6 +41,7 @@ class HandednessSettings:
     weight: float
     largest: float
     keypoints: float
+    network: float
     most: float
     kept: float
     shoulder: float
