@@ -1,9 +1,9 @@
 """Handedness: evidence for a right and for a left hand, summed up over comparisons.
 
 The same image is explained twice, by the detector's poses of a right hand and by those of a left
-one, each brought onto the seen points; their posteriors are compared (lifecycle.py). The network's
-own probability of a side is left out: on renders it is better than this, on other persons' hands
-worse, for it has learned which poses are drawn.
+one, each brought onto the seen points; their posteriors are compared (comparing.py). The network's
+own word counts a little beside them: where the image says nothing, as of a fist that does not move,
+it is right more often, but it believes a wrong pose whose crop it sees.
 """
 
 from __future__ import annotations
