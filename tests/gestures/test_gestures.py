@@ -347,6 +347,17 @@ def test_a_followed_hand_out_of_the_pose_space_is_other() -> None:
     assert reported.lost and reported.gesture == "other"
 
 
+def test_a_fist_whose_thumb_lies_beside_the_index_finger_pinches_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("toftrack.gestures.recognition.pinch_of", lambda *_: 1.0)
+    for shown, pinches in ((pose("fist"), False), (pose("palm"), True)):
+        state = None
+        for _ in range(6):
+            state, told = tell_gesture(GESTURES, state, estimate(shown), SPACE)
+        assert told.pinch == 1 and told.pinching == pinches, told.gesture
+
+
 def test_without_gestures_there_are_no_labels() -> None:
     state, reported = tell_gesture(None, None, estimate(pose("gun")), SPACE)
     assert state is None and reported.gesture == "" and math.isnan(reported.gesture_probability)

@@ -17,6 +17,7 @@ import numpy as np
 from toftrack.gestures import features
 
 OTHER = "other"
+FIST = "fist"
 POINTING = "pointing"
 POINTING_THUMB = "pointing_thumb"
 RAY_GESTURES = (POINTING, POINTING_THUMB)
@@ -104,7 +105,7 @@ _NONE = tuple(_define(OTHER, fingers, _ANY) for fingers in ("HHHH", "FFFF", "LLL
 _ALL = (
     _define("palm", "SSSS", _OPEN),
     _define("palm", "SSSS", _BESIDE),
-    _define("fist", "CCCC", _NOT_STRETCHED),
+    _define(FIST, "CCCC", _NOT_STRETCHED),
     _define(POINTING, "SCCC", _NOT_STRETCHED),
     _define(POINTING_THUMB, "SCCC", _STRETCHED),
     # Two fingers side by side point as well; in a V they are a number.
@@ -124,7 +125,7 @@ _ALL = (
 )
 _PAPER = (
     _define("palm", "SSSS", _ANY),
-    _define("fist", "CCCC", _ANY),
+    _define(FIST, "CCCC", _ANY),
     _define(POINTING, "SCCC", _ANY),
 )
 SETS = {"all": _ALL, "paper": _PAPER}

@@ -23,7 +23,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.gestures import features
-from toftrack.gestures.definitions import OTHER, RAY_GESTURES, SETS, Definition
+from toftrack.gestures.definitions import FIST, OTHER, RAY_GESTURES, SETS, Definition
 from toftrack.gestures.files import NamedPose, read_poses
 from toftrack.gestures.pinch import PinchSettings, PinchState, pinch_of, update_pinch
 from toftrack.hand.skeleton import JOINT_NAMES
@@ -313,7 +313,9 @@ def tell_gesture(
     if not gestures.decided(label, values):
         label, probability = "", math.nan
     pinch = pinch_of(joints, gestures.settings.pinch, asked)
-    pinched = update_pinch(state.pinch, pinch, gestures.settings.pinch, frames)
+    # The thumb of a fist lies beside the index finger's tip and pinches nothing.
+    nothing = label == FIST and not state.pinch.pinching
+    pinched = update_pinch(state.pinch, 0.0 if nothing else pinch, gestures.settings.pinch, frames)
     state = replace(state, pinch=pinched)
     estimate = replace(
         estimate,
