@@ -354,8 +354,8 @@ def test_a_fist_whose_thumb_lies_beside_the_index_finger_pinches_nothing(
     for shown, pinches in ((pose("fist"), False), (pose("palm"), True)):
         state = None
         for _ in range(6):
-            state, told = tell_gesture(GESTURES, state, estimate(shown), SPACE)
-        assert told.pinch == 1 and told.pinching == pinches, told.gesture
+            state, reported = tell_gesture(GESTURES, state, estimate(shown), SPACE)
+        assert reported.pinch == 1 and reported.pinching == pinches, reported.gesture
 
 
 def test_without_gestures_there_are_no_labels() -> None:
