@@ -358,6 +358,17 @@ def test_a_fist_whose_thumb_lies_beside_the_index_finger_pinches_nothing(
         assert reported.pinch == 1 and reported.pinching == pinches, reported.gesture
 
 
+@pytest.mark.parametrize(("confidence", "name"), [(0.9, "palm"), (0.2, "fist"), (math.nan, "fist")])
+def test_a_pose_that_is_surely_right_has_its_gesture_whatever_the_image_explains(
+    confidence: float, name: str
+) -> None:
+    state, _ = tell_gesture(GESTURES, None, estimate(pose("fist")), SPACE)
+    one = dataclasses.replace(estimate(pose("palm")), score=0.4, confidence=confidence)
+    for _ in range(6):
+        state, reported = tell_gesture(GESTURES, state, one, SPACE)
+    assert reported.gesture == name
+
+
 def test_without_gestures_there_are_no_labels() -> None:
     state, reported = tell_gesture(None, None, estimate(pose("gun")), SPACE)
     assert state is None and reported.gesture == "" and math.isnan(reported.gesture_probability)

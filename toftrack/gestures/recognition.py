@@ -309,7 +309,9 @@ def tell_gesture(
     asked = estimate.joint_ok | (estimate.joint_confidence >= gestures.settings.joint)
     known = features.known_features(asked)
     values = np.where(known, features.features(angles, joints), np.nan)
-    state, label, probability = update(state, values, estimate.score, off_rad, gestures, frames)
+    # Of a hand on a table much of the image is not explained, and the pose is right all the same.
+    score = float(np.fmax(estimate.score, estimate.confidence))
+    state, label, probability = update(state, values, score, off_rad, gestures, frames)
     if not gestures.decided(label, values):
         label, probability = "", math.nan
     pinch = pinch_of(joints, gestures.settings.pinch, asked)
