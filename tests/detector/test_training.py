@@ -179,6 +179,13 @@ def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> Non
     assert "poses" in done.stderr and "finder" in done.stderr, "progress bars"
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_the_program_refuses_a_device_that_is_not_there(tmp_path: Path) -> None:
+    done = command(tmp_path, "compute=cuda")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("error: compute=cuda, but torch finds no CUDA")
+
+
 def test_the_program_refuses_what_cannot_be(tmp_path: Path) -> None:
     done = command(tmp_path, "shapes=0")
     assert done.returncode == 1
