@@ -30,12 +30,12 @@ from toftrack.tracking.state import HandState, Track
 
 _GONE_S = 1.0
 """A hand that was believed so long ago may have made way for another one."""
+_LEAST_SIDE = 1e-4
+"""The network is never surer of a side than by this."""
 _SWITCHED = 0.45
 """The side is changed when it has become less probable than this, so that it does not flicker."""
 _LEAST_PRESENT = 0.5
 """Where a hand is less probable than this, its sides are not compared."""
-_LEAST_SIDE = 1e-4
-"""The network is never surer of a side than by this."""
 _LEAST_LOG_ODDS = -1.0
 """Nor are those of a given side's track that is less surely right than this: neither pose is the
 hand's, and which one explains more of the image is chance."""
