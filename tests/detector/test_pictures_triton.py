@@ -13,11 +13,12 @@ import torch
 from helpers.detection import clean_sensors, small_bank
 
 from toftrack.detector import pictures
+from toftrack.detector.batches import mapped
 from toftrack.detector.hands import HAND
 from toftrack.detector.images import crop_scenes, crops_on_device
 from toftrack.detector.images_numba import read_pictures
 from toftrack.detector.pictures import RANGE, Shots, take
-from toftrack.detector.training import Schedule, mapped, train_poses
+from toftrack.detector.training import Schedule, train_poses
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import itertools
 import json
-import pickle
+import multiprocessing
 import subprocess
 import sys
 import threading
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from helpers.detection import small_bank
 from helpers.tracking import ROOT
 
-from toftrack.detector import checkpoints, images, training
+from toftrack.detector import batches, checkpoints, images, training
+from toftrack.detector.batches import tensors_of
 from toftrack.detector.checkpoints import Checkpoints, Progress, RunningMeans, save
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
-from toftrack.detector.training import Schedule, tensors_of, train_finder, train_poses
+from toftrack.detector.training import Schedule, train_finder, train_poses
 from toftrack.detector.weights import load_weights, save_weights
 from toftrack.errors import ToftrackError
 
@@ -35,7 +37,7 @@ TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
 def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -> None:
     """However many processes make the images."""
     one, other = (train(TINY, 6, seed) for seed in (0, 1))
-    monkeypatch.setattr(training, "threads", lambda: 2)
+    monkeypatch.setattr(batches, "threads", lambda: 2)
     two = train(TINY, 6, 0)
     for key, value in one[0].state_dict().items():
         assert torch.equal(value, two[0].state_dict()[key]), key
@@ -108,8 +110,8 @@ def test_batches_come_in_order_from_a_thread_that_ends_with_whoever_asks() -> No
 
     for asked in (3, 100):
         ended = threading.Event()
-        with training._prefetched(numbers(), lambda number: 2 * number) as batches:
-            found = list(itertools.islice(batches, asked))
+        with batches.prefetched(numbers(), lambda number: 2 * number) as ready:
+            found = list(itertools.islice(ready, asked))
         assert found == list(range(0, 2 * asked, 2))
         assert ended.wait(5), "what makes the batches is told to end"
 
@@ -119,17 +121,24 @@ def test_what_goes_wrong_while_batches_are_made_reaches_whoever_asks() -> None:
         yield 1
         raise ToftrackError("no memory")
 
-    with training._prefetched(numbers(), None) as batches:
-        assert next(batches) == 1
+    with batches.prefetched(numbers(), None) as ready:
+        assert next(ready) == 1
         with pytest.raises(ToftrackError, match="no memory"):
-            next(batches)
+            next(ready)
+
+
+def through_a_queue(batch: Any) -> Any:
+    """As it comes from a process that makes it."""
+    queue = multiprocessing.get_context("spawn").Queue()
+    queue.put(batches.arrays(batch))
+    return batches.tensors(queue.get(timeout=60))
 
 
 def test_scenes_that_were_sent_to_another_process_give_the_same_crops() -> None:
     """On a CUDA device processes make scenes, and their pictures are taken beside the training."""
     crops = images.crop_images(8, small_bank(), torch.Generator().manual_seed(0))
     scenes = images.crop_scenes(8, small_bank(), torch.Generator().manual_seed(0))
-    sent = training._tensors(pickle.loads(pickle.dumps(training._arrays(scenes))))
+    sent = through_a_queue(scenes)
     for one, other in zip(tensors_of(crops), tensors_of(images.crops_of(sent)), strict=True):
         assert torch.equal(one, other)
 

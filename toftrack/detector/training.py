@@ -5,35 +5,35 @@ The rate stays where it is for two thirds of the images and then falls to nothin
 NeurIPS 2024), so that a training can still be made longer or shorter while the rate has not begun
 to fall. On a GPU the processes that make images set the pace, one on each core.
 
-Each batch is drawn by a generator of its own, of the seed and the batch's number, so that
-an interrupted training goes on with the batches that it would have seen (checkpoints.py).
+An interrupted training goes on with the batches that it would have seen (batches.py,
+checkpoints.py).
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import itertools
 import math
-import multiprocessing
-import os
-import queue as queues
 import sys
-import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from toftrack.compute.threads import threads
 from toftrack.compute.transfer import on_device
+from toftrack.detector.batches import (
+    keep_memory,
+    made_batches,
+    makers,
+    mapped,
+    prefetched,
+    tensors_of,
+)
 from toftrack.detector.checkpoints import Checkpoints, Progress
-from toftrack.detector.crops import CROP
 from toftrack.detector.images import (
     Crops,
     CropScenes,
@@ -46,23 +46,13 @@ from toftrack.detector.images import (
 from toftrack.detector.losses import finder_loss, pose_losses
 from toftrack.detector.muon import Muon
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.shapes import shape_bank
 from toftrack.detector.weights import go_on_from
 from toftrack.errors import ToftrackError
 
-_READY = 6
-"""Batches of each process that wait to be trained on."""
-_WAITING = 2
-"""Batches that are here and wait to be trained on."""
-_MAKERS = 8
-"""At most so many processes make images: one that trains on the CPU takes no more."""
-_NICE = 19
-"""By how much the processes that make images give way to the one that trains."""
 _WARM = 300
 """Steps in which the rate rises."""
 _STEADY = 2 / 3
 """Share of the images after which it falls."""
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _CPU = torch.device("cpu")
 _DECAY = 0.02
 """Of the weights, times the learning rate, in each step."""
@@ -291,7 +281,7 @@ def _train(
     checkpoints: Checkpoints | None,
     device: torch.device,
 ) -> tuple[Network, Course]:
-    _keep_memory()
+    keep_memory()
     steps = schedule.steps
     start = None
     if schedule.start is not None:
@@ -316,9 +306,9 @@ def _train(
         total=steps * schedule.batch, initial=done, unit=" images", desc=task.name, file=sys.stderr
     )
     numbers = range(progress.step, steps)
-    made = _made(task.images.make, schedule.batch, numbers, shapes, seed, _makers(device))
+    made = made_batches(task.images.make, schedule.batch, numbers, shapes, seed, makers(device))
     step = _Step(task, network, averaged, optimiser, device)
-    with bar, writing as stepped, _prefetched(made, task.images.taken) as batches:
+    with bar, writing as stepped, prefetched(made, task.images.taken) as batches:
         for batch in batches:
             number = progress.step
             share = 1 - min(0.998, (number + 1) / (number + 10))
@@ -353,16 +343,6 @@ def _check_length(name: str, progress: Progress, schedule: Schedule) -> None:
     progress.images = schedule.images
 
 
-def _keep_memory() -> None:
-    """Ask glibc to reuse what was freed: the batches' large arrays come and go all the time, and
-    fresh pages cost more than half of the time on some machines. Elsewhere nothing happens.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        libc = ctypes.CDLL(None)
-        for option in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD):
-            libc.mallopt(option, 1 << 30)
-
-
 @torch.no_grad()
 def _average(averaged: nn.Module, network: nn.Module, share: Tensor) -> None:
     """Move all weights and statistics towards another network's by a () share of the way."""
@@ -375,139 +355,3 @@ def _average(averaged: nn.Module, network: nn.Module, share: Tensor) -> None:
     away = torch._foreach_sub(news, olds)
     torch._foreach_mul_(away, share)
     torch._foreach_add_(olds, away)
-
-
-def _makers(device: torch.device) -> int:
-    """How many processes make images: where a GPU trains, all cores but one."""
-    if device.type == "cpu":
-        return min(threads(), _MAKERS)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return max(1, (cores or 1) - 1)
-
-
-@contextlib.contextmanager
-def _prefetched(
-    batches: Generator[Any], taken: Callable[[Any], Any] | None
-) -> Iterator[Iterator[Any]]:
-    """The same batches, fetched, and `taken`, by a thread beside the training."""
-    ready: queues.Queue[Any] = queues.Queue(_WAITING)
-    ended = threading.Event()
-
-    def put(one: Any) -> bool:
-        while not ended.is_set():
-            with contextlib.suppress(queues.Full):
-                ready.put(one, timeout=0.2)
-                return True
-        return False
-
-    def fetch() -> None:
-        last: Any = None
-        try:
-            for batch in batches:
-                if not put((batch if taken is None else taken(batch), None)):
-                    break
-        except BaseException as error:
-            last = error
-        finally:
-            batches.close()
-        put((None, last))
-
-    def all_of_them() -> Iterator[Any]:
-        while True:
-            batch, error = ready.get()
-            if error is not None:
-                raise error
-            if batch is None:
-                return
-            yield batch
-
-    thread = threading.Thread(target=fetch, name="toftrack-batches", daemon=True)
-    thread.start()
-    try:
-        yield all_of_them()
-    finally:
-        ended.set()
-        thread.join()
-
-
-def _made(
-    make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int, makers: int
-) -> Generator[Any]:
-    """The batches of these numbers, made by so many other processes, in order."""
-    if len(numbers) == 0:
-        return
-    context = multiprocessing.get_context("spawn")
-    working: list[tuple[Any, Any]] = []
-    count = min(makers, len(numbers))
-    try:
-        for first in range(count):
-            queue, mine = context.Queue(_READY), numbers[first::count]
-            worker = context.Process(
-                target=_make_batches, args=(queue, make, batch, mine, shapes, seed), daemon=True
-            )
-            worker.start()
-            working.append((queue, worker))
-        for _, (queue, worker) in zip(numbers, itertools.cycle(working), strict=False):
-            while True:
-                try:
-                    yield _tensors(queue.get(timeout=10))
-                    break
-                except queues.Empty:
-                    if not worker.is_alive():
-                        raise ToftrackError(
-                            "a process that makes training images has ended; is there enough"
-                            " memory?"
-                        ) from None
-    finally:
-        for _, worker in working:
-            worker.terminate()
-            worker.join()
-
-
-def _make_batches(
-    queue: Any, make: Callable[..., Any], batch: int, numbers: range, shapes: int, seed: int
-) -> None:
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
-    torch.set_num_threads(1)
-    _keep_memory()
-    generator = torch.Generator().manual_seed(seed)
-    bank = shape_bank(shapes, generator)
-    first = int(torch.randint(2**31, (1,), generator=generator))
-    for number in numbers:
-        generator.manual_seed((first + number) % 2**32)
-        queue.put(_arrays(make(batch, bank, generator)))
-
-
-def _arrays(batch: Any) -> Any:
-    """A batch as arrays, which travel by themselves: torch would share memory through a helper that
-    a busy machine may starve. Images in half precision, which is more than a sensor's.
-    """
-    return mapped(batch, lambda one: (one.half() if _is_image(one) else one).numpy())
-
-
-def _tensors(batch: Any) -> Any:
-    """The batch again, its images in half precision."""
-    return mapped(batch, torch.from_numpy)
-
-
-def _is_image(one: Tensor) -> bool:
-    return one.ndim == 4 and one.shape[-1] >= CROP
-
-
-def mapped(batch: Any, function: Callable[[Any], Any]) -> Any:
-    """The same dataclass with a function's results in place of its tensors."""
-    values = {field.name: getattr(batch, field.name) for field in fields(batch)}
-    return type(batch)(
-        **{
-            name: mapped(one, function) if is_dataclass(one) else function(one)
-            for name, one in values.items()
-        }
-    )
-
-
-def tensors_of(batch: Any) -> list[Tensor]:
-    """All of a dataclass."""
-    found: list[Tensor] = []
-    mapped(batch, found.append)
-    return found
