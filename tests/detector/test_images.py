@@ -12,12 +12,14 @@ from helpers.detection import small_bank
 
 from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M, channels
 from toftrack.detector.dice import Dice
+from toftrack.detector.hands import HAND, posed_hands
 from toftrack.detector.images import (
     NEW_HANDS,
     WIDE_SIZE,
     Crops,
     WideImages,
     crop_images,
+    other_hands,
     poorly_read,
     wide_images,
 )
@@ -179,6 +181,24 @@ def test_fingers_point_up_in_crops_of_hands_that_are_followed(crops: Crops) -> N
     up = -fingers[:, 1] / fingers[:, :2].norm(dim=1)
     upright = (up[across] > 0.8).float().mean()
     assert 1 - NEW_HANDS < float(upright) + 0.1 and (up < 0).any()
+
+
+def test_many_second_hands_touch_the_first_and_mirror_it_and_the_others_are_apart() -> None:
+    n, own = 400, Dice(torch.Generator().manual_seed(0))
+    left = torch.arange(n) < 40
+    hands = posed_hands(small_bank(), torch.tensor([[0.0, 0.0, 0.5]]).expand(n, 3), left, own, HAND)
+    may = torch.arange(n) % 2 == 0
+    second = other_hands(hands, small_bank(), own, touching=may)
+    apart = (second.pivot_m - hands.pivot_m)[:, :2].norm(dim=1)
+    beside = (apart < 0.14) & (apart >= 0.05)
+    alike = (second.angles - hands.angles).abs().mean(1) < 0.12
+    twins = alike & (second.left != hands.left)
+    assert 0.3 < float(beside[may].float().mean()) < 0.7
+    assert 0.15 < float(twins[may].float().mean()) < 0.35
+    assert float(twins[~may].float().mean()) < 0.03, "only by chance"
+    twins &= may & beside
+    assert (second.parts[twins][..., 0] < 0).all(), "a mirror image holds nothing"
+    assert 0.3 < float((second.parts[~may][..., 0] >= 0).any(1).float().mean()) < 0.6
 
 
 @pytest.mark.parametrize("make", [crop_images, wide_images])

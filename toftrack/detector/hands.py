@@ -44,6 +44,7 @@ class Hands:
     """A batch of posed hands.
 
     pivot_m: (N, 3) middle of the palm.  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
+    left: (N,), see posed_hands.
     joints_m: (N, 21, 3) truth.  elbow_m: (N, 3).
     centres_m, axes_m: (N, E, 3), (N, E, 3, 3) the hand's ellipsoids and the forearm's.
     labels: (N, E), -1 = not drawn.
@@ -55,6 +56,7 @@ class Hands:
     rotation: Tensor
     angles: Tensor
     log_size: Tensor
+    left: Tensor
     joints_m: Tensor
     elbow_m: Tensor
     centres_m: Tensor
@@ -130,25 +132,33 @@ def posed_hands(
     rotation: Tensor | None = None,
     angles: Tensor | None = None,
     views: Tensor | None = None,
+    known: Tensor | None = None,
 ) -> Hands:
     """Random hands about given middles of the palm (N, 3); `left` (N,) are mirror images.
 
-    rotation, angles: (N, 3, 3), (N, 21), where they are known; with angles, no hand holds a thing.
+    rotation, angles: (N, 3, 3), (N, 21), where they are known; these hands hold no thing.
+    known: (N,) which of those given are; None = all of them.
     """
     n = len(pivot_m)
     rows = dice.rows(len(bank.log_size), n)
     shape, surface = bank.rows(rows)
     size = bank.log_size[rows].exp()
     parts = torch.zeros(n, 0, PART)
-    known = angles is not None
-    angles = shown_poses(n, dice.generator) if angles is None else angles
+    free = torch.zeros(n, dtype=torch.bool) if known is None else ~known
+    if angles is None or known is not None:
+        own = shown_poses(n, dice.generator)
+        free = torch.ones_like(free) if angles is None else free
+        angles = own if angles is None else torch.where(free[:, None], own, angles)
     shape, surface = cupped(shape, surface, angles, bank.log_size[rows], dice)
-    if not known:
-        angles, parts = _holding(angles, shape, surface, size, dice)
-    if rotation is None:
+    if bool(free.any()):
+        angles, parts = _holding(angles, shape, surface, size, free, dice)
+    if rotation is None or known is not None:
         raised = thumb_is_up(angles) & dice.chance(UPRIGHT_THUMBS, n)
-        rotation = random_rotations(n, dice, views)
-        rotation = torch.where(raised[:, None, None], upright_thumbs(n, dice), rotation)
+        turned = random_rotations(n, dice, views)
+        turned = torch.where(raised[:, None, None], upright_thumbs(n, dice), turned)
+        rotation = (
+            turned if rotation is None else torch.where(free[:, None, None], turned, rotation)
+        )
     state = torch.zeros(n, 27)
     state[:, 3:6] = roma.rotmat_to_rotvec(rotation)
     state[:, 6:] = angles
@@ -173,6 +183,7 @@ def posed_hands(
         rotation=rotation,
         angles=angles,
         log_size=bank.log_size[rows],
+        left=left,
         joints_m=joints,
         elbow_m=elbow * mirror + shift,
         centres_m=centres,
@@ -184,14 +195,19 @@ def posed_hands(
 
 
 def _holding(
-    angles: Tensor, shape: HandShape, surface: HandSurface, size: Tensor, dice: Dice
+    angles: Tensor,
+    shape: HandShape,
+    surface: HandSurface,
+    size: Tensor,
+    free: Tensor,
+    dice: Dice,
 ) -> tuple[Tensor, Tensor]:
-    """Poses (N, 21), some of which hold a thing now, and what they hold (N, Q, PART), in the
-    hands' frames.
+    """Poses (N, 21), some of the `free` (N,) of which hold a thing now, and what they hold
+    (N, Q, PART), in the hands' frames.
     """
     n = len(size)
     angles = angles.clone()
-    some = dice.chance(HOLDING, n).nonzero()[:, 0]
+    some = (free & dice.chance(HOLDING, n)).nonzero()[:, 0]
     shape = HandShape(shape.base_m[some], shape.base_frames[some], shape.bone_lengths_m[some])
     surface = HandSurface(surface.frame_index, surface.centres_m[some], surface.axes_m[some])
     parts = torch.zeros(n, PARTS_OF_A_THING, PART)

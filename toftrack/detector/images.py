@@ -37,6 +37,7 @@ from toftrack.detector.scenes import (
     things,
 )
 from toftrack.detector.shapes import ShapeBank
+from toftrack.pose_space.data.shown_poses import within_limits
 
 _SAMPLES = 2 * CROP
 _WHOLE = math.ceil(_SAMPLES * 2**0.5) + 1
@@ -70,6 +71,12 @@ _CUT = 0.45, 0.25
 """Those that are cut by a border of the image."""
 _MIDDLE = 0.6
 """Whole images whose hand is near the middle; of the others it is anywhere, also at the border."""
+_OTHERS = 0.30, 0.25
+"""Crops of hands, and crops about something else, with a second hand."""
+_TOUCHING = 0.4
+"""How many second hands are beside the first and touch it, before or behind it."""
+_TWINS = 0.6
+"""How many of those show its mirror image."""
 _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
@@ -203,7 +210,9 @@ def crop_scenes(n: int, bank: ShapeBank, generator: torch.Generator) -> CropScen
     gone = ~present & dice.chance(0.75, n)
     pieces = labels.shape[1] - FOREARM_PIECES
     labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
-    scenes = random_scenes(hands, labels, bank, dice, others=0.25, objects=0.12, views=views)
+    other = other_hands(hands, bank, dice, touching=present)
+    there = dice.chance(torch.where(present, *_OTHERS), n)
+    scenes = random_scenes(hands, labels, (other, there), dice, objects=0.12, views=views)
     # What a hand held is as likely to lie there alone.
     alone = gone & (hands.parts[..., 0] >= 0).any(1) & dice.chance(0.6, n)
     onto = _onto_something(scenes, centre, dice)
@@ -287,11 +296,9 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     # Without its hand, mostly no forearm is held up either.
     no_arm = ~raised & dice.chance(0.7, n)
     labels[:, pieces:] = torch.where(no_arm[:, None], -1, labels[:, pieces:])
-    other, other_left = _other_hands(hands, bank, dice)
+    other = other_hands(hands, bank, dice, touching=raised)
     there = dice.chance(0.35, n) & raised
-    scenes = random_scenes(
-        hands, labels, bank, dice, others=0.0, objects=0.15, other=(other, there), views=views
-    )
+    scenes = random_scenes(hands, labels, (other, there), dice, objects=0.15, views=views)
     scenes = furnished(scenes, dice.chance(torch.where(raised, *FURNISHED), n), dice)
     taken, which = take_pictures(scenes, lens, random_sensors(n, dice), WIDE_SIZE, dice)
     depth = poorly_read(torch.from_numpy(taken), lens, dice)
@@ -356,36 +363,46 @@ def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
     return torch.where(stray, dice.uniform(n, height, width, low=0.05, high=1.5), depth_m)
 
 
-def _other_hands(hands: Hands, bank: ShapeBank, dice: Dice) -> tuple[Hands, Tensor]:
-    """A second hand of either side, 10 to 40 cm away, and which of them are left."""
+def other_hands(hands: Hands, bank: ShapeBank, dice: Dice, touching: Tensor) -> Hands:
+    """Second hands of either side: 10 to 40 cm away from the first ones, or touching them.
+
+    touching: (N,) which may touch. Many of these are mirror images of the first ones, as people
+    hold up both hands.
+    """
     n = len(hands.pivot_m)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.11, high=0.40)
     away[:, 2] *= 0.6
-    pivot = hands.pivot_m + away
+    touching = touching & dice.chance(_TOUCHING, n)
+    twins = touching & dice.chance(_TWINS, n)
+    direction = math.pi * dice.rows(2, n) + 0.4 * dice.normal(n)
+    beside = dice.uniform(n, low=0.05, high=0.14)
+    nearer = torch.where(dice.chance(0.5, n), 1.0, -1.0) * dice.uniform(n, high=0.07)
+    nearer = torch.where(beside < 0.08, 0.03 * nearer.sign() + 0.6 * nearer, nearer)
+    close = torch.stack((beside * direction.cos(), beside * direction.sin(), nearer), 1)
+    pivot = hands.pivot_m + torch.where(touching[:, None], close, away)
     pivot[:, 2] = pivot[:, 2].clamp(min=0.22)
-    left = dice.chance(0.5, n)
-    return posed_hands(bank, pivot, left, dice, OTHER_HAND), left
+    left = torch.where(twins, ~hands.left, dice.chance(0.5, n))
+    alike = hands.rotation @ turn(0.25 * dice.normal(n), 2) @ turn(0.25 * dice.normal(n), 1)
+    angles = within_limits(hands.angles + 0.1 * dice.normal(n, 21))
+    return posed_hands(bank, pivot, left, dice, OTHER_HAND, alike, angles, known=twins)
 
 
 def random_scenes(
     hands: Hands,
     labels: Tensor,
-    bank: ShapeBank,
+    other: tuple[Hands, Tensor],
     dice: Dice,
-    others: float,
     objects: float,
-    other: tuple[Hands, Tensor] | None = None,
     views: Tensor | None = None,
 ) -> Scenes:
-    """Everything around a batch of hands; another hand with probability `others`, or as given.
+    """Everything around a batch of hands.
 
-    labels: (N, E) of the hands' ellipsoids.  views: (N,) where the cameras are, see scenes; None =
-    before the persons.
+    labels: (N, E) of the hands' ellipsoids.  other: second hands, and where there are any (N,).
+    objects: probability of each of two things before or behind a hand.
+    views: (N,) where the cameras are, see scenes; None = before the persons.
     """
     n = len(labels)
-    if other is None:
-        other = _other_hands(hands, bank, dice)[0], dice.chance(others, n)
     second, there = other
     body = surroundings(hands, hands.pivot_m[:, 2], dice, views)
     stuff = things(hands.pivot_m, 2, objects, dice)

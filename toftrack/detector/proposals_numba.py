@@ -67,17 +67,18 @@ def start_pose_network(
     """The same, begun in another thread if there may be one; what is returned waits for it.
 
     That thread has nothing to do but the network, so that it hardly needs the interpreter's lock.
-    centres_m, up: one, (1, 3).
     """
     if isinstance(pose, PoseNet) or not _may_be_shared(pose):
         return functools.partial(run_pose_network, pose, depth_m, k, centres_m, side, up)
     task = _prepared(pose, depth_m, k, centres_m, side, up)
-    _, depth, left, k, centres, rotations, hand, out, _ = task.args
-    turn, image = rotations[0], _crop(pose, depth, left, k, centres[0], rotations[0])
-    wait = beside(functools.partial(pose.outputs, image))
+    _, depth, left, k, centres, rotations, hand, out, rows = task.args
+    places = list(zip(rows, rotations, centres, strict=False))
+    images = [_crop(pose, depth, left, k, centre, turn) for _, turn, centre in places]
+    wait = beside(lambda: [pose.outputs(image) for image in images])
 
     def reported() -> NetworkOutput:
-        _decode(wait(), image, turn, centres[0], left, hand, out, 0)
+        for (row, turn, centre), image, outputs in zip(places, images, wait(), strict=True):
+            _decode(outputs, image, turn, centre, left, hand, out, row)
         return _reported(task)
 
     return reported

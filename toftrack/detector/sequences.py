@@ -18,7 +18,7 @@ from torch import Tensor
 from toftrack.archives import read_archive
 from toftrack.detector.dice import Dice
 from toftrack.detector.hands import HAND, posed_hands, random_rotations, random_views
-from toftrack.detector.images import FURNISHED, furnished, random_scenes
+from toftrack.detector.images import FURNISHED, furnished, other_hands, random_scenes
 from toftrack.detector.pictures import Lens, random_sensors, take_pictures
 from toftrack.detector.shapes import ShapeBank
 from toftrack.errors import ToftrackError
@@ -87,7 +87,9 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         same = Dice(torch.Generator().manual_seed(scene))
         hands = posed_hands(bank, pivot[None], left, same, HAND, turn[None], pose)
         labels = torch.where(hands.labels == HAND, -1, hands.labels) if empty else hands.labels
-        scenes = random_scenes(hands, labels, bank, same, others, objects=0.06, views=views)
+        other = other_hands(hands, bank, same, touching=torch.tensor([True]))
+        second = other, same.chance(others, 1)
+        scenes = random_scenes(hands, labels, second, same, objects=0.06, views=views)
         scenes = furnished(scenes, there, same)
         depth, which = take_pictures(scenes, lens, sensor, (height, width), dice)
         images.append(depth[0])

@@ -24,10 +24,10 @@ from toftrack.pose_space.data.natural_poses import (
 
 KINDS = {
     "shown": 0.42,  # SHOWN
-    "pinch": 0.13,  # the thumb's tip on that of any finger, the other fingers as shown
+    "pinch": 0.16,  # the thumb's tip on that of any finger, the other fingers as shown
     "moving": 0.19,  # between two that are shown, or one of them and any fingers
-    "any": 0.10,  # each finger straight, half bent, hooked or curled
-    "recorded": 0.10,
+    "any": 0.08,  # each finger straight, half bent, hooked or curled
+    "recorded": 0.09,
     "crossed": 0.06,  # fingers of two recorded poses
 }
 """How often poses of each kind are drawn."""
@@ -84,9 +84,9 @@ _CLOSED = ("across", "tucked", "hooked", "folded")
 SHOWN = (
     Shown("palm", ("out", "up", "beside"), _four("straight"), _APART, 6),
     Shown("stretched palm", ("out", "up"), _four("back"), _APART, 5),
-    Shown("flat", ("beside", "out", "folded"), _four("straight"), _TOGETHER, 8),
+    Shown("flat", ("beside", "beside", "beside", "out"), _four("straight"), _TOGETHER, 11),
     Shown("flat, thumb away", ("up", "out"), _four("straight"), _TOGETHER, 4),
-    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 10),
+    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 12),
     Shown("fist about the thumb", ("tucked", "folded"), _four("over"), _TOGETHER, 2),
     Shown("fist, flat knuckles", ("across", "beside", "hooked"), _four("folded"), _TOGETHER, 4),
     Shown("loose fist", _CLOSED, _four("loose"), _ANY, 3),
@@ -115,7 +115,7 @@ SHOWN = (
         _ANY,
         3,
     ),
-    Shown("little", _CLOSED, ("tight", "tight", "tight", "straight"), _ANY, 4),
+    Shown("little", _CLOSED, ("tight", "tight", "tight", "straight"), _ANY, 6),
     Shown("thumb and little", ("out", "up"), ("tight", "tight", "tight", "straight"), _ANY, 3),
     Shown("middle", _CLOSED, ("tight", "straight", "tight", "tight"), _ANY, 1),
     Shown("bent knuckles", ("beside", "opposed", "out"), _four("bent"), _ANY, 6),
