@@ -1,5 +1,5 @@
 """What stands about in rooms and is no hand: bars side by side, boards, clutter, leaves, branches,
-and heads.
+heads, and frames.
 
 Nothing else in a room looks so much like fingers, palms and fists.
 """
@@ -20,7 +20,7 @@ PIECES = 9
 """Parts of the furniture in an image."""
 
 
-_OFTEN = 2.0, 2.0, 2.0, 2.0, 1.0, 3.0
+_OFTEN = 2.0, 2.0, 2.0, 2.0, 1.0, 3.0, 3.0
 """How often each kind of furniture stands there, in parts of their sum."""
 
 
@@ -34,7 +34,7 @@ def before_camera(n: int, dice: Dice) -> Tensor:
 def furniture(there: Tensor, middle: Tensor, dice: Dice) -> Tensor:
     """(N, PIECES, PART) of one kind each about (N, 3); there: (N,) where there is any."""
     n = len(there)
-    makers = (_bars, _boards, _clutter, _leaves, _branches, _heads)
+    makers = (_bars, _boards, _clutter, _leaves, _branches, _heads, _frames)
     kinds = torch.stack([make(middle, dice) for make in makers])
     often = torch.tensor(_OFTEN).expand(n, -1)
     which = torch.multinomial(often, 1, generator=dice.generator)[:, 0]
@@ -187,3 +187,21 @@ def _heads(middle: Tensor, dice: Dice) -> Tensor:
         offset = (at[:, None] @ rows)[:, 0]
         pieces.append(make_part(kind, middle + offset, rows, sized, zero + 0.8 * edge, zero))
     return torch.stack(pieces, 1)
+
+
+def _frames(middle: Tensor, dice: Dice) -> Tensor:
+    """As of a chair's back, a fence or a window: flat slats one way and the other in one plane."""
+    n, zero = len(middle), torch.zeros(len(middle))
+    rows = _standing(n, dice)
+    crossed = rows[:, [1, 0, 2]] * torch.tensor([1.0, 1.0, -1.0])[:, None]
+    thick = dice.uniform(n, low=0.004, high=0.015)
+    slats = []
+    for number in range(PIECES):
+        across = number % 2 == 0
+        wide = dice.uniform(n, low=0.008, high=0.05)
+        half = torch.stack((wide, dice.uniform(n, low=0.05, high=0.35), thick), 1)
+        place = dice.uniform(n, 1, low=-0.25, high=0.25) * rows[:, 1 if across else 0]
+        behind = 0.006 * dice.normal(n, 1) * rows[:, 2]
+        turned = crossed if across else rows
+        slats.append(make_part(BOX, middle + place + behind, turned, half, zero, zero))
+    return torch.stack(slats, 1)

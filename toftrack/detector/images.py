@@ -59,7 +59,7 @@ _DIRECTION = 0.15, 0.8
 pose is right, and where it is wrong, which turns crops by half a right angle."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
-_ELSEWHERE = 0.28
+_ELSEWHERE = 0.30
 """Crops about something else than a hand."""
 _EMPTY = 0.25
 """Whole images without a raised hand."""
