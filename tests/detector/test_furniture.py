@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from toftrack.detector.dice import Dice
-from toftrack.detector.furniture import PIECES, before_camera, furniture, on_a_piece
+from toftrack.detector.furniture import PIECES, before_camera, frames, furniture, on_a_piece
 from toftrack.detector.hands import HAND, OTHER_HAND
 from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
 from toftrack.detector.scenes import Scenes
@@ -81,3 +81,16 @@ def test_it_is_seen_and_is_no_hand() -> None:
     seen = (depth > 0).reshape(n, -1).sum(1)
     assert (seen > 30).mean() > 0.8 and depth[depth > 0].min() > 0.05
     assert not ((labels == HAND) | (labels == OTHER_HAND)).any()
+
+
+def test_slats_of_a_frame_lie_in_one_plane_and_cross_at_right_angles() -> None:
+    middle = torch.tensor([[0.0, 0.0, 0.8]]).expand(N, 3)
+    slats = frames(middle, Dice(torch.Generator().manual_seed(0)))
+    rows = slats[..., 4:13].unflatten(-1, (3, 3))
+    long, normal = rows[:, :, 1], rows[:, :1, 2]
+    off = ((slats[..., 1:4] - middle[:, None]) * normal).sum(-1).abs()
+    assert off.max() < 0.04 and off.median() < 0.01
+    assert (long * normal).sum(-1).abs().max() < 1e-4
+    between = (long[:, :1] * long).sum(-1).abs()
+    assert ((between < 1e-4) | (between > 1 - 1e-4)).all() and 0.3 < between.mean() < 0.7
+    assert (slats[..., 13] < slats[..., 14]).all() and (slats[..., 15] < 0.02).all()

@@ -34,7 +34,7 @@ def before_camera(n: int, dice: Dice) -> Tensor:
 def furniture(there: Tensor, middle: Tensor, dice: Dice) -> Tensor:
     """(N, PIECES, PART) of one kind each about (N, 3); there: (N,) where there is any."""
     n = len(there)
-    makers = (_bars, _boards, _clutter, _leaves, _branches, _heads, _frames)
+    makers = (_bars, _boards, _clutter, _leaves, _branches, _heads, frames)
     kinds = torch.stack([make(middle, dice) for make in makers])
     often = torch.tensor(_OFTEN).expand(n, -1)
     which = torch.multinomial(often, 1, generator=dice.generator)[:, 0]
@@ -189,7 +189,7 @@ def _heads(middle: Tensor, dice: Dice) -> Tensor:
     return torch.stack(pieces, 1)
 
 
-def _frames(middle: Tensor, dice: Dice) -> Tensor:
+def frames(middle: Tensor, dice: Dice) -> Tensor:
     """As of a chair's back, a fence or a window: flat slats one way and the other in one plane."""
     n, zero = len(middle), torch.zeros(len(middle))
     rows = _standing(n, dice)
