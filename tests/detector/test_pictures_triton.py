@@ -56,7 +56,7 @@ def compared(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
         found = pictures_triton.take(mapped(shots, lambda one: one.to(there)), SIZE, 0)
         return *take(shots, SIZE), *(one.cpu().numpy() for one in found)
 
-    shots = small_shots(1)
+    shots = small_shots(6)
     depth, labels, other, other_labels = both(shots)
     seen = (depth > 0) & (other > 0)
     assert ((labels >= 0) == (other_labels >= 0)).all()
