@@ -29,7 +29,6 @@ _CLEAR_M = 0.010
 AROUND_M = {
     1: np.zeros((1, 3)),
     2: 0.008 * np.array([[1.0, 1, 0], [-1, -1, 0]]),
-    4: 0.008 * np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]),
 }
 """Where crops of one hand lie about its palm, by their number: about half a cell of the network's
 map away."""
