@@ -237,6 +237,13 @@ def test_else_both_are_tried_in_every_frame(
     assert all(schedule(track, hidden, alternate) == (True, True) for track in tracks)
 
 
+def test_of_two_hands_both_are_tried_of_one_that_is_rather_wrong_than_right() -> None:
+    for sure, found in ((0.1, {(True, False), (False, True)}), (-0.1, {(True, True)})):
+        tracks = [sure_track(frames, log_odds=sure) for frames in range(1, 7)]
+        each = [schedule(track, True, 0.9, turn) for turn, track in enumerate(tracks)]
+        assert set(each) == found
+
+
 @pytest.mark.parametrize("frames", [24, 25])
 def test_the_table_keeps_to_the_schedule(frames: int) -> None:
     age = Duration(frames * FRAME_S)

@@ -124,6 +124,15 @@ def test_of_two_hands_what_is_seen_of_both_says_which_is_of_the_given_side() -> 
     assert given.beside(HandednessEstimate(fits=2.0), fit).alone(fit).seems("right") > 0.8
 
 
+def test_of_two_hands_of_given_sides_either_speaks_for_the_other() -> None:
+    fit = handedness_settings(given=2.0, partner=2.0)
+    left = HandednessEstimate(given=True, prior=-2.0, fits=-3.0)
+    right = HandednessEstimate(given=True, prior=2.0, fits=-2.5)
+    assert right.alone(fit).seems("right") < 0.4 < 0.8 < right.beside(left, fit).seems("right")
+    exchanged = left.beside(replace(right, fits=-6.0), fit)
+    assert exchanged.prior == -2.0 and exchanged.partner == 2.0
+
+
 def test_what_was_there_before_is_of_the_given_side_only_if_it_clearly_seems_so() -> None:
     fit = handedness_settings(weight=1.0)
     for side, sign in (("right", 1), ("left", -1)):

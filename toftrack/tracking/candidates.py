@@ -389,14 +389,16 @@ def schedule(
     """Whether the detector's poses are candidates in a frame, and whether fingers are exchanged.
 
     Both; but in turn where the last estimate was surely right and nothing challenges it, and of two
-    hands also where it was not.
+    hands wherever it was rather right than wrong: one that is wrong needs the detector's poses now.
 
     alternate: probability from which on it was; 1 = never.
     turn: of one of two hands that are followed; odd for one and even for the other.
     """
-    if turn is not None and alternate < 1 and not track.challenged.begun:
+    if track.challenged.begun or track.log_odds < 0:
+        return True, True
+    if turn is not None and alternate < 1:
         return turn % 2 == 0, turn % 2 == 1
-    if hidden or track.challenged.begun or not _sure(track, alternate):
+    if hidden or not _sure(track, alternate):
         return True, True
     even = round(track.age.seconds / FRAME_S) % 2 == 0
     return even, not even

@@ -158,12 +158,11 @@ class HandednessEstimate:
         """The same where another hand is tracked: a person's two hands are not of one side.
 
         Where one hand is asked for, the given side is that of either of the two, and what is seen
-        of both says of which.
+        of both says of which. Where two are, each has its own, and both may be exchanged.
         """
-        if self.given and other.given:
-            return self
         if self.given:
-            prior = math.copysign(_OF_EITHER * settings.given, self.prior)
+            left = 1.0 if other.given else _OF_EITHER
+            prior = math.copysign(left * settings.given, self.prior)
             most = settings.partner
             return replace(self, prior=prior, partner=-min(max(other.fits, -most), most))
         surely = math.tanh(0.5 * (other.fits + other.shoulder))
