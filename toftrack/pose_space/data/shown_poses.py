@@ -38,7 +38,7 @@ _STATES = {
     "back": ((-14, 4, 0), (8, 5, 5)),  # bent backwards a little, as of a hand stretched out
     "tight": ((86, 105, 65), (5, 6, 8)),  # as a fist closes: the tip is 26 to 37 mm off the knuckle
     "loose": ((74, 92, 45), (11, 12, 14)),
-    "folded": ((32, 98, 58), (22, 9, 12)),  # as tight, over knuckles that are bent half or less
+    "folded": ((38, 115, 72), (18, 5, 9)),  # as tight, over knuckles that are bent half or less
     "hooked": ((5, 92, 55), (12, 14, 16)),
     "claw": ((-8, 52, 38), (9, 14, 13)),
     "half": ((35, 40, 20), (18, 20, 13)),
@@ -86,12 +86,10 @@ SHOWN = (
     Shown("stretched palm", ("out", "up"), _four("back"), _APART, 5),
     Shown("flat", ("beside", "beside", "beside", "out"), _four("straight"), _TOGETHER, 11),
     Shown("flat, thumb away", ("up", "out"), _four("straight"), _TOGETHER, 4),
-    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 12),
+    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 18),
     Shown("fist about the thumb", ("tucked", "folded"), _four("over"), _TOGETHER, 2),
-    Shown("fist, flat knuckles", ("across", "beside", "hooked"), _four("folded"), _TOGETHER, 4),
     Shown("loose fist", _CLOSED, _four("loose"), _ANY, 3),
-    Shown("thumb up", ("up", "out", "up"), _four("tight"), _TOGETHER, 9),
-    Shown("thumb up, flat knuckles", ("up", "out", "up"), _four("folded"), _TOGETHER, 6),
+    Shown("thumb up", ("up", "out", "up"), _four("tight"), _TOGETHER, 15),
     Shown("thumb up, loose", ("up", "out"), _four("loose"), _ANY, 2),
     Shown("point", _CLOSED, ("straight", "tight", "tight", "tight"), _ANY, 7),
     Shown("point, loose", _CLOSED, ("straight", "loose", "loose", "loose"), _ANY, 3),
@@ -129,6 +127,8 @@ SHOWN = (
     ),
     Shown("relaxed", ("out", "opposed", "beside"), _four("half"), _ANY, 6),
 )
+_FLAT_KNUCKLES = 0.4
+"""How many of those who close fingers hardly bend their knuckles: tight ones are folded."""
 _TOUCHING_M = 0.020
 _ONE_BY_ONE = 0.25
 """Standard deviation of how much further than its neighbour a finger is on its way."""
@@ -178,6 +178,8 @@ def shown_only(n: int, generator: torch.Generator, rows: Tensor | None = None) -
         rows = torch.multinomial(weights, n, True, generator=generator)
     names = list(_STATES)
     state = torch.tensor([[names.index(f) for f in shown.fingers] for shown in SHOWN])[rows]
+    flat = (_uniform(generator, n, 1) < _FLAT_KNUCKLES) & (state == names.index("tight"))
+    state = torch.where(flat, names.index("folded"), state)
     means = torch.tensor([mean for mean, _ in _STATES.values()], dtype=torch.float32)
     deviations = torch.tensor([deviation for _, deviation in _STATES.values()], dtype=torch.float32)
     # One way of bending for all fingers of a person, and a little of each finger's own.
