@@ -116,6 +116,14 @@ def test_a_thumb_is_up_over_loosely_curled_fingers_which_make_no_fist() -> None:
     assert label_of(of_thumb(angles, "across")) != "fist"
 
 
+def test_a_fist_is_one_also_over_knuckles_that_are_hardly_bent() -> None:
+    angles = fingers(0, 1, 2, 3)
+    for finger in range(4):
+        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians([38, 115, 72])
+    assert label_of(of_thumb(angles, "across")) == label_of(of_thumb(angles, "beside")) == "fist"
+    assert label_of(of_thumb(angles, "up")) == "thumb_up"
+
+
 def test_a_thumb_is_up_over_fingers_that_roll_up_with_their_knuckles_hardly_bent() -> None:
     angles = fingers(0, 1, 2, 3)
     for finger in range(4):

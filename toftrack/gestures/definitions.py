@@ -3,8 +3,9 @@
 A finger's state is a range of its total flexion and of its split (see features.py), in degrees;
 the ranges are those of functional motion (Bain et al., J. Hand Surg. Eur. 40(4), 2015): a straight
 finger is within 30 degrees of straight, one curled into the palm has about 90, 100 and 50 degrees
-in its joints, and the fingers of a resting hand 30, 40 and 15, the little one the most. The thumb
-is recognised by where its tip is. Nothing here was fitted to recordings.
+in its joints, or 40, 115 and 70 where its knuckle is hardly bent, and the fingers of a resting hand
+30, 40 and 15, the little one the most. The thumb is recognised by where its tip is. Nothing here
+was fitted to recordings.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ class _Finger(NamedTuple):
 
 
 _STRAIGHT = _Finger((-30, 30), (-25, 25))
-_CURLED = _Finger((205, 270), (20, 100))
+_CURLED = _Finger((205, 270), (20, 160))
 _LOOSELY_CURLED = _Finger((150, 270), (-5, 100))
-_ROLLED_UP = _Finger((172, 225), (80, 128))
+_ROLLED_UP = _Finger((172, 270), (80, 160))
 _RESTING = _Finger((55, 130), (-5, 60))
 _HOOKED = _Finger((120, 190), (100, 180))
 _FLAT_BENT = _Finger((60, 110), (-110, -40))
