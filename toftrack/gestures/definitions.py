@@ -48,11 +48,11 @@ class _Finger(NamedTuple):
 
 
 _STRAIGHT = _Finger((-30, 30), (-25, 25))
-_CURLED = _Finger((205, 270), (20, 160))
+_CURLED = _Finger((200, 270), (20, 160))
 _LOOSELY_CURLED = _Finger((150, 270), (-5, 100))
-_ROLLED_UP = _Finger((172, 270), (80, 160))
+_ROLLED_UP = _Finger((172, 225), (80, 128))
 _RESTING = _Finger((55, 130), (-5, 60))
-_HOOKED = _Finger((120, 190), (100, 180))
+_HOOKED = _Finger((120, 176), (100, 180))
 _FLAT_BENT = _Finger((60, 110), (-110, -40))
 _PINCHING = _Finger((70, 160), (-10, 90))
 _NEARLY_STRAIGHT = _Finger((-30, 60), (-25, 40))
