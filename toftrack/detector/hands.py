@@ -104,7 +104,8 @@ def random_rotations(n: int, dice: Dice, views: Tensor | None = None) -> Tensor:
 def thumb_is_up(angles: Tensor) -> Tensor:
     """(N,) which of the poses (N, 21) have a straight thumb away from four curled fingers."""
     degrees = torch.rad2deg(angles)
-    curled = (degrees[:, 7::4] > 65).all(1) & (degrees[:, 6::4] > 45).all(1)
+    # A fist closes with bent knuckles, or with middle joints that are bent the more.
+    curled = (degrees[:, 7::4] > 65).all(1) & (degrees[:, 6::4] + degrees[:, 7::4] > 125).all(1)
     away = (degrees[:, 0] > -12) & (degrees[:, 1] < 22) & (degrees[:, 3] < 18)
     return curled & away & (degrees[:, 4] < 25)
 
