@@ -164,7 +164,7 @@ def _images(rows: Rows) -> list[str]:
         line("... fingertips, median", "kinect2", "tips_median_mm", "mm", 1),
         line("... fingertips, mean", "kinect2", "tips_mean_mm", "mm", 1),
         line("stills: found", "stills", "found_pct", "%"),
-        line("... of these, named rightly", "stills", "named_pct", "%"),
+        line("... named rightly, of all images", "stills", "named_pct", "%"),
         line("... given the name of another gesture", "stills", "wrong_name_pct", "%"),
         line("no raised hand: frames called a hand", "empty", "silent_pct", "%", 1),
     ]
