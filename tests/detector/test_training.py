@@ -53,6 +53,8 @@ def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -
         ({"batch": 2.5}, "batch of a network must be"),
         ({"width": -1}, "width of a network must be"),
         ({"rate": 1.5}, "rate of a network must be between 0 and 1"),
+        ({"restart_images": -1}, "restart_images of a network must be a whole number, 0 or more"),
+        ({"restart_rate": 0.0}, "restart_rate of a network must be between 0 and 1"),
         ({"start": "w.npz", "start_share": 1.0}, "start_share of a network must be at least 0"),
         ({"start_share": 0.5}, "start_share of a network needs weights to start from"),
     ],
@@ -99,6 +101,44 @@ def test_a_share_of_the_start_makes_the_mean_of_both(tmp_path: Path) -> None:
             torch.testing.assert_close(
                 value, 0.25 * start[key] + 0.75 * end[key], atol=1e-3, rtol=1e-3
             )
+
+
+@pytest.mark.slow
+def test_a_restart_ends_with_the_mean_of_both_ends(tmp_path: Path) -> None:
+    """As two trainings do, of which the second begins from the first one's weights."""
+    first, before = train_finder(TINY, 6, 0)
+    save_weights(tmp_path / "w.npz", PoseNet(4), first, {})
+    begun = {"start": str(tmp_path / "w.npz"), "start_share": 0.5}
+    second, _ = train_finder(replace(TINY, rate=0.001, **begun), 6, training._RESTART_SEED)
+    schedule = replace(TINY, restart_images=24, restart_rate=0.001)
+    both, course = train_finder(schedule, 6, 0)
+    moved = 0.0
+    for key, value in both.state_dict().items():
+        if value.is_floating_point():
+            end = second.state_dict()[key]
+            torch.testing.assert_close(value, end, atol=1e-3, rtol=1e-3)
+            moved = max(moved, float((value - first.state_dict()[key]).abs().max()))
+    assert moved > 0.002
+    assert [row["images"] for row in course] == [24, 48]
+    assert course[0]["loss"] == before[0]["loss"] and course[1]["seconds"] > course[0]["seconds"]
+
+
+@pytest.mark.slow
+def test_a_restart_that_was_interrupted_ends_with_the_same_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("whole", "first", "part", "rest"):
+        (tmp_path / name).mkdir()
+    schedule = replace(TINY, restart_images=24)
+    whole, course = train_finder(schedule, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
+    train_finder(TINY, 6, 0, Checkpoints(tmp_path / "first", 1.0))
+    resumed = Checkpoints(tmp_path / "part", 1e-9, resume=tmp_path / "first")
+    interrupted(train_finder, resumed, monkeypatch, after=2, schedule=schedule)
+    resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "part")
+    rest, other = train_finder(schedule, 6, 0, resumed)
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, rest.state_dict()[key]), key
+    assert [row["loss"] for row in course] == [row["loss"] for row in other]
 
 
 def test_batches_come_in_order_from_a_thread_that_ends_with_whoever_asks() -> None:
@@ -213,7 +253,7 @@ def test_an_interrupted_training_ends_with_the_same_weights(
     for name in ("whole", "part", "rest", "end"):
         (tmp_path / name).mkdir()
     whole, course = train(TINY, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
-    interrupted(train, tmp_path / "part", monkeypatch, after=2)
+    interrupted(train, Checkpoints(tmp_path / "part", 1e-9), monkeypatch, after=2)
     again = Checkpoints(tmp_path / "rest", 1e-9, resume=tmp_path / "part")
     rest, other = train(TINY, 6, 0, again)
     for key, value in whole.state_dict().items():
@@ -224,7 +264,13 @@ def test_an_interrupted_training_ends_with_the_same_weights(
     assert torch.equal(done.state_dict()["heads.weight"], rest.state_dict()["heads.weight"])
 
 
-def interrupted(train, folder: Path, monkeypatch: pytest.MonkeyPatch, after: int) -> None:
+def interrupted(
+    train,
+    kept_in: Checkpoints,
+    monkeypatch: pytest.MonkeyPatch,
+    after: int,
+    schedule: Schedule = TINY,
+) -> None:
     """A training that ends after some batches, with a checkpoint."""
     kept = checkpoints.save
 
@@ -236,7 +282,7 @@ def interrupted(train, folder: Path, monkeypatch: pytest.MonkeyPatch, after: int
     with monkeypatch.context() as patched:
         patched.setattr(checkpoints, "save", save)
         with pytest.raises(SwitchedOffError):
-            train(TINY, 6, 0, Checkpoints(folder, 1e-9))
+            train(schedule, 6, 0, kept_in)
 
 
 @pytest.mark.slow
@@ -248,13 +294,13 @@ def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
         (tmp_path / name).mkdir()
     more_images = replace(TINY, images=48)
     whole, _ = train_finder(more_images, 6, 0, Checkpoints(tmp_path / "whole", 1.0))
-    interrupted(train_finder, tmp_path / "early", monkeypatch, after=1)
+    interrupted(train_finder, Checkpoints(tmp_path / "early", 1e-9), monkeypatch, after=1)
     resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "early")
     rest, course = train_finder(more_images, 6, 0, resumed)
     assert course[-1]["images"] == 48
     for key, value in whole.state_dict().items():
         assert torch.equal(value, rest.state_dict()[key]), key
-    interrupted(train_finder, tmp_path / "late", monkeypatch, after=3)
+    interrupted(train_finder, Checkpoints(tmp_path / "late", 1e-9), monkeypatch, after=3)
     late = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "late")
     with pytest.raises(ToftrackError, match="finder.images cannot become 48 any more; give 24"):
         train_finder(more_images, 6, 0, late)

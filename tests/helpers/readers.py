@@ -19,7 +19,7 @@ from toftrack.camera import Camera
 from toftrack.configuration.compose import configuration, configuration_folder
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import onnx_file, read_session
-from toftrack.detector.weights import DEFAULT_FILE, _checksum, load_weights, save_weights
+from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save_weights
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
@@ -255,7 +255,7 @@ def read_weights(path: Path) -> None:
         except Exception:  # it is damaged in another way, too
             raise error from None
         metadata = json.loads(arrays.pop("metadata").item())
-        metadata["sha256"] = _checksum(arrays)
+        metadata["sha256"] = checksum(arrays)
         right = path.with_name("right.npz")
         np.savez(right, metadata=np.array(json.dumps(metadata)), **arrays)
         load_weights(right)

@@ -3,7 +3,11 @@
 The rate stays where it is for two thirds of the images and then falls to nothing along a line
 (Hägele et al., "Scaling laws and compute-optimal training beyond fixed training durations",
 NeurIPS 2024), so that a training can still be made longer or shorter while the rate has not begun
-to fall. On a GPU the processes that make images set the pace, one on each core.
+to fall. Then, where the schedule says so, the rate rises once more, to less, and falls again, a
+warm restart (Loshchilov and Hutter, "SGDR: stochastic gradient descent with warm restarts", ICLR
+2017), and the result is the mean of both ends, weight by weight (Izmailov et al., "Averaging
+weights leads to wider optima and better generalization", UAI 2018). On a GPU the processes that
+make images set the pace, one on each core.
 
 An interrupted training goes on with the batches that it would have seen (batches.py,
 checkpoints.py).
@@ -46,7 +50,7 @@ from toftrack.detector.images import (
 from toftrack.detector.losses import finder_loss, pose_losses
 from toftrack.detector.muon import Muon
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.weights import go_on_from
+from toftrack.detector.weights import checksum, go_on_from
 from toftrack.errors import ToftrackError
 
 _WARM = 300
@@ -56,6 +60,10 @@ _STEADY = 2 / 3
 _CPU = torch.device("cpu")
 _DECAY = 0.02
 """Of the weights, times the learning rate, in each step."""
+_RESTART_SHARE = 0.5
+"""Of the weights that a restart begins from, in the result."""
+_RESTART_SEED = 100
+"""What is added to the seed for a restart, so that its images and hands are others."""
 Network = TypeVar("Network", PoseNet, Finder)
 
 
@@ -70,6 +78,8 @@ class Schedule:
     start_share: of these weights in the result, which is the mean of both, weight by weight: what
         the start knew of images unlike those it now learns from is kept so (Wortsman et al.,
         "Robust fine-tuning of zero-shot models", CVPR 2022).
+    restart_images: seen after `images`, while the rate rises again and falls; the result is the
+        mean of both ends; 0 = no restart.  restart_rate: the highest learning rate meanwhile.
     """
 
     images: int
@@ -78,6 +88,8 @@ class Schedule:
     width: int
     start: str | None = None
     start_share: float = 0.0
+    restart_images: int = 0
+    restart_rate: float = 0.0012
 
     def __post_init__(self) -> None:
         for name in ("images", "batch", "width"):
@@ -85,8 +97,11 @@ class Schedule:
             if not (isinstance(getattr(self, name), int) and getattr(self, name) >= least):
                 more = "" if name != "images" else ", or 0 with weights to start from"
                 raise ToftrackError(f"{name} of a network must be a whole number above 0{more}")
-        if not 0 < self.rate < 1:
-            raise ToftrackError("rate of a network must be between 0 and 1")
+        if not (isinstance(self.restart_images, int) and self.restart_images >= 0):
+            raise ToftrackError("restart_images of a network must be a whole number, 0 or more")
+        for name in ("rate", "restart_rate"):
+            if not 0 < getattr(self, name) < 1:
+                raise ToftrackError(f"{name} of a network must be between 0 and 1")
         if not 0 <= self.start_share < 1:
             raise ToftrackError("start_share of a network must be at least 0 and less than 1")
         if self.start_share > 0 and self.start is None:
@@ -140,7 +155,7 @@ def train_poses(
 
     on_cpu = device.type == "cpu"
     images: Images = Images(crop_images) if on_cpu else Images(crop_scenes, _Taken(device, seed))
-    task = Task("poses", images, losses, replayed=not on_cpu)
+    task = Task("poses", "poses.images", images, losses, replayed=not on_cpu)
     return _train(network, task, schedule, shapes, seed, checkpoints, device)
 
 
@@ -164,7 +179,7 @@ def train_finder(
         loss = finder_loss(found, images)
         return loss, {"loss": loss.detach()}
 
-    task = Task("finder", Images(wide_images), losses)
+    task = Task("finder", "finder.images", Images(wide_images), losses)
     return _train(network, task, schedule, shapes, seed + 1, checkpoints, device)
 
 
@@ -185,11 +200,13 @@ class Images:
 class Task:
     """What a network is trained on.
 
+    name: of its checkpoint.  counted: the setting that says how many images it sees.
     losses: of a batch, and what is reported; () tensors.  replayed: on a CUDA device, a step is
     recorded once and replayed, as all its sizes are the same each time.
     """
 
     name: str
+    counted: str
     images: Images
     losses: Callable[[Any], tuple[Tensor, dict[str, Tensor]]]
     replayed: bool = False
@@ -282,13 +299,48 @@ def _train(
     device: torch.device,
 ) -> tuple[Network, Course]:
     keep_memory()
-    steps = schedule.steps
     start = None
     if schedule.start is not None:
         kind = "pose" if isinstance(network, PoseNet) else "finder"
         start = go_on_from(schedule.start, kind, network, schedule.width)
+    where = (shapes, checkpoints, device)
+    course = _descend(network, task, schedule, seed, start, schedule.start_share, *where)
+    if schedule.restart_images > 0:
+        before = course[-1] if course else {"images": 0, "seconds": 0.0}
+        restart = replace(
+            schedule, images=schedule.restart_images, rate=schedule.restart_rate, restart_images=0
+        )
+        name = task.name
+        task = replace(task, name=f"{name}_restart", counted=f"{name}.restart_images")
+        begun = checksum({k: v.cpu().numpy() for k, v in network.state_dict().items()})
+        seed += _RESTART_SEED
+        for row in _descend(network, task, restart, seed, begun, _RESTART_SHARE, *where):
+            images = before["images"] + row["images"]
+            seconds = round(before["seconds"] + row["seconds"], 1)
+            course.append(row | {"images": images, "seconds": seconds})
+    return network.cpu(), course
+
+
+def _descend(
+    network: PoseNet | Finder,
+    task: Task,
+    schedule: Schedule,
+    seed: int,
+    start: str | None,
+    start_share: float,
+    shapes: int,
+    checkpoints: Checkpoints | None,
+    device: torch.device,
+) -> Course:
+    """Train a network until the rate has fallen to nothing; it is left with the average of its
+    weights.
+
+    start: the checksum of the weights that it comes with; None = they are random.
+    start_share: of these weights in the result.
+    """
+    steps = schedule.steps
     network.train().to(device, memory_format=torch.channels_last)
-    begun = deepcopy(network) if schedule.start_share > 0 else None
+    begun = deepcopy(network) if start_share > 0 else None
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     averaged = deepcopy(network)
     progress = Progress(network, averaged, optimiser, schedule.images)
@@ -297,7 +349,7 @@ def _train(
     writing: Any = contextlib.nullcontext(lambda: None)
     if checkpoints is not None:
         checkpoints.restore(task.name, progress, settings)
-        _check_length(task.name, progress, schedule)
+        _check_length(task.counted, progress, schedule)
         writing = checkpoints.writing(task.name, progress, settings)
     course = progress.course
     before, began = progress.seconds, time.perf_counter()
@@ -324,21 +376,22 @@ def _train(
                 course.append({"images": images, "seconds": seconds} | recent)
             stepped()
     if begun is not None:
-        _average(averaged, begun, torch.tensor(schedule.start_share, device=device))
-    return averaged.cpu(), course
+        _average(averaged, begun, torch.tensor(start_share, device=device))
+    network.load_state_dict(averaged.state_dict())
+    return course
 
 
-def _check_length(name: str, progress: Progress, schedule: Schedule) -> None:
+def _check_length(counted: str, progress: Progress, schedule: Schedule) -> None:
     """A training that goes on may end elsewhere than was meant, if neither would have begun to end.
 
-    Raises ToftrackError.
+    counted: the setting that says how many images it sees. Raises ToftrackError.
     """
     meant = replace(schedule, images=progress.images)
     if meant.steps != schedule.steps and progress.step > _STEADY * min(meant.steps, schedule.steps):
         raise ToftrackError(
-            f"the training of {name} has seen {progress.step * schedule.batch} images of"
-            f" {meant.images}: its rate falls, or would have to already, so that {name}.images"
-            f" cannot become {schedule.images} any more; give {meant.images}"
+            f"of the {progress.images} images of {counted} {progress.step * schedule.batch} have"
+            f" been seen: the rate falls, or would have to already, so that {counted} cannot become"
+            f" {schedule.images} any more; give {progress.images}"
         )
     progress.images = schedule.images
 

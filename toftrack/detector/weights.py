@@ -49,7 +49,7 @@ def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any
     metadata = {
         "format": FORMAT,
         "version": VERSION,
-        "sha256": _checksum(arrays),
+        "sha256": checksum(arrays),
         "pose_width": pose.stem[0].out_channels,
         "finder_width": finder.heads.in_channels,
         "about": about,
@@ -203,14 +203,15 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"
             f" version {VERSION}; {_AGAIN}"
         )
-    if metadata.get("sha256") != _checksum(arrays):
+    if metadata.get("sha256") != checksum(arrays):
         raise ToftrackError(f"{path} is damaged, its checksum is wrong; {_AGAIN}")
     for before, now in _RENAMED.items():
         arrays = {name.replace(before, now): array for name, array in arrays.items()}
     return arrays, metadata
 
 
-def _checksum(arrays: dict[str, np.ndarray]) -> str:
+def checksum(arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 of arrays and their names, as hexadecimal digits."""
     digest = hashlib.sha256()
     for key in sorted(arrays):
         digest.update(key.encode())
