@@ -69,7 +69,8 @@ def test_no_images_leave_the_weights_of_a_start_as_they_are(tmp_path: Path) -> N
     finder = Finder(8)
     save_weights(tmp_path / "w.npz", PoseNet(4), finder, {})
     start = str(tmp_path / "w.npz")
-    same, course = train_finder(Schedule(0, 8, 0.002, 8, start), shapes=6, seed=0)
+    nothing = Schedule(0, 8, 0.002, 8, start, restart_images=24)
+    same, course = train_finder(nothing, shapes=6, seed=0)
     assert course == []
     for key, value in finder.state_dict().items():
         torch.testing.assert_close(same.state_dict()[key], value, atol=1e-3, rtol=1e-3)
@@ -212,7 +213,8 @@ def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> None:
-    sizes = ("poses.images=256", "finder.images=256", "poses.batch=32", "finder.batch=32")
+    sizes = ["poses.images=256", "finder.images=256", "poses.batch=32", "finder.batch=32"]
+    sizes += ["poses.restart_images=64", "finder.restart_images=32"]
     done = command(tmp_path, *sizes, "shapes=6", "poses.width=4", "finder.width=8")
     assert done.returncode == 0, done.stderr
     derived = ("detector.pose.onnx", "detector.finder.onnx")
@@ -223,8 +225,9 @@ def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> Non
     pose, finder = load_networks(tmp_path / "detector.npz")
     assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
     assert (about["pose_images"], about["finder_images"], about["shapes"]) == (256, 256, 6)
+    assert (about["pose_restart_images"], about["finder_restart_images"]) == (64, 32)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["poses"][-1]["images"] == summary["finder"][-1]["images"] == 256
+    assert [summary[name][-1]["images"] for name in ("poses", "finder")] == [320, 288]
     assert "poses" in done.stderr and "finder" in done.stderr, "progress bars"
 
 

@@ -71,8 +71,8 @@ Network = TypeVar("Network", PoseNet, Finder)
 class Schedule:
     """How a network is trained; see conf/train_detector.yaml.
 
-    images: in all; 0 leaves the weights of `start` as they are.  batch: images of a step.  rate:
-    the highest learning rate, see rate_at.
+    images: before a restart; 0 leaves the weights of `start` as they are.
+    batch: images of a step.  rate: the highest learning rate, see rate_at.
     width: channels of the network's first layer.
     start: a file of weights to go on from; None begins from nothing.
     start_share: of these weights in the result, which is the mean of both, weight by weight: what
@@ -305,8 +305,8 @@ def _train(
         start = go_on_from(schedule.start, kind, network, schedule.width)
     where = (shapes, checkpoints, device)
     course = _descend(network, task, schedule, seed, start, schedule.start_share, *where)
-    if schedule.restart_images > 0:
-        before = course[-1] if course else {"images": 0, "seconds": 0.0}
+    if schedule.restart_images > 0 and schedule.images > 0:
+        before = course[-1]
         restart = replace(
             schedule, images=schedule.restart_images, rate=schedule.restart_rate, restart_images=0
         )

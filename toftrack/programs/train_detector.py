@@ -94,7 +94,7 @@ def train(config: DictConfig) -> float:
         if schedule.start is not None:
             about[f"{name}_start"] = load_weights(schedule.start).about
             about[f"{name}_start_share"] = schedule.start_share
-        if schedule.restart_images > 0:
+        if schedule.restart_images > 0 and schedule.images > 0:
             about[f"{name}_restart_images"] = schedule.restart_images
     save_weights(path, pose_network, finder_network, about)
     pictures = ["images.png"]
