@@ -5,13 +5,15 @@
     python docs/make_figures.py --kinect2 KINECT2.npz --stills STILLS.npz --sets DATA
     python docs/make_figures.py --tables          write the tables only
     python docs/make_figures.py --strangers       track the public test set, append to history.md
+    python docs/make_figures.py --in-turn FILE    take the times, measure nothing
 
 The first measures the sample, tests/data/guards and tests/data/empty; with the recordings that
 tests/data/kinect2/make_extract.py and tests/data/stills/make_extract.py make, the labelled images;
 with --sets, the folders crowd, grasps and mesh-hand in DATA. What is not given keeps its figures
 and their commit. The public test set, tests/data/strangers, is tracked by --strangers only, once
 at the end of a piece of work: its rows are read from docs/lab/history.md. --peer-python PYTHON
-measures MediaPipe, too, wherever there is amplitude.
+measures MediaPipe, too, wherever there is amplitude. The README's times are of one run, in which
+all programs take turns: `toftrack benchmark alternating --peer-python PYTHON --json FILE`.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import statistics
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -48,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.strangers:
         _append_strangers(options)
     figures = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.exists() else {"rows": {}}
-    if not options.tables and not options.strangers:
+    if options.in_turn is not None:
+        figures["rows"] |= _in_turn(options.in_turn)
+    elif not options.tables and not options.strangers:
         figures["rows"] |= _measured(options)
     figures["rows"] = {
         name: row for name, row in figures["rows"].items() if not name.startswith("strangers")
@@ -71,6 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--strangers", action="store_true", help="track the public test set")
     what.add_argument("--tables", action="store_true", help="measure nothing")
+    what.add_argument("--in-turn", type=Path, metavar="FILE", help="of benchmark alternating")
     parser.add_argument("--kinect2", type=Path, metavar="FILE", help="the real recording")
     parser.add_argument("--stills", type=Path, metavar="FILE", help="the real stills")
     parser.add_argument("--sets", type=Path, metavar="DATA", help="the sets to develop on")
@@ -98,6 +104,28 @@ def _measured(options: argparse.Namespace) -> dict[str, Any]:
         for name, side in SETS.items():
             rows |= _rows(name, [options.sets / name], side, options, peer=True)
     return rows
+
+
+def _in_turn(file: Path) -> dict[str, Any]:
+    """The rows of times from what `toftrack benchmark alternating --json` wrote."""
+    from toftrack import __version__
+    from toftrack.benchmark.results import commit
+
+    found = json.loads(file.read_text(encoding="utf-8"))
+    machine = found["machine"]
+    about = {
+        "commit": commit(),
+        "seeds": [0],
+        "side": "told",
+        "machine": f"{machine['processor']}, {machine['cores']} cores",
+        "versions": f"toftrack {__version__}, torch {machine['torch']}",
+    }
+    names = {"one hand, side given": "in turn", "MediaPipe, one hand": "in turn, mediapipe"}
+    medians = {
+        times["name"]: statistics.median(statistics.median(one) for one in times["rounds"])
+        for times in found["frames"]
+    }
+    return {row: about | {"median_ms": medians[name]} for name, row in names.items()}
 
 
 def _rows(
