@@ -1,32 +1,30 @@
-"""`.npz` archives that others wrote: what is claimed is checked before and while it is read.
+"""`.npz` archives: written in one way, and read with bounds, as they may come from strangers.
 
-Python's own reader decompresses as much as a piece of the file makes, which of bzip2 can be
-gigabytes from kilobytes, and numpy's allocates what a header claims. Here both are bounded, pickled
-objects are never loaded, and every way in which an archive can be broken is a ValueError.
+numpy's own reader allocates what a header claims, and Python's `zipfile` decompresses without
+bounds what bzip2 or lzma packed. So headers are checked against the archive's directory first, only
+stored and deflated arrays are read, pickled objects never are, and every way in which an archive
+can be broken is a ValueError.
 """
 
 from __future__ import annotations
 
-import bz2
-import copy
 import errno
 import io
-import lzma
 import math
 import struct
 import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO, Any
 
 import numpy as np
 
-from toftrack.safe_files import open_to_read
+from toftrack.safe_files import open_to_read, whole_file
 
 MOST_BYTES = 2**30
 """An array of more than a gigabyte is not loaded."""
@@ -36,12 +34,11 @@ _MOST_RATIO, _SMALL_BYTES = 1000, 2**26
 """What shrank to less than a thousandth was made to fill memories, unless it is small anyway;
 depth and amplitude images of real cameras shrink to a tenth to a fortieth."""
 _MOST_HEADER_BYTES = 2**16
-_MOST_DICTIONARY_BYTES = 2**26
-_PIECE_BYTES = 2**16
+_PIECE_BYTES = 2**20
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
-    lzma.LZMAError,
     struct.error,
     EOFError,
     RuntimeError,  # an encrypted member; an unknown compression; too deep a header
@@ -110,9 +107,11 @@ class Archive:
         with broken_is_value_error(name), self._open(name) as stream:
             header = _header(stream)
             _check(name, header, self._entries[name], most_bytes)
-            content = bytearray(header.size)
-            if _fill(stream, memoryview(content)) < header.size or stream.read(1):
-                raise ValueError("it is of another length than its header says")
+            content = bytearray()
+            while piece := stream.read(_PIECE_BYTES):
+                content += piece
+            if len(content) < header.size:
+                raise EOFError("it is shorter than the archive says")
             array = np.frombuffer(content, header.kind)
             if header.kind.kind == "U" and not _is_text(array):
                 raise ValueError("its text is damaged")
@@ -129,7 +128,10 @@ class Archive:
         self._zip.close()
 
     def _open(self, name: str) -> IO[bytes]:
-        return io.BufferedReader(_Member(self._zip, self._entries[name]), _PIECE_BYTES)
+        entry = self._entries[name]
+        if entry.compress_type not in _METHODS:
+            raise ValueError("its compression is not read; save it with numpy.savez_compressed")
+        return self._zip.open(entry)
 
 
 def read_archive(path: str | Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -145,6 +147,42 @@ def read_archive(path: str | Path, names: Collection[str] | None = None) -> dict
         if sum(archive.header(name).size for name in wanted) > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e9:.1f} GB")
         return {name: archive.read(name) for name in wanted}
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """An array that is written in pieces, as its rows come, of that shape and type as a whole."""
+
+    shape: tuple[int, ...]
+    kind: np.dtype
+    pieces: Iterable[np.ndarray]
+
+
+def write_archive(path: str | Path, arrays: Mapping[str, Any], level: int | None = None) -> None:
+    """Write an .npz file, compressed as `np.savez_compressed` does; it is there as a whole, or as
+    it was.
+
+    Args:
+        path: of the file.
+        arrays: whatever numpy makes numbers or text of, or `Pieces`, by name.
+        level: of the compression, 0 to 9; None = zlib's own, 6.
+
+    Raises OSError.
+    """
+    with (
+        whole_file(path) as target,
+        zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as archive,
+    ):
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if not isinstance(array, Pieces):
+                    np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+                    continue
+                described = np.lib.format.dtype_to_descr(array.kind)
+                header = {"descr": described, "fortran_order": False, "shape": array.shape}
+                np.lib.format.write_array_header_1_0(member, header)
+                for piece in array.pieces:
+                    member.write(piece.astype(array.kind, copy=False).tobytes())
 
 
 @contextmanager
@@ -207,134 +245,3 @@ def _is_text(array: np.ndarray) -> bool:
     """Whether all characters of texts (n,) are some; Python cannot make a string of others."""
     characters = array.view(np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
     return int(characters.max(initial=0)) <= sys.maxunicode
-
-
-def _fill(stream: IO[bytes], target: memoryview) -> int:
-    """Read until the target is full or nothing comes any more; how much there was."""
-    done = 0
-    while done < len(target):
-        piece = stream.read(min(2**20, len(target) - done))
-        if not piece:
-            break
-        target[done : done + len(piece)] = piece
-        done += len(piece)
-    return done
-
-
-class _Decompressor(Protocol):
-    """Makes at most so many bytes at a time, as those of bz2 and lzma do."""
-
-    @property
-    def needs_input(self) -> bool: ...
-
-    @property
-    def eof(self) -> bool: ...
-
-    def decompress(self, data: bytes, max_length: int, /) -> bytes: ...
-
-
-class _Member(io.RawIOBase):
-    """A member's bytes, decompressed in pieces of at most what is asked for, its checksum tested.
-
-    Ends with the size that the archive states; what would come after it is not made.
-    """
-
-    def __init__(self, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-        # Read as if it were stored: the bytes as they lie in the file, of which there are as many.
-        raw = copy.copy(entry)
-        raw.compress_type, raw.file_size = zipfile.ZIP_STORED, entry.compress_size
-        del raw.CRC
-        self._raw = archive.open(raw)
-        self._left, self._crc, self._wanted_crc = entry.file_size, 0, entry.CRC
-        self._decompressor = _decompressor(entry.compress_type, self._raw)
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, target: bytearray | memoryview) -> int:  # type: ignore[override]
-        data = self._some(min(len(target), self._left))
-        target[: len(data)] = data
-        self._crc = zlib.crc32(data, self._crc)
-        self._left -= len(data)
-        if not self._left and self._crc != self._wanted_crc:
-            raise zipfile.BadZipFile("its checksum is wrong")
-        return len(data)
-
-    def _some(self, count: int) -> bytes:
-        """Up to so many bytes; none only at the end."""
-        while count:
-            hungry = self._decompressor.needs_input
-            source = self._raw.read(_PIECE_BYTES) if hungry else b""
-            try:
-                data = self._decompressor.decompress(source, count)
-            except OSError:  # bz2's way to say so
-                raise zipfile.BadZipFile("its data are damaged") from None
-            if data:
-                return data
-            if self._decompressor.eof or (hungry and not source):
-                raise EOFError("it is shorter than the archive says")
-        return b""
-
-    def close(self) -> None:
-        self._raw.close()
-        super().close()
-
-
-def _decompressor(method: int, raw: IO[bytes]) -> _Decompressor:
-    if method == zipfile.ZIP_STORED:
-        return _Stored()
-    if method == zipfile.ZIP_DEFLATED:
-        return _Inflate()
-    if method == zipfile.ZIP_BZIP2:
-        return bz2.BZ2Decompressor()
-    if method == zipfile.ZIP_LZMA:
-        return _lzma(raw)
-    raise ValueError(f"it is compressed in an unknown way ({method})")
-
-
-class _Stored:
-    """What is not compressed."""
-
-    eof = False
-
-    def __init__(self) -> None:
-        self._rest = b""
-
-    @property
-    def needs_input(self) -> bool:
-        return not self._rest
-
-    def decompress(self, data: bytes, max_length: int, /) -> bytes:
-        data, self._rest = self._rest + data, b""
-        data, self._rest = data[:max_length], data[max_length:]
-        return data
-
-
-class _Inflate:
-    """zlib's decompressor with the face of bz2's."""
-
-    def __init__(self) -> None:
-        self._inflate = zlib.decompressobj(-15)
-
-    @property
-    def eof(self) -> bool:
-        return self._inflate.eof
-
-    @property
-    def needs_input(self) -> bool:
-        return not self._inflate.unconsumed_tail
-
-    def decompress(self, data: bytes, max_length: int, /) -> bytes:
-        return self._inflate.decompress(self._inflate.unconsumed_tail + data, max_length)
-
-
-def _lzma(raw: IO[bytes]) -> lzma.LZMADecompressor:
-    """Of a zip's kind: two bytes version, the length of the properties, and these five."""
-    start = raw.read(9)
-    if len(start) < 9 or start[2:4] != b"\x05\x00" or start[4] >= 9 * 5 * 5:
-        raise ValueError("its lzma properties are damaged")
-    (rest, lc), dictionary = divmod(start[4], 9), int.from_bytes(start[5:], "little")
-    if dictionary > _MOST_DICTIONARY_BYTES:
-        raise ValueError(f"its lzma dictionary would have {dictionary / 1e6:.0f} MB")
-    kind = {"id": lzma.FILTER_LZMA1, "lc": lc, "lp": rest % 5, "pb": rest // 5}
-    return lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[kind | {"dict_size": dictionary}])

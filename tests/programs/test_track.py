@@ -296,7 +296,7 @@ def test_a_bad_recording_ends_the_program_before_it_writes(here, tmp_path) -> No
 @pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut off"])
 def test_what_is_no_archive_is_one_clear_sentence(tmp_path, content: bytes) -> None:
     (tmp_path / "bad.npz").write_bytes(content)
-    with pytest.raises(ToftrackError, match="bad.npz' is not an .npz archive"):
+    with pytest.raises(ToftrackError, match="bad.npz' is damaged .it is no .npz archive"):
         Replay(tmp_path / "bad.npz")
 
 

@@ -156,13 +156,13 @@ def test_a_directory(tmp_path: Path) -> None:
 def test_not_an_archive(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "text.npz"
     path.write_bytes(content)
-    assert "not an .npz" in complaint(path)
+    assert "it is no .npz archive" in complaint(path)
 
 
 def test_a_single_array_is_not_an_archive(tmp_path: Path) -> None:
     path = tmp_path / "array.npy"
     np.save(path, np.ones(3))
-    assert "not an .npz" in complaint(path)
+    assert "it is no .npz archive" in complaint(path)
 
 
 def test_cut_off_archive(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_damage_on_the_way_is_reported_when_it_is_met(long: Path) -> None:
     content[at : at + 4] = b"\0\0\xc0\x7f"
     long.write_bytes(content)
     recording = read_recording(long)
-    with pytest.raises(ToftrackError, match="long.npz' is damaged .*checksum"):
+    with pytest.raises(ToftrackError, match="long.npz' is damaged .*CRC"):
         for index in range(9):
             recording.image(index)
 

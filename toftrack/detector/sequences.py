@@ -15,7 +15,7 @@ import roma
 import torch
 from torch import Tensor
 
-from toftrack.archives import read_archive
+from toftrack.archives import read_archive, write_archive
 from toftrack.detector.dice import Dice
 from toftrack.detector.hands import HAND, posed_hands, random_rotations, random_views
 from toftrack.detector.images import FURNISHED, furnished, other_hands, random_scenes
@@ -23,7 +23,6 @@ from toftrack.detector.pictures import Lens, random_sensors, take_pictures
 from toftrack.detector.shapes import ShapeBank
 from toftrack.errors import ToftrackError
 from toftrack.pose_space.data.shown_poses import shown_poses
-from toftrack.safe_files import whole_file
 
 CAMERAS = ((176, 144, 200.0), (176, 144, 200.0), (320, 240, 280.0), (512, 424, 365.0))
 """Columns, rows and focal length in pixels."""
@@ -108,15 +107,14 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
 
 def write_sequence(path: Path, sequence: Sequence) -> None:
     """Keep a sequence as an npz file."""
-    with whole_file(path) as stream:
-        np.savez_compressed(
-            stream,
-            depth=sequence.depth_m,
-            k=sequence.k,
-            joints=sequence.joints_m,
-            visible=sequence.visible,
-            side=sequence.side,
-        )
+    arrays = {
+        "depth": sequence.depth_m,
+        "k": sequence.k,
+        "joints": sequence.joints_m,
+        "visible": sequence.visible,
+        "side": sequence.side,
+    }
+    write_archive(path, arrays)
 
 
 def read_sequence(path: Path) -> Sequence:

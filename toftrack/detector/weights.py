@@ -12,12 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from toftrack.archives import read_archive
+from toftrack.archives import read_archive, write_archive
 from toftrack.detector.crops import CROP_CHANNELS
 from toftrack.detector.network import SEGMENTS, Finder, PoseNet, Residual
 from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
-from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-detector"
 VERSION = 1
@@ -54,9 +53,7 @@ def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any
         "finder_width": finder.heads.in_channels,
         "about": about,
     }
-    content: dict[str, Any] = {"metadata": np.array(json.dumps(metadata)), **arrays}
-    with whole_file(path) as stream:
-        np.savez_compressed(stream, **content)
+    write_archive(path, {"metadata": json.dumps(metadata), **arrays})
 
 
 class Weights(NamedTuple):

@@ -14,15 +14,15 @@ from __future__ import annotations
 import itertools
 import sys
 import tempfile
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, BinaryIO, Self
+from typing import IO, Any, Self
 
 import numpy as np
 from tqdm import tqdm
 
+from toftrack.archives import Pieces, write_archive
 from toftrack.estimate import Estimate, is_vacant, no_estimate
 from toftrack.output.lines import (
     FRAME_FIELDS,
@@ -235,36 +235,30 @@ def _record_kind(line: Mapping[str, Any]) -> np.dtype:
     )
 
 
-def write_archive(
-    stream: BinaryIO,
+def write_results(
+    path: Path,
     records: Records,
     rows: np.ndarray,
     changed: dict[str, np.ndarray],
     small: dict[str, np.ndarray],
 ) -> None:
-    """Write the `.npz` of some rows of all columns, as `np.savez_compressed` would.
+    """Write the `.npz` of some rows of all columns. Raises OSError.
 
     rows: not decreasing.  changed: arrays in place of columns.  small: further arrays.
     """
     names = [name for name in records.names if name not in changed]
-    with (
-        zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive,
-        _bar("writing the results", len(rows)) as bar,
-    ):
-        for name in names:
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                header = {
-                    "descr": np.lib.format.dtype_to_descr(records.kind(name)),
-                    "fortran_order": False,
-                    "shape": (len(rows), *records.shape(name)),
-                }
-                np.lib.format.write_array_header_1_0(member, header)
-                for piece in records.pieces(name, rows):
-                    member.write(piece.tobytes())
-                    bar.update(len(piece) / len(names))
-        for name, array in (changed | small).items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+    with _bar("writing the results", len(rows)) as bar:
+
+        def pieces(name: str) -> Iterator[np.ndarray]:
+            for piece in records.pieces(name, rows):
+                yield piece
+                bar.update(len(piece) / len(names))
+
+        columns = {
+            name: Pieces((len(rows), *records.shape(name)), records.kind(name), pieces(name))
+            for name in names
+        }
+        write_archive(path, columns | changed | small, _LEVEL)
 
 
 def _bar(words: str, frames: int) -> tqdm:

@@ -33,9 +33,9 @@ from toftrack.output.lines import (
 )
 from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.realtime import RealTime
-from toftrack.output.records import Records, write_archive
+from toftrack.output.records import Records, write_results
 from toftrack.output.summary import run_doubts, run_metrics, summarise
-from toftrack.safe_files import whole_file, write_whole
+from toftrack.safe_files import write_whole
 
 _VERSION = 1
 _MOST_HELD = 10_000_000
@@ -202,8 +202,7 @@ def finish(
         counted = ~dropped | bool((metadata.get("config") or {}).get("count_dropped"))
         metrics = run_metrics(records, rows, changed["index"], truth, counted)
         summary |= {"metrics": metrics} if metrics else {}
-    with whole_file(folder / "track.npz") as stream:
-        write_archive(stream, records, rows, changed, small)
+    write_results(folder / "track.npz", records, rows, changed, small)
     _write_json(folder / "summary.json", summary)
     return summary
 

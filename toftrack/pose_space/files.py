@@ -18,13 +18,12 @@ import torch
 from threadpoolctl import threadpool_limits
 
 import toftrack.pose_space
-from toftrack.archives import read_archive
+from toftrack.archives import read_archive, write_archive
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.json_text import parse_json
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
-from toftrack.safe_files import whole_file
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
@@ -96,9 +95,7 @@ def save_pose_space(
         "sources": sources,
     }
     arrays = {name: tensor.cpu().numpy() for name, tensor in space.arrays().items()}
-    with whole_file(path) as file:
-        content: dict[str, Any] = {"header": np.array(json.dumps(header)), **arrays}
-        np.savez_compressed(file, **content)
+    write_archive(path, {"header": json.dumps(header), **arrays})
 
 
 def load_pose_space(path: str | Path) -> PoseSpace:

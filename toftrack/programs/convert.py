@@ -24,7 +24,6 @@ from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npy import NpyStack
 from toftrack.recordings.npz import Recording, write_recording
-from toftrack.recordings.npz_stream import write_npz_streamed
 from toftrack.recordings.png_folder import PngFolder, PngFolderWriter
 from toftrack.recordings.rosbag import RosBag
 from toftrack.recordings.sr_frame import (
@@ -128,7 +127,7 @@ def convert(
             _warn(f"{source}: {damage}; the frames before are converted")
         with tqdm(total=len(store), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
             if kind == ".npz":
-                _to_npz(store, target, bar)
+                write_recording(target, store, bar.update)
             elif kind == ".srs":
                 _to_srs(store, target, unambiguous_range_m(modulation_mhz), overwrite, bar)
             else:
@@ -136,13 +135,6 @@ def convert(
     finally:
         store.close()
     return len(store)
-
-
-def _to_npz(store: FrameStore, target: Path, bar: tqdm) -> None:
-    if isinstance(store, Recording):
-        write_recording(target, store)
-    else:
-        write_npz_streamed(target, store, bar.update)
 
 
 def _to_srs(store: FrameStore, target: Path, range_m: float, overwrite: bool, bar: tqdm) -> None:

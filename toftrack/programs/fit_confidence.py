@@ -21,13 +21,14 @@ from scipy.special import expit
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
+from toftrack.archives import write_archive
 from toftrack.detector.sequences import Sequence, random_sequence, read_sequence, write_sequence
 from toftrack.detector.shapes import shape_bank
 from toftrack.errors import ToftrackError
 from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.programs import command_line
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
-from toftrack.safe_files import whole_file, write_whole
+from toftrack.safe_files import write_whole
 from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES, ConfidenceModel
 from toftrack.tracking.model import TrackerModel
 from toftrack.views.pictures import write_picture
@@ -120,15 +121,9 @@ def main(arguments: list[str] | None = None) -> None:
     write_whole(asked.output / "confidence.yaml", pasted + "\n")
     picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
     write_picture(asked.output / "reliability.png", picture)
-    with whole_file(asked.output / "features.npz") as stream:
-        np.savez_compressed(
-            stream,
-            features=seen.features,
-            right=seen.right,
-            whole=seen.whole,
-            sequence=seen.sequence,
-            **{f"joint_{name}": values for name, values in seen.joints._asdict().items()},
-        )
+    arrays = {name: getattr(seen, name) for name in ("features", "right", "whole", "sequence")}
+    arrays |= {f"joint_{name}": values for name, values in seen.joints._asdict().items()}
+    write_archive(asked.output / "features.npz", arrays)
     print(f"{pasted}\n\n{_words(summary)}\nresults: {asked.output}")
 
 

@@ -23,14 +23,14 @@ Unknown keys are ignored.
 from __future__ import annotations
 
 import json
-import zipfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from toftrack.archives import MOST_BYTES, Archive, PickledError
+from toftrack.archives import MOST_BYTES, Archive, PickledError, Pieces, write_archive
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import (
@@ -42,10 +42,11 @@ from toftrack.frames import (
 )
 from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz_camera import CAMERA_KEYS, camera_arrays, camera_of
 from toftrack.recordings.streamed_images import Images, StreamedImages
 from toftrack.recordings.truth import TRUTH_KEYS, of_shape, read_truth, truth_arrays
-from toftrack.safe_files import open_to_read, whole_file
+from toftrack.safe_files import open_to_read
 
 DEFAULT_FPS = 25.0
 LOADED_BYTES = MOST_BYTES
@@ -99,26 +100,48 @@ def read_recording(path: str | Path) -> Recording:
         raise ToftrackError(f"the recording '{path}' cannot be used: {error}") from None
 
 
-def write_recording(path: str | Path, recording: Recording) -> None:
-    """Write a recording, compressed; an existing file is replaced only by a complete one.
+def write_recording(
+    path: str | Path, store: FrameStore, progress: Callable[[], object] = lambda: None
+) -> None:
+    """Write any recording frame by frame, compressed; an existing file is replaced only by a
+    complete one.
 
-    Depth keeps its type (float16 or float32). Raises ToftrackError when the file cannot be written.
+    Args:
+        path: the file.
+        store: read twice where it has amplitudes. Depth keeps the type of a `Recording` (float16 or
+            float32), and becomes float32 of others.
+        progress: called after each frame's depth.
+
+    Raises:
+        ToftrackError: the file cannot be written, or the store not be read.
     """
-    path = Path(path)
+
+    def depth_images() -> Iterator[np.ndarray]:
+        for index in range(len(store)):
+            yield store.image(index)[0]
+            progress()
+
+    def amplitude_images() -> Iterator[np.ndarray]:
+        for index in range(len(store)):
+            amplitude = store.image(index)[1]
+            assert amplitude is not None  # all images have one, or none has
+            yield amplitude
+
+    shape = (len(store), store.camera.height, store.camera.width)
+    kind = store.depth.dtype if isinstance(store, Recording) else np.dtype("<f4")
     arrays: dict[str, Any] = {
-        "radial_m" if recording.radial else "depth_m": recording.depth,
-        **camera_arrays(recording.camera),
-        "timestamp_s": np.asarray(recording.timestamp_s, np.float64),
-        "fps": np.float64(recording.fps),
-        "metadata": json.dumps(recording.metadata),
+        "radial_m" if store.radial else "depth_m": Pieces(shape, kind, depth_images()),
+        **camera_arrays(store.camera),
+        "timestamp_s": np.asarray(store.timestamp_s, np.float64),
+        "fps": np.float64(store.fps),
+        "metadata": json.dumps(store.metadata),
     }
-    if recording.amplitude is not None:
-        arrays["amplitude"] = recording.amplitude
-    if recording.truth is not None:
-        arrays |= truth_arrays(recording.truth)
+    if store.image(0)[1] is not None:
+        arrays["amplitude"] = Pieces(shape, np.dtype("<u2"), amplitude_images())
+    if store.truth is not None:
+        arrays |= truth_arrays(store.truth)
     try:
-        with whole_file(path) as stream:
-            np.savez_compressed(stream, **arrays)
+        write_archive(path, arrays)
     except OSError as error:
         raise ToftrackError(
             f"the recording '{path}' cannot be written ({error.strerror}); choose another place"
@@ -143,11 +166,6 @@ def _read_members(path: Path) -> dict[str, Images]:
         raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.npz)")
     try:
         with open_to_read(path) as stream:
-            if not zipfile.is_zipfile(stream):
-                raise ToftrackError(
-                    f"'{path}' is not an .npz archive, or it was cut off; give a recording as "
-                    "numpy.savez writes it"
-                )
             return _read_archive(path, Archive(stream))
     except FileNotFoundError:
         raise ToftrackError(
