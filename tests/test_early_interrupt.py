@@ -56,7 +56,7 @@ def test_an_interrupt_while_tracking_is_loaded(
     "name", "record convert calibrate evaluate figures gesture report benchmark".split()
 )
 def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
-    moment = "toftrack.benchmark.scoring" if name == "benchmark" else "hydra"
+    moment = "toftrack.benchmark.speed" if name == "benchmark" else "hydra"
     reported = interrupted(tmp_path, moment, "-m", f"toftrack.{name}", "x")
     assert (reported.returncode, reported.stderr) == (130, "interrupted\n")
 

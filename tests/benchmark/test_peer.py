@@ -12,7 +12,7 @@ from helpers.tracking import sample
 
 from toftrack.benchmark import peer, peer_mediapipe
 from toftrack.benchmark.accuracy import main
-from toftrack.benchmark.peer import Peer, PeerEstimate, peer_estimates
+from toftrack.benchmark.peer import Peer
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 
@@ -133,15 +133,3 @@ def test_the_given_side_goes_before_the_surer_hand() -> None:
     assert peer_mediapipe.chosen(found, "left") is None
     nobody = SimpleNamespace(multi_hand_landmarks=None, multi_handedness=None)
     assert peer_mediapipe.chosen(nobody, "left") is None
-
-
-def test_sides_are_measured_only_where_they_were_to_be_found() -> None:
-    said = [PeerEstimate(np.zeros((21, 3)), False, "left", 0.8, 0.02)] * 3
-    reported, seconds = peer_estimates(said, found_side=False)
-    assert (
-        reported.side is None
-        and reported.joints_m.shape == (3, 21, 3)
-        and list(seconds) == [0.02] * 3
-    )
-    found, _ = peer_estimates(said, found_side=True)
-    assert list(found.side) == ["left"] * 3

@@ -13,7 +13,6 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from toftrack.benchmark.decoding import AIMS_MS, decode_times
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.pose_space import isomap, kernel_pca, lle
@@ -199,13 +198,3 @@ def test_barycentric_weights_make_up_a_point_between_its_neighbours() -> None:
     assert weights.sum().item() == pytest.approx(1.0)
     made = torch.einsum("nk,nkd->nd", weights, corners[nearest])
     torch.testing.assert_close(made, torch.tensor([[0.25, 0.25]]), atol=5e-3, rtol=0)
-
-
-def test_decoding_is_timed_for_every_space() -> None:
-    spaces = {kind: fitted(kind) for kind in KINDS}
-    rows = decode_times(spaces=spaces, count=100, repeats=3)
-    assert [row.space for row in rows] == list(KINDS)
-    assert all(0 < row.min_ms <= row.median_ms for row in rows)
-    assert all((row.latents, row.dims, row.repeats) == (100, 4, 3) for row in rows)
-    # The aims are of 10 000 latents, and of fewer they say nothing.
-    assert set(AIMS_MS) <= set(KINDS) and {row.aim_ms for row in rows} == {None}

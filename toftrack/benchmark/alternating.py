@@ -28,15 +28,17 @@ import numpy as np
 import torch
 
 from toftrack.api import make_device, make_hands_tracker
-from toftrack.benchmark.frames import SIZES, enlarged
 from toftrack.benchmark.peer import Peer
-from toftrack.benchmark.table import processor
+from toftrack.benchmark.results import processor
+from toftrack.benchmark.speed import enlarged
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.safe_files import write_whole
 
 FIRST = "one hand, side given"
 """The program whose times the others' are compared with."""
+SIZES = ((640, 480), (1280, 720))
+"""Columns and rows of larger images."""
 PEER_HANDS = {"MediaPipe, two hands": 2, "MediaPipe, one hand": 1}
 _UNDERWAY = 10
 """Frames of a recording before its tracks are under way."""

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 _MODULES = {
-    "speed": "toftrack.benchmark.scoring",
+    "speed": "toftrack.benchmark.speed",
     "alternating": "toftrack.benchmark.alternating",
     "accuracy": "toftrack.benchmark.accuracy",
     "ablation": "toftrack.benchmark.ablation",

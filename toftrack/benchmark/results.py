@@ -15,7 +15,6 @@ from typing import Any
 import torch
 
 import toftrack
-from toftrack.benchmark.table import processor
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
 from toftrack.output.accuracy import Row, by_recording, groups, image_totals, totals
@@ -35,6 +34,15 @@ def circumstances() -> dict[str, Any]:
         "python": platform.python_version(),
         "machine": {"processor": processor(), "cores": os.cpu_count()},
     }
+
+
+def processor() -> str:
+    """The processor's name, as well as it is known here."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
 
 
 def commit() -> str | None:
