@@ -58,11 +58,6 @@ def test_a_recording_gives_what_the_sdk_recorded(recording: Path, images: np.nda
         assert frame.timestamp_s == pytest.approx(1 + number / 30, abs=1e-5)
 
 
-def test_a_start_behind_the_end_is_reported(recording: Path) -> None:
-    with pytest.raises(ToftrackError, match="no frame from start=50 on"):
-        list(orbbec(bag=recording, keep="every", start=50))
-
-
 def test_what_is_no_recording_is_reported(tmp_path: Path, recording: Path) -> None:
     for content in (b"", b"nonsense" * 50, recording.read_bytes()[:9000]):
         (tmp_path / "a.bag").write_bytes(content)

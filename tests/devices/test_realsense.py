@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import cv2
-import hydra
 import numpy as np
 import pytest
 from helpers.settings import realsense, realsense_emulator
-from helpers.tracking import ROOT, configuration, make_tracker
 
 from toftrack.camera import Camera
 from toftrack.devices.base import Device
 from toftrack.devices.realsense.device import RealSense
 from toftrack.devices.realsense.emulator import EmulatedCamera
-from toftrack.devices.realsense.sdk import camera_of, load_sdk
+from toftrack.devices.realsense.sdk import camera_of, choose_streams, load_sdk, set_preset
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 
@@ -55,34 +52,6 @@ def test_the_software_device_delivers_the_samples_frames(rs: ModuleType) -> None
         np.testing.assert_allclose(got.depth[near], true.depth[near], atol=6e-5)
         np.testing.assert_array_equal(got.amplitude, true.amplitude)
         assert got.timestamp_s == pytest.approx(got.index / 500, abs=1e-6)
-
-
-def test_tracks_as_well_through_the_sdk_as_the_recording_itself(rs: ModuleType) -> None:
-    def error_mm(device: Device) -> float:
-        tracker, errors = make_tracker(), []
-        for row, frame in enumerate(device):
-            depth = device.camera.rectify(frame.depth, frame.radial)
-            estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-            errors.append(np.linalg.norm(estimate.joints_m - device.truth.joints_m[row], axis=-1))
-        assert len(errors) == 25
-        return 1e3 * float(np.mean(errors))
-
-    straight = error_mm(Sample(stop=25))
-    for unit_m in (0.001, 0.0001):
-        settings = realsense_emulator(fps=500.0, unit_m=unit_m)
-        assert error_mm(emulated(stop=25, emulated=settings)) == pytest.approx(straight, abs=1)
-
-
-def test_the_configuration_makes_the_device(rs: ModuleType) -> None:
-    config = configuration(
-        "device=realsense",
-        "device.transport=emulated",
-        "device.keep=every",
-        "device.start=2",
-        "device.stop=4",
-        "device.emulated.fps=500",
-    )
-    assert [frame.index for frame in hydra.utils.instantiate(config.device)] == [2, 3]
 
 
 def test_newest_drops_what_nobody_took_and_leaves_a_gap(rs: ModuleType) -> None:
@@ -250,15 +219,49 @@ def test_a_camera_file_of_another_size_is_reported(rs: ModuleType, tmp_path: Pat
         emulated(camera_file=tmp_path / "camera.json")
 
 
-def test_without_a_camera_the_user_is_reported_at_once(rs: ModuleType, tmp_path: Path) -> None:
+def test_without_a_camera_the_user_is_told_what_else_there_is(rs: ModuleType) -> None:
     if len(rs.context().devices):
         pytest.skip("a camera is plugged in")
-    done = subprocess.run(
-        [sys.executable, "track.py", "device=realsense", f"hydra.run.dir={tmp_path}"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
+    with pytest.raises(ToftrackError, match="no RealSense camera.*device.bag.*emulated"):
+        realsense()
+
+
+def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(rs: ModuleType) -> None:
+    camera = EmulatedCamera(rs, FINE).device
+    with pytest.raises(ToftrackError, match="641x6 pixels at 30.*one of 176x144 at 500"):
+        choose_streams(rs, camera, (641, 6, 30), infrared=False, owner="the camera")
+
+
+def test_presets_are_chosen_by_name(rs: ModuleType) -> None:
+    names = {0.0: "Default", 1.0: "High Accuracy"}
+    taken: list[float] = []
+    sensor = SimpleNamespace(
+        supports=lambda option: True,
+        get_option_range=lambda option: SimpleNamespace(min=0.0, max=1.0),
+        get_option_value_description=lambda option, value: names[value],
+        set_option=lambda option, value: taken.append(value),
     )
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: no RealSense camera")
-    assert done.stderr.count("\n") == 1
+    set_preset(rs, sensor, "high_accuracy")
+    assert taken == [1.0]
+    with pytest.raises(ToftrackError, match="no preset hand.*null, default, high_accuracy"):
+        set_preset(rs, sensor, "hand")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reported"),
+    [
+        ({"transport": "wifi"}, "transport=wifi is unknown"),
+        ({"bag": __file__}, "test_realsense.py' is not a recording.*device=replay"),
+        ({"bag": "a.bag", "transport": "emulated"}, "device.emulated.source"),
+    ],
+)
+def test_senseless_settings_are_reported(changes: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ToftrackError, match=reported):
+        realsense(**changes)
+
+
+def test_a_missing_or_old_sdk_is_reported_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (None, ModuleType("pyrealsense2")):
+        monkeypatch.setitem(sys.modules, "pyrealsense2", module)
+        with pytest.raises(ToftrackError, match=r"pyrealsense2.*pip install -e '.\[realsense\]'"):
+            realsense()

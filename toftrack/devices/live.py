@@ -3,9 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import logging
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
+from toftrack.camera import Camera
+from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
+from toftrack.frames import Frame
+
+_log = logging.getLogger(__name__)
+BUSY = (
+    "close other programs that use it, plug it in again, into a USB 3 port, and on Linux install "
+    "its udev rules"
+)
+OTHER_FILE = "choose another file"
 
 _LONGEST_GAP_S = 60  # results have a row for each index, so that a wild number must not become one
 
@@ -48,6 +63,162 @@ def reported_errors(
         raise ToftrackError(f"{what} ({reason}); {remedy}") from error
 
 
+def chosen_serial(
+    numbers: Sequence[str], serial: str | int | None, maker: str, otherwise: str = ""
+) -> str:
+    """The serial number of the camera that is meant, of those plugged in; None: the only one.
+
+    otherwise: what else a user without a camera may do.
+
+    Raises ToftrackError where there is none of it, or several and none is chosen.
+    """
+    listed = ", ".join(sorted(numbers))
+    if not numbers:
+        raise ToftrackError(
+            f"no {maker} camera was found: plug it in, into a USB 3 port; on Linux its udev rules "
+            f"must be installed; or replay a recording with device.bag=FILE{otherwise}"
+        )
+    if serial is None and len(numbers) > 1:
+        raise ToftrackError(
+            f"there are {len(numbers)} {maker} cameras; choose one with device.serial=, of {listed}"
+        )
+    for number in numbers:
+        # A number on the command line loses its zeros.
+        if serial is None or number.lstrip("0") == str(serial).lstrip("0"):
+            return number
+    raise ToftrackError(
+        f"there is no {maker} camera of the serial number {serial}; there is {listed}"
+    )
+
+
+class SdkCamera(BaseDevice):
+    """A camera behind a vendor's SDK, or a recording of that SDK.
+
+    The index is the camera's frame number, counted from the first frame; what was dropped leaves a
+    gap. Leaving the iteration stops the camera, another iteration starts it again.
+
+    A kind of camera says in `__init__` what it is (after `_begin`, by `_set_up`), and how the SDK
+    is asked in the abstract methods.
+    """
+
+    kind: str
+    """Of the configuration."""
+    maker: str
+    first_number: int | None = None
+    """Of the first frame; None = whatever comes first."""
+
+    def _begin(
+        self,
+        bag: str | Path | None,
+        keep: str,
+        queue_frames: int,
+        start: int,
+        stop: int | None,
+        timeout_s: float,
+    ) -> None:
+        """Check the settings that all such cameras have; raises ToftrackError."""
+        check_live(self.kind, keep, queue_frames, start, stop, timeout_s)
+        self._path = None if bag is None else Path(bag).expanduser()
+        if self._path is not None and not self._path.is_file():
+            raise ToftrackError(f"there is no file '{bag}'; give a recording with device.bag=FILE")
+        self._owner = "the camera" if bag is None else f"'{bag}'"
+        self._remedy = BUSY if bag is None else OTHER_FILE
+        self._capacity = queue_frames if keep == "every" else 1
+        self._start, self._stop, self._timeout_s = start, stop, timeout_s
+        self._about: dict[str, Any] = {"recording": None if bag is None else str(bag)}
+        self._about |= {"keep": keep, "start": start, "stop": stop}
+
+    def _set_up(
+        self,
+        size: tuple[int, int],
+        fps: float,
+        live: bool,
+        camera_file: str | Path | None,
+        own: Callable[[], Camera],
+        **about: Any,
+    ) -> None:
+        """What is known of the images; `own` gives the camera where there is no file of one."""
+        camera = own() if camera_file is None else Camera.load_for(camera_file, *size, self._owner)
+        super().__init__(camera, fps, live=live)
+        if self._path is None and self._stop is not None:
+            self.frames = self._stop - self._start
+        more = {"fps": self.fps, "camera_file": None if camera_file is None else str(camera_file)}
+        self.description = {"device": self.kind, "size": list(size), **self._about, **about, **more}
+
+    @abstractmethod
+    def _take(self) -> Any | None:
+        """The next set of frames; None where none has come for a tenth of a second."""
+
+    @abstractmethod
+    def _over(self) -> bool:
+        """No more frames will come from a recording; asked only when none is there."""
+
+    @abstractmethod
+    def _plugged_in(self) -> bool: ...
+
+    @abstractmethod
+    def _number(self, depth: Any) -> int:
+        """The camera's number of a depth frame."""
+
+    @abstractmethod
+    def _frame(self, came: Any, depth: Any, index: int) -> Frame:
+        """A set of frames and its depth frame as ours."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.open()
+        self.dropped = 0
+        numbers, delivered, begun = FrameNumbers(self.fps, self.first_number), 0, False
+        try:
+            while self._stop is None or numbers.index + 1 < self._stop:
+                came = self._wait(begun)
+                if came is None:
+                    break
+                depth = came.get_depth_frame()
+                if not depth:
+                    continue
+                begun = True
+                index = numbers.take(self._number(depth))
+                self.dropped = numbers.dropped
+                if index < self._start:
+                    continue
+                if self._stop is not None and index >= self._stop:
+                    break
+                delivered += 1
+                yield self._frame(came, depth, index)
+        finally:
+            self.close()
+            _log.info("%s: frames: %d delivered, %d dropped", self.kind, delivered, self.dropped)
+        if not delivered and self._path is not None:
+            if numbers.index < 0:
+                raise ToftrackError(f"'{self._path}' has no frame with depth; record it again")
+            raise ToftrackError(
+                f"'{self._path}' has no frame from start={self._start} on, but {numbers.index + 1} "
+                "before; choose a smaller device.start"
+            )
+
+    def _wait(self, begun: bool) -> Any | None:
+        """The next set of frames, None at the end; ToftrackError when none comes."""
+        deadline, over = time.monotonic() + self._timeout_s, False
+        while True:
+            came = self._take()
+            if came is not None:
+                return came
+            if over:
+                return None
+            over = begun and self._over()  # a recording that has not begun is stopped, too
+            if self._path is None and not self._plugged_in():
+                raise ToftrackError(
+                    f"the {self.maker} camera was unplugged; plug it in and start again (what was "
+                    "done until then is kept)"
+                )
+            if time.monotonic() > deadline:
+                raise ToftrackError(
+                    f"no frame has come from the {self.maker} camera for {self._timeout_s:g} s; "
+                    "unplug it and plug it in again, into a USB 3 port, or lower device.width, "
+                    "device.height and device.fps"
+                )
+
+
 def check_live(
     device: str, keep: str, queue_frames: int, start: int, stop: int | None, timeout_s: float
 ) -> None:
@@ -65,13 +236,3 @@ def check_live(
             f"device={device} needs whole numbers 0 <= start < stop, but they are "
             f"{start!r} and {stop!r}"
         )
-
-
-def recording_index_error(path: object, index: int, start: int) -> ToftrackError:
-    """What to say of a recording that delivered nothing, its last frame being that of `index`."""
-    if index < 0:
-        return ToftrackError(f"'{path}' has no frame with depth; record it again")
-    return ToftrackError(
-        f"'{path}' has no frame from start={start} on, but {index + 1} before; choose a smaller "
-        "device.start"
-    )

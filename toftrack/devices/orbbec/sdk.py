@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import reported_errors
+from toftrack.devices.live import BUSY, chosen_serial, reported_errors
 from toftrack.errors import ToftrackError
 
 _PIXELS = ("Y16", "Z16")
@@ -63,7 +63,7 @@ def errors(ob: ModuleType) -> tuple[type[Exception], ...]:
     return (RuntimeError, ob.OBError)
 
 
-def find_camera(ob: ModuleType, serial: str | None) -> tuple[Any, str]:
+def find_camera(ob: ModuleType, serial: str | int | None) -> tuple[Any, str]:
     """The plugged-in camera of that serial number, the only one for None, and its number.
 
     Raises ToftrackError when there is none, or several and none is chosen.
@@ -71,28 +71,9 @@ def find_camera(ob: ModuleType, serial: str | None) -> tuple[Any, str]:
     with reported_errors("the Orbbec cameras cannot be listed", "plug them in again", errors(ob)):
         devices = ob.Context().query_devices()
         numbers = serials(devices)
-    listed = ", ".join(sorted(numbers))
-    if not numbers:
-        raise ToftrackError(
-            "no Orbbec camera was found: plug it in, into a USB 3 port; on Linux its udev rules "
-            "must be installed; or replay a recording with device.bag=FILE"
-        )
-    if serial is None and len(numbers) > 1:
-        raise ToftrackError(
-            f"there are {len(numbers)} Orbbec cameras; choose one with device.serial=, of {listed}"
-        )
-    for index, number in enumerate(numbers):
-        # A number on the command line loses its zeros.
-        if serial is None or number.lstrip("0") == serial.lstrip("0"):
-            with reported_errors(
-                "the Orbbec camera was found, but cannot be opened",
-                "close other programs that use it, and on Linux install its udev rules",
-                errors(ob),
-            ):
-                return devices.get_device_by_index(index), number
-    raise ToftrackError(
-        f"there is no Orbbec camera of the serial number {serial}; there is {listed}"
-    )
+    number = chosen_serial(numbers, serial, "Orbbec")
+    with reported_errors("the Orbbec camera was found, but cannot be opened", BUSY, errors(ob)):
+        return devices.get_device_by_index(numbers.index(number)), number
 
 
 def serials(devices: Any) -> list[str]:

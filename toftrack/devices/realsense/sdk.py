@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import reported_errors
+from toftrack.devices.live import chosen_serial, reported_errors
 from toftrack.errors import ToftrackError
 
 _WORST_FIT_PX = 0.5
@@ -52,32 +52,14 @@ def _preload_libusb() -> None:
     ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
 
 
-def find_camera(rs: ModuleType, serial: str | None) -> Any:
+def find_camera(rs: ModuleType, serial: str | int | None) -> Any:
     """The plugged-in camera of that serial number, the only one for None; else ToftrackError."""
     with reported_errors(
         "the RealSense cameras cannot be listed", "unplug them and plug them in again"
     ):
         found = {_info(rs, device, "serial_number"): device for device in rs.context().devices}
-    listed = ", ".join(sorted(found))
-    if not found:
-        raise ToftrackError(
-            "no RealSense camera was found: plug it in, into a USB 3 port; on Linux its udev rules "
-            "must be installed; or replay a recording with device.bag=FILE, or try it without a "
-            "camera with device.transport=emulated"
-        )
-    if serial is None:
-        if len(found) > 1:
-            raise ToftrackError(
-                f"there are {len(found)} RealSense cameras; choose one with device.serial=, of "
-                f"{listed}"
-            )
-        return next(iter(found.values()))
-    for number, device in found.items():
-        if number.lstrip("0") == serial.lstrip("0"):  # a number on the command line loses its zeros
-            return device
-    raise ToftrackError(
-        f"there is no RealSense camera of the serial number {serial}; there is {listed}"
-    )
+    otherwise = ", or try it without a camera with device.transport=emulated"
+    return found[chosen_serial(list(found), serial, "RealSense", otherwise)]
 
 
 def facts(rs: ModuleType, device: Any) -> dict[str, Any]:
