@@ -82,10 +82,7 @@ def write_icvl(folder: Path, seen: Scene, name: str = "test_seq_1") -> None:
 
 
 def write_nyu(folder: Path, seen: Scene) -> None:
-    """The images and labels of NYU; points that are not compared lie far away.
-
-    The labels are written by SciPy, which toftrack does not read them with.
-    """
+    """The images and labels of NYU; points that are not compared lie far away."""
     folder.mkdir(parents=True)
     points = np.full((3, len(seen.joints_m), 36, 3), -999.0)
     ours = {20: 0, 18: 3, 16: 6, 14: 9, 12: 12, 10: 15, 8: 18, 6: 21, 4: 24, 3: 25, 2: 27}
