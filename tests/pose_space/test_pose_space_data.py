@@ -29,7 +29,6 @@ from toftrack.pose_space.files import fit_pose_space, load_pose_space, make_pose
 from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
 from toftrack.pose_space.reach import nearest_latents
 from toftrack.programs import train
-from toftrack.views.figures import poses
 from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
 
 LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
@@ -336,16 +335,6 @@ def test_a_single_clip_has_no_held_out_figures() -> None:
     row = evaluate_space("pca", 2, data)
     assert row.held_out is None
     assert " - " in errors_table([row])
-
-
-def test_the_manifold_says_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
-    written: list[str] = []
-    monkeypatch.setattr(poses.cv2, "putText", lambda _, text, *__: written.append(text))
-    space = fit_pose_space("pca", 2)
-    manifold_figure(space)
-    for end in (*space.training_latents.amin(0).tolist(), *space.training_latents.amax(0).tolist()):
-        assert f"{end:.2g}" in written
-    assert "pointing" in written and "gun" not in written
 
 
 @pytest.mark.parametrize("dims", [1, 4])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from helpers import programs
 from helpers.configured import f_measure, nearest_surface
 from helpers.programs import QUICK
 from helpers.tracking import ROOT, make_tracker, sample
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
@@ -28,7 +31,7 @@ from toftrack.render.reference import ReferenceScorer
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify
-from toftrack.views.figures import chart, runs
+from toftrack.views.figures import chart
 from toftrack.views.skeleton import SLOT_RGB
 
 NAMES = ("measurement", "filmstrip", "lost", "course", "latent")
@@ -69,8 +72,10 @@ def change(run: Path, **arrays: Callable[[np.ndarray], np.ndarray]) -> None:
     np.savez(run / "track.npz", **content)
 
 
-def share(picture: np.ndarray, bgr: tuple[int, ...]) -> float:
-    return float((picture == np.array(bgr, np.uint8)).all(-1).mean())
+def share(picture: np.ndarray, colour: str | tuple[int, ...]) -> float:
+    """Of the pixels of a BGR picture that have a colour, as #rrggbb or BGR."""
+    bgr = bytes.fromhex(colour[1:])[::-1] if isinstance(colour, str) else bytes(colour)
+    return float((picture == np.frombuffer(bgr, np.uint8)).all(-1).mean())
 
 
 def states() -> list[np.ndarray]:
@@ -160,48 +165,27 @@ def test_the_recording_is_found_from_another_folder(
     assert footage is not None and len(footage.truth) == FRAMES
 
 
-def test_the_numbers_of_a_frame_stand_in_its_figure(
+def test_figures_say_the_runs_numbers_in_the_words_used_elsewhere(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     texts: list[str] = []
-    true_write = chart.write
-    monkeypatch.setattr(
-        chart,
-        "write",
-        lambda picture, text, *a, **k: (texts.append(text), true_write(picture, text, *a, **k)),
-    )
+    true_picture = chart.picture_of
+
+    def noted(figure: Figure) -> np.ndarray:
+        picture = true_picture(figure)
+        texts.extend(text.get_text().replace("\n", " ") for text in figure.findobj(Text))
+        return picture
+
+    monkeypatch.setattr(chart, "picture_of", noted)
     draw_figures(run, frame=3, out=tmp_path / "out")
     score = read_run(run).results["score"][3]
-    assert any(text.startswith(f"Frame 3: score {score:.2f}, ") for text in texts)
-    assert any(text.endswith(" missed") for text in texts)
     mean = json.loads((run / "summary.json").read_text())["metrics"]["mean_mm"]
-    assert any(f"mean joint error {mean:.1f} mm" in text for text in texts)
-    assert any(text.startswith("No frame was lost: the ") for text in texts)
-
-
-def test_the_course_and_the_manifold_are_labelled_in_the_words_used_elsewhere(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    texts: list[str] = []
-    true_write = chart.write
-    monkeypatch.setattr(
-        chart,
-        "write",
-        lambda picture, text, *a, **k: (texts.append(text), true_write(picture, text, *a, **k)),
-    )
-    draw_figures(run, out=tmp_path / "out")
-    assert "pointing" in texts and "gun" not in texts
-    assert any("may lie beyond it" in text for text in texts)
-    course = texts[texts.index("frame") :]
-    assert [text for text in ("0", "2", "4", "6", "8", "10") if text not in course] == []
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "found"),
-    [(0, 99, list(range(0, 100, 10))), (50, 69, list(range(50, 69, 2))), (3, 5, [3, 4, 5])],
-)
-def test_frames_on_an_axis_have_round_numbers(first: int, last: int, found: list[int]) -> None:
-    assert runs._round_frames(first, last) == found
+    for words in (
+        *(f"Frame 3: score {score:.2f}, ", " missed", f"mean joint error {mean:.1f} mm"),
+        *("No frame was lost: the ", "may lie beyond it", "pointing", "time, s", "score", "lost"),
+    ):
+        assert any(words in text for text in texts), words
+    assert "gun" not in texts
 
 
 def test_lost_frames_are_shown_and_shaded(run: Path, tmp_path: Path) -> None:
@@ -379,25 +363,15 @@ def test_the_command_answers_errors_with_a_sentence(
     assert str(run / "own" / "latent.png") in capsys.readouterr().out
 
 
-def test_axes_place_values_and_keep_those_beyond_on_the_edge() -> None:
-    axes = chart.Axes(10, 110, 20, 220, (0.0, 2.0), (1.0, 100.0), log_y=True)
-    np.testing.assert_allclose(axes.place(1.0, 10.0), (60, 120))
-    np.testing.assert_allclose(axes.place(3.0, 0.1), (110, 220))
-    picture = chart.canvas(240, 120)
-    axes.line(picture, np.arange(3.0), np.array([10.0, np.nan, 10.0]), chart.BLUE)
-    drawn = np.flatnonzero((picture == chart.BLUE).all(-1).any(0))
-    assert 10 in drawn and 110 in drawn and not ((drawn > 15) & (drawn < 105)).any()
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-63.0, 137.0), (0.0, 0.12), (3.0, 9e5)])
-def test_ticks_are_round_few_and_within(low: float, high: float) -> None:
-    ticks = chart.ticks(low, high)
-    assert 2 <= len(ticks) <= 8
-    assert min(ticks) >= low - 1e-9 and max(ticks) <= high + 1e-9
-    steps = np.diff(ticks)
-    np.testing.assert_allclose(steps, steps[0])
-
-
-def test_long_notes_are_broken_into_lines_that_fit() -> None:
-    lines = chart.wrapped("a note of many words that does not fit into a line " * 3, 300)
-    assert len(lines) > 2 and all(chart.text_width(line) <= 300 for line in lines)
+def test_a_missing_matplotlib_is_one_sentence_and_leaves_out_plots_alone(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[figures\]'"):
+        draw_figures(run)
+    drawn = {
+        "plot.png": lambda: chart.picture_of(chart.new_figure(90, 90)),
+        "picture.png": lambda: np.zeros((9, 9, 3), np.uint8),
+    }
+    assert chart.write_figures(run, drawn) == ["picture.png"]
+    assert "without plot.png: figures need matplotlib" in capsys.readouterr().err

@@ -28,6 +28,7 @@ from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import open_recording
 from toftrack.safe_files import write_whole
 from toftrack.views.figures.calibration import corner_sheet, error_plot
+from toftrack.views.figures.chart import write_figures
 from toftrack.views.pictures import write_picture
 
 _PICTURES = 12
@@ -236,7 +237,7 @@ def _write_report(
     chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int))
     sheet = corner_sheet([(result.amplitudes[i], views[i].corners_px) for i in chosen], board)
     before, after = facts["before"], facts["after"]
-    plot = error_plot(
+    errors = (
         np.array(before["board_distance_m"]),
         np.array(before["board_error_mm"]) / 1000,
         np.array(after["board_error_mm"]) / 1000,
@@ -245,8 +246,8 @@ def _write_report(
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / "report.txt", text + "\n")
         write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
-        for name, picture in (("corners.png", sheet), ("depth_error.png", plot)):
-            write_picture(folder / name, picture)
+        write_picture(folder / "corners.png", sheet)
+        write_figures(folder, {"depth_error.png": lambda: error_plot(*errors)})
     except OSError as error:
         raise ToftrackError(
             f"the report folder '{folder}' cannot be written ({error.strerror}); choose another "

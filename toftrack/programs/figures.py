@@ -34,6 +34,7 @@ from toftrack.output.run_folder import Footage, Run, observe, open_footage, read
 from toftrack.render.model_image import model_range_image
 from toftrack.safe_files import make_folder
 from toftrack.views.classified import classify
+from toftrack.views.figures.chart import new_figure
 from toftrack.views.figures.runs import (
     course_figure,
     filmstrip_figure,
@@ -86,8 +87,9 @@ def draw_figures(
 
     Raises:
         ToftrackError: the folder is no run's, the recording is gone or another one, the run has no
-            such frame, or nothing can be written.
+            such frame, matplotlib is missing, or nothing can be written.
     """
+    new_figure(1, 1)  # better missed now than when the recording is open
     run = read_run(folder)
     footage = open_footage(run, recording)
     if frame is not None:

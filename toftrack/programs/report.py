@@ -23,7 +23,8 @@ import yaml
 from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
 from toftrack.safe_files import open_to_read, write_whole
-from toftrack.views.pictures import write_picture
+from toftrack.views.figures.chart import write_figures
+from toftrack.views.figures.sweep import sweep_figure
 
 FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
 """What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
@@ -228,9 +229,6 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 
     Raises ToftrackError when there is no job, no job has the figure, or nothing can be written.
     """
-
-    from toftrack.views.figures.sweep import sweep_figure
-
     folder = Path(folder)
     runs = read_runs(folder)
     figure = figure or error_figure(runs)
@@ -258,9 +256,8 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     ]
     if points:
         label = f"{figure.removeprefix('metrics.')}, mean over recordings"
-        picture = folder / "sweep.png"
-        write_picture(picture, sweep_figure(points, label))
-        written.append(picture)
+        drawn = write_figures(folder, {"sweep.png": lambda: sweep_figure(points, label)})
+        written += [folder / name for name in drawn]
     print("\n" + "\n".join(_printable(f"  {path}") for path in written))
     return runs, groups
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,13 @@ from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space, spaces_to_learn
 from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.safe_files import write_whole
+from toftrack.views.figures.chart import write_figures
 from toftrack.views.figures.poses import (
     corners_figure,
     manifold_figure,
     poses_figure,
     traversals_figure,
 )
-from toftrack.views.pictures import write_picture
 
 _SILENT_S = 1.0
 """What is done sooner needs no progress shown."""
@@ -61,14 +62,13 @@ def train(config: DictConfig) -> float:
 
     model = folder / "pose_space.npz"
     save_pose_space(space, model, data.sources)
-    figures = {
-        "poses.png": poses_figure(space),
-        "manifold.png": manifold_figure(space),
-        "traversals.png": traversals_figure(space),
-        "corners.png": corners_figure(space),
+    drawn = {
+        "poses.png": poses_figure,
+        "manifold.png": manifold_figure,
+        "traversals.png": traversals_figure,
+        "corners.png": corners_figure,
     }
-    for name, picture in figures.items():
-        write_picture(folder / name, picture)
+    figures = write_figures(folder, {name: partial(draw, space) for name, draw in drawn.items()})
     asked = next(row for row in rows if row.dims == dims)
     error = (asked.reached or asked.training).degrees
     summary = _summary(kind, dims, data, rows)

@@ -5,31 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 
-from toftrack.views.figures.chart import (
-    BLUE,
-    GREEN,
-    GREY,
-    SKY,
-    VERMILLION,
-    box_mark,
-    canvas,
-    legend,
-    ticks,
-    titled,
-    write,
-)
+from toftrack.views.figures import chart
 
 _PARTS = (
-    ("usable", "usable_pct", GREEN),
-    ("partly", "partly_pct", SKY),
-    ("false alarm", "false_alarm_pct", BLUE),
-    ("silently wrong", "silent_pct", VERMILLION),
+    ("usable", "usable_pct", chart.GREEN),
+    ("partly", "partly_pct", chart.SKY),
+    ("false alarm", "false_alarm_pct", chart.BLUE),
+    ("silently wrong", "silent_pct", chart.VERMILLION),
 )
-_LINE = 26
-_LEFT, _BAR = 330, 560
 
 
 def accuracy_figure(each: Mapping[str, Mapping[str, Any]], total: Mapping[str, Any]) -> np.ndarray:
@@ -39,42 +24,26 @@ def accuracy_figure(each: Mapping[str, Mapping[str, Any]], total: Mapping[str, A
     drawn as a line across its end.
     """
     rows = {**each, "mean of the recordings": total}
-    height = 76 + _LINE * len(rows)
-    picture = canvas(height, _LEFT + _BAR + 150)
-    entries = [(name, colour) for name, _, colour in _PARTS] + [("flagged, rightly", (235,) * 3)]
-    legend(picture, entries, (_LEFT, 20), box_mark)
-    for tick in ticks(0.0, 100.0, most=11):
-        u = _place(tick)
-        cv2.line(picture, (u, 32), (u, height - 34), (225, 225, 225), 1)
-        write(picture, f"{tick:g}", (u, height - 14), align="middle", size=0.45)
-    write(picture, "% of the visible frames", (_LEFT + _BAR + 24, height - 14), size=0.4)
-    for number, (name, row) in enumerate(rows.items()):
-        top = 38 + _LINE * number
-        write(picture, name, (_LEFT - 10, top + 15), align="right", size=0.45)
-        begin = 0.0
-        cv2.rectangle(picture, (_LEFT, top), (_LEFT + _BAR, top + 18), (235,) * 3, -1)
-        for _, key, colour in _PARTS:
-            end = min(begin + (row.get(key) or 0.0), 100.0)
-            cv2.rectangle(picture, (_place(begin), top), (_place(end), top + 18), colour, -1)
-            begin = end
-        cv2.rectangle(picture, (_LEFT, top), (_LEFT + _BAR, top + 18), GREY, 1)
-        error = row.get("mean_all_mm")
-        if error is not None:
-            write(picture, f"{error:.1f} mm", (_LEFT + _BAR + 14, top + 15), size=0.45)
+    figure = chart.new_figure(1000, 110 + 26 * len(rows))
+    axes = figure.subplots()
+    begin = np.zeros(len(rows))
+    for name, key, colour in _PARTS:
+        share = np.minimum([row.get(key) or 0.0 for row in rows.values()], 100 - begin)
+        axes.barh(list(rows), share, left=begin, color=colour, label=name)
+        begin += share
+    axes.barh(list(rows), 100 - begin, left=begin, color="#ebebeb", label="flagged, rightly")
     if ends := total.get("usable_90"):
-        middle = 38 + _LINE * (len(rows) - 1) + 9
-        low, high = (_place(end) for end in ends)
-        cv2.line(picture, (low, middle), (high, middle), (0, 0, 0), 2)
-        for u in (low, high):
-            cv2.line(picture, (u, middle - 5), (u, middle + 5), (0, 0, 0), 2)
+        axes.plot(ends, [len(rows) - 1] * 2, "k|-")
+    for number, row in enumerate(rows.values()):
+        if row.get("mean_all_mm") is not None:
+            axes.text(101, number, f"{row['mean_all_mm']:.1f} mm", va="center")
+    axes.set(xlim=(0, 100), ylim=(len(rows) - 0.4, -0.6), xlabel="% of the visible frames")
+    axes.set_xticks(range(0, 101, 10))
+    figure.legend(loc="outside upper center", ncols=5, frameon=False)
     several = "s" if total["seeds"] > 1 else ""
     note = (
         f"{total['recordings']} recordings, {total['seeds']} seed{several}. Beside the bars "
         "the mean joint error over all visible frames, across the last one the 90 % interval of "
         "usable. Silently wrong ones are % of all frames."
     )
-    return titled(picture, "What the frames are", note)
-
-
-def _place(percent: float) -> int:
-    return round(_LEFT + _BAR * percent / 100)
+    return chart.titled(chart.picture_of(figure), "What the frames are", note)

@@ -8,9 +8,6 @@ import cv2
 import numpy as np
 
 from toftrack.views.figures import chart
-from toftrack.views.figures.chart import Axes
-
-_BEFORE, _AFTER = (60, 60, 220), (60, 160, 40)  # BGR
 
 
 def corner_sheet(
@@ -46,20 +43,14 @@ def error_plot(distance_m: np.ndarray, before_m: np.ndarray, after_m: np.ndarray
         before_m: (V,) errors of the measured distance.
         after_m: (V,) errors of the corrected distance.
     """
-    picture = chart.canvas(480, 720)
-    errors_mm = 1000 * np.concatenate([before_m, after_m, [0.0]])
-    across = _limits(float(distance_m.min()), float(distance_m.max()))
-    up = _limits(float(errors_mm.min()), float(errors_mm.max()))
-    axes = Axes(70, 700, 40, 430, across, up)
-    axes.draw(picture, "true distance, m", "mean error of each board, mm")
-    axes.line(picture, np.array(across), np.zeros(2), chart.GREY, 1)
-    for values, colour in ((before_m, _BEFORE), (after_m, _AFTER)):
-        for spot in np.round(axes.place(distance_m, 1000 * values)).astype(int).tolist():
-            cv2.circle(picture, spot, 3, colour, -1, cv2.LINE_AA)
-    chart.legend(picture, [("before", _BEFORE), ("after", _AFTER)], (420, 30))
-    return picture
-
-
-def _limits(low: float, high: float) -> tuple[float, float]:
-    margin = 0.05 * (high - low) or 1.0
-    return low - margin, high + margin
+    figure = chart.new_figure(720, 480)
+    axes = figure.subplots()
+    chart.label(axes, "true distance, m", "mean error of each board, mm")
+    axes.axhline(0, color=chart.GREY, linewidth=1)
+    for errors_m, name, colour in (
+        (before_m, "before", chart.VERMILLION),
+        (after_m, "after", chart.GREEN),
+    ):
+        axes.plot(distance_m, 1000 * errors_m, "o", color=colour, markersize=4, label=name)
+    axes.legend()
+    return chart.picture_of(figure)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 import torch
@@ -13,17 +15,19 @@ from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.training_poses import GESTURES, basic_pose
 from toftrack.render.closed_form import render_range_images
+from toftrack.views.figures import chart
 from toftrack.views.overlay import range_grey
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-# Okabe and Ito's colours, which colour-blind people can tell apart; BGR.
-BASIC_BGR = {"palm": (178, 114, 0), "fist": (0, 94, 213), "gun": (115, 158, 0)}
+COLOURS = {"palm": chart.BLUE, "fist": chart.VERMILLION, "gun": chart.GREEN}
+"""Of the basic poses."""
 WORDS = {"gun": "pointing"}
 """What pictures call a basic pose, where it is not its name in the training poses."""
 _NEAR_DEGREES = 15.0
 """A pose is coloured as the gesture that it is within this root mean square distance of."""
-_BETWEEN, _THUMB = (150, 150, 150), (167, 121, 204)
-_TEXT = (40, 40, 40)
 
 
 def pose_picture(angles: Tensor, size: int = 200, shape: HandShape | None = None) -> np.ndarray:
@@ -37,102 +41,53 @@ def pose_picture(angles: Tensor, size: int = 200, shape: HandShape | None = None
     return range_grey(render_range_images(hand, k, size, size)[0].numpy())
 
 
-def poses_figure(space: PoseSpace, width: int = 1000, height: int = 720) -> np.ndarray:
+def poses_figure(space: PoseSpace) -> np.ndarray:
     """Training poses in the first two coordinates, the gestures marked (fig. 4, left); BGR."""
-    picture = np.full((height, width, 3), 255, np.uint8)
-    points = np.degrees(space.training_latents[:, :2].cpu().numpy())
-    if points.shape[1] == 1:
-        points = np.column_stack((points, np.zeros(len(points))))
-    low, high = points.min(0), points.max(0)
-    margin, span = 90, np.maximum(high - low, 1e-6)
-
-    def place(point: np.ndarray) -> tuple[int, int]:
-        x, y = (point - low) / span
-        return (
-            int(margin + x * (width - 2 * margin)),
-            int(height - margin - y * (height - 2 * margin)),
-        )
-
-    corner_low, corner_high = place(low), place(high)
-    cv2.rectangle(picture, corner_low, corner_high, (210, 210, 210), 1)
-    for label, point in zip(space.training_labels, points, strict=True):
-        colour = _THUMB if "+" in label else _BETWEEN
-        if label not in BASIC_BGR:
-            cv2.circle(picture, place(point), 5, colour, -1, cv2.LINE_AA)
-    for label, point in zip(space.training_labels, points, strict=True):
-        if label not in BASIC_BGR:
-            continue
-        u, v = place(point)
-        index = space.training_labels.index(label)
-        thumb = pose_picture(space.decode(space.training_latents[index : index + 1])[0], 110)
-        left, top = np.clip((u - 55, v - 130), 0, (width - 110, height - 110))
-        patch = picture[top : top + 110, left : left + 110]
-        np.minimum(patch, thumb[..., None], out=patch)
-        cv2.circle(picture, (u, v), 9, BASIC_BGR[label], -1, cv2.LINE_AA)
-        cv2.putText(picture, label, (u + 14, v + 6), _FONT, 0.7, BASIC_BGR[label], 2, cv2.LINE_AA)
-    for text, x, y in (
-        ("component 1 (degrees)", width // 2 - 110, height - 30),
-        (f"{low[0]:.0f}", corner_low[0] - 20, height - 60),
-        (f"{high[0]:.0f}", corner_high[0] - 20, height - 60),
-        ("component 2", 10, margin - 50),
-        (f"{high[1]:.0f}", 30, corner_high[1] + 8),
-        (f"{low[1]:.0f}", 30, corner_low[1] + 8),
+    figure = chart.new_figure(1000, 720)
+    axes = figure.subplots()
+    chart.label(axes, "component 1 (degrees)", "component 2 (degrees)")
+    latents = space.training_latents[:, :2].rad2deg().cpu()
+    points = torch.nn.functional.pad(latents, (0, 2 - latents.shape[1])).numpy()
+    labels = np.array(space.training_labels)
+    basic, thumb = np.isin(labels, list(COLOURS)), np.char.find(labels, "+") >= 0
+    for among, name, colour in (
+        (~basic & ~thumb, "transformation", chart.GREY),
+        (~basic & thumb, "thumb configuration", chart.PURPLE),
     ):
-        cv2.putText(picture, text, (x, y), _FONT, 0.6, _TEXT, 1, cv2.LINE_AA)
-    for row, (text, colour) in enumerate(
-        (("transformation", _BETWEEN), ("thumb configuration", _THUMB))
-    ):
-        y = height - 150 + 26 * row
-        cv2.circle(picture, (120, y - 5), 6, colour, -1, cv2.LINE_AA)
-        cv2.putText(picture, text, (135, y), _FONT, 0.6, _TEXT, 1, cv2.LINE_AA)
-    return picture
+        axes.scatter(*points[among].T, color=colour, label=name)
+    for row in np.flatnonzero(basic):
+        label, colour = labels[row], COLOURS[labels[row]]
+        axes.scatter(*points[row], 80, color=colour)
+        beside = {"textcoords": "offset points", "color": colour, "weight": "bold", "size": 12}
+        axes.annotate(WORDS.get(label, label), points[row], (9, -4), **beside)
+        hand = pose_picture(space.decode(space.training_latents[row : row + 1])[0], 110)
+        chart.picture_above(axes, points[row], hand)
+    axes.margins(0.1, 0.15)
+    axes.legend(loc="lower left")
+    return chart.picture_of(figure)
 
 
-def manifold_figure(space: PoseSpace, size: int = 460) -> np.ndarray:
+def manifold_figure(space: PoseSpace) -> np.ndarray:
     """Training poses in pairs of coordinates (1-2, 1-3, 2-3), coloured by the nearest gesture, grey
     where none is near; poses of other sources than the synthetic ones, too. BGR.
     """
-    latents = space.training_latents
-    nearest = nearest_gestures(space.decode(latents))
-    points = latents.cpu().numpy()
     pairs = [(i, j) for i, j in ((0, 1), (0, 2), (1, 2)) if j < space.dims] or [(0, 0)]
-    panels = []
-    for i, j in pairs:
-        panel = np.full((size, size, 3), 255, np.uint8)
-        cv2.rectangle(panel, (30, 30), (size - 30, size - 30), (210, 210, 210), 1)
-        xy = points[:, (i, j)]
-        span = np.maximum(xy.max(0) - xy.min(0), 1e-9)
-        spots = 30 + (xy - xy.min(0)) / span * (size - 60)
-        for (u, v), gesture in sorted(
-            zip(spots, nearest, strict=True), key=lambda item: item[1] is not None
-        ):
-            colour = _BETWEEN if gesture is None else BASIC_BGR[gesture]
-            cv2.circle(panel, (int(u), int(size - v)), 4, colour, -1, cv2.LINE_AA)
-        _write_limits(panel, xy.min(0), xy.max(0), f"{j + 1} against {i + 1}")
-        panels.append(panel)
-    x = 34
-    for name, colour in (*BASIC_BGR.items(), ("other", _BETWEEN)):
-        cv2.circle(panels[0], (x, 16), 5, colour, -1, cv2.LINE_AA)
-        word = WORDS.get(name, name)
-        cv2.putText(panels[0], word, (x + 9, 21), _FONT, 0.5, _TEXT, 1, cv2.LINE_AA)
-        x += 80
-    return np.hstack(panels)
+    figure = chart.new_figure(440 * len(pairs), 460)
+    points = space.training_latents.cpu().numpy()
+    for (i, j), axes in zip(pairs, figure.subplots(1, len(pairs), squeeze=False)[0], strict=True):
+        scatter_gestures(axes, space, points[:, (i, j)])
+        chart.label(axes, f"coordinate {i + 1}", f"coordinate {j + 1}")
+    names = axes.get_legend_handles_labels()
+    figure.legend(*names, loc="outside upper left", ncols=4, frameon=False)
+    return chart.picture_of(figure)
 
 
-def _write_limits(panel: np.ndarray, low: np.ndarray, high: np.ndarray, name: str) -> None:
-    """Both coordinates' values at the ends of a manifold's panel, and the panel's name between."""
-    bottom, right = panel.shape[0] - 10, panel.shape[1] - 30
-
-    def write(text: str, x: int, y: int, aligned: float = 0.0, size: float = 0.5) -> None:
-        width = cv2.getTextSize(text, _FONT, size, 1)[0][0]
-        at = (x - round(aligned * width), y)
-        cv2.putText(panel, text, at, _FONT, size, _TEXT, 1, cv2.LINE_AA)
-
-    write(name, panel.shape[1] // 2, bottom, 0.5)
-    write(f"{low[0]:.2g}", 30, bottom, size=0.42)
-    write(f"{high[0]:.2g}", right, bottom, 1.0, size=0.42)
-    write(f"{high[1]:.2g}", 34, 45, size=0.42)
-    write(f"{low[1]:.2g}", 34, panel.shape[0] - 36, size=0.42)
+def scatter_gestures(axes: Axes, space: PoseSpace, points: np.ndarray) -> None:
+    """The training poses at (N, 2) points of a plot, coloured by the nearest gesture."""
+    nearest = np.array(nearest_gestures(space.decode(space.training_latents)), object)
+    for gesture, colour in ((None, chart.GREY), *COLOURS.items()):
+        name = "other training poses" if gesture is None else WORDS.get(gesture, gesture)
+        axes.scatter(*points[nearest == gesture].T, 36, color=colour, alpha=0.6, label=name)
 
 
 def nearest_gestures(angles: Tensor) -> list[str | None]:

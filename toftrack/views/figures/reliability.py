@@ -3,26 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import cycle
 
-import cv2
 import numpy as np
 
-from toftrack.views.figures.chart import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    Axes,
-    canvas,
-    legend,
-    titled,
-    write,
-)
+from toftrack.views.figures import chart
 
-_COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY)
 _BINS = 10
 _FEWEST = 10
 
@@ -32,20 +18,16 @@ def reliability_figure(groups: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> n
 
     groups: by name, the probabilities said (N,) and whether the estimates were right (N,).
     """
-    picture = canvas(470, 760)
-    axes = Axes(70, 470, 40, 420, (0.0, 1.0), (0.0, 1.0))
-    axes.draw(picture, "said", "right")
-    ends = np.array([0.0, 1.0])
-    axes.line(picture, ends, ends, GREY, 1)
-    for row, (name, (said, right)) in enumerate(groups.items()):
-        colour = _COLOURS[row % len(_COLOURS)]
-        x, y = _binned(said, right)
-        axes.line(picture, x, y, colour)
-        for u, v in np.round(axes.place(x, y)).astype(int):
-            cv2.circle(picture, (int(u), int(v)), 4, colour, -1, cv2.LINE_AA)
-        legend(picture, ((f"{name} ({len(said)})", colour),), (500, 70 + 26 * row))
-    write(picture, "points: tenths of the range, mean of each", (500, 420), size=0.4)
-    return titled(picture, "Reliability of the confidence", "On the line is calibrated.")
+    figure = chart.new_figure(700, 460)
+    axes = figure.subplots()
+    chart.label(axes, "said (points: tenths of the range, mean of each)", "right")
+    axes.plot((0, 1), (0, 1), color=chart.GREY, linewidth=1)
+    for (name, (said, right)), colour in zip(groups.items(), cycle(chart.COLOURS), strict=False):
+        axes.plot(*_binned(said, right), "o-", color=colour, label=f"{name} ({len(said)})")
+    axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    figure.legend(loc="outside right upper", frameon=False)
+    picture = chart.picture_of(figure)
+    return chart.titled(picture, "Reliability of the confidence", "On the line is calibrated.")
 
 
 def _binned(said: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

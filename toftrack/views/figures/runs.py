@@ -6,21 +6,21 @@ Pictures are (h, w, 3) uint8 BGR.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.segmentation import Observation
 from toftrack.views.classified import CLASS_RGB, CLASSES, Classified
 from toftrack.views.figures import chart
-from toftrack.views.figures.chart import Axes
-from toftrack.views.figures.poses import BASIC_BGR, WORDS, nearest_gestures
+from toftrack.views.figures.poses import scatter_gestures
 from toftrack.views.overlay import film_tile, filmstrip, range_grey
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _MARGIN_PX = 8
-_GAP = 16
-_SURE = chart.PURPLE
 
 
 def measurement_figure(observation: Observation, pixels: Classified, title: str) -> np.ndarray:
@@ -42,31 +42,29 @@ def measurement_figure(observation: Observation, pixels: Classified, title: str)
     greys = np.hsplit(range_grey(np.hstack([np.where(hand, depth, 0), pixels.range_m])), 2)
     near = np.full_like(greys[0], 255)
     near[pixels.neighbourhood], near[pixels.range_m > 0] = 190, 60
-    colours = np.array(CLASS_RGB, np.uint8)[pixels.labels()][..., ::-1]
-    panels = []
-    for picture, caption in (
+    colours = np.array(CLASS_RGB, np.uint8)[pixels.labels()]
+    figure = chart.new_figure(
+        1240, 90 + round(300 * colours[here].shape[0] / colours[here].shape[1])
+    )
+    panels = (
         (greys[0], "input, segmented"),
         (greys[1], "range image of the estimate"),
         (near, "its neighbourhood (grey)"),
         (colours, "classified pixels"),
-    ):
-        part = picture[here]
-        scale = 290 / part.shape[1]
-        size = (290, max(1, round(part.shape[0] * scale)))
-        part = cv2.resize(np.ascontiguousarray(part), size, interpolation=cv2.INTER_NEAREST)
-        part = part if part.ndim == 3 else cv2.cvtColor(part, cv2.COLOR_GRAY2BGR)
-        cv2.rectangle(part, (0, 0), (size[0] - 1, size[1] - 1), chart.GREY, 1)
-        head = chart.canvas(30, size[0])
-        chart.write(head, caption, (2, 20))
-        panels += [chart.canvas(size[1] + 30, _GAP), np.vstack([head, part])]
-    body = np.hstack([*panels, chart.canvas(panels[0].shape[0], _GAP)])
+    )
+    for axes, (picture, caption) in zip(figure.subplots(1, 4), panels, strict=True):
+        axes.imshow(picture[here], "gray", vmin=0, vmax=255, interpolation="nearest")
+        axes.set(xticks=(), yticks=(), title=caption)
     counts = (int(image.sum()) for image in (pixels.correct, pixels.false, pixels.missed))
-    names = [f"{count} {name}" for count, name in zip(counts, CLASSES[2:], strict=True)]
-    foot = chart.canvas(46, body.shape[1])
-    entries = [(n, rgb[::-1]) for n, rgb in zip(names, CLASS_RGB[2:], strict=True)]
-    chart.legend(foot, [*entries, (CLASSES[1], CLASS_RGB[1])], (30, 28), chart.box_mark)
+    names = [
+        *(f"{count} {name}" for count, name in zip(counts, CLASSES[2:], strict=True)),
+        CLASSES[1],
+    ]
+    for name, rgb in zip(names, (*CLASS_RGB[2:], CLASS_RGB[1]), strict=True):
+        axes.scatter([], [], marker="s", s=80, color=np.divide(rgb, 255), label=name)
+    figure.legend(loc="outside lower left", ncols=4, frameon=False)
     note = "Nearer is darker, in both range images alike. Pixels as the likelihood counts them."
-    return chart.titled(np.vstack([body, foot]), title, note)
+    return chart.titled(chart.picture_of(figure), title, note)
 
 
 def filmstrip_figure(panels: Sequence[np.ndarray], title: str) -> np.ndarray:
@@ -98,39 +96,16 @@ def lost_figure(
     """
     strip = filmstrip([film_tile(panel) for panel in panels])
     width = max(strip.shape[1], 1000)
-    strip = cv2.copyMakeBorder(
-        strip, 0, 0, 0, width - strip.shape[1], cv2.BORDER_CONSTANT, value=(255, 255, 255)
-    )
-    plot = chart.canvas(330, width)
-    axes = Axes(70, width - 30, 60, 250, _span(time_s), (0.0, 1.0))
-    axes.shade(plot, time_s, lost, chart.SHADE)
-    axes.draw(plot, "time, s", "score")
-    axes.line(plot, time_s, score, chart.BLUE)
-    for row in rows:
-        x, y = np.round(axes.place(time_s[row], score[row])).astype(int)
-        cv2.circle(plot, (x, y), 6, chart.VERMILLION, -1, cv2.LINE_AA)
-        cv2.line(plot, (x, axes.top), (x, axes.top - 6), chart.VERMILLION, 2)
-    _write_frames(plot, axes, time_s[list(rows)], frames[list(rows)])
-    chart.legend(plot, [("frames shown above", chart.VERMILLION)], (84, 318))
-    chart.legend(plot, [("lost", chart.SHADE)], (290, 318), chart.box_mark)
-    if confidence is not None and np.isfinite(confidence).any():
-        axes.line(plot, time_s, confidence, _SURE)
-        chart.legend(plot, [("score", chart.BLUE), ("confidence", _SURE)], (400, 318))
+    strip = np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0)), constant_values=255)
+    figure = chart.new_figure(width, 340)
+    axes = figure.subplots()
+    _draw_score(axes, time_s, score, lost, confidence)
+    shown = list(rows)
+    axes.plot(time_s[shown], score[shown], "o", color=chart.VERMILLION, label="frames shown above")
+    _number_frames(axes, time_s[shown], frames[shown])
+    figure.legend(loc="outside lower left", ncols=4, frameon=False)
     note = "Above: the camera's image with the estimated skeleton, and the estimate's range image."
-    return chart.titled(np.vstack([strip, plot]), title, note)
-
-
-def _write_frames(picture: np.ndarray, axes: Axes, time_s: np.ndarray, frames: np.ndarray) -> None:
-    """Frame numbers above the axes of the score; those that would overlap are left out."""
-    y, size = axes.top - 10, 0.45
-    chart.write(picture, "frame", (axes.right, y), align="right")
-    end: float = axes.left + chart.text_width("score") + 10
-    last = axes.right - chart.text_width("frame") - 10
-    for time, frame in sorted(zip(time_s.tolist(), frames.tolist(), strict=True)):
-        x, half = float(axes.place(time, axes.y[0])[0]), chart.text_width(f"{frame}", size) / 2
-        if x - half > end and x + half < last:
-            chart.write(picture, f"{frame}", (x, y), align="middle", size=size)
-            end = x + half + 8
+    return chart.titled(np.vstack([strip, chart.picture_of(figure)]), title, note)
 
 
 def course_figure(
@@ -151,62 +126,66 @@ def course_figure(
         absent: (T,) the truth says that there is no hand to track, or not one of the known poses.
         confidence: (T,) that every joint is within 40 mm, NaN where nothing says; or None.
     """
-    width, above = 1100, 0 if error_mm is None else 330
-    picture = chart.canvas(above + 350, width)
-    span = _span(time_s)
+    count = 1 if error_mm is None else 2
+    figure = chart.new_figure(1100, 330 * count)
+    *above, below = figure.subplots(count, squeeze=False)[:, 0]
     if error_mm is not None:
-        mean, largest = error_mm.mean(1), error_mm.max(1)
-        axes = Axes(80, width - 30, 60, 300, span, _error_limits(mean, largest), log_y=True)
-        axes.shade(picture, time_s, lost, chart.SHADE)
-        axes.draw(picture, "", "joint error, mm (logarithmic)")
-        axes.line(picture, time_s, largest, chart.ORANGE)
-        axes.line(picture, time_s, mean, chart.BLUE)
-        entries = [("mean of the joints", chart.BLUE), ("largest of a joint", chart.ORANGE)]
-        chart.legend(picture, entries, (420, 50))
-    axes = Axes(80, width - 30, above + 60, above + 250, span, (0.0, 1.0))
-    axes.shade(picture, time_s, lost, chart.SHADE)
-    axes.draw(picture, "time, s", "score")
-    axes.line(picture, time_s, score, chart.GREEN)
-    numbers = np.searchsorted(frames, _round_frames(int(frames[0]), int(frames[-1])))
-    _write_frames(picture, axes, time_s[numbers], frames[numbers])
-    entries = [("lost, says the tracker", chart.SHADE)]
+        axes = above[0]
+        chart.label(axes, "", "joint error, mm (logarithmic)")
+        chart.shade(axes, time_s, lost, chart.SHADE, "")
+        axes.plot(time_s, error_mm.max(1), ".-", color=chart.ORANGE, label="largest of a joint")
+        axes.plot(time_s, error_mm.mean(1), ".-", color=chart.BLUE, label="mean of the joints")
+        chart.round_log_ticks(axes, "y")
+        axes.set_xlim(*_span(time_s))
+        axes.legend(loc="upper left", ncols=2)
+    _draw_score(below, time_s, score, lost, confidence)
     if absent is not None:
-        entries.append(("no hand of the known poses, says the truth", chart.GREY))
-        bar = Axes(axes.left, axes.right, axes.top, axes.top + 7, axes.x, axes.y)
-        bar.shade(picture, time_s, absent, chart.GREY)
-    chart.legend(picture, entries, (94, above + 330), chart.box_mark)
-    if confidence is not None and np.isfinite(confidence).any():
-        axes.line(picture, time_s, confidence, _SURE)
-        lines = [("score", chart.GREEN), ("confidence", _SURE)]
-        chart.legend(picture, lines, (axes.right - 260, above + 330))
+        name = "no hand of the known poses, says the truth"
+        chart.shade(below, time_s, absent, chart.GREY, name, top=0.96)
+    at = np.flatnonzero(np.isin(frames, chart.round_numbers(frames[0], frames[-1])))
+    _number_frames(below, time_s[at], frames[at])
+    figure.legend(
+        *below.get_legend_handles_labels(), loc="outside lower left", ncols=4, frameon=False
+    )
     note = (
         "The recording has no truth, so there is no error to show."
         if error_mm is None
         else "The error is left out where the truth has no visible hand."
     )
-    return chart.titled(picture, title, note)
+    return chart.titled(chart.picture_of(figure), title, note)
 
 
-def _round_frames(first: int, last: int) -> list[int]:
-    """Frame numbers to be written on an axis: multiples of 1, 2 or 5 times a power of ten."""
-    return [round(tick) for tick in chart.ticks(first, last, 11) if tick == round(tick)]
+def _draw_score(
+    axes: Axes,
+    time_s: np.ndarray,
+    score: np.ndarray,
+    lost: np.ndarray,
+    confidence: np.ndarray | None,
+) -> None:
+    """Score and confidence over time, lost frames shaded."""
+    chart.label(axes, "time, s", "score")
+    chart.shade(axes, time_s, lost, chart.SHADE, "lost, says the tracker")
+    axes.plot(time_s, score, color=chart.GREEN, label="score")
+    if confidence is not None and np.isfinite(confidence).any():
+        axes.plot(time_s, confidence, color=chart.PURPLE, label="confidence")
+    axes.set(xlim=_span(time_s), ylim=(0, 1.02))
+
+
+def _number_frames(axes: Axes, time_s: np.ndarray, frames: np.ndarray) -> None:
+    """Frame numbers at the upper edge; those that would overlap are left out."""
+    apart = np.ptp(axes.get_xlim()) / 30
+    kept: list[int] = []
+    for row, time in enumerate(time_s):
+        if not kept or time - time_s[kept[-1]] > apart:
+            kept.append(row)
+    upper = axes.twiny()
+    upper.set(xlim=axes.get_xlim(), xlabel="frame")
+    upper.set_xticks(time_s[kept], frames[kept])
 
 
 def _span(time_s: np.ndarray) -> tuple[float, float]:
     """Limits of the axis of time, also of a single frame."""
     return float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3)
-
-
-def _error_limits(*errors: np.ndarray) -> tuple[float, float]:
-    """Limits in mm that hold every error, from a round number to a round number."""
-    values = np.concatenate(errors)
-    values = values[np.isfinite(values) & (values > 0)]
-    if not len(values):
-        return 1.0, 100.0
-    steps = np.array([f * 10.0**power for power in range(-3, 6) for f in (1, 2, 5)])
-    low = steps[steps <= max(values.min(), 0.1)].max(initial=0.1)
-    high = steps[steps >= values.max()].min(initial=1e6)
-    return float(min(low, high / 10)), float(high)
 
 
 def latent_figure(
@@ -229,94 +208,31 @@ def latent_figure(
     linear = space.kind == "pca"
     scale, unit = (180 / np.pi, ", degrees") if linear else (1.0, "")
     training = scale * space.training_latents.cpu().numpy()
-    gestures = nearest_gestures(space.decode(space.training_latents))
+    low, high = (scale * bound.cpu().numpy() for bound in (space.lower, space.upper))
     path = scale * latent
-    bounds = scale * np.stack([space.lower.cpu().numpy(), space.upper.cpu().numpy()])
-    pairs = [(i, min(i + 1, space.dims - 1)) for i in range(0, min(space.dims, 4), 2)]
-    panels = [
-        _latent_panel(training, gestures, path, lost, time_s, bounds, pair, unit) for pair in pairs
-    ]
-    body = np.hstack([*panels, _time_bar(time_s, panels[0].shape[0])])
-    foot = chart.canvas(44, body.shape[1])
-    entries = [(WORDS.get(name, name), colour) for name, colour in BASIC_BGR.items()]
-    chart.legend(foot, [*entries, ("other training poses", chart.GREY)], (30, 24))
-    chart.legend(foot, [("estimates", chart.TEXT)], (body.shape[1] - 330, 24), _dot)
-    chart.legend(foot, [("lost", chart.TEXT)], (body.shape[1] - 200, 24), _cross)
+    pairs = [[i, min(i + 1, space.dims - 1)] for i in range(0, min(space.dims, 4), 2)]
+    figure = chart.new_figure(110 + 520 * len(pairs), 560)
+    panels = figure.subplots(1, len(pairs), squeeze=False)[0]
+    for pair, axes in zip(pairs, panels, strict=True):
+        i, j = pair
+        chart.label(axes, f"coordinate {i + 1}{unit}", f"coordinate {j + 1}{unit}")
+        corners = [low[i], low[i], high[i], high[i]], [low[j], high[j], high[j], low[j]]
+        axes.fill(*corners, facecolor="none", edgecolor=chart.GREY)
+        scatter_gestures(axes, space, training[:, pair])
+        axes.plot(*path[:, pair].T, color="black", linewidth=0.5)
+        for where, mark, name in ((~lost, ".", "estimates"), (lost, "x", "lost")):
+            axes.scatter([], [], color="black", marker=mark, label=name)
+            times = {"c": time_s[where], "vmin": time_s[0], "vmax": _span(time_s)[1]}
+            # Bright ends of other maps would not be seen on white.
+            look = {"cmap": "copper", "marker": mark, "zorder": 3}
+            dots = axes.scatter(*path[where][:, pair].T, 30, **times, **look)
+    figure.colorbar(dots, ax=panels, label="time, s")
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc="outside lower left", ncols=6, frameon=False
+    )
     about = (
         "Training poses (large dots) by their nearest gesture, and over them the way of the "
         "estimates. The rectangle is the range of the training poses, to which the particles keep; "
         "an estimate may lie beyond it, because the refinement is free of it."
     )
-    return chart.titled(np.vstack([body, foot]), title, about + note)
-
-
-def _latent_panel(
-    training: np.ndarray,
-    gestures: Sequence[str | None],
-    path: np.ndarray,
-    lost: np.ndarray,
-    time_s: np.ndarray,
-    bounds: np.ndarray,
-    pair: tuple[int, int],
-    unit: str,
-    size: int = 520,
-) -> np.ndarray:
-    i, j = pair
-    picture = chart.canvas(size, size)
-    finite = np.isfinite(path).all(1)
-    everything = np.concatenate([training, bounds, path[finite]])[:, (i, j)]
-    low, high = everything.min(0), everything.max(0)
-    margin = 0.04 * np.maximum(high - low, 1e-6)
-    (x0, y0), (x1, y1) = low - margin, high + margin
-    axes = Axes(70, size - 20, 50, size - 60, (float(x0), float(x1)), (float(y0), float(y1)))
-    axes.draw(picture, f"coordinate {i + 1}{unit}", f"coordinate {j + 1}{unit}")
-    corners = np.round(axes.place(bounds[:, i], bounds[:, j])).astype(int).tolist()
-    cv2.rectangle(picture, corners[0], corners[1], chart.GREY, 1)
-    for point, gesture in zip(training, gestures, strict=True):
-        colour = BASIC_BGR[gesture] if gesture else chart.GREY
-        pale = tuple(int(255 - 0.55 * (255 - c)) for c in colour)
-        spot = np.round(axes.place(point[i], point[j])).astype(int)
-        cv2.circle(picture, spot, 6, pale, -1, cv2.LINE_AA)
-        cv2.circle(picture, spot, 6, colour, 1, cv2.LINE_AA)
-    spots = np.round(np.nan_to_num(axes.place(path[:, i], path[:, j])) * 8).astype(np.int32)
-    colours = _time_colours(time_s)
-    for row in np.flatnonzero(finite):
-        if row and finite[row - 1]:
-            ends = (spots[row - 1].tolist(), spots[row].tolist())
-            cv2.line(picture, *ends, colours[row], 1, cv2.LINE_AA, 3)
-    for row in np.flatnonzero(finite):
-        if lost[row]:
-            _cross(picture, tuple((spots[row] // 8).tolist()), colours[row])
-        else:
-            cv2.circle(picture, spots[row].tolist(), 8 * 3, colours[row], -1, cv2.LINE_AA, 3)
-    return picture
-
-
-def _dot(picture: np.ndarray, centre: tuple[int, int], colour: chart.Colour) -> None:
-    cv2.circle(picture, centre, 3, colour, -1, cv2.LINE_AA)
-
-
-def _cross(picture: np.ndarray, centre: tuple[int, int], colour: chart.Colour) -> None:
-    cv2.drawMarker(picture, centre, colour, cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
-
-
-def _time_colours(time_s: np.ndarray) -> list[chart.Colour]:
-    """Of each frame, dark to bright; the brightest third would not be seen on white."""
-    start, end = _span(time_s)
-    shades = np.round(180 * (time_s - start) / (end - start)).astype(np.uint8)
-    colours = cv2.applyColorMap(shades[:, None], cv2.COLORMAP_INFERNO)[:, 0]
-    return [(int(b), int(g), int(r)) for b, g, r in colours]
-
-
-def _time_bar(time_s: np.ndarray, height: int) -> np.ndarray:
-    picture = chart.canvas(height, 110)
-    start, end = _span(time_s)
-    axes = Axes(20, 40, 50, height - 60, (0.0, 1.0), (start, end))
-    shades = np.linspace(end, start, axes.bottom - axes.top)
-    column = np.array(_time_colours(shades[::-1])[::-1], np.uint8)
-    picture[axes.top : axes.bottom, axes.left : axes.right] = column[:, None]
-    chart.write(picture, "time, s", (axes.left - 8, axes.top - 14))
-    for tick in chart.ticks(start, end, 6):
-        v = float(axes.place(0.0, tick)[1])
-        chart.write(picture, f"{tick:g}", (axes.right + 8, v + 5), size=0.45)
-    return picture
+    return chart.titled(chart.picture_of(figure), title, about + note)

@@ -10,9 +10,10 @@ import torch
 
 from toftrack.detector.images import crop_images, wide_images
 from toftrack.detector.shapes import shape_bank
-from toftrack.views.figures.chart import BLUE, VERMILLION, Axes, canvas, legend, titled
+from toftrack.views.figures import chart
 
 _CROPS, _COLUMNS, _SIDE = 48, 8, 128
+_PALM, _OTHER = (178, 114, 0), (0, 94, 213)  # BGR
 _PART_COLOURS = np.array(
     [[0, 0, 0], [0, 70, 0], [80, 0, 0], [0, 0, 90], [0, 80, 80], [60, 0, 60]], np.uint8
 )
@@ -37,7 +38,7 @@ def images_figure(seed: int) -> np.ndarray:
         for hand, (cell, seen) in enumerate(zip(wides.cell[i], wides.seen[i], strict=True)):
             if float(seen) > 0.15:
                 u, v = ((cell + 0.5) * 4 * scale).tolist()
-                colour = VERMILLION if hand else BLUE
+                colour = _OTHER if hand else _PALM
                 cv2.circle(tile, (round(u), round(v)), 7, colour, 2, cv2.LINE_AA)
         tiles.append(tile)
     wide_rows = [np.hstack(tiles[i : i + 4]) for i in (0, 4)]
@@ -45,7 +46,7 @@ def images_figure(seed: int) -> np.ndarray:
         "Above, crops: hand green, forearm blue, another hand red, things yellow, outside violet."
         " Below, whole images: a blue ring on a palm, a red one on another hand's."
     )
-    return titled(np.vstack(crop_rows + wide_rows), "Training images", note)
+    return chart.titled(np.vstack(crop_rows + wide_rows), "Training images", note)
 
 
 def _grey(nearness: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -55,15 +56,17 @@ def _grey(nearness: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def course_figure(course: list[dict[str, Any]]) -> np.ndarray:
     """Mean joint errors on fresh training images over their number, BGR."""
-    picture = canvas(420, 760)
-    images = np.array([row["images"] for row in course]) / 1e3
-    keypoints = np.array([row["keypoints_mm"] for row in course])
-    joints = np.array([row["joints_mm"] for row in course])
-    top = float(max(joints.max(), keypoints.max(), 1.0))
-    low = float(min(joints.min(), keypoints.min(), top / 2))
-    axes = Axes(70, 730, 60, 360, (0.0, float(images[-1])), (low * 0.9, top * 1.1), log_y=True)
-    axes.draw(picture, "thousand images", "mean joint error, mm")
-    axes.line(picture, images, joints, VERMILLION)
-    axes.line(picture, images, keypoints, BLUE)
-    legend(picture, (("likeliest hypothesis", VERMILLION), ("keypoints", BLUE)), (330, 40))
-    return titled(picture, "Training of the pose network", "On images never seen before.")
+    figure = chart.new_figure(760, 420)
+    axes = figure.subplots()
+    chart.label(axes, "thousand images", "mean joint error, mm")
+    images = [row["images"] / 1e3 for row in course]
+    for key, name, colour in (
+        ("joints_mm", "likeliest hypothesis", chart.VERMILLION),
+        ("keypoints_mm", "keypoints", chart.BLUE),
+    ):
+        axes.plot(images, [row[key] for row in course], color=colour, label=name)
+    chart.round_log_ticks(axes, "y")
+    axes.set_xlim(left=0)
+    axes.legend()
+    picture = chart.picture_of(figure)
+    return chart.titled(picture, "Training of the pose network", "On images never seen before.")
