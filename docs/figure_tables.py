@@ -102,7 +102,7 @@ def _readme(rows: Rows) -> list[str]:
         "| **a real Kinect V2 recording**, 27 labelled frames, *with which weights and thresholds"
         " were chosen*: those with all visible fingertips within 40 mm |"
         f" {one('kinect2', 'tips_40_pct', '%')} |",
-        "| ... 25 other frames of it, not used before: the same |"
+        "| ... 25 other frames of it, with which nothing was chosen: the same |"
         f" {one('kinect2, kept back', 'tips_40_pct', '%')} |",
         "| ... of these 25: a fingertip is farther off, and not flagged |"
         f" {one('kinect2, kept back', 'wrong_pct', '%')} |",
