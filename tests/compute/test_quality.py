@@ -117,18 +117,16 @@ def test_each_level_leaves_out_more() -> None:
         assert less is model.at_quality(quality), "made once"
         assert less.detector.settings.every > before.detector.settings.every
         assert less.detector.settings.search > before.detector.settings.search
-        assert less.hysteresis.exchanged <= before.hysteresis.exchanged
-        assert less.detector.settings.candidates <= before.detector.settings.candidates
-        assert less.filter == model.filter and less.poses is model.poses
+        assert less.filter == model.filter
         shape = model.first_state(0).hands[0].shape
         assert less.hand("right", shape) is model.hand("right", shape)
         before = less
 
 
 def test_settings_that_leave_out_more_stay() -> None:
-    model = make_tracker("detector.every=6", "detector.candidates=0", "refine=none").model
+    model = make_tracker("detector.every=6", "detector.places=1", "refine=none").model
     less = model.at_quality(LEVELS[-1])
-    assert less.detector.settings.every == 6 and less.detector.settings.candidates == 0
+    assert less.detector.settings.every == 6 and less.detector.settings.places == 1
 
 
 def test_less_quality_may_be_one_thread() -> None:

@@ -55,7 +55,7 @@ def test_a_wrong_value_is_refused_in_one_sentence(override: str, words: str) -> 
         ("lost.whole.intercept=-1", "lost.whole.weights.keypoints_off=-0.5"),
         ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
         ("experiment=paper", "start.pose=[0,0,0.4,0,0,0]", "detector=none", "start=rough"),
-        ("refine=none", "detector.candidates=0", "posterior.overlap=0", "hysteresis.exchanged=0"),
+        ("refine=none", "detector.places=1", "posterior.keypoints=0", "hysteresis.place_lead=0"),
         ("+device.anything=-1",),
         ("~device.repeat",),
         ("gestures.file=mine.csv", "device.stop=5"),

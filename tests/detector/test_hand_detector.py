@@ -16,8 +16,7 @@ from helpers.tracking import sample
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector import hand_detector as module
 from toftrack.detector.hand_detector import Detection, HandDetector, merit
-from toftrack.detector.proposals import NetworkOutput, Places
-from toftrack.detector.proposals_numba import run_pose_network
+from toftrack.detector.proposals import Places
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -70,48 +69,6 @@ def test_a_hand_s_length_is_the_mean_of_the_hypotheses() -> None:
     weights = seen.log_probability.exp()
     length = 0.19 * math.exp(float((weights * seen.log_size).sum() / weights.sum()))
     assert seen.length_m == pytest.approx(length, rel=1e-4)
-
-
-def seen_in_crops(keypoints: torch.Tensor, sigma: float) -> NetworkOutput:
-    """What crops of one hand show, their keypoints being these (C, 21, 3), all with a deviation but
-    those of the last crop, which have twice that.
-    """
-    depth, k, at = sample().depth_m[0], sample().k, sample().joints_m[0, [9]]
-    pose, _ = small_networks()
-    seen = run_pose_network(pose, depth, k, np.repeat(at, len(keypoints), 0), "right")
-    sigmas = torch.full((len(keypoints), 21), sigma)
-    sigmas[-1] *= 2
-    error = torch.full_like(seen.error_m, 0.01)
-    return replace(seen, keypoints_m=keypoints, sigma_m=sigmas, error_m=error)
-
-
-@pytest.mark.parametrize(("off", "share"), [(0.01, 0.2), (0.10, 0.0)], ids=["same", "another"])
-def test_crops_of_one_hand_give_the_surer_mean_and_one_of_another_does_not_count(
-    off: float, share: float
-) -> None:
-    points = torch.rand(21, 3, generator=torch.Generator().manual_seed(0))
-    keypoints = torch.stack((points, points + torch.tensor([off, 0.0, 0.0])))
-    both = module.together(seen_in_crops(keypoints, sigma=0.005))
-    assert (both.keypoints.points_m - points)[:, 0].numpy() == pytest.approx(share * off, abs=1e-6)
-    assert both.keypoints.sigma_m.numpy() == pytest.approx(0.005 * (1 + share))
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_hand_that_is_followed_is_detected_in_several_crops_about_its_palm(count: int) -> None:
-    depth, k, palm = sample().depth_m[0], sample().k, sample().joints_m[0, 9]
-    up = np.array([0.0, -1.0, 0.0])
-    here = detector(crops=count)
-    seen = here.start(depth, k, palm, "right", up)()
-    assert seen.keypoints.points_m.isfinite().all() and not seen.empty
-    centres = palm + module.AROUND_M[count]
-    assert centres.mean(0) == pytest.approx(palm)
-    alone = here.detect(depth, k, centres, "right", np.repeat(up[None], count, 0))
-    low, high = (
-        np.stack([one.keypoints.points_m.numpy() for one in alone]).min(0),
-        np.stack([one.keypoints.points_m.numpy() for one in alone]).max(0),
-    )
-    points = seen.keypoints.points_m.numpy()
-    assert (points > low - 1e-5).all() and (points < high + 1e-5).all()
 
 
 def test_without_a_place_nothing_is_detected() -> None:

@@ -70,7 +70,7 @@ def any_hand_model() -> TrackerModel:
 
 def track_of(pose: torch.Tensor, model: TrackerModel | None = None, **changes: object) -> Track:
     """A track at a pose that goes on for a second, and is surely right."""
-    track = new_track(pose, model or right_hand_model(), 0.5)
+    track = new_track(pose, model or right_hand_model())
     usual = {"age": Duration(1.0), "log_odds": 5.0, "believed": True}
     return replace(track, **(usual | changes))
 

@@ -15,8 +15,8 @@ from helpers.tracking import sample
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
-from toftrack.hand.shape import HandShape, default_hand_shape
-from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, FINGERS, forward_kinematics
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.output.evaluation import TIPS
 from toftrack.pose_space.base import clamp_to_joint_limits
@@ -29,7 +29,6 @@ from toftrack.refinement.gauss_newton import (
     point_jacobian,
     refine,
 )
-from toftrack.refinement.proposals import swap_fingers
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -279,46 +278,6 @@ def test_unknown_landmarks_count_as_none_and_a_wrong_one_little() -> None:
     assert (off_mm(with_landmarks(), joints_of(plain)[0]) < 1).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_joint_limits_are_kept_whatever_is_seen(seed: int) -> None:
-    state, shape = true_states()[:1], default_hand_shape()
-    joints = forward_kinematics(state, shape).joints_m[0]
-    g = generator(seed)
-    noise = 0.02 * torch.randn(20, 21, 3, generator=g)
-    seen = replace(nothing_seen(), points_m=(joints + noise).flatten(0, 1))
-    loose = refinement(iterations=20, angle_rad=10.0, point_m=1e-4)
-    found = refine(state, state[:, 6:], seen, shape, hand_surface(shape), loose)
-    assert found.isfinite().all()
-    assert (found[0, 6:] >= LIMITS[:, 0] - 1e-6).all()
-    assert (found[0, 6:] <= LIMITS[:, 1] + 1e-6).all()
-    assert not torch.equal(found, state)
-
-
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_swapped_hands_differ_from_the_first_in_exactly_one_finger(side: str) -> None:
-    poses = torch.stack([random_state(seed)[0, 6:].float() for seed in range(8)])
-    state = random_state(99).float()
-    n = 400
-    tried = swap_fingers(state, poses, n, generator(3))
-    assert tried.shape == (n + 1, 27)
-    assert torch.equal(tried[:1], state)
-    assert torch.equal(tried[:, :6], state[:, :6].expand(n + 1, 6))
-    finger_of = np.array([name.split("_")[0] for name in ANGLE_NAMES])
-    changed = (tried[1:, 6:] != state[:, 6:]).numpy()
-    names = [set(finger_of[row]) for row in changed]
-    assert all(len(one) == 1 for one in names)
-    # Every finger is tried: 400 fair draws leave one of five out with a probability below 1e-38.
-    assert set().union(*names) == set(FINGERS)
-    for row, name in zip(tried[1:], names, strict=True):
-        columns = torch.from_numpy(finger_of == name.copy().pop())
-        assert (row[6:][columns] == poses[:, columns]).all(1).any(), "it is taken from one pose"
-    shape: HandShape = default_hand_shape(side=side)
-    first, *rest = forward_kinematics(tried[:20], shape).joints_m.unbind(0)
-    for joints, name in zip(rest, names, strict=False):
-        still = [i for i in range(21) if i == 0 or (i - 1) // 4 != FINGERS.index(*name)]
-        torch.testing.assert_close(joints[still], first[still])
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -329,7 +288,6 @@ def test_swapped_hands_differ_from_the_first_in_exactly_one_finger(side: str) ->
         ("point_m", -0.01),
         ("angle_rad", "wide"),
         ("damping", math.nan),
-        ("carry", 2),
     ],
 )
 def test_impossible_settings_are_refused(key: str, value: object) -> None:

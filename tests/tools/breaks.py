@@ -56,8 +56,8 @@ BREAKS = {
         "all joints' standard deviations twice as large", ("lost.joints.scale=2",)
     ),
     "hysteresis off": Break(
-        "another pose or finger need not lead for a while before it takes over",
-        ("hysteresis.place_lead=0", "hysteresis.place_frames=1", "hysteresis.lead=0"),
+        "a pose at another place need not lead for a while before it takes over",
+        ("hysteresis.place_lead=0", "hysteresis.place_frames=1"),
     ),
     "other side": Break("the other hand's side is given", other_side=True),
     "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),

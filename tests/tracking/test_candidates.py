@@ -13,9 +13,8 @@ from helpers.configured import refinement
 from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
 
-from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.crops import crop_rotation
-from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.hand_detector import Detection
 from toftrack.detector.network import PARTS
 from toftrack.detector.parts import (
     ANOTHER_PART,
@@ -25,7 +24,6 @@ from toftrack.detector.parts import (
     THING_PART,
     Parts,
 )
-from toftrack.refinement.proposals import FINGER_OF_ANGLE
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import (
@@ -35,87 +33,76 @@ from toftrack.tracking.candidates import (
     keypoints_of,
     posterior_of,
     propose,
-    schedule,
 )
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.pixels import with_own_arm, without_things
-from toftrack.tracking.select import Hypotheses, Source
-from toftrack.tracking.state import Track
+from toftrack.tracking.select import Source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def model_with(exchanged: int = 0, detector: FixedDetector | None = None) -> TrackerModel:
-    """The tracker of a right hand; of natural poses, no finger is taken if nothing is said."""
-    model = right_hand_model()
-    hysteresis = replace(model.hysteresis, exchanged=exchanged)
-    return replace(model, hysteresis=hysteresis, detector=detector or FixedDetector())
+def model_with(**settings: float) -> TrackerModel:
+    """The tracker of a right hand with some settings of the detector."""
+    return replace(right_hand_model(), detector=FixedDetector(**settings))
 
 
 def filtered(
     x: float,
     seed: int = 0,
-    exchanged: int = 0,
     covered: bool = False,
     detection: Detection | None = None,
     **changes: object,
 ) -> FilteredFrame:
     """A hand that the track has with other fingers than the image and the detector."""
     truth = bent(hand_at(x), seed, 0.4)
-    usual = {"log_odds": 0.0, "contender": bent(hand_at(x), seed + 10, 0.3)}
-    track = track_of(hand_at(x), **(usual | changes))
+    track = track_of(hand_at(x), **({"log_odds": 0.0} | changes))
     detection = detection_of(truth) if detection is None else detection
-    frame = frame_of(image_of(truth), track, detection, model=model_with(exchanged))
+    frame = frame_of(image_of(truth), track, detection, model=model_with())
     if covered:
         depth = torch.full_like(frame.observation.depth_m, 0.3)
         frame = replace(frame, observation=replace(frame.observation, depth_m=depth))
     return FilteredFrame.of(frame, track.mean)
 
 
-def table_of(hand: FilteredFrame) -> Hypotheses:
-    return propose(hand, torch.Generator().manual_seed(0))
-
-
 def test_every_hypothesis_is_scored_by_the_posterior() -> None:
-    hand = filtered(-0.1, 1, exchanged=16)
-    table = table_of(hand)
+    hand = filtered(-0.1, 1)
+    table = propose(hand)
     torch.testing.assert_close(table.log_posterior, hand.posterior(table.pose))
 
 
 def test_each_source_proposes_its_poses() -> None:
-    table = table_of(filtered(0.0, contender=torch.zeros(0, 27)))
-    counts = {source: len(table.of_source(source)) for source in Source}
-    assert counts[Source.HELD] == counts[Source.CONTENDER] == 0
-    assert counts[Source.PREVIOUS] == counts[Source.DYNAMICS] == 1
-    assert counts[Source.DETECTOR] >= 2, "as it is, and bent to the keypoints"
-    assert len(table_of(filtered(0.0)).of_source(Source.CONTENDER)) == 1
+    found = propose(filtered(0.0)).source.tolist()
+    assert found == [Source.PREVIOUS, Source.DYNAMICS, Source.DETECTOR, Source.DETECTOR], (
+        "the detector's as it is, and bent to the keypoints"
+    )
 
 
 def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> None:
     hand = filtered(0.0)
-    table = table_of(hand)
+    table = propose(hand)
     before = float(hand.posterior(hand.frame.track.pose))
-    assert float(table.of_source(Source.PREVIOUS).log_posterior) > before
-    assert float(table.best.log_posterior) > before + 0.1
+    assert float(table.log_posterior[table.source == Source.PREVIOUS]) > before
+    assert float(table.log_posterior.max()) > before + 0.1
 
 
 def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    hand = filtered(0.0, contender=torch.zeros(0, 27))
+    hand = filtered(0.0)
     far = hand.pose.clone()
     far[:, 2] += 0.5
     assert bool(hand.posterior(far).isneginf())
     monkeypatch.setattr(FilteredFrame, "refined", lambda _, poses: far.repeat(len(poses), 1))
-    standing = table_of(hand).of_source(Source.PREVIOUS, Source.DYNAMICS)
-    torch.testing.assert_close(standing.pose[:, :3], hand.pose[:, :3].repeat(2, 1))
-    assert bool(standing.log_posterior.isneginf().all())
+    table = propose(hand)
+    standing = table.source <= Source.DYNAMICS
+    torch.testing.assert_close(table.pose[standing, :3], hand.pose[:, :3].repeat(2, 1))
+    assert bool(table.log_posterior[standing].isneginf().all())
 
 
 def test_a_covered_hand_is_held_where_it_was() -> None:
-    covered = filtered(0.0, exchanged=16, covered=True)
-    table = table_of(covered)
+    covered = filtered(0.0, covered=True)
+    table = propose(covered)
     assert table.source.tolist() == [Source.HELD]
     assert torch.equal(table.pose, covered.frame.track.pose)
 
@@ -144,7 +131,7 @@ def emerging(
 def test_a_covered_hand_that_the_detector_surely_sees_emerges() -> None:
     found = emerging()
     assert found.emerges and not found.covered and not found.hidden
-    assert len(table_of(found).of_source(Source.DETECTOR))
+    assert Source.DETECTOR in propose(found).source.tolist()
 
 
 @pytest.mark.parametrize(
@@ -155,7 +142,7 @@ def test_a_covered_hand_that_the_detector_surely_sees_emerges() -> None:
 def test_else_it_stays_covered(changes: dict[str, float]) -> None:
     found = emerging(**changes)
     assert not found.emerges and found.covered and found.detection.empty
-    assert table_of(found).source.tolist() == [Source.HELD]
+    assert propose(found).source.tolist() == [Source.HELD]
     assert emerging(other_m=-0.2).emerges, "the other hand is elsewhere"
 
 
@@ -164,13 +151,13 @@ def test_a_hand_mostly_out_of_sight_is_not_compared_with_the_detector() -> None:
     assert not filtered(0.0).detection.empty
     far = filtered(0.35)  # most of it is beside the image
     assert far.detection.empty and not far.covered
-    assert len(table_of(far).of_source(Source.DETECTOR)) == 0
+    assert Source.DETECTOR not in propose(far).source.tolist()
 
 
 def test_a_hand_that_comes_into_the_image_is_compared_with_it_until_it_is_believed() -> None:
     detection = detection_of(bent(hand_at(0.35), 0, 0.4))
     coming = filtered(0.35, believed=False)
-    assert not coming.detection.empty and len(table_of(coming).of_source(Source.DETECTOR))
+    assert not coming.detection.empty and Source.DETECTOR in propose(coming).source.tolist()
     assert filtered(0.35, believed=True).detection.empty
     unsure, elsewhere = replace(detection, present=0.5), detection_of(hand_at(0.1))
     for other in (unsure, elsewhere):
@@ -178,78 +165,12 @@ def test_a_hand_that_comes_into_the_image_is_compared_with_it_until_it_is_believ
     assert filtered(0.0, believed=False, covered=True).detection.empty, "something hides it"
 
 
-def test_fingers_are_exchanged_from_the_second_round_on_only() -> None:
-    for hand in (filtered(-0.1, 1, exchanged=64), filtered(0.1, 2, exchanged=64)):
-        table = table_of(hand)
-        exchanged = table.source == Source.EXCHANGED
-        assert exchanged.any(), "the track has other fingers than the image"
-        assert exchanged.int().diff().min() >= 0, "all others come before"
-        best = table.of_source(Source.PREVIOUS, Source.DYNAMICS).best
-        tried = table.of_source(Source.EXCHANGED)
-        as_they_are = tried.rows(torch.arange(len(tried) // 2))
-        for pose, value in zip(as_they_are.pose, as_they_are.log_posterior, strict=True):
-            changed = (pose[6:] != best.pose[0, 6:]).nonzero()[:, 0].tolist()
-            assert len({FINGER_OF_ANGLE[angle] for angle in changed}) == 1
-            assert torch.equal(pose[:6], best.pose[0, :6]) and value > best.log_posterior
-        again = hand.refined(as_they_are.pose)
-        torch.testing.assert_close(tried.pose[len(tried) // 2 :], again)
-
-
-def test_nothing_is_exchanged_where_there_is_nothing_to_take_fingers_from() -> None:
-    alone = table_of(filtered(0.0, detection=NO_DETECTION))
-    assert len(alone.of_source(Source.EXCHANGED)) == 0
-    natural = table_of(filtered(0.0, exchanged=128, detection=NO_DETECTION))
-    assert len(natural.of_source(Source.EXCHANGED)) > 0
-
-
 def test_without_refinement_the_filter_alone_proposes() -> None:
-    hand = filtered(0.0, exchanged=16)
+    hand = filtered(0.0)
     model = replace(hand.frame.model, refinement=refinement(iterations=0))
     plain = replace(hand, frame=replace(hand.frame, model=model))
-    table = table_of(plain)
+    table = propose(plain)
     assert table.source.tolist() == [Source.DYNAMICS] and torch.equal(table.pose, hand.pose)
-
-
-def sure_track(frames: int, **changes: object) -> Track:
-    usual = {"age": Duration(frames * FRAME_S), "log_odds": 5.0}
-    return track_of(hand_at(), **(usual | changes))
-
-
-def test_the_detector_and_other_fingers_alternate_on_a_sure_hand() -> None:
-    found = [schedule(sure_track(frames), False, 0.9) for frames in range(1, 7)]
-    assert found == [(False, True), (True, False)] * 3
-
-
-@pytest.mark.parametrize(
-    ("changes", "hidden", "alternate"),
-    [
-        ({"log_odds": 0.0}, False, 0.9),
-        ({"challenged": Duration(FRAME_S)}, False, 0.9),
-        ({}, True, 0.9),
-        ({}, False, 1.0),
-    ],
-    ids=["doubtful", "challenged", "hidden", "never in turn"],
-)
-def test_else_both_are_tried_in_every_frame(
-    changes: dict[str, object], hidden: bool, alternate: float
-) -> None:
-    tracks = [sure_track(frames, **changes) for frames in range(1, 5)]
-    assert all(schedule(track, hidden, alternate) == (True, True) for track in tracks)
-
-
-def test_of_two_hands_both_are_tried_of_one_that_is_rather_wrong_than_right() -> None:
-    for sure, found in ((0.1, {(True, False), (False, True)}), (-0.1, {(True, True)})):
-        tracks = [sure_track(frames, log_odds=sure) for frames in range(1, 7)]
-        each = [schedule(track, True, 0.9, turn) for turn, track in enumerate(tracks)]
-        assert set(each) == found
-
-
-@pytest.mark.parametrize("frames", [24, 25])
-def test_the_table_keeps_to_the_schedule(frames: int) -> None:
-    age = Duration(frames * FRAME_S)
-    table = table_of(filtered(0.0, exchanged=64, log_odds=5.0, age=age))
-    kinds = set(table.source.tolist()) & {Source.DETECTOR, Source.EXCHANGED}
-    assert kinds == ({Source.DETECTOR} if frames % 2 == 0 else {Source.EXCHANGED})
 
 
 def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
@@ -267,12 +188,8 @@ def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
     assert float(off.mean()) < 0.005
 
 
-def with_settings(**settings: float) -> TrackerModel:
-    return model_with(detector=FixedDetector(**settings))
-
-
 def test_keypoints_are_trusted_no_more_than_is_set() -> None:
-    model = with_settings(keypoint_m=0.02, keypoint_sigmas=2.0)
+    model = model_with(keypoint_m=0.02, keypoint_sigmas=2.0)
     detection = detection_of(hand_at())
     assert (keypoints_of(detection, model).sigma_m == 0.02).all()
     unsure = replace(detection.keypoints, sigma_m=torch.full((21,), 0.03))
@@ -282,7 +199,7 @@ def test_keypoints_are_trusted_no_more_than_is_set() -> None:
 def test_a_keypoint_weight_divides_the_deviations_and_0_leaves_them_without_effect() -> None:
     detection = detection_of(hand_at())
     plain, half, none = (
-        keypoints_of(detection, with_settings(keypoint_weight=weight)).sigma_m
+        keypoints_of(detection, model_with(keypoint_weight=weight)).sigma_m
         for weight in (1.0, 0.5, 0.0)
     )
     torch.testing.assert_close(half, 2 * plain)

@@ -15,7 +15,7 @@ from toftrack.tracking.handedness import HandednessEstimate, body_offset_m
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 FRAMES = 12
-SMALL = ("filter.particles=80", "hysteresis.exchanged=16")
+SMALL = ("filter.particles=80",)
 
 
 def first(count: int = FRAMES) -> Scene:

@@ -15,7 +15,7 @@ from toftrack.tracking.tracker import HandsTracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SMALL = ("filter.particles=80", "hysteresis.exchanged=16")
+SMALL = ("filter.particles=80",)
 ROWS = range(14, 34)
 """Frames of the sample with the hand to the left of the image's middle."""
 

@@ -28,7 +28,7 @@ from toftrack.tracking.tracker import HandsTracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SMALL = ("hands=2", "filter.particles=80", "hysteresis.exchanged=16")
+SMALL = ("hands=2", "filter.particles=80")
 FRAMES = 14
 READY_S = 120.0
 

@@ -21,7 +21,7 @@ from toftrack.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SMALL = ("filter.particles=80", "hysteresis.exchanged=16")
+SMALL = ("filter.particles=80",)
 
 
 def quick(*overrides: str) -> Tracker:

@@ -118,7 +118,7 @@ def test_a_restart_forgets_the_hand_and_may_change_its_side() -> None:
 
 def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
     scene = first(3)
-    quick = ("hand.shape=default", "hysteresis.exchanged=8", "filter.particles=60")
+    quick = ("hand.shape=default", "filter.particles=60")
     one, two = (follow(scene, *quick, f"renderer={name}") for name in ("numba", "torch"))
     difference = np.linalg.norm(one[-1].joints_m - two[-1].joints_m, axis=-1).mean()
     # Pixels on an outline may fall to either side, so the draws part: not the same bits.
@@ -225,7 +225,6 @@ def test_a_mirrored_sequence_of_a_left_hand_gives_the_same_error(default: Run) -
         ("filter.exponent=0", "filter.exponent=0 is not possible; give a number above 0"),
         ("filter.spread.latent=-0.1", "filter.spread.latent=-0.1 is not possible"),
         ("filter.spread.depth_m=far", "filter.spread.depth_m=far is not possible"),
-        ("posterior.overlap=-1", "posterior.overlap=-1 is not possible"),
         ("lost.believe=60", "lost.believe=60 is not possible; give a number of at least 0 and at"),
         ("lost.patience=-1", "lost.patience=-1 is not possible"),
         ("hand.adapt.alike=2", "hand.adapt.alike=2 is not possible"),

@@ -21,7 +21,7 @@ from toftrack.tracking.watching import first_estimate, watched_over
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SMALL = ("filter.particles=80", "hysteresis.exchanged=16")
+SMALL = ("filter.particles=80",)
 
 
 def watching(first: bool, other: bool, **changes: object) -> TrackerState:

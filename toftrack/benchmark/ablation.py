@@ -53,9 +53,6 @@ VARIANTS: dict[str, Variant] = {
         "no keypoints, neither in the refinement nor in the posterior",
         ("posterior.keypoints=0", "detector.keypoint_weight=0"),
     ),
-    "no-candidates": Variant("no candidates of the detector", ("detector.candidates=0",)),
-    "no-exchange": Variant("no exchanged fingers", ("hysteresis.exchanged=0",)),
-    "no-overlap": Variant("fingers may be in one another", ("posterior.overlap=0",)),
     "side-found": Variant("handedness detected", (), "auto"),
     "two-hands": Variant("two hands", ("hands=2",)),
 }

@@ -36,15 +36,12 @@ class Quality:
         they help.
     every: frames from one detection of a believed hand to the next.
     search: likewise from one search of the whole image to the next, while none is.
-    exchanged: part of the poses with another finger that are tried.
-    candidates, places: at most.
+    places: that are looked at in a search, at most.
     """
 
     threads: int | None = None
     every: int = 1
     search: int = 1
-    exchanged: float = 1.0
-    candidates: int | None = None
     places: int | None = None
 
 
@@ -52,8 +49,7 @@ LEVELS = (
     Quality(),
     Quality(threads=1),
     Quality(1, every=2, search=2),
-    Quality(1, every=3, search=3, exchanged=0.5, candidates=2, places=2),
-    Quality(1, every=4, search=4, exchanged=0.25, candidates=1, places=2),
+    Quality(1, every=4, search=4, places=2),
 )
 """All effort first; each leaves out more than the one before. Fewer particles or passes save little
 and cost much of the accuracy: rather frames are dropped."""

@@ -18,7 +18,6 @@ from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networ
 from toftrack.detector.parts import ALL_HAND, Parts
 from toftrack.detector.proposals import NetworkOutput, Places, find_hands, start_finding
 from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
-from toftrack.errors import ToftrackError
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 
@@ -26,15 +25,6 @@ _AGAIN = 2.0
 """Places whose merit is so much lower than the best are not considered again."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
-AROUND_M = {
-    1: np.zeros((1, 3)),
-    2: 0.008 * np.array([[1.0, 1, 0], [-1, -1, 0]]),
-}
-"""Where crops of one hand lie about its palm, by their number: about half a cell of the network's
-map away."""
-
-_ANOTHER_M = 0.025
-"""Keypoints so much farther apart on average are of two hands."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +35,9 @@ class DetectorSettings:
     least: float
     merit: float
     hypotheses: int
-    candidates: int
     every: int
     search: int
     sure: float
-    crops: int
     keypoint_m: float
     keypoint_sigmas: float
     keypoint_weight: float
@@ -57,13 +45,9 @@ class DetectorSettings:
     def __post_init__(self) -> None:
         for name in ("places", "hypotheses"):
             check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
-        check_number("detector.candidates", self.candidates, 0, whole=True)
         for name in ("every", "search"):
             check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
         check_number("detector.sure", self.sure, 0.5, 0.999)
-        if self.crops not in AROUND_M:
-            allowed = ", ".join(map(str, AROUND_M))
-            raise ToftrackError(f"detector.crops={self.crops} must be one of {allowed}")
         check_number("detector.least", self.least, 0, 1)
         check_number("detector.merit", self.merit)
         check_number("detector.keypoint_weight", self.keypoint_weight, 0)
@@ -196,16 +180,10 @@ class HandDetector:
         side: str,
         up: np.ndarray | None = None,
     ) -> Callable[[], Detection]:
-        """The same at one place (3,), begun beside whatever does not need it.
-
-        Where the fingers point is known of a hand that is followed, which is looked at in `crops`
-        crops: what the network says of a joint depends on where the borders of its cells lie.
-        """
-        count = 1 if up is None else self.settings.crops
-        centres = centre_m + AROUND_M[count]
-        up = None if up is None else np.repeat(up[None], count, 0)
-        wait = start_pose_network(self.pose, depth_m, k, centres, side, up)
-        return lambda: together(wait())
+        """The same at one place (3,), begun beside whatever does not need it."""
+        ups = None if up is None else up[None]
+        wait = start_pose_network(self.pose, depth_m, k, centre_m[None], side, ups)
+        return lambda: _detection(wait(), 0)
 
     def search(
         self,
@@ -279,28 +257,6 @@ def _detection(seen: NetworkOutput, row: int) -> Detection:
         present=float(seen.present[row].sigmoid()),
         right_side=float(seen.right[row].sigmoid()),
         parts=seen.parts[row],
-    )
-
-
-def together(seen: NetworkOutput) -> Detection:
-    """What crops of one hand show: the mean of their keypoints, the surer the heavier, and the rest
-    of the crop that is surest. Crops that show another hand than that one do not count.
-    """
-    crops = [_detection(seen, row) for row in range(len(seen.present))]
-    best = min(crops, key=doubt_m)
-    away = (seen.keypoints_m - best.keypoints.points_m).norm(dim=2).mean(1)
-    same = away < _ANOTHER_M
-    if int(same.sum()) == 1:
-        return best
-    weight = seen.sigma_m[same].square().reciprocal()
-    weight = (weight / weight.sum(0))[..., None]
-    joints, sigma = seen.keypoints_m[same], seen.sigma_m[same, :, None]
-    mean = Keypoints((weight * joints).sum(0), (weight * sigma).sum((0, 2)))
-    return replace(
-        best,
-        keypoints=mean,
-        present=float(seen.present[same].mean().sigmoid()),
-        right_side=float(seen.right[same].mean().sigmoid()),
     )
 
 

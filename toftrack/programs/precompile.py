@@ -117,11 +117,9 @@ def compile_poses() -> None:
     from toftrack.detector.proposals_numba import compile_decoding
     from toftrack.hand.openxr_numba import openxr_hand_compiled
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
-    from toftrack.refinement.penalty_numba import joints_penalty
 
     shape = default_hand_shape()
     CompiledRefiner(shape)
     compile_decoding()
     joints = forward_kinematics(torch.zeros(1, 27), shape).joints_m
-    joints_penalty(joints, shape.hand_length_m, 1.0, None, 0.0)
     openxr_hand_compiled(joints[0].numpy(), np.zeros(27), openxr_rig(shape))

@@ -81,7 +81,6 @@ class Refinement:
         ones count more.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     steadying: how much of a change from frame to frame is believed.
-    carry: part of the pose's distance from the pose space that the next frame's hypotheses keep.
     """
 
     iterations: int
@@ -92,7 +91,6 @@ class Refinement:
     angle_rad: float
     damping: float
     steadying: Steadying
-    carry: float
 
     def __post_init__(self) -> None:
         for name, least in (("iterations", 0), ("points", 1)):
@@ -100,7 +98,6 @@ class Refinement:
         for name in ("reach_m", "point_m", "silhouette_px", "angle_rad"):
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
         check_number("refine.damping", self.damping, 0)
-        check_number("refine.carry", self.carry, 0, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,9 @@ from torch import Tensor
 from toftrack.checks import check_number
 from toftrack.compute.motions import Motions
 from toftrack.compute.pace import FRAME_S
-from toftrack.refinement.proposals import FINGER_OF_ANGLE
+from toftrack.hand.skeleton import ANGLE_NAMES, FINGERS
 
-_GROUP = np.array([5, 5, 5, 6, 6, 6, *FINGER_OF_ANGLE])
+_GROUP = np.array([5, 5, 5, 6, 6, 6, *(FINGERS.index(name.split("_")[0]) for name in ANGLE_NAMES)])
 """Of each degree of freedom: the fingers, translation, rotation."""
 
 

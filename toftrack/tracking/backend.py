@@ -16,8 +16,7 @@ from toftrack.compute.motions import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.refinement import penalty
-from toftrack.refinement.gauss_newton import Keypoints, Refiner, TorchRefiner
+from toftrack.refinement.gauss_newton import Refiner, TorchRefiner
 from toftrack.render.scoring import Scorer
 from toftrack.render.torch_scorer import TorchScorer
 
@@ -30,8 +29,6 @@ class Backend:
     device: where the particles are. A frame's estimate is on the CPU, where its few poses are
         refined and compared, as is all that is said of it.
     motions: of particles, there and on the CPU.
-    joints_penalty: what speaks against joints besides the image, see refinement/penalty.py; on the
-        CPU.
     make_scorer: for a hand of some sizes, given on the CPU; it takes states on the device.
     make_refiner: likewise, on the CPU.
     """
@@ -39,7 +36,6 @@ class Backend:
     name: str
     device: torch.device
     motions: Motions
-    joints_penalty: Callable[[Tensor, float, float, Keypoints | None, float], Tensor]
     make_scorer: Callable[[HandShape], Scorer]
     make_refiner: Callable[[HandShape], Refiner]
 
@@ -94,16 +90,13 @@ class _Beside(TypedDict):
     """What a back end has beside its scorer."""
 
     motions: Motions
-    joints_penalty: Callable[..., Tensor]
     make_refiner: Callable[[HandShape], Refiner]
 
 
 def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
     """In torch on the CPU; on a device `there`, with compiled code on the CPU next to it."""
     if device.type == "cpu":
-        return _Beside(
-            motions=there, joints_penalty=penalty.joints_penalty, make_refiner=TorchRefiner
-        )
+        return _Beside(motions=there, make_refiner=TorchRefiner)
     here = _compiled()
 
     def at(tensor: Tensor) -> Motions:
@@ -115,23 +108,14 @@ def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
         redraw=there.redraw,
         mean=there.mean,
     )
-    return _Beside(
-        motions=motions,
-        joints_penalty=here["joints_penalty"],
-        make_refiner=here["make_refiner"],
-    )
+    return _Beside(motions=motions, make_refiner=here["make_refiner"])
 
 
 def _compiled() -> _Beside:
     from toftrack.compute import rigid_numba
-    from toftrack.refinement import penalty_numba
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 
-    return _Beside(
-        motions=rigid_numba.motions(),
-        joints_penalty=penalty_numba.joints_penalty,
-        make_refiner=CompiledRefiner,
-    )
+    return _Beside(motions=rigid_numba.motions(), make_refiner=CompiledRefiner)
 
 
 def _numba(device: torch.device) -> Backend:

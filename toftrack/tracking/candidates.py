@@ -1,8 +1,7 @@
 """The hypotheses of a frame: proposed, brought onto the seen points, scored.
 
-Two rounds, as in ICONDENSATION (Isard and Blake, ECCV 1998) with local optimisation (Gall et al.,
-"Optimization and filtering for human motion capture", IJCV 87, 2010): what the filter and the
-detector propose; then the best of these with single fingers of other poses.
+As in ICONDENSATION (Isard and Blake, ECCV 1998) with local optimisation (Gall et al., "Optimization
+and filtering for human motion capture", IJCV 87, 2010): what the filter and the detector propose.
 """
 
 from __future__ import annotations
@@ -16,19 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.refinement.proposals import exchange_fingers, swap_fingers
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.confidence import log_odds, out_of_sight
+from toftrack.tracking.confidence import out_of_sight
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
 from toftrack.tracking.pixels import with_own_arm, without_things
 from toftrack.tracking.posterior import (
     ImageTerm,
-    JointsTerm,
+    KeypointsTerm,
     OtherHandTerm,
     Posterior,
     Term,
@@ -57,11 +54,6 @@ _BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
 best, and how far an angle may go."""
 _NO_WEIGHT = 1e-6
 """Instead of 0, so that deviations stay numbers: kilometres."""
-_DONORS = 4
-"""Single fingers are taken from so many of the detector's poses."""
-_SCREENED, _EXCHANGED = 16, 2
-"""Of the poses with another finger, so many of the best by the image are scored by all terms, and
-so many of those are refined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +66,6 @@ class HandFrame:
     detection: what the detector says of it, and `pending` waits for it where it is still computed.
     others: hands that are tracked as well.  image: the likelihood of the image.
     mirrored: where the sides are to be compared, waits for what the detector says of the other one.
-    turn: odd or even; in one frame it is another one for each of two hands.
     """
 
     slot: int
@@ -89,12 +80,6 @@ class HandFrame:
     image: ImageTerm
     model: TrackerModel
     mirrored: Callable[[], Detection] | None = None
-    turn: int = 0
-
-    @property
-    def in_turn(self) -> int | None:
-        """The turn, where another hand is followed as well; None where nothing else takes time."""
-        return self.turn if any(other.believed for other in self.others) else None
 
     @cached_property
     def hidden(self) -> bool:
@@ -133,7 +118,7 @@ class FilteredFrame:
     @classmethod
     def of(cls, frame: HandFrame, mean: Tensor) -> FilteredFrame:
         """mean: (1, 6 + d) of the particles."""
-        pose = frame.model.decode(mean, frame.track.offset)
+        pose = frame.model.decode(mean)
         outside, behind = frame.out_of_sight(pose)
         unseen = outside + behind > _UNSEEN
         if unseen and behind <= _UNSEEN:
@@ -209,14 +194,8 @@ def posterior_of(
     weights, terms = model.weights, dict[str, Term]()
     keypoints = weights.keypoints if keypoints is None else keypoints
     keypoints = 0.0 if detection.empty else keypoints
-    if keypoints or weights.overlap:
-        terms["joints"] = JointsTerm(
-            model.backend.joints_penalty,
-            fitted.shape.hand_length_m,
-            keypoints_of(detection, model),
-            keypoints,
-            weights.overlap,
-        )
+    if keypoints:
+        terms["keypoints"] = KeypointsTerm(keypoints_of(detection, model), keypoints)
     if weights.other_hand:
         touched = [other.joints_m for other in others if other.certain]
         terms |= {
@@ -304,69 +283,26 @@ def best_start(
     return poses[best][None], float(values[best])
 
 
-def propose(filtered: FilteredFrame, generator: torch.Generator) -> Hypotheses:
-    """The scored hypotheses of a frame's hand, in two rounds."""
-    proposed, donors = _first_round(filtered)
-    first = _refined(proposed, filtered)
-    second = _second_round(filtered, first, donors, generator)
-    return Hypotheses.joined((first, second)) if len(second) else first
+def propose(filtered: FilteredFrame) -> Hypotheses:
+    """The scored hypotheses of a frame's hand: the last frame's fingers where the filter has the
+    hand, the filter's estimate, and the detector's likeliest pose; refined.
 
-
-def _first_round(filtered: FilteredFrame) -> tuple[Hypotheses, Tensor]:
-    """What the filter and the detector propose, not refined; and the poses (M, 21) to take single
-    fingers from.
-
-    The pose of the last frame stands until another one is clearly better: what the image does not
-    decide, such as a hidden finger, must not flicker. A contender moves along with it.
+    A hand that is mostly hidden is held where it was.
     """
     frame, track, state = filtered.frame, filtered.frame.track, filtered.pose
-    model, settings = frame.model, frame.model.detector.settings
+    model = frame.model
     if not model.refinement.iterations:
-        return Hypotheses.of(state, Source.DYNAMICS), state[:0, 6:]
+        return _refined(Hypotheses.of(state, Source.DYNAMICS), filtered)
     if filtered.covered:
-        return Hypotheses.of(track.pose, Source.HELD), state[:0, 6:]
-    detected = detected_poses(
-        filtered.detection, frame.observation, frame.fitted, model, settings.candidates
-    )
+        return _refined(Hypotheses.of(track.pose, Source.HELD), filtered)
+    detected = detected_poses(filtered.detection, frame.observation, frame.fitted, model, 1)
+    previous = torch.cat((state[:, :6], track.pose[:, 6:]), 1)
     tables = [
-        Hypotheses.of(_with_fingers(state, track.pose), Source.PREVIOUS),
+        Hypotheses.of(previous, Source.PREVIOUS),
         Hypotheses.of(state, Source.DYNAMICS),
-        Hypotheses.of(_with_fingers(state, track.contender), Source.CONTENDER),
+        Hypotheses.of(detected, Source.DETECTOR),
     ]
-    if schedule(track, frame.hidden, model.hysteresis.alternate, frame.in_turn)[0]:
-        tables.append(Hypotheses.of(detected, Source.DETECTOR))
-    return Hypotheses.joined(tables), detected[:_DONORS, 6:]
-
-
-def _second_round(
-    filtered: FilteredFrame, table: Hypotheses, donors: Tensor, generator: torch.Generator
-) -> Hypotheses:
-    """The best pose with single fingers of other poses, as they are and refined, scored."""
-    frame, none = filtered.frame, table.rows(slice(0))
-    standing = table.of_source(Source.PREVIOUS, Source.DYNAMICS)
-    alternate = frame.model.hysteresis.alternate
-    due = schedule(frame.track, frame.hidden, alternate, frame.in_turn)[1]
-    # One expensive thing a frame, where nothing is at stake.
-    busy = frame.mirrored is not None and _sure(frame.track, alternate)
-    if busy or not (frame.model.refinement.iterations and len(standing) and due):
-        return none
-    best, exchanged = standing.best, frame.model.hysteresis.exchanged
-    poses = torch.cat(
-        (
-            swap_fingers(best.pose, frame.model.poses, exchanged, generator)[1:],
-            exchange_fingers(best.pose, donors),
-        )
-    )
-    if not len(poses):
-        return none
-    values = filtered.posterior.screened(poses, _SCREENED)
-    top = values.topk(min(_EXCHANGED, len(values)))
-    rows = top.indices[top.values > best.log_posterior]
-    if not len(rows):
-        return none
-    tried = torch.cat((poses[rows], filtered.refined(poses[rows])))
-    found = Hypotheses.of(tried, Source.EXCHANGED)
-    return replace(found, log_posterior=filtered.posterior(tried))
+    return _refined(Hypotheses.joined(tables), filtered)
 
 
 def _refined(table: Hypotheses, filtered: FilteredFrame) -> Hypotheses:
@@ -381,34 +317,3 @@ def _refined(table: Hypotheses, filtered: FilteredFrame) -> Hypotheses:
     values = filtered.posterior(pose)
     pose = torch.where(values.isneginf()[:, None], table.pose, pose)
     return replace(table, pose=pose, log_posterior=values)
-
-
-def schedule(
-    track: Track, hidden: bool, alternate: float, turn: int | None = None
-) -> tuple[bool, bool]:
-    """Whether the detector's poses are candidates in a frame, and whether fingers are exchanged.
-
-    Both; but in turn where the last estimate was surely right and nothing challenges it, and of two
-    hands wherever it was rather right than wrong: one that is wrong needs the detector's poses now.
-
-    alternate: probability from which on it was; 1 = never.
-    turn: of one of two hands that are followed; odd for one and even for the other.
-    """
-    if track.challenged.begun or track.log_odds < 0:
-        return True, True
-    if turn is not None and alternate < 1:
-        return turn % 2 == 0, turn % 2 == 1
-    if hidden or not _sure(track, alternate):
-        return True, True
-    even = round(track.age.seconds / FRAME_S) % 2 == 0
-    return even, not even
-
-
-def _sure(track: Track, alternate: float) -> bool:
-    """Whether the last estimate was right with so much probability; 1 = never."""
-    return alternate < 1 and track.log_odds >= log_odds(alternate)
-
-
-def _with_fingers(state: Tensor, poses: Tensor) -> Tensor:
-    """Poses (N, 27) with the wrist of a hand (1, 27)."""
-    return torch.cat((state[:, :6].expand(len(poses), 6), poses[:, 6:]), 1)

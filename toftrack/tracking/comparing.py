@@ -203,7 +203,7 @@ def begun(
 ) -> Track:
     """A track that begins with the best of the detector's poses."""
     pose, _ = _best_start(hand, detection, observation, others, model)
-    return new_track(pose, model, model.refinement.carry)
+    return new_track(pose, model)
 
 
 def _best_start(

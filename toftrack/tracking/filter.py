@@ -87,10 +87,9 @@ def run_filter(
     Nothing within waits for the device, so that it is not held up between passes.
     """
     space, motions = model.space_of(track.particles), model.backend.motions
-    offset = on_device(track.offset, model.device)
 
     def log_scores(particles: Tensor) -> Tensor:
-        states = model.decode(particles, offset)
+        states = model.decode(particles)
         with spans("filter: scoring"):
             return image(states)
 
@@ -165,14 +164,11 @@ def velocity_after(track: Track, mean: Tensor, dt_s: float, model: FilterModel) 
     return torch.lerp(moved / dt_s, track.velocity, keep)
 
 
-def new_track(pose: Tensor, model: FilterModel, carry: float) -> Track:
-    """A track that begins with a pose (1, 27), all particles in one place.
-
-    carry: part of the pose's distance from the pose space that is kept beside them.
-    """
-    particle, off = model.nearest(pose)
+def new_track(pose: Tensor, model: FilterModel) -> Track:
+    """A track that begins with a pose (1, 27), all particles in one place."""
+    particle = model.encode(pose)
     n = model.filter.particles
     particles = on_device(particle, model.device).repeat(n, 1)
     weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)
     still = particle.new_zeros(particle.shape[1])
-    return Track(particles, weights, particle, still, carry * off, pose)
+    return Track(particles, weights, particle, still, pose)

@@ -64,8 +64,6 @@ _PATIENT = 10
 """Times as long is waited for a hand that is hidden: each of its frames counts so much less."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
 """A second track ends when it was not believed for so long, and is searched for so much later."""
-_COMPARED_EVERY = 4
-"""The sides of one of two hands are compared in every so many frames at most, never both's."""
 _ONE_FRAMES = 4
 """Two tracks that were believed may be on one hand for so many frames."""
 
@@ -115,8 +113,6 @@ def open_hand(
     alone, track, mirrored = without(image, others), hand.track, None
     if track is not None and goes_on(hand, others):
         due = comparison_due(hand, model, dt_s)
-        if any(other.believed for other in others):  # one hand in a frame, and not in each
-            due = due and (slot + image.index) % _COMPARED_EVERY == 0
         asked = due or detection_due(track, model.detector.settings, dt_s)
         pending = start_detection(hand, track, alone, model, dt_s) if asked else _nothing
         if due:
@@ -152,7 +148,6 @@ def open_hand(
         image_term(observation, fitted, model),
         model,
         mirrored,
-        slot + image.index,
     )
 
 
@@ -243,14 +238,12 @@ def close(
             status = replace(status, lost=True, state_name="searching")
     # Without refinement the particles stay where they are.
     followed = drawn_to(found, model) if model.refinement.iterations else found.filtered
-    carried = model.refinement.carry * found.offset if model.refinement.iterations else track.offset
     track = replace(
         track,
         particles=followed.particles,
         weights=followed.weights,
         mean=followed.mean,
         velocity=velocity_after(track, followed.mean, dt_s, model),
-        offset=carried,
         pose=found.pose,
         trend=found.trend,
         age=track.age.extended(dt_s),

@@ -19,7 +19,6 @@ from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
-from toftrack.pose_space.data.natural_poses import natural_poses
 from toftrack.refinement.gauss_newton import Refinement, Refiner
 from toftrack.refinement.shape_fit import ShapeEstimate, ShapeFit, first_shape
 from toftrack.render.likelihood import FMeasure
@@ -169,10 +168,9 @@ class FilterModel:
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
         return lru_cache(_HANDS)(partial(_fitted_hand, self.configured.shape, self.backend))
 
-    def decode(self, particles: Tensor, offset: Tensor | float = 0.0) -> Tensor:
-        """(N, 6 + d) particles to (N, 27) hand states, all displaced by `offset` (21,) rad."""
-        decoded = self.space_of(particles).decode(particles[:, 6:])
-        angles = clamp_to_joint_limits(decoded + offset)
+    def decode(self, particles: Tensor) -> Tensor:
+        """(N, 6 + d) particles to (N, 27) hand states."""
+        angles = clamp_to_joint_limits(self.space_of(particles).decode(particles[:, 6:]))
         return torch.cat((particles[:, :6], angles), 1)
 
     def encode(self, states: Tensor) -> Tensor:
@@ -235,29 +233,18 @@ class TrackerModel(FilterModel):
             return shape
         return replace(shape, fitted=hand.shape.summary(self.fit))
 
-    @cached_property
-    def poses(self) -> Tensor:
-        """(M, 21) rad, natural poses, to take single fingers from."""
-        return natural_poses()
-
 
 def _at_quality(model: TrackerModel, quality: Quality) -> TrackerModel:
     if quality == Quality(quality.threads):
         return model
-    settings, hysteresis = model.detector.settings, model.hysteresis
+    settings = model.detector.settings
     settings = replace(
         settings,
         every=max(settings.every, quality.every),
         search=max(settings.search, quality.search),
-        candidates=_at_most(settings.candidates, quality.candidates),
         places=_at_most(settings.places, quality.places),
     )
-    exchanged = math.ceil(quality.exchanged * hysteresis.exchanged)
-    made = replace(
-        model,
-        hysteresis=replace(hysteresis, exchanged=exchanged),
-        detector=replace(model.detector, settings=settings),
-    )
+    made = replace(model, detector=replace(model.detector, settings=settings))
     vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the quality
     return made
 

@@ -208,7 +208,7 @@ def _particles_sigma(
 
     def joints_of(tangents: torch.Tensor) -> torch.Tensor:
         moved = motions.compose(found.particle.repeat(len(tangents), 1), tangents)
-        return fitted.refiner.joints(model.decode(moved, track.offset))
+        return fitted.refiner.joints(model.decode(moved))
 
     around = motions.difference(filtered.particles, on_device(filtered.mean, model.device))
     (spread,) = on_host(covariance(around, filtered.weights))

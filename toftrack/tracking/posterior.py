@@ -1,10 +1,10 @@
 """The posterior of a hand's pose: one definition for all who compare poses.
 
-    log p(pose | frame) = image + keypoints + overlap + other hand  (up to a constant)
+    log p(pose | frame) = image + keypoints + other hand  (up to a constant)
 
-A start, the candidates of a frame, exchanged fingers and the two sides of a hand are compared by
-it; the particle filter weighs its particles by the image alone, sharpened. Each term is a small
-object, and a term of weight 0 is left out.
+A start, the candidates of a frame and the two sides of a hand are compared by it; the particle
+filter weighs its particles by the image alone, sharpened. Each term is a small object, and a term
+of weight 0 is left out.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer
 
+_FAR_SIGMAS = 3.0
+"""Farther off, a joint is as wrong as it can be."""
 _TOUCH_M = 0.018
 """Joints of two hands come no nearer to each other, as a rule: fingers are so thick."""
 Term = Callable[[Tensor, Tensor], Tensor]
@@ -32,7 +34,6 @@ class PosteriorWeights:
     """The weights of the posterior's terms; see conf/posterior for what each does."""
 
     keypoints: float
-    overlap: float
     other_hand: float
 
     def __post_init__(self) -> None:
@@ -69,27 +70,19 @@ class ImageTerm:
 
 
 @dataclass(frozen=True, eq=False)
-class JointsTerm:
-    """Joints away from the detector's keypoints (Geman-McClure), and fingers in one another.
-
-    penalty: of the back end, see refinement/penalty.py.
+class KeypointsTerm:
+    """Joints away from the detector's keypoints: the mean of their squared deviations in standard
+    deviations, robust (Geman-McClure).
     """
 
-    penalty: Callable[[Tensor, float, float, Keypoints | None, float], Tensor]
-    hand_length_m: float
     keypoints: Keypoints
-    keypoints_weight: float
-    overlap_weight: float
+    weight: float
 
     def __call__(self, poses: Tensor, joints_m: Tensor) -> Tensor:
         """See Term."""
-        return -self.penalty(
-            joints_m,
-            self.hand_length_m,
-            self.overlap_weight,
-            self.keypoints,
-            self.keypoints_weight,
-        )
+        off = (joints_m - self.keypoints.points_m).norm(dim=-1) / self.keypoints.sigma_m
+        off = off.square()
+        return -self.weight * (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,19 +110,9 @@ class Posterior:
 
     def __call__(self, poses: Tensor) -> Tensor:
         """(N, 27) on the CPU to (N,)."""
-        return self.image(poses) + self._rest(poses)
-
-    def screened(self, poses: Tensor, most: int) -> Tensor:
-        """The same of many poses, of which only the `most` best by the image can be the best.
-
-        The rest are -inf. What the other terms add is small beside what the image tells apart.
-        """
-        values = self.image(poses)
-        if len(poses) <= most:
-            return values + self._rest(poses)
-        rows = values.topk(most).indices
-        total = torch.full_like(values, -torch.inf)
-        total[rows] = values[rows] + self._rest(poses[rows])
+        joints, total = self.joints(poses), self.image(poses)
+        for term in self.terms.values():
+            total = total + term(poses, joints)
         return total
 
     def named(self, poses: Tensor) -> dict[str, Tensor]:
@@ -138,12 +121,6 @@ class Posterior:
         return {"image": self.image(poses)} | {
             name: term(poses, joints) for name, term in self.terms.items()
         }
-
-    def _rest(self, poses: Tensor) -> Tensor:
-        joints, total = self.joints(poses), torch.zeros(len(poses))
-        for term in self.terms.values():
-            total = total + term(poses, joints)
-        return total
 
 
 def touching(joints_m: Tensor, other_m: Tensor) -> Tensor:

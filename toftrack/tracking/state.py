@@ -29,12 +29,8 @@ class Track:
     particles: (N, 6 + d), after the last observation.  weights: (N,) normalised. Both are on the
         model's device; all else is on the CPU.
     mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a second.
-    offset: (21,) rad, by how much the refined pose lies off the pose space; all hypotheses are
-        displaced by it.
     pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
-    contender: (C, 27) another pose that may take its place, C = 0 or 1; lead: by how much it has
-        been better, log posteriors summed up over frames.
     age: how long it has been followed.
     doubtful: how long its confidence has been below what a track is kept for.
     challenged: how long a pose of another place has been better.
@@ -53,11 +49,8 @@ class Track:
     weights: Tensor
     mean: Tensor
     velocity: Tensor
-    offset: Tensor
     pose: Tensor
     trend: Tensor = field(default_factory=lambda: torch.full((27,), math.nan))
-    contender: Tensor = field(default_factory=lambda: torch.zeros(0, 27))
-    lead: float = 0.0
     age: Duration = Duration()
     doubtful: Duration = Duration()
     challenged: Duration = Duration()

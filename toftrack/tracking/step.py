@@ -89,8 +89,8 @@ def step(
        F-measure of the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
     3. Wait for detections that ran beside it.
     4. *Propose*: a table of hypotheses (M, 27), refined by Levenberg-Marquardt steps, scored by the
-       posterior; in a second round the best ones with exchanged fingers.
-    5. *Select* a pose, with hysteresis (Page's test, Biometrika 41, 1954).
+       posterior.
+    5. *Select* the best pose.
     6. *Close*: steady the pose, judge it, carry the track on or end it, learn the hand's shape.
 
     Two hands know of each other where they are predicted; at the end their slots are reconciled.
@@ -188,7 +188,7 @@ def concluded(
             filtered = filtered_frame(frame, dt_s, generator, spans)
     with spans("refinement"):
         candidates = FilteredFrame.of(frame, filtered.mean)
-        choice = choose(candidates, propose(candidates, generator), dt_s)
+        choice = choose(candidates, propose(candidates), dt_s)
     return conclude(frame, filtered, choice, image, dt_s)
 
 
@@ -221,14 +221,7 @@ def choose(filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
     """One of the table's poses."""
     frame, track = filtered.frame, filtered.frame.track
     joints = frame.fitted.refiner.joints
-    incumbent = Incumbent(
-        joints(track.contender) if len(track.contender) else torch.zeros(0, 21, 3),
-        track.lead,
-        track.challenged,
-        track.log_odds,
-        not track.age.begun,
-        filtered.emerges,
-    )
+    incumbent = Incumbent(track.challenged, not track.age.begun, filtered.emerges)
     asked, settings = not frame.detection.empty, frame.model.hysteresis
     return select(table, joints(table.pose), incumbent, dt_s, asked, filtered.hidden, settings)
 
@@ -240,15 +233,13 @@ def conclude(
     model, track, seen = frame.model, frame.track, frame.observation
     pose, trend = choice.pose, track.trend
     if choice.moved:
-        begun = new_track(pose, model, model.refinement.carry)
+        begun = new_track(pose, model)
         track = replace(begun, believed=track.believed, flagged_s=track.flagged_s)
         trend = begun.trend
     elif model.refinement.iterations:
         steadying, motions = model.refinement.steadying, model.backend.motions
         pose, trend = steadied(pose, track.pose, trend, dt_s, steadying, motions)
-    track = replace(
-        track, contender=choice.contender, lead=choice.lead, challenged=choice.challenged
-    )
+    track = replace(track, challenged=choice.challenged)
     found = Found(filtered, pose, trend, *model.nearest(pose))
     score, joints = frame.image.score(pose), frame.fitted.refiner.joints(pose)[0]
     age_s, last = track.age.seconds, track.features
@@ -285,8 +276,7 @@ def conclude(
 def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
     """The estimate of the hand's shape after a believed estimate of its pose."""
     shape, fitted, model = frame.hand.shape, frame.fitted, frame.model
-    busy = (frame.in_turn or 0) % 2 == 1  # of two hands one learns in a frame
-    if busy or frame.detection.empty or frame.hidden or shape.applied != fitted.applied:
+    if frame.detection.empty or frame.hidden or shape.applied != fitted.applied:
         return shape  # of a hand that was given up in this very frame nothing is learned
     return shape_fit.learned(
         shape,
