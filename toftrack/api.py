@@ -104,7 +104,7 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
 
 _PARTS = (
     "hand pose_space segmentation likelihood filter gestures renderer compute detector"
-    " lost start refine posterior hysteresis"
+    " lost start refine posterior"
 ).split()
 """Of a configuration, what build_model makes a model of."""
 
@@ -163,7 +163,6 @@ def build_model(config: DictConfig) -> FilterModel:
         detector=detector.to(device),
         refinement=instantiate(config.refine),
         weights=instantiate(config.posterior),
-        hysteresis=instantiate(config.hysteresis),
     )
 
 

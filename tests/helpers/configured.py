@@ -12,14 +12,11 @@ from omegaconf import OmegaConf
 
 from toftrack.detector.hand_detector import DetectorSettings
 from toftrack.refinement.gauss_newton import Refinement
-from toftrack.refinement.steadying import Steadying
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import NearestSurface
 from toftrack.tracking.confidence import ConfidenceModel
-from toftrack.tracking.handedness import HandednessSettings
 from toftrack.tracking.paper import RoughStart
 from toftrack.tracking.posterior import PosteriorWeights
-from toftrack.tracking.select import Hysteresis
 
 
 @cache
@@ -42,19 +39,9 @@ def refinement(**changes: Any) -> Refinement:
     return replace(_part("refine"), **changes)
 
 
-def steadying(**changes: Any) -> Steadying:
-    """The steadying of conf/refine/gauss_newton.yaml"""
-    return replace(_part("refine").steadying, **changes)
-
-
 def posterior_weights(**changes: Any) -> PosteriorWeights:
     """conf/posterior/default.yaml"""
     return replace(_part("posterior"), **changes)
-
-
-def hysteresis(**changes: Any) -> Hysteresis:
-    """conf/hysteresis/default.yaml"""
-    return replace(_part("hysteresis"), **changes)
 
 
 def rough_start(**changes: Any) -> RoughStart:
@@ -78,8 +65,3 @@ def _detector_settings() -> DetectorSettings:
 def detector_settings(**changes: Any) -> DetectorSettings:
     """conf/detector/network.yaml, without its weights"""
     return replace(_detector_settings(), **changes)
-
-
-def handedness_settings(**changes: Any) -> HandednessSettings:
-    """hand.sides."""
-    return replace(_part("hand").handedness, **changes)

@@ -11,7 +11,6 @@ from helpers.detection import detection_of
 from helpers.tracking import make_tracker
 
 from toftrack.detector.hand_detector import Detection
-from toftrack.errors import ToftrackError
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.shape_space import POPULATION_SIGMA, shape_derivatives, shaped
 from toftrack.hand.skeleton import forward_kinematics
@@ -21,15 +20,7 @@ from toftrack.refinement.shape_fit import ShapeEstimate, ShapeFit, first_shape, 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-FIT = ShapeFit(
-    sure_m=0.004,
-    length_sigma=0.03,
-    keypoints=4.0,
-    alike=0.65,
-    certain_poses=12,
-    contradiction=3.5,
-    memory=20,
-)
+FIT = ShapeFit()
 KEYPOINTS_OFF = torch.tensor(shape_fit._KEYPOINTS_OFF)
 BETWEEN_FINGERS = torch.tensor([0.05, 0.06, 0.0, 0.0, -0.05, 0.04])
 
@@ -185,9 +176,3 @@ def test_only_auto_is_fitted() -> None:
     assert make_tracker().model.fits
     fitted_hand = make_tracker("hand.side=left").fitted
     assert fitted_hand.side == "left" and fitted_hand.fitted is None, "nothing was fitted yet"
-
-
-@pytest.mark.parametrize("name", ["sure_m", "length_sigma", "keypoints", "certain_poses", "memory"])
-def test_impossible_settings_are_refused(name: str) -> None:
-    with pytest.raises(ToftrackError, match=f"hand.adapt.{name}=0"):
-        replace(FIT, **{name: 0})

@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.configured import steadying
 
 from toftrack.compute import rigid
 from toftrack.compute.pace import FRAME_S
-from toftrack.errors import ToftrackError
 from toftrack.refinement.steadying import Steadying, steadied
 
-SETTINGS = steadying()
+SETTINGS = Steadying()
 
 
 def hand(x: float = 0.0) -> torch.Tensor:
@@ -70,11 +68,3 @@ def test_a_slow_movement_after_rest_is_followed_soon() -> None:
 def test_a_jump_is_taken_at_once() -> None:
     path = followed([*trembling(20), hand(0.2)])
     assert float(path[-1, 0]) > 0.19
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("translation_m", -1), ("finger_rad", "much"), ("calm", -1), ("memory", 2)]
-)
-def test_impossible_settings_are_refused(key: str, value: object) -> None:
-    with pytest.raises(ToftrackError, match=f"^refine.steadying.{key}={value} "):
-        steadying(**{key: value})

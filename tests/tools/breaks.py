@@ -55,10 +55,6 @@ BREAKS = {
     "sigma doubled": Break(
         "all joints' standard deviations twice as large", ("lost.joints.scale=2",)
     ),
-    "hysteresis off": Break(
-        "a pose at another place need not lead for a while before it takes over",
-        ("hysteresis.place_lead=0", "hysteresis.place_frames=1"),
-    ),
     "other side": Break("the other hand's side is given", other_side=True),
     "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),
 }

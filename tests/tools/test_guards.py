@@ -56,12 +56,6 @@ def test_the_strangers_are_not_what_the_guards_track() -> None:
     assert not {file.stem for file in files} & {*guards(), *empty()}
 
 
-def test_poses_at_another_place_must_lead_for_a_while() -> None:
-    """What "hysteresis off" turns off, and the guards hardly see."""
-    cfg = configuration()
-    assert cfg.hysteresis.place_frames >= 3 and cfg.hysteresis.place_lead >= 0.02
-
-
 def test_a_turned_finger_is_turned_back() -> None:
     before = default_hand_shape().base_frames
     with BREAKS["finger's axis"].patched():

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.configured import handedness_settings
 from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 
 from toftrack.frames import DepthImage
-from toftrack.tracking.handedness import HandednessEstimate, body_offset_m
+from toftrack.tracking.handedness import HandednessEstimate, HandednessSettings, body_offset_m
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -76,7 +75,7 @@ def test_a_restart_may_detect_the_side_of_a_hand_that_was_given() -> None:
 
 def test_the_evidence_of_comparisons_is_summed_up_and_bounded() -> None:
     fit, belief = (
-        handedness_settings(weight=1.0, largest=2.0, most=3.0, shoulder=0.0),
+        HandednessSettings(weight=1.0, largest=2.0, most=3.0, shoulder=0.0),
         HandednessEstimate(),
     )
     belief = belief.compared(0.5, 0.0, fit)
@@ -89,20 +88,20 @@ def test_the_evidence_of_comparisons_is_summed_up_and_bounded() -> None:
 
 
 def test_comparisons_of_a_mirror_image_say_the_opposite() -> None:
-    fit, one, other = handedness_settings(), HandednessEstimate(), HandednessEstimate()
+    fit, one, other = HandednessSettings(), HandednessEstimate(), HandednessEstimate()
     for gain, body_m in ((0.3, 0.1), (-0.1, 0.05), (0.4, -0.02)):
         one, other = one.compared(gain, body_m, fit), other.compared(-gain, -body_m, fit)
         assert one.log_odds == pytest.approx(-other.log_odds)
 
 
 def test_when_the_hand_has_left_the_next_one_is_likely_but_not_surely_of_its_side() -> None:
-    fit = handedness_settings(kept=1.0)
+    fit = HandednessSettings(kept=1.0)
     gone = HandednessEstimate(fits=5.0, shoulder=0.5, comparisons=9).left(fit)
     assert gone.log_odds == pytest.approx(1.0)
 
 
 def test_two_hands_are_of_different_sides_the_more_surely_the_surer_one_of_them_is() -> None:
-    fit, new = handedness_settings(partner=2.0), HandednessEstimate()
+    fit, new = HandednessSettings(partner=2.0), HandednessEstimate()
     beside = [
         new.beside(HandednessEstimate(fits=fits), fit).log_odds for fits in (-4.0, 0.0, 1.0, 4.0)
     ]
@@ -112,7 +111,7 @@ def test_two_hands_are_of_different_sides_the_more_surely_the_surer_one_of_them_
 
 
 def test_of_two_hands_what_is_seen_of_both_says_which_is_of_the_given_side() -> None:
-    fit = handedness_settings(given=2.0, partner=2.0)
+    fit = HandednessSettings(given=2.0, partner=2.0)
     given = HandednessEstimate(given=True, prior=2.0, fits=-0.3)
     assert given.alone(fit).seems("right") > 0.8
     seems = [given.beside(HandednessEstimate(fits=fits), fit).seems("right") for fits in (-2, 0, 2)]
@@ -125,7 +124,7 @@ def test_of_two_hands_what_is_seen_of_both_says_which_is_of_the_given_side() -> 
 
 
 def test_of_two_hands_of_given_sides_either_speaks_for_the_other() -> None:
-    fit = handedness_settings(given=2.0, partner=2.0)
+    fit = HandednessSettings(given=2.0, partner=2.0)
     left = HandednessEstimate(given=True, prior=-2.0, fits=-3.0)
     right = HandednessEstimate(given=True, prior=2.0, fits=-2.5)
     assert right.alone(fit).seems("right") < 0.4 < 0.8 < right.beside(left, fit).seems("right")
@@ -134,7 +133,7 @@ def test_of_two_hands_of_given_sides_either_speaks_for_the_other() -> None:
 
 
 def test_what_was_there_before_is_of_the_given_side_only_if_it_clearly_seems_so() -> None:
-    fit = handedness_settings(weight=1.0)
+    fit = HandednessSettings(weight=1.0)
     for side, sign in (("right", 1), ("left", -1)):
         new = HandednessEstimate(given=True, prior=2.0 * sign).stranger(side)
         assert 0.08 < new.seems(side) < 0.2 and new.left(fit).seems(side) > 0.8

@@ -227,7 +227,6 @@ def test_a_mirrored_sequence_of_a_left_hand_gives_the_same_error(default: Run) -
         ("filter.spread.depth_m=far", "filter.spread.depth_m=far is not possible"),
         ("lost.believe=60", "lost.believe=60 is not possible; give a number of at least 0 and at"),
         ("lost.patience=-1", "lost.patience=-1 is not possible"),
-        ("hand.adapt.alike=2", "hand.adapt.alike=2 is not possible"),
         ("renderer=opengl", "renderer=opengl is unknown"),
         ("compute=tpu", "compute=tpu is unknown"),
         ("hand.side=both", "hand.side"),

@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.configured import handedness_settings
 from helpers.rendered import hand_at, right_hand_model, track_of
 from helpers.tracking import configuration, sample
 from helpers.two_hands import beside_its_mirror
 
 from toftrack.api import build_hands_tracker
 from toftrack.estimate import Estimate
-from toftrack.tracking.handedness import HandednessEstimate
+from toftrack.tracking.handedness import HandednessEstimate, HandednessSettings
 from toftrack.tracking.hands import partnered
 from toftrack.tracking.seeking import due_slots
 from toftrack.tracking.state import TrackerState
@@ -70,7 +69,7 @@ def with_evidence(state: TrackerState, slot: int, **changes: object) -> TrackerS
 
 
 def test_what_is_surely_of_the_other_side_is_followed_as_the_other_hand() -> None:
-    settings = handedness_settings()
+    settings = HandednessSettings()
     unsure = watched_over(with_evidence(watching(True, False), 0, fits=-2.5), settings)
     assert unsure.hands[0].track is not None
     after = watched_over(with_evidence(watching(True, False), 0, fits=-6.0), settings)
@@ -103,10 +102,10 @@ def test_of_two_hands_of_the_given_side_only_a_sure_one_is_reported(
 def test_only_a_hand_that_was_never_beside_the_first_one_can_be_it_after_all() -> None:
     state = with_evidence(watching(False, True), 1, fits=5.0)
     known = replace(state.hands[1], side="right")
-    after = watched_over(replace(state, hands=(state.hands[0], known)), handedness_settings())
+    after = watched_over(replace(state, hands=(state.hands[0], known)), HandednessSettings())
     assert after.hands[0].track is not None and after.hands[1].track is None
     beside = replace(known, beside=True)
-    after = watched_over(replace(state, hands=(state.hands[0], beside)), handedness_settings())
+    after = watched_over(replace(state, hands=(state.hands[0], beside)), HandednessSettings())
     assert after.hands[0].track is None and after.hands[1].track is not None
 
 
@@ -130,12 +129,12 @@ def test_where_no_side_was_given_a_hand_that_comes_back_is_the_first_one_again(
     first = replace(first, handedness=HandednessEstimate(given=False), seen=seen)
     track = replace(other.track, believed=True)
     other = replace(other, side=first.side, beside=beside, track=track)
-    after = watched_over(replace(state, hands=(first, other)), handedness_settings())
+    after = watched_over(replace(state, hands=(first, other)), HandednessSettings())
     assert (after.hands[0].track is track) == back
 
 
 def test_of_two_hands_the_one_that_rather_is_of_the_given_side_is_the_first() -> None:
-    settings = handedness_settings()
+    settings = HandednessSettings()
     state = with_evidence(watching(True, True), 0, fits=-0.6)
     state = with_evidence(state, 1, fits=0.6, comparisons=3)
     given, other = partnered(
@@ -180,21 +179,24 @@ def test_a_first_hand_that_nobody_believed_makes_way_for_one_that_rather_is_it(
     assert given.track is not None and other.track is not None
     given = replace(given, track=replace(given.track, believed=believed))
     other = replace(other, side="right", beside=beside, track=replace(other.track, believed=beside))
-    after = watched_over(replace(state, hands=(given, other)), handedness_settings())
+    after = watched_over(replace(state, hands=(given, other)), HandednessSettings())
     assert (after.hands[0].track is other.track) is exchanged
 
 
 def follow(depth_m: np.ndarray, k: np.ndarray, *overrides: str) -> list[Estimate]:
+    """The first slot's estimates, another hand being looked for every 0.1 s."""
     tracker = build_hands_tracker(configuration(*SMALL, *overrides))
+    often = replace(tracker.model.configured, handedness=HandednessSettings(watch_s=0.1))
+    tracker.model = replace(tracker.model, configured=often)
     return [tracker.step(depth, k, i, i / 25)[0] for i, depth in enumerate(depth_m)]
 
 
 def test_the_other_hand_is_not_taken_for_one_that_has_left() -> None:
-    rows, watch = range(14, 32), "hand.sides.watch_s=0.1"
+    rows = range(14, 32)
     both = beside_its_mirror(sample().cut(*rows), 30)
     alone = np.where(both.depth_m == sample().cut(*rows).depth_m, 1.5, both.depth_m)
     depth = np.concatenate((both.depth_m[:8], alone[8:]))
-    found = follow(depth.astype(np.float32), both.k, "hand.side=right", watch)
+    found = follow(depth.astype(np.float32), both.k, "hand.side=right")
     off = [np.linalg.norm(found[i].joints_m - both.joints_m[0, i], axis=1).mean() for i in range(8)]
     assert not any(e.lost for e in found[3:8]) and max(off[3:8]) < 0.03
     assert all(e.lost for e in found[12:])

@@ -103,8 +103,7 @@ def programs(two_hands: Sequence[str] = ()) -> list[Program]:
             if device.truth is None:
                 raise ToftrackError(f"{path}: there is no truth in it; give a recording that has")
             side = device.truth.side
-        alone = (f"hand.side={side}", "hand.sides.watch_s=1e9")
-        found.append(Program(f"{name}, one hand", alone, str(path), hands=1))
+        found.append(Program(f"{name}, one hand", (f"hand.side={side}",), str(path), hands=1))
         found.append(Program(f"{name}, both", (f"hand.side={side}", "hands=2"), str(path), hands=2))
     return found
 

@@ -35,8 +35,6 @@ _ABOVE_ZERO = frozenset(
     gestures.flexion_rad gestures.off_rad gestures.other gestures.pinch.open gestures.split_rad
     gestures.thumb_rad gestures.tips_palms
     hands
-    hand.adapt.certain_poses hand.adapt.contradiction hand.adapt.length_sigma hand.adapt.memory
-    hand.adapt.sure_m hand.adapt.keypoints
     hand.length_m
     likelihood.beta likelihood.tolerance_m
     lost.joints.scale
@@ -44,7 +42,6 @@ _ABOVE_ZERO = frozenset(
     record_limit_gb
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
     detector.hypotheses detector.keypoint_m detector.keypoint_sigmas detector.places
-    hysteresis.place_frames hysteresis.place_m
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz
@@ -77,7 +74,7 @@ _OF_PAPER = {
     "lost._target_": ("toftrack.tracking.paper.ScoreThreshold", "lost=never"),
 }
 """Likewise the paper's."""
-_GROUPS = {"detector": "network", "posterior": "default", "hysteresis": "default"}
+_GROUPS = {"detector": "network", "posterior": "default"}
 """Groups that a tracker needs, and their usual choices; the paper's needs the first alone."""
 _NOWHERE = object()
 _NO_NETWORKS = "toftrack.detector.hand_detector.no_detector"

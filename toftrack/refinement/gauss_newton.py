@@ -30,7 +30,6 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement.seen_points import SeenPoints
-from toftrack.refinement.steadying import Steadying
 
 # The joints of the 21 angles: (finger, bone that moves first, is it an abduction).
 _JOINTS = [
@@ -80,7 +79,6 @@ class Refinement:
     point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
         ones count more.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
-    steadying: how much of a change from frame to frame is believed.
     """
 
     iterations: int
@@ -90,7 +88,6 @@ class Refinement:
     silhouette_px: float
     angle_rad: float
     damping: float
-    steadying: Steadying
 
     def __post_init__(self) -> None:
         for name, least in (("iterations", 0), ("points", 1)):

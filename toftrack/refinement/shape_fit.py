@@ -30,7 +30,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.rotations import rotation_matrix, rotvec_to_rotmat
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
@@ -77,25 +76,26 @@ class SeenHand(Protocol):
 
 @dataclass(frozen=True)
 class ShapeFit:
-    """How the shape is fitted; see conf/hand for what each does.
+    """How the shape is fitted.
 
-    fixed: it is not, and stays as it is configured.
+    sure_m: deviation of the keypoints in a frame that counts fully; see above.
+    length_sigma: error of the network's log length in such a frame.
+    keypoints: times that the keypoints count by what the refinement takes them for.
+    alike: part of a frame's error that all frames of a hand share.
+    certain_poses: different poses seen as surely as that, from which on the shape stays.
+    contradiction, memory: the fit is begun anew when the network's lengths are off by so many
+        expected errors over about so many detections, one in _EVERY frames.
+    fixed: the shape is not fitted, and stays as it is configured.
     """
 
-    sure_m: float
-    length_sigma: float
-    keypoints: float
-    alike: float
-    certain_poses: float
-    contradiction: float
-    memory: float
+    sure_m: float = 0.004
+    length_sigma: float = 0.03
+    keypoints: float = 4.0
+    alike: float = 0.65
+    certain_poses: float = 12
+    contradiction: float = 3.5
+    memory: float = 20
     fixed: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("sure_m", "length_sigma", "keypoints", "certain_poses", "contradiction"):
-            check_number(f"hand.adapt.{name}", getattr(self, name), 0, above=True)
-        check_number("hand.adapt.alike", self.alike, 0, 1)
-        check_number("hand.adapt.memory", self.memory, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.motions import Motions
 from toftrack.compute.pace import FRAME_S
 from toftrack.hand.skeleton import ANGLE_NAMES, FINGERS
@@ -28,16 +27,11 @@ class Steadying:
         movement more surely and later.
     """
 
-    translation_m: float
-    rotation_rad: float
-    finger_rad: float
-    calm: float
-    memory: float
-
-    def __post_init__(self) -> None:
-        for name in ("translation_m", "rotation_rad", "finger_rad", "calm"):
-            check_number(f"refine.steadying.{name}", getattr(self, name), 0)
-        check_number("refine.steadying.memory", self.memory, 0, 1)
+    translation_m: float = 0.003
+    rotation_rad: float = 0.03
+    finger_rad: float = 0.12
+    calm: float = 4.0
+    memory: float = 0.85
 
 
 def steadied(
@@ -45,8 +39,8 @@ def steadied(
     before: Tensor,
     trend: Tensor,
     dt_s: float,
-    settings: Steadying,
     motions: Motions,
+    settings: Steadying = Steadying(),
 ) -> tuple[Tensor, Tensor]:
     """Take less of a change the more it looks like noise, so that a still hand does not tremble.
 

@@ -9,11 +9,10 @@ it is right more often, but it believes a wrong pose whose crop it sees.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toftrack.checks import check_number
 from toftrack.frames import DepthImage
 
 _BODY_COMPARISONS = 20
@@ -36,30 +35,41 @@ OTHER_SIDE = {"right": "left", "left": "right"}
 
 @dataclass(frozen=True)
 class HandednessSettings:
-    """How the side is detected; see conf/hand for what each does."""
+    """How the side is detected.
 
-    weight: float
-    largest: float
-    keypoints: float
-    network: float
-    most: float
-    kept: float
-    shoulder: float
-    shoulder_most: float
-    partner: float
-    sure: float
-    interval_unsure_s: float
-    interval_sure_s: float
-    given: float
-    interval_given_s: float
-    other: float
-    watch_s: float
+    weight, largest: a comparison counts `weight` times the difference of the log posteriors, at
+        most `largest`.
+    keypoints: weight of the keypoints in a comparison; little, for the network sees a hand of
+        either side where it looks for one.
+    network: weight of the difference of the network's own log odds of the two sides.
+    most: log odds that are never exceeded.  kept: likewise when the hand has left.
+    shoulder: log odds for each m that the body is beside the hand: people face the camera.
+    shoulder_most: they are never more.
+    partner: log odds that two hands which are tracked at once are of different sides.
+    sure: probability from which on the sides are compared less often.
+    interval_unsure_s, interval_sure_s, interval_given_s: seconds between two comparisons while
+        unsure, while sure, and while a given side is sure.
+    given: log odds that a given side is that of what is followed, before anything is compared.
+    other: probability below which what is followed is not the hand of the given side.
+    watch_s: seconds between two searches for another hand than the one that is followed.
+    """
 
-    def __post_init__(self) -> None:
-        limits = {"sure": (0.5, 0.999), "other": (0, 0.5)}
-        for entry in fields(self):
-            least, most = limits.get(entry.name, (0, math.inf))
-            check_number(f"hand.sides.{entry.name}", getattr(self, entry.name), least, most)
+    weight: float = 2.0
+    largest: float = 3.0
+    keypoints: float = 0.1
+    network: float = 0.03
+    most: float = 6.0
+    kept: float = 1.4
+    shoulder: float = 10.0
+    shoulder_most: float = 1.0
+    partner: float = 2.0
+    sure: float = 0.95
+    interval_unsure_s: float = 0.08
+    interval_sure_s: float = 0.4
+    given: float = 2.0
+    interval_given_s: float = 1.2
+    other: float = 0.08
+    watch_s: float = 2.0
 
 
 @dataclass(frozen=True)

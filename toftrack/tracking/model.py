@@ -28,7 +28,6 @@ from toftrack.tracking.backend import Backend
 from toftrack.tracking.confidence import ConfidenceModel
 from toftrack.tracking.handedness import OTHER_SIDE, HandednessEstimate, HandednessSettings
 from toftrack.tracking.posterior import PosteriorWeights
-from toftrack.tracking.select import Hysteresis
 from toftrack.tracking.state import HandState, LastSeen, TrackerState
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
@@ -49,18 +48,16 @@ class Hand:
 
     shape: HandShape
     fit: ShapeFit
-    handedness: HandednessSettings
     side_given: bool
+    handedness: HandednessSettings = HandednessSettings()
 
 
-def make_hand(
-    shape: str, side: str, length_m: float, adapt: ShapeFit, sides: HandednessSettings
-) -> Hand:
+def make_hand(shape: str, side: str, length_m: float) -> Hand:
     """See toftrack.hand.make_hand_shape; only shape="auto" is fitted, and only side="auto"
     detected: it begins as a right hand.
     """
     made = make_hand_shape(shape, "right" if side == "auto" else side, length_m)
-    return Hand(made, replace(adapt, fixed=shape != "auto"), sides, side != "auto")
+    return Hand(made, ShapeFit(fixed=shape != "auto"), side != "auto")
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,14 +186,13 @@ class FilterModel:
 class TrackerModel(FilterModel):
     """The parts of the tracker with networks.
 
-    weights: of the terms of the posterior.  hysteresis: when another pose takes over.
+    weights: of the terms of the posterior.
     lost: when an estimate is not to be used, and its track is given up.
     """
 
     detector: HandDetector
     refinement: Refinement
     weights: PosteriorWeights
-    hysteresis: Hysteresis
     lost: ConfidenceModel
 
     def at_quality(self, quality: Quality) -> TrackerModel:

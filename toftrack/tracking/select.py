@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.pace import Duration
 
 _WORST = -1e6
@@ -72,16 +71,18 @@ class Hypotheses:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """When another pose takes over; see conf/hysteresis for what each does."""
+    """When a pose of the detector takes over.
 
-    place_m: float
-    place_lead: float
-    place_frames: int
+    margin: by so much its log posterior must be better than that of the last frame's fingers, or
+        neighbouring fingers change places from frame to frame (on fresh draws swaps -0.6 points).
+    place_m, place_lead, place_frames: one that is, on average over the joints, at least so many
+        metres away must be better by so much in so many frames without a break.
+    """
 
-    def __post_init__(self) -> None:
-        check_number("hysteresis.place_m", self.place_m, 0, above=True)
-        check_number("hysteresis.place_lead", self.place_lead, 0)
-        check_number("hysteresis.place_frames", self.place_frames, 1, whole=True)
+    margin: float = 0.02
+    place_m: float = 0.02
+    place_lead: float = 0.03
+    place_frames: int = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +119,14 @@ def select(
     dt_s: float,
     detected: bool,
     hidden: bool,
-    settings: Hysteresis,
+    settings: Hysteresis = Hysteresis(),
 ) -> Choice:
     """The pose of one hand in a frame.
 
-    The best of all hypotheses, but for those of the detector at another place than the best of the
-    filter's: such a one takes over when it was better by `place_lead` in `place_frames` frames, or
-    at once where a hand emerges; while something hides the hand, only with a large lead.
+    The best of all hypotheses, those of the detector with a margin, but for its hypotheses at
+    another place than the best of the filter's: such a one takes over when it was better by
+    `place_lead` in `place_frames` frames, or at once where a hand emerges; while something hides
+    the hand, only with a large lead.
 
     table: the hand's hypotheses, scored.  joints_m: (N, 21, 3) of them.
     dt_s: since the last frame.  detected: the detector was asked in this frame.
@@ -134,8 +136,9 @@ def select(
     values = np.maximum(table.log_posterior.numpy(), _WORST)
     base = _best_of(values, source <= Source.DYNAMICS)
     score = values - values[base]
-    elsewhere = _distances(joints, joints[base]).mean(1) >= settings.place_m
-    elsewhere &= source == Source.DETECTOR
+    detectors = source == Source.DETECTOR
+    away = np.sqrt(np.square(joints - joints[base]).sum(-1)).mean(1)
+    elsewhere = detectors & (away >= settings.place_m)
     best, challenged = _best_of(score, elsewhere), incumbent.challenged
     if detected:
         lead = float(score[best]) if best >= 0 else -math.inf
@@ -145,16 +148,10 @@ def select(
         at_once = incumbent.new or incumbent.emerges
         if leads and (at_once or challenged.reached(settings.place_frames)):
             return Choice(table.pose[best][None], True, Duration())
-    best = _best_of(score, ~elsewhere)
+    best = _best_of(score - settings.margin * detectors, ~elsewhere)
     return Choice(table.pose[best][None], False, challenged)
 
 
 def _best_of(values: np.ndarray, mask: np.ndarray) -> int:
     """The row of the largest value under a mask; -1 where the mask has none."""
     return int(np.where(mask, values, -np.inf).argmax()) if mask.any() else -1
-
-
-def _distances(joints_m: np.ndarray, from_m: np.ndarray) -> np.ndarray:
-    """(N, 21) how far the joints of hands (N, 21, 3) are from another hand's (21, 3)."""
-    away: np.ndarray = np.sqrt(np.square(joints_m - from_m).sum(-1))
-    return away

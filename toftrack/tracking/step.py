@@ -222,8 +222,8 @@ def choose(filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
     frame, track = filtered.frame, filtered.frame.track
     joints = frame.fitted.refiner.joints
     incumbent = Incumbent(track.challenged, not track.age.begun, filtered.emerges)
-    asked, settings = not frame.detection.empty, frame.model.hysteresis
-    return select(table, joints(table.pose), incumbent, dt_s, asked, filtered.hidden, settings)
+    asked = not frame.detection.empty
+    return select(table, joints(table.pose), incumbent, dt_s, asked, filtered.hidden)
 
 
 def conclude(
@@ -237,8 +237,7 @@ def conclude(
         track = replace(begun, believed=track.believed, flagged_s=track.flagged_s)
         trend = begun.trend
     elif model.refinement.iterations:
-        steadying, motions = model.refinement.steadying, model.backend.motions
-        pose, trend = steadied(pose, track.pose, trend, dt_s, steadying, motions)
+        pose, trend = steadied(pose, track.pose, trend, dt_s, model.backend.motions)
     track = replace(track, challenged=choice.challenged)
     found = Found(filtered, pose, trend, *model.nearest(pose))
     score, joints = frame.image.score(pose), frame.fitted.refiner.joints(pose)[0]
