@@ -23,9 +23,11 @@ from toftrack.archives import (
     write_archive,
 )
 
-STORED, DEFLATED = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED
+STORED, DEFLATED, BZIP2 = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2
 ZEROS = bytes(2**20)
-every_method = pytest.mark.parametrize("method", [STORED, DEFLATED], ids=["stored", "deflate"])
+every_method = pytest.mark.parametrize(
+    "method", [STORED, DEFLATED, BZIP2], ids=["stored", "deflate", "bzip2"]
+)
 
 
 def npy(array: Any) -> bytes:
@@ -168,10 +170,25 @@ def test_an_array_beyond_the_cap_is_refused(
         Archive(stream).read("a", 100)
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_other_compressions_are_refused(tmp_path: Path, method: int) -> None:
-    path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, method)
+def test_other_compressions_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_LZMA)
     assert "'a': its compression is not read; save it with numpy.savez" in reported(path)
+
+
+def test_what_bzip2_packed_a_million_times_smaller_than_the_directory_says_is_not_unpacked(
+    tmp_path: Path,
+) -> None:
+    path = save(tmp_path / "a.npz", {"a": [header((2**30,), "<u1"), *[ZEROS] * 1024]}, BZIP2)
+    whole = path.read_bytes()
+    size = struct.pack("<I", 2**30 + len(header((2**30,), "<u1")))
+    assert size in whole
+    small = npy(np.zeros(1000, np.uint8))
+    path.write_bytes(whole.replace(size, struct.pack("<I", len(small))))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="'a': it is of another length"):
+        read_archive(path)
+    assert tracemalloc.get_traced_memory()[1] < 1e7
+    tracemalloc.stop()
 
 
 @every_method

@@ -25,7 +25,7 @@ def followed(states: list[torch.Tensor], settings: Steadying = SETTINGS) -> torc
     """(T, 27) the steadied states."""
     believed, trend, path = states[0], torch.full((27,), torch.nan), [states[0]]
     for state in states[1:]:
-        believed, trend = steadied(state, believed, trend, FRAME_S, settings, rigid.MOTIONS)
+        believed, trend = steadied(state, believed, trend, FRAME_S, rigid.MOTIONS, settings)
         path.append(believed)
     return torch.cat(path)
 
