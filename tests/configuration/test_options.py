@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from helpers import fake_orbbec, fake_realsense
+from helpers import fake_orbbec
 from helpers.bags import recording, write_bag
 from helpers.tracking import CONF, ROOT, configuration
 from omegaconf import DictConfig, OmegaConf
@@ -67,6 +67,7 @@ def given_for(folder: Path) -> dict[tuple[str, str], list[str]]:
         ("device", "replay"): [f"device.path={sample}"],
         ("device", "folder"): [f"device.path={images}"],
         ("device", "sr3000"): ["device.transport=emulated"],  # there is no camera here
+        ("device", "realsense"): ["device.transport=emulated"],
         ("data", "file"): [f"data.path={folder / 'poses.csv'}"],
         ("data", "leap"): [f"data.path={folder / 'leap.npz'}"],
         ("data", "run"): [f"data.path={folder}"],
@@ -89,10 +90,9 @@ def test_every_option_composes_and_can_be_made(
     if (group, option) in OF_EXTRAS:
         package, extra = OF_EXTRAS[group, option]
         pytest.importorskip(package, reason=f"pip install '.[{extra}]'")
-    # A camera like none, so that realsense.yaml needs neither its SDK nor a camera here.
-    camera = fake_realsense.Camera("1", [fake_realsense.Profile("depth", "z16", (640, 480))], [])
-    monkeypatch.setitem(sys.modules, "pyrealsense2", fake_realsense.Sdk(camera))
-    femto = fake_orbbec.Camera("1", {fake_orbbec.DEPTH: [fake_orbbec.Profile("y16")]})
+    if option == "realsense":
+        pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
+    femto = fake_orbbec.Camera("1", {fake_orbbec.DEPTH: [fake_orbbec.profile("y16")]})
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", fake_orbbec.Sdk(femto))
     given = given_for(tmp_path).get((group, option), []) + FASTER.get(option, [])
     if option == "rosbag":

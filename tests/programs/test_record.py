@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_orbbec import DEPTH, IR, Image, Images, Profile, Sdk
+from helpers.fake_orbbec import DEPTH, IR, Images, Sdk, image, profile
 from helpers.fake_orbbec import Camera as FakeCamera
 from helpers.programs import QUICK, interrupted_when
 from helpers.settings import orbbec, realsense, realsense_emulator, sr3000, sr3000_emulator
@@ -46,8 +46,8 @@ def a_realsense(monkeypatch: pytest.MonkeyPatch) -> Device:
 
 def an_orbbec(monkeypatch: pytest.MonkeyPatch) -> Device:
     lens = (0.1, -0.2, 0.05, 0.3, -0.04, 0.01, 0.001, -0.002)
-    profiles = {DEPTH: [Profile("y16", lens=lens)], IR: [Profile("y8")]}
-    sets = [Images(Image(n, "depth"), Image(n, "ir", np.uint8)) for n in (150, 151, 152, 154, 155)]
+    profiles = {DEPTH: [profile("y16", lens=lens)], IR: [profile("y8")]}
+    sets = [Images(image(n), image(n, np.uint8)) for n in (150, 151, 152, 154, 155)]
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", Sdk(FakeCamera("0042", profiles, sets)))
     return orbbec(keep="every", stop=FEW)
 
