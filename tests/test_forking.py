@@ -74,7 +74,7 @@ def test_a_fork_waits_until_another_thread_has_compiled() -> None:
     begun, go_on = threading.Event(), threading.Event()
 
     def compile_something() -> None:
-        with compiling.announced("compiling"):
+        with compiling.lock:
             begun.set()
             go_on.wait(_LIMIT_S)
 
@@ -84,7 +84,7 @@ def test_a_fork_waits_until_another_thread_has_compiled() -> None:
     threading.Timer(0.1, go_on.set).start()
     child = os.fork()
     if child == 0:
-        with compiling.announced("compiling"):
+        with compiling.lock:
             os._exit(7)
     thread.join()
     assert _status(child) == 7

@@ -1,94 +1,191 @@
-"""Compiling a kernel is announced if it takes long, and where its code cannot be kept."""
+"""What is wrong with the cache of the kernels costs compiling and a sentence, no run."""
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import logging
-import pkgutil
+import os
+import pickle
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
-from numba.core.dispatcher import Dispatcher
-from numba.core.extending import _Intrinsic
 
-import toftrack
 from toftrack.compute import compiling
-from toftrack.compute.compiling import announced
+from toftrack.compute.compiling import Kernel, compiled, entry_point
+
+FACTOR = 2.0
 
 
-@pytest.mark.parametrize(("silent_s", "reported"), [(0.0, ["compiling"]), (1000.0, [])])
-def test_only_what_takes_long_is_announced(
-    silent_s: float,
-    reported: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+@compiled
+def _times_factor(value):
+    return FACTOR * value
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Of the kernels, which is empty; and nothing has been said yet."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(compiling, "_said", set())
+    yield tmp_path / "toftrack" / "kernels"
+
+
+def _made() -> Kernel:
+    """The same kernel as a process has it that starts."""
+    compiling._said.clear()
+
+    @entry_point
+    def doubled(values):
+        for i in range(len(values)):
+            values[i] = _times_factor(values[i])
+
+    return doubled
+
+
+def _is_loaded() -> bool:
+    """Run the kernel in a new process, which must work; whether its code was on the disk."""
+    kernel, values = _made(), np.arange(3.0)
+    kernel(values)
+    assert values.tolist() == [0, FACTOR, 2 * FACTOR]
+    return bool(kernel.dispatcher.stats.cache_hits)
+
+
+def _files(folder: Path) -> list[Path]:
+    return [file for file in folder.rglob("*") if file.is_file()]
+
+
+def test_a_kernel_is_compiled_once_for_all_runs(folder: Path, caplog) -> None:
+    kernel = _made()
+    assert not kernel.is_compiled
+    kernel(np.arange(3.0))
+    assert kernel.is_compiled and len(_files(folder)) == 2
+    assert _is_loaded() and not caplog.messages
+    assert str(folder.parents[1]) == numba.config.CACHE_DIR, "for the kernels of others"
+
+
+def test_a_changed_constant_compiles_a_kernel_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not _is_loaded() and _is_loaded()
+    before = compiling._fingerprint(_made().function)
+    monkeypatch.setattr(sys.modules[__name__], "FACTOR", 3.0)
+    assert compiling._fingerprint(_made().function) != before
+
+
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda file: file.write_bytes(b""),
+        lambda file: file.write_bytes(os.urandom(500)),
+        lambda file: file.write_bytes(file.read_bytes()[:-100]),
+        lambda file: file.write_bytes(pickle.dumps(("nothing", "that", "numba", "knows"))),
+    ],
+    ids=["empty", "garbage", "cut", "other"],
+)
+def test_a_damaged_kernel_is_compiled_anew_and_reported_once(
+    damage: Callable[[Path], object], kind: str, folder: Path, caplog
 ) -> None:
+    assert not _is_loaded()
+    (file,) = folder.rglob(f"*.{kind}")
+    damage(file)
+    assert not _is_loaded()
+    # An index that is of another version is none.
+    assert len(caplog.messages) == 1 or (kind == "nbi" and not caplog.messages)
+    assert all("damaged" in message for message in caplog.messages)
+    assert _is_loaded(), "it was mended"
+
+
+def test_what_stands_in_the_way_of_a_kernel_is_reported(folder: Path, caplog) -> None:
+    assert not _is_loaded()
+    (file,) = folder.rglob("*.nbi")
+    file.unlink()
+    file.mkdir()
+    assert not _is_loaded()
+    (message,) = caplog.messages
+    assert str(file) in message
+
+
+def test_where_it_cannot_be_written_every_run_compiles_and_says_why(folder: Path, caplog) -> None:
+    folder.parent.mkdir()
+    folder.write_bytes(b"mine")
+    for _ in range(2):
+        caplog.clear()
+        assert not _is_loaded()
+        (message,) = caplog.messages
+        assert str(folder) in message and "NUMBA_CACHE_DIR" in message
+    assert folder.read_bytes() == b"mine"
+
+
+def test_a_full_disk_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch, caplog) -> None:
+    def replace(source: str, target: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", replace)
+    assert not _is_loaded()
+    (message,) = caplog.messages
+    assert "No space left on device" in message and not _files(folder)
+
+
+class _Executed:
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows says it otherwise")
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o750, None])
+def test_what_others_could_have_written_is_never_unpickled(
+    mode: int | None, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    assert not _is_loaded()
+    for file in _files(folder):
+        file.write_bytes(pickle.dumps(_Executed(tmp_path / "executed")))
+    if mode is not None:
+        folder.chmod(mode)
+    elif os.geteuid() == 0:
+        os.chown(folder, 12345, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    assert not _is_loaded()
+    assert not (tmp_path / "executed").exists()
+    (message,) = caplog.messages
+    assert "closed to others" in message and str(folder) in message
+
+
+def test_an_error_of_a_kernel_s_own_is_raised() -> None:
+    @entry_point
+    def wrong(values):
+        values[0] = values + "text"
+
+    with pytest.raises(numba.TypingError):
+        wrong(np.zeros(1))
+
+
+@pytest.mark.parametrize(("silent_s", "kept"), [(0.0, True), (0.0, False), (1000.0, True)])
+def test_only_what_takes_long_is_announced(
+    silent_s: float, kept: bool, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    if not kept:
+        folder.parent.mkdir()
+        folder.touch()
     monkeypatch.setattr(compiling, "_SILENT_S", silent_s)
     caplog.set_level(logging.INFO)
-    with announced("compiling"):
-        deadline = time.monotonic() + 20
-        while len(caplog.messages) < len(reported) and time.monotonic() < deadline:
-            time.sleep(0.01)
-    assert caplog.messages == reported
+    _made()(np.arange(3.0))
+    deadline = time.monotonic() + 20
+    while silent_s == 0 and "compiling" not in compiling._said and time.monotonic() < deadline:
+        time.sleep(0.01)
+    announced = [message for message in caplog.messages if message.startswith("compiling kernels")]
+    assert len(announced) == (silent_s == 0)
+    assert all(("once on a machine" in message) == kept for message in announced)
 
 
-def test_where_the_code_cannot_be_kept_it_is_said_to_be_compiled_in_every_run(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_kernels_are_kept_in_the_user_s_cache_not_in_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compiling, "can_be_kept", lambda: False)
-    monkeypatch.setattr(compiling, "_SILENT_S", 0.0)
-    caplog.set_level(logging.INFO)
-    with announced("compiling (once, about 6 s)"):
-        deadline = time.monotonic() + 20
-        while not caplog.messages and time.monotonic() < deadline:
-            time.sleep(0.01)
-    assert caplog.messages == ["compiling (in every run, about 6 s)"]
-
-
-def _made_of(function: Callable, seen: set[Callable]) -> set[Callable]:
-    """All that a kernel calls, itself included, through any number of others."""
-    if function not in seen:
-        seen.add(function)
-        captured = inspect.getclosurevars(function)
-        for value in (*captured.globals.values(), *captured.nonlocals.values()):
-            if isinstance(value, Dispatcher):
-                _made_of(value.py_func, seen)
-            elif isinstance(value, _Intrinsic):
-                seen.add(value._defn)
-    return seen
-
-
-def test_a_change_in_any_file_that_a_kernel_is_made_of_compiles_it_anew() -> None:
-    kernels: dict[Callable, frozenset[str]] = {}
-    for found in pkgutil.walk_packages(toftrack.__path__, "toftrack."):
-        if "numba" in found.name or found.name == "toftrack.detector.pictures":
-            for value in vars(importlib.import_module(found.name)).values():
-                if isinstance(value, Dispatcher) and hasattr(value, "sources"):
-                    kernels[value.py_func] = value.sources
-    assert len(kernels) > 10
-    for kernel, sources in kernels.items():
-        files = {str(Path(inspect.getfile(part)).resolve()) for part in _made_of(kernel, set())}
-        assert files <= sources, f"{kernel.__qualname__} is also made of {files - sources}"
-
-
-@pytest.mark.parametrize("shape", [5, (3, 4), (2, 0, 3)])
-@pytest.mark.parametrize("dtype", [np.float32, np.int64, np.uint8])
-def test_a_kernel_s_arrays_are_numpy_s_also_where_numba_lacks_what_makes_them_quickly(
-    shape: int | tuple[int, ...], dtype: type
-) -> None:
-    def made(empty: Callable, zeros: Callable) -> tuple[np.ndarray, np.ndarray]:
-        return numba.njit(lambda size: (empty(size, dtype), zeros(size, dtype)))(shape)
-
-    expected = np.zeros(shape, dtype)
-    for empty, zeros in (
-        made(compiling.empty, compiling.zeros),
-        made(compiling.plain_empty, compiling.plain_zeros),
-    ):
-        assert empty.shape == expected.shape and empty.dtype == expected.dtype
-        assert empty.flags.c_contiguous and zeros.flags.c_contiguous
-        np.testing.assert_array_equal(zeros, expected)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME", str(tmp_path))
+    assert compiling._private_folder() == tmp_path / "toftrack" / "kernels"

@@ -18,10 +18,8 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-_cached = entry_point(__file__, rigid_numba.__file__)
 
-
-@_cached
+@entry_point
 def _rotations(before, after, back, turned):
     """Products of rotations, and a vector turned by them, through quaternions."""
     for i in range(len(before)):
@@ -34,7 +32,7 @@ def _rotations(before, after, back, turned):
             back[i, j], turned[i, j] = vector[j], x[j]
 
 
-@_cached
+@entry_point
 def _pose(state, base_frames, base, lengths, mirror, frames, joints):
     rigid_numba.pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
 
@@ -43,7 +41,7 @@ def particles(n: int, size: float, seed: int) -> Tensor:
     return size * torch.randn(n, 10, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("motions", [rigid.MOTIONS, rigid_numba.motions()], ids=["torch", "numba"])
+@pytest.mark.parametrize("motions", [rigid.MOTIONS, rigid_numba.MOTIONS], ids=["torch", "numba"])
 def test_an_offset_leads_back_to_where_it_was_taken(motions) -> None:
     reference, moved = particles(1, 0.5, 0), particles(40, 0.5, 1)
     found = motions.compose(reference, motions.difference(moved, reference))
@@ -52,7 +50,7 @@ def test_an_offset_leads_back_to_where_it_was_taken(motions) -> None:
     torch.testing.assert_close(still, torch.zeros_like(still), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("motions", [rigid.MOTIONS, rigid_numba.motions()], ids=["torch", "numba"])
+@pytest.mark.parametrize("motions", [rigid.MOTIONS, rigid_numba.MOTIONS], ids=["torch", "numba"])
 def test_turning_leaves_the_middle_of_the_hand_where_it_is(motions) -> None:
     reference, tangent = particles(20, 0.5, 2), torch.zeros(20, 10)
     tangent[:, 3:6] = particles(20, 0.5, 3)[:, 3:6]
@@ -68,7 +66,7 @@ def test_turning_leaves_the_middle_of_the_hand_where_it_is(motions) -> None:
 @pytest.mark.parametrize("size", [0.0, 1e-4, 0.1, 1.0, 3.0])
 def test_compiled_motions_agree_with_the_reference(size: float) -> None:
     moved, tangent = particles(50, size, 4), particles(50, 0.1, 5)
-    compiled, reference = rigid_numba.motions(), rigid.MOTIONS
+    compiled, reference = rigid_numba.MOTIONS, rigid.MOTIONS
     pairs = (
         (compiled.compose(moved, tangent), reference.compose(moved, tangent)),
         (compiled.compose(moved[:1], tangent), reference.compose(moved[:1], tangent)),
@@ -84,7 +82,7 @@ def test_compiled_motions_agree_with_the_reference(size: float) -> None:
 
 
 def test_no_particles_and_those_that_are_no_numbers() -> None:
-    compiled = rigid_numba.motions()
+    compiled = rigid_numba.MOTIONS
     reference = particles(1, 0.5, 6)
     assert compiled.difference(reference[:0], reference).shape == (0, 10)
     rows = particles(3, 0.5, 7)

@@ -13,7 +13,7 @@ from toftrack.compute.compiling import entry_point
 from toftrack.compute.threads import beside, run_shared, small_operations, threads
 
 
-@entry_point(__file__, compiling.__file__)
+@entry_point
 def _count(counter, done):
     while True:
         i = compiling.take(counter)

@@ -10,13 +10,11 @@ import torch
 from helpers.configured import refinement
 from torch import Tensor
 
-from toftrack.compute import rigid_numba
 from toftrack.compute.compiling import entry_point
 from toftrack.compute.rigid_numba import pose_hand
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
-from toftrack.refinement import gauss_newton_numba
 from toftrack.refinement import residuals_numba as compiled
 from toftrack.refinement.gauss_newton import (
     Keypoints,
@@ -36,21 +34,18 @@ SETTINGS = refinement()
 SIDES = ("right", "left")
 K = np.array([[220.0, 0.0, 88.0], [0.0, 215.0, 72.0], [0.0, 0.0, 1.0]])
 
-_cached = entry_point(
-    __file__, compiled.__file__, gauss_newton_numba.__file__, rigid_numba.__file__
-)
 # What an entry point calls cannot be called from Python: one that calls it.
-_choose = _cached(lambda *a: compiled.choose_points(*a))
-_nearest = _cached(lambda *a: compiled.nearest_ellipsoids(*a))
-_add_wrench = _cached(lambda *a: compiled.add_wrench(*a))
-_add_points = _cached(lambda *a: compiled.add_points(*a))
-_add_silhouette = _cached(lambda *a: compiled.add_silhouette(*a))
-_add_landmarks = _cached(lambda *a: compiled.add_landmarks(*a))
-_assemble = _cached(lambda *a: compiled.assemble(*a))
-_solve = _cached(lambda *a: solve(*a))
+_choose = entry_point(lambda *a: compiled.choose_points(*a))
+_nearest = entry_point(lambda *a: compiled.nearest_ellipsoids(*a))
+_add_wrench = entry_point(lambda *a: compiled.add_wrench(*a))
+_add_points = entry_point(lambda *a: compiled.add_points(*a))
+_add_silhouette = entry_point(lambda *a: compiled.add_silhouette(*a))
+_add_landmarks = entry_point(lambda *a: compiled.add_landmarks(*a))
+_assemble = entry_point(lambda *a: compiled.assemble(*a))
+_solve = entry_point(lambda *a: solve(*a))
 
 
-@_cached
+@entry_point
 def _pose(state, shape, surface, hand, posed):
     base_frames, base, lengths, mirror = shape
     pose_hand(state, base_frames, base, lengths, mirror, hand[0], hand[1])

@@ -15,7 +15,7 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.render.closed_form import project
 from toftrack.render.disc import disc_square, disc_steps
-from toftrack.render.numba import hand, missed, vector, words
+from toftrack.render.numba import hand, missed
 from toftrack.render.numba.hand import LANES, TERMS
 from toftrack.render.numba.kernel import pack_evidence
 from toftrack.render.numba.scorer import NumbaScorer
@@ -41,10 +41,8 @@ ROWS = {
 WIDTH, HEIGHT = 176, 144
 K = torch.tensor([[170.0, 0.0, 88.2], [0.0, 175.0, 71.8], [0.0, 0.0, 1.0]])
 
-_cached = entry_point(__file__, *(module.__file__ for module in (hand, missed, vector, words)))
 
-
-@_cached
+@entry_point
 def _pose_and_project(
     states, slots, base, lengths, mirror, index, surface, k, size, frames, valid, out, boxes
 ):
@@ -53,7 +51,7 @@ def _pose_and_project(
     hand.project_hands(frames, index, surface, k[0], k[1], k[2], k[3], size[0], size[1], out, boxes)
 
 
-@_cached
+@entry_point
 def _count_missed(model, words, rows, reach, steps, wanted, buffer):
     return missed.count_missed(model, words, rows, reach, steps, wanted, buffer)
 

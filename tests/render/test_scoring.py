@@ -209,20 +209,6 @@ def test_wide_images():
         check(make_scorer(name, shape, CPU)(states, evidence), expected)
 
 
-def test_the_compiled_kernel_is_cached():
-    """A second process compiles nothing."""
-    make_scorer("numba", default_hand_shape(), CPU)
-    code = (
-        "from toftrack.hand.shape import default_hand_shape\n"
-        "from toftrack.render.numba.scorer import NumbaScorer, score_hands\n"
-        "NumbaScorer(default_hand_shape())\n"
-        "found = score_hands.stats\n"
-        "assert sum(found.cache_hits.values()) == 1 and not found.cache_misses, found\n"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 130), (70, 1), (9, 65)])
 def test_images_of_a_pixel_s_width(back_end, size):
     shape = default_hand_shape()

@@ -1,11 +1,17 @@
-"""How numba's kernels are compiled: once on a machine, announced if it takes long, then cached."""
+"""How numba's kernels are compiled: once on a machine, announced if it takes long, then cached.
+
+Whatever is wrong with the cache costs compiling once more and a sentence in the log, never a run.
+numba describes what it keeps by pickles, so only a folder is used that is closed to other users.
+"""
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import inspect
 import logging
 import os
 import threading
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,48 +20,171 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
-from numba.core.compiler_lock import global_compiler_lock
-from numba.extending import intrinsic, register_jitable
-from numba.np import arrayobj
-
-from toftrack.compute.kernel_cache import KernelCache, can_be_kept
-from toftrack.compute.quick_typing import quick_typing
-from toftrack.compute.whole_kernels import as_kernel, is_part
+from numba import types
+from numba.extending import intrinsic
 
 log = logging.getLogger(__name__)
 
 OPTIONS = {"fastmath": {"contract", "arcp", "nsz"}, "nogil": True, "error_model": "numpy"}
 """nnan and ninf stay off: NaN is how a kernel learns that a square root missed."""
-_part = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+compiled: Any = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Decorator of the functions that kernels call, and that Python cannot."""
 
 _SILENT_S = 1.0
-"""Taking a kernel from numba's cache is faster than this, compiling it is slower."""
-_compiling = threading.RLock()
+"""Taking a kernel from the cache is faster than this, compiling it is slower."""
+lock = threading.RLock()
+"""Of the thread that compiles."""
+_said: set[str] = set()
 
 
-def compiled(function: Callable) -> Any:
-    """Decorator of the functions that entry points call, and that nothing else can."""
-    return is_part(_part(function))
+class Kernel:
+    """A compiled function that Python calls: compiled, or taken from the cache, when it first is.
 
-
-def entry_point(*sources: str | Path | None) -> Callable:
-    """Decorator of a kernel's entry points: compiled at the first call, or from the cache.
-
-    sources: the files that the kernel is made of; a change in any of them compiles it anew.
+    Only one thread compiles at a time, so that the others do not compile the same once more.
     """
-    files = [file for file in (__file__, *sources) if file is not None]
-    checksum = zlib.crc32(b"".join(Path(file).read_bytes() for file in files))
 
-    def decorator(function: Callable) -> Callable:
-        function.__qualname__ += f"_{checksum:08x}"
-        kernel = numba.njit(**OPTIONS)(function)
-        kernel._cache = KernelCache(f"{function.__module__}.{function.__qualname__}")
-        kernel._compiler.compile = quick_typing()(as_kernel(kernel._compiler.compile))
-        kernel.sources = frozenset(str(Path(file).resolve()) for file in files)
-        return kernel
+    def __init__(self, function: Callable) -> None:
+        functools.update_wrapper(self, function)
+        self.function = function
+        self.dispatcher: Any = None
 
-    return decorator
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a call need not wait for the compiler."""
+        return self.dispatcher is not None and bool(self.dispatcher.overloads)
+
+    def __call__(self, *args: Any) -> Any:
+        """Run it."""
+        if self.is_compiled:
+            return self._run(args)
+        with lock:
+            if self.dispatcher is None:
+                self.dispatcher = _cached(self.function)
+            with _announced(self.dispatcher):
+                return self._run(args)
+
+    def _run(self, args: tuple) -> Any:
+        try:
+            return self.dispatcher(*args)
+        except Exception as error:  # whatever reading a damaged file may bring about
+            runs = tuple(map(numba.typeof, args)) in self.dispatcher.overloads
+            if isinstance(error, numba.errors.NumbaError) or (
+                runs and not isinstance(error, OSError)
+            ):
+                raise
+            _say_once(error)
+            if runs:  # it could not be kept
+                return self.dispatcher(*args)
+        try:
+            self.dispatcher.recompile()  # empties what numba has kept of it
+            return self.dispatcher(*args)
+        except OSError:
+            self.dispatcher = numba.njit(**OPTIONS)(self.function)
+            return self.dispatcher(*args)
+
+
+entry_point = Kernel
+"""Decorator of the functions that Python calls."""
+
+
+def _cached(function: Callable) -> Any:
+    """numba's function with a cache, or without one where it cannot be trusted or written."""
+    before = numba.config.CACHE_DIR
+    try:
+        folder = _private_folder() / _fingerprint(function)
+        numba.config.CACHE_DIR = str(folder)
+        dispatcher = numba.njit(**OPTIONS, cache=True)(function)
+        if not Path(dispatcher.stats.cache_path).is_relative_to(folder):
+            raise PermissionError(f"'{folder}' cannot be written")
+        return dispatcher
+    except (OSError, RuntimeError) as error:  # no home, no source file
+        _say_once(error)
+        return numba.njit(**OPTIONS)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def _private_folder() -> Path:
+    """The folder of this user's kernels, made if need be. Raises OSError or RuntimeError."""
+    given = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
+    caches = numba.config.CACHE_DIR or given or Path.home() / ".cache"
+    folder = Path(caches).absolute() / "toftrack" / "kernels"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = os.stat(folder)
+    # Windows does not say it so.
+    if hasattr(os, "geteuid") and (found.st_uid != os.geteuid() or found.st_mode & 0o077):
+        raise PermissionError(f"'{folder}' must belong to this user and be closed to others")
+    return folder
+
+
+def _fingerprint(function: Callable) -> str:
+    """Of all that a kernel is made of: numba notices only what changes in the kernel's own file.
+
+    These are the files of the functions that it calls, and the constants that these read.
+    """
+    digest = hashlib.sha256()
+    left, known = [function], set()
+    while left:
+        part = inspect.unwrap(left.pop())
+        if part in known:
+            continue
+        known.add(part)
+        digest.update(_content(inspect.getfile(part)))
+        captured = inspect.getclosurevars(part)
+        for _, value in sorted({**captured.globals, **captured.nonlocals}.items()):
+            if hasattr(value, "__wrapped__") or inspect.isfunction(value):
+                left.append(value)
+            elif inspect.ismodule(value) and hasattr(value, "__file__"):
+                digest.update(_content(value.__file__))
+            else:
+                raw = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+                digest.update(raw)
+    return digest.hexdigest()[:16]
+
+
+@functools.cache
+def _content(file: str) -> bytes:
+    return Path(file).read_bytes()
+
+
+def _say_once(error: Exception) -> None:
+    """A sentence a process on why kernels are compiled anew."""
+    if "cache" not in _said:
+        _said.add("cache")
+        log.warning(
+            f"compiled kernels cannot be kept, or what was kept is damaged ({error}), so that they "
+            "are compiled anew; if every run says so, set NUMBA_CACHE_DIR to a folder of your own"
+        )
+
+
+@contextmanager
+def _announced(dispatcher: Any) -> Iterator[None]:
+    """Around the first call of a kernel: says once a process that compiling takes long."""
+    often = "once on a machine" if dispatcher.stats.cache_path else "in every run"
+    timer = threading.Timer(_SILENT_S, _announce, (often,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _announce(often: str) -> None:
+    if "compiling" not in _said:
+        _said.add("compiling")
+        log.info(f"compiling kernels ({often}, about 20 s)")
+
+
+if hasattr(os, "register_at_fork"):
+    # What another thread compiles is finished first: a lock that it holds would never be released
+    # in the forked process, which has no such thread.
+    os.register_at_fork(
+        before=lock.acquire,
+        after_in_parent=lock.release,
+        after_in_child=lock.release,
+    )
 
 
 @intrinsic
@@ -67,106 +196,3 @@ def take(typingctx, counter):
         return builder.atomic_rmw("add", at, ir.IntType(64)(1), "monotonic")
 
     return types.int64(counter), codegen
-
-
-@intrinsic
-def _quick_empty(typingctx, shape, dtype):
-    """np.empty of a shape, a number or a tuple."""
-    return _array_type(shape, dtype)(shape, dtype), _make_array
-
-
-@intrinsic
-def _quick_zeros(typingctx, shape, dtype):
-    """np.zeros, likewise."""
-
-    def codegen(context, builder, signature, args):
-        made = _make_array(context, builder, signature, args)
-        array = context.make_array(signature.return_type)(context, builder, made)
-        size = builder.mul(array.nitems, array.itemsize)
-        cgutils.memset(builder, array.data, size, 0)
-        return made
-
-    return _array_type(shape, dtype)(shape, dtype), codegen
-
-
-def _array_type(shape, dtype):
-    dimensions = len(shape) if isinstance(shape, types.BaseTuple) else 1
-    return types.Array(dtype.dtype, dimensions, "C")
-
-
-def _make_array(context, builder, signature, args):
-    lengths = arrayobj._parse_shape(context, builder, signature.args[0], args[0])
-    return arrayobj._empty_nd_impl(context, builder, signature.return_type, lengths)._getvalue()
-
-
-@register_jitable
-def plain_empty(shape, dtype):
-    """The same by numba's own np.empty."""
-    return np.empty(shape, dtype)
-
-
-@register_jitable
-def plain_zeros(shape, dtype):
-    """Likewise."""
-    return np.zeros(shape, dtype)
-
-
-_is_quick = hasattr(arrayobj, "_parse_shape") and hasattr(arrayobj, "_empty_nd_impl")
-empty: Any = _quick_empty if _is_quick else plain_empty
-zeros: Any = _quick_zeros if _is_quick else plain_zeros
-"""What kernels use instead of np.empty and np.zeros, and they copy numbers in loops: numba compiles
-a function, and the texts of its errors, for each type of these and of each assignment of an array
-to a slice, a sixth of what all kernels take. Where numba lacks what this needs, they are its
-own."""
-
-
-@contextmanager
-def announced(message: str) -> Iterator[None]:
-    """Around the first call of an entry point: logs the message if compiling it takes long.
-
-    Only one thread compiles at a time, so that the others do not compile the same once more.
-    """
-    with _compiling:
-        timer = threading.Timer(_SILENT_S, _tell, (message,))
-        timer.daemon = True
-        timer.start()
-        try:
-            yield
-        finally:
-            timer.cancel()
-
-
-def _tell(message: str) -> None:
-    log.info(message if can_be_kept() else message.replace("(once", "(in every run"))
-
-
-def _before_fork() -> None:
-    # What another thread compiles is finished first: a lock that it holds would never be released
-    # in the forked process, which has no such thread.
-    _compiling.acquire()
-    global_compiler_lock.acquire()
-
-
-def _after_fork() -> None:
-    global_compiler_lock.release()
-    _compiling.release()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(
-        before=_before_fork, after_in_parent=_after_fork, after_in_child=_after_fork
-    )
-
-
-def called(kernel: Any, message: str, *arguments: object) -> None:
-    """Call an entry point; the message is logged if it must be compiled before."""
-    if kernel.overloads:
-        kernel(*arguments)
-        return
-    with announced(message):
-        kernel(*arguments)
-
-
-def must_be_compiled(kernel: Any) -> bool:
-    """Whether an entry point's code is not on the disk, but can be kept there."""
-    return not kernel.overloads and can_be_kept() and not kernel._cache.is_kept()

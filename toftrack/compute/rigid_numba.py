@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import announced, compiled, empty, entry_point, zeros
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.motions import Motions
 from toftrack.compute.rigid import PIVOT_M
 
-_cached = entry_point(__file__)
 _PIVOT = np.array(PIVOT_M)
 _SWEEPS = 8
 """Of Jacobi's method, which doubles the number of exact digits in each."""
@@ -81,14 +80,14 @@ def compose_row(r, t, pivot, out):
         out[j] = r[j] + t[j]
 
 
-@_cached
+@entry_point
 def compose_rows(reference, tangent, pivot, out):
     """See rigid.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
     for i in range(len(out)):
         compose_row(reference[i], tangent[i], pivot, out[i])
 
 
-@_cached
+@entry_point
 def redraw_rows(particles, weights, positions, tangents, lower, upper, reflect, pivot, out):
     """See redraw.redraw_with; weights, positions, pivot: float64, the others float32."""
     last, total = 0, 0.0
@@ -114,7 +113,7 @@ def redraw_rows(particles, weights, positions, tangents, lower, upper, reflect, 
             out[n, 6 + j] = value
 
 
-@_cached
+@entry_point
 def difference_rows(particles, reference, pivot, out):
     """See rigid.difference; particles, out: (N, 6 + d), reference: (1, 6 + d), float32."""
     r = reference[0]
@@ -187,16 +186,16 @@ def mix_columns(frame, column, angle):
         frame[i, column + 1] = cosine * q - sine * p
 
 
-@_cached
+@entry_point
 def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
     """The joints of N hands, see pose_hand; states: (N, 27), joints: (N, 21, 3) float32.
 
     frames_out: (N, 16, 3, 3) float32 for their frames, or (0, 16, 3, 3).
     """
     frames, posed, state = (
-        empty((16, 3, 3), np.float64),
-        empty((21, 3), np.float64),
-        empty(27, np.float64),
+        np.empty((16, 3, 3), np.float64),
+        np.empty((21, 3), np.float64),
+        np.empty(27, np.float64),
     )
     for i in range(len(states)):
         for j in range(27):
@@ -212,10 +211,10 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
                         frames_out[i, j, row, column] = frames[j, row, column]
 
 
-@_cached
+@entry_point
 def mean_of_rows(particles, weights, out):
     """See rigid.mean; particles: (N, 6 + d), out: (1, 6 + d), float32.  weights: (N,) float64."""
-    scatter, total = zeros((4, 4), np.float64), zeros(out.shape[1], np.float64)
+    scatter, total = np.zeros((4, 4), np.float64), np.zeros(out.shape[1], np.float64)
     for n in range(len(particles)):
         p = particles[n]
         for j in range(len(total)):
@@ -238,7 +237,7 @@ def main_axis(symmetric):
 
     Golub and Van Loan, "Matrix computations", section 8.5.
     """
-    axes = zeros((4, 4), np.float64)
+    axes = np.zeros((4, 4), np.float64)
     for i in range(4):
         axes[i, i] = 1.0
     for _ in range(_SWEEPS):
@@ -318,13 +317,4 @@ def _rows(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.numpy(), np.float32)
 
 
-def motions() -> Motions:
-    """The compiled motions; compiles them if need be, about a second once on a machine."""
-    if not difference_rows.overloads:
-        with announced("filter: compiling its numba kernels (once, about 1 s)"):
-            row = torch.zeros(1, 7)
-            difference(compose(row, row), row)
-            one, none = row[:, 0] + 1, row[0, 6:]
-            redraw(row, one, row[:, 0], row, none, none, "reflect")
-            mean(row, one)
-    return Motions(compose, difference, redraw, mean)
+MOTIONS = Motions(compose, difference, redraw, mean)

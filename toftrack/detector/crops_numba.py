@@ -6,25 +6,23 @@ import math
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, empty, entry_point
-from toftrack.detector import crops
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.detector.crops import CROP, CROP_M
 
-_cached = entry_point(__file__, crops.__file__)
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _LEAST_SLOPE = np.float32(0.05)
 
 
-@_cached
+@entry_point
 def crop_at(depth, mirror, k, centre, turn, image):
     """See crops.crop: about a centre (3,), turned by (3, 3), into an image (C, CROP, CROP).
 
     mirror: the depth is read as a mirror shows it; k and the centre are those of the mirrored.
     """
     mapping, single, slope = (
-        empty((3, 3), np.float64),
-        empty((3, 3), np.float32),
-        empty(3, np.float32),
+        np.empty((3, 3), np.float64),
+        np.empty((3, 3), np.float32),
+        np.empty(3, np.float32),
     )
     distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
     focal, middle = 2 * CROP * distance / CROP_M, (2 * CROP - 1) / 2
@@ -60,7 +58,7 @@ def _read_crop(depth, flip, mapping, slope, scale, distance, image):
     border, each = image.shape[0] > 3, image.shape[0] > 4
     size = image.shape[1]
     samples = 2 * size
-    places, share = empty(samples, np.int64), empty(samples, np.float32)
+    places, share = np.empty(samples, np.int64), np.empty(samples, np.float32)
     for row in range(size):
         image[:4, row] = _ZERO
         image[4:, row] = _ONE

@@ -6,11 +6,9 @@ import math
 
 import numpy as np
 
-from toftrack.compute import rigid_numba
-from toftrack.compute.compiling import compiled, empty, entry_point, zeros
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rigid_numba import pose_hand, rotation_vector
-from toftrack.detector import crops, network, proposals
 from toftrack.detector.crops import CROP, CROP_M
 from toftrack.detector.network import (
     ANGLES,
@@ -27,19 +25,16 @@ from toftrack.detector.network import (
     cube_rotations,
 )
 from toftrack.detector.proposals import DOUBT_M, KEPT
-from toftrack.hand import overlap, overlap_numba
 from toftrack.hand.overlap_numba import add_overlaps
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
-_SOURCES = (rigid_numba, overlap, overlap_numba, crops, network, proposals)
-_cached = entry_point(__file__, *(module.__file__ for module in _SOURCES))
 _ANCHORS = cube_rotations().double().numpy()
 _LIMITS = np.array(ANGLE_LIMITS)
 _PIVOT = np.array(PIVOT_M)
 
 
-@_cached
+@entry_point
 def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
     """What the network's outputs for a crop mean, see PoseNet.decode and proposals.
 
@@ -55,7 +50,7 @@ def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
     for j in range(JOINTS):
         p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
         _into_camera(p, turn, centre, mirror, joints[c, j])
-    of_finger = zeros(5, np.float64)
+    of_finger = np.zeros(5, np.float64)
     length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
     add_overlaps(joints[c], length, of_finger)
     for finger in range(5):
@@ -69,15 +64,15 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
     """The likeliest hypotheses of a crop, in their order."""
     pivot, rotvec, angles, log_size, log_probability, error, joints, _, _, _, _ = out
     count = len(_ANCHORS)
-    chance = empty(count, np.float64)
+    chance = np.empty(count, np.float64)
     for h in range(count):
         chance[h] = reported[h * EACH + EACH - 2]
     first, total = _largest(chance), 0.0
     top = chance[first]
     for h in range(count):
         total += math.exp(chance[h] - top)
-    matrix, state = empty((3, 3), np.float64), zeros(27, np.float64)
-    frames, posed = empty((16, 3, 3), np.float64), empty((JOINTS, 3), np.float64)
+    matrix, state = np.empty((3, 3), np.float64), np.zeros(27, np.float64)
+    frames, posed = np.empty((16, 3, 3), np.float64), np.empty((JOINTS, 3), np.float64)
     for kept in range(KEPT):
         h = _largest(chance)
         log_probability[c, kept] = chance[h] - top - math.log(total)
@@ -173,7 +168,7 @@ def _into_camera(p, turn, centre, mirror, out):
 def _decode_keypoints(keypoints, depth, joints, sigma):
     """Weighted means of the cells' keypoints (5 * JOINTS, 16, 16), see PoseNet._joints."""
     # Depth is predicted about the surface that the cell sees.
-    seen, block = zeros((CELLS, CELLS), np.float64), CROP // CELLS
+    seen, block = np.zeros((CELLS, CELLS), np.float64), CROP // CELLS
     for row in range(CROP):
         for column in range(CROP):
             seen[row // block, column // block] += depth[row, column]

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import announced
 from toftrack.detector.dice import Dice
 from toftrack.detector.grasps_numba import CLOSE, YIELD, grasp
 from toftrack.detector.held_things import (
@@ -68,21 +67,20 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     most = within_limits(torch.deg2rad(most)).double()
     angles, parts = angles.double().contiguous(), parts.double().contiguous()
     flesh = ((0.013 + 0.0015 * dice.normal(n)) * size).double()
-    with announced("detector: compiling the grasps' kernel (once, about 5 s)"):
-        grasp(
-            angles.numpy(),
-            _doubles(thumbs),
-            opposed.numpy(),
-            most.numpy(),
-            tasks.contiguous().numpy(),
-            power.numpy(),
-            flesh.numpy(),
-            *(_doubles(x) for x in (shape.base_frames, shape.base_m, shape.bone_lengths_m)),
-            _doubles(radii),
-            _doubles(shifts),
-            parts.numpy(),
-            said.numpy(),
-        )
+    grasp(
+        angles.numpy(),
+        _doubles(thumbs),
+        opposed.numpy(),
+        most.numpy(),
+        tasks.contiguous().numpy(),
+        power.numpy(),
+        flesh.numpy(),
+        *(_doubles(x) for x in (shape.base_frames, shape.base_m, shape.bone_lengths_m)),
+        _doubles(radii),
+        _doubles(shifts),
+        parts.numpy(),
+        said.numpy(),
+    )
     held = (said[:, 0] >= 2) & (said[:, 1] < _DEEPEST_M)
     angles, parts = angles.float(), parts.float()
     # Some are about to take or to let go: the fingers are on the way to another pose.

@@ -11,13 +11,10 @@ import math
 
 import numpy as np
 
-from toftrack.compute import rigid_numba
 from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid_numba import mix_columns
-from toftrack.detector import things_numba
 from toftrack.detector.things_numba import part_distance
 
-_entry = entry_point(__file__, things_numba.__file__, rigid_numba.__file__)
 CLOSE, YIELD = range(2)
 """What a finger does: it closes on the thing, or gives way where it is in it."""
 _STEP, _BACK = math.radians(6.0), math.radians(9.0)
@@ -227,7 +224,7 @@ def _yield(finger, angles, hand):
             angles[angle] = max(angles[angle] - _BACK, min(_LEAST, angles[angle]))
 
 
-@_entry
+@entry_point
 def grasp(
     angles,
     thumbs,

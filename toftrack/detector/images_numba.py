@@ -6,11 +6,10 @@ import math
 
 import numpy as np
 
-from toftrack.compute.compiling import announced, entry_point
+from toftrack.compute.compiling import entry_point
 from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
 from toftrack.detector.network import PARTS
 
-_entry = entry_point(__file__)
 _PER_PART = CROP // PARTS
 _SCALE, _QUARTER = np.float32(2 / CROP_M), np.float32(0.25)
 
@@ -34,12 +33,11 @@ def read_pictures(
     n = len(depth)
     image = np.zeros((n, CROP_CHANNELS, CROP, CROP), np.float32)
     parts = np.empty((n, PARTS, PARTS), np.int8)
-    with announced("detector: compiling the training crops' kernel (once, about 2 s)"):
-        _read(depth, labels, side, distance_m, turn, border, image, parts)
+    _read(depth, labels, side, distance_m, turn, border, image, parts)
     return image, parts
 
 
-@_entry
+@entry_point
 def _read(depth, labels, side, distance, turn, border, image, parts):
     shown = np.empty((2 * CROP, 2 * CROP), np.int8)
     for n in range(len(depth)):

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import announced, compiled, entry_point
-from toftrack.detector import skin_numba, things_numba
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.detector.dice import Dice
 from toftrack.detector.hands import THING
 from toftrack.detector.scenes import Scenes
@@ -24,7 +23,6 @@ from toftrack.detector.skin import PRIMITIVE
 from toftrack.detector.skin_numba import draw_skin
 from toftrack.detector.things_numba import TILE, draw_part
 
-_entry = entry_point(__file__, things_numba.__file__, skin_numba.__file__)
 (
     NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE, HOLLOW,
 ) = range(13)  # fmt: skip
@@ -145,8 +143,7 @@ def take(shots: Shots, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     labels = np.full((n, *size), -1, np.int8)
     arrays = {field.name: getattr(shots, field.name).numpy() for field in fields(shots)}
     seeds = arrays.pop("seeds").astype(np.uint32)
-    with announced("detector: compiling the training pictures' kernel (once, about 5 s)"):
-        _take(*arrays.values(), seeds, depth, labels)
+    _take(*arrays.values(), seeds, depth, labels)
     return depth, labels
 
 
@@ -347,7 +344,7 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
                     depth[v, u] = 0.0
 
 
-@_entry
+@entry_point
 def _take(
     centres,
     axes,

@@ -12,13 +12,12 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import torch
 
-from toftrack.compute.compiling import called
 from toftrack.compute.threads import beside, run_shared
 from toftrack.detector import proposals
 from toftrack.detector.crops import CROP, crop_rotation
 from toftrack.detector.crops_numba import crop_at
 from toftrack.detector.decoding_numba import decode_at
-from toftrack.detector.network import ANGLES, CELLS, JOINTS, PARTS, REPORTED, PoseNet
+from toftrack.detector.network import ANGLES, JOINTS, PARTS, PoseNet
 from toftrack.detector.onnx_networks import OnnxPoseNet
 from toftrack.detector.parts import Parts, likeliest_parts
 from toftrack.detector.proposals import KEPT, MIRROR, NetworkOutput, mean_hand
@@ -37,7 +36,6 @@ _SHAPES = {
     "right": (),
 }
 """Of a crop: the numbers of a NetworkOutput, as the compiled code writes them."""
-_COMPILING = "detector: compiling its numba kernels (once, about 4 s)"
 
 
 def run_pose_network(
@@ -86,7 +84,7 @@ def start_pose_network(
 
 def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
     """Whether other threads may compute: torch has threads of its own, and needs the lock."""
-    return isinstance(pose, OnnxPoseNet) and bool(decode_at.overloads)
+    return isinstance(pose, OnnxPoseNet) and decode_at.is_compiled
 
 
 def _reported(task: functools.partial[None]) -> NetworkOutput:
@@ -160,7 +158,7 @@ def _crop(
 ) -> np.ndarray:
     """A crop's image (1, inputs, CROP, CROP)."""
     image = np.empty((1, pose.inputs, CROP, CROP), np.float32)
-    called(crop_at, _COMPILING, depth, left, k, centre, turn, image[0])
+    crop_at(depth, left, k, centre, turn, image[0])
     return image
 
 
@@ -178,27 +176,8 @@ def _decode(
     heads, keypoints, painted = outputs
     *numbers, kinds = out
     given = heads[0], keypoints[0], image[0, 0], turn, centre, left, hand, row, tuple(numbers)
-    called(decode_at, _COMPILING, *given)
+    decode_at(*given)
     kinds[row] = likeliest_parts(painted[0])
-
-
-def compile_crops() -> None:
-    """What reads crops, compiled now; without a network."""
-    centre, image = np.array([0.0, 0.0, 0.5]), np.empty((3, CROP, CROP), np.float32)
-    depth, turn = np.zeros((2, 2), np.float32), crop_rotation(centre)
-    called(crop_at, _COMPILING, depth, False, np.eye(3), centre, turn, image)
-
-
-def compile_decoding() -> None:
-    """What reads a network's outputs, compiled now; without a network."""
-    centre, image = np.array([0.0, 0.0, 0.5]), np.zeros((1, 1, CROP, CROP), np.float32)
-    outputs = (
-        np.zeros((1, REPORTED), np.float32),
-        np.zeros((1, 5 * JOINTS, CELLS, CELLS), np.float32),
-        np.zeros((1, 4, CELLS, CELLS), np.float32),
-    )
-    out, turn = _empty(1), crop_rotation(centre)
-    _decode(outputs, image, turn, centre, False, _mean_hand("right"), out, 0)
 
 
 def _outputs(

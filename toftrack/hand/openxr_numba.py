@@ -9,12 +9,9 @@ import math
 
 import numpy as np
 
-from toftrack.compute import rigid_numba
-from toftrack.compute.compiling import announced, compiled, empty, entry_point, zeros
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid_numba import pose_hand
 from toftrack.hand.openxr import OpenXRHand, OpenXRRig
-
-_cached = entry_point(__file__, rigid_numba.__file__)
 
 
 def openxr_hand_compiled(joints_m: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> OpenXRHand:
@@ -22,24 +19,19 @@ def openxr_hand_compiled(joints_m: np.ndarray, state: np.ndarray, rig: OpenXRRig
     position, orientation = np.empty((26, 3)), np.empty((26, 4))
     joints, state = np.asarray(joints_m, np.float64), np.asarray(state, np.float64)
     mirror = -1.0 if rig.mirrored else 1.0
-    given = (joints, state, *rig[:3], mirror, position, orientation)
-    if place.overloads:
-        place(*given)
-    else:
-        with announced("compiling the joints of OpenXR (once)"):
-            place(*given)
+    place(joints, state, *rig[:3], mirror, position, orientation)
     return OpenXRHand(position, orientation, rig.radius_m)
 
 
-@_cached
+@entry_point
 def place(joints, state, base_frames, metacarpals, radius, mirror, position, orientation):
     """joints: (21, 3), state: (27,), and the rig's arrays; the last two are written, all float64.
 
     mirror: -1 for a left hand, else 1.
     """
-    frames, none = empty((16, 3, 3), np.float64), zeros((21, 3), np.float64)
+    frames, none = np.empty((16, 3, 3), np.float64), np.zeros((21, 3), np.float64)
     pose_hand(state, base_frames, none[:5], none[:5], mirror, frames, none)
-    way, nail, start = empty(3, np.float64), empty(3, np.float64), empty(3, np.float64)
+    way, nail, start = np.empty(3, np.float64), np.empty(3, np.float64), np.empty(3, np.float64)
     for i in range(3):
         position[1, i] = joints[0, i]
     for finger in range(5):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, empty
+from toftrack.compute.compiling import compiled
 from toftrack.hand.overlap import BENT, PAIRS, RADII_MM, SQUEEZED, STRAIGHT, STRICT
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 
@@ -17,7 +17,7 @@ _FIRST, _SECOND = np.array(PAIRS).T.copy()
 @compiled
 def add_overlaps(joints, hand_length_m, of_finger):
     """Of one hand, joints (21, 3): add each finger's overlap with all others to of_finger (5,)."""
-    straight, points = empty(5, np.float64), empty((5, 5, 3), np.float64)
+    straight, points = np.empty(5, np.float64), np.empty((5, 5, 3), np.float64)
     for finger in range(5):
         first = 1 + 4 * finger
         whole = _distance(joints[first], joints[first + 3])

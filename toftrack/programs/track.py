@@ -19,6 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import Pace
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
@@ -34,7 +35,6 @@ from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words
-from toftrack.programs.precompile import ready_tracker
 from toftrack.programs.run_facts import ShapeFiles, opening, run_metadata
 from toftrack.recordings.recorder import Recorder
 from toftrack.tracking.tracker import HandsTracker
@@ -64,7 +64,7 @@ def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Reco
 
 
 def _track(config: DictConfig, device: Device, stream: Stream, recorder: Recorder | None) -> float:
-    tracker = ready_tracker(config)
+    tracker = build_hands_tracker(config)
     tracker.time.pace = _pace(tracker.time.pace, device)
     reach_m = float(config.segmentation.get("max_distance_m", math.inf))
     make = hydra.utils.instantiate

@@ -10,16 +10,15 @@ import math
 
 import numpy as np
 import torch
+from numpy import empty, zeros
 from torch import Tensor
 
-from toftrack.compute import rigid_numba
-from toftrack.compute.compiling import announced, compiled, empty, entry_point, take, zeros
+from toftrack.compute.compiling import compiled, entry_point, take
 from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
 from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose
 from toftrack.hand.surface import HandSurface, hand_surface
-from toftrack.refinement import gauss_newton, residuals_numba, seen_points
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.residuals_numba import (
     add_landmarks,
@@ -34,9 +33,6 @@ from toftrack.refinement.residuals_numba import (
 )
 from toftrack.refinement.seen_points import SeenPoints
 
-# gauss_newton.py and seen_points.py are in for their numbers.
-_SOURCES = (rigid_numba, residuals_numba, gauss_newton, seen_points)
-_cached = entry_point(__file__, *(module.__file__ for module in _SOURCES))
 _LIMITS = np.array(ANGLE_LIMITS)
 _NO_FRAMES = np.empty((0, 16, 3, 3), np.float32)
 _ORIGINS = [0, *(1 + 4 * finger + bone for finger in range(5) for bone in range(3))]
@@ -145,7 +141,7 @@ def scratch(ellipsoids, points, seen):
     )
 
 
-@_cached
+@entry_point
 def refine_hands(states, priors, keypoints, seen, shape, surface, settings, counter):
     """Refine hands as long as `counter` has any; called from several threads.
 
@@ -172,10 +168,7 @@ class CompiledRefiner:
     """Refines hands of one shape on the CPU; see gauss_newton.Refiner."""
 
     def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """Compiles the kernel if need be, some seconds once on a machine.
-
-        surface: instead of the shape's own.
-        """
+        """surface: instead of the shape's own."""
         surface = surface or hand_surface(shape)
         self._shape = (
             _array(shape.base_frames),
@@ -188,12 +181,6 @@ class CompiledRefiner:
             _array(surface.centres_m[:-1]),
             _array(surface.axes_m[:-1]),
         )
-        if not refine_hands.overloads:
-            with announced("refine: compiling the numba kernel (once, about 5 s)"):
-                none = torch.zeros(0, 27)
-                seen = SeenPoints(torch.ones(1, 3), torch.zeros(1, 1, 2), torch.eye(3), (1, 1))
-                self._refined(none, none[:, 6:], seen, (1, 1, *[1.0] * 5), None)
-                self.joints(none)
 
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""

@@ -16,8 +16,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy import zeros
 
-from toftrack.compute.compiling import compiled, zeros
+from toftrack.compute.compiling import compiled
 from toftrack.refinement.gauss_newton import (
     ALONG_BONE,
     FACING_M,

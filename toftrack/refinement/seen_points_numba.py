@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy import zeros
 
-from toftrack.compute.compiling import called, entry_point, zeros
-
-_cached = entry_point(__file__)
-_COMPILING = "refine: compiling what reads points (once, about 1 s)"
+from toftrack.compute.compiling import entry_point
 
 
 def smooth_points(
@@ -25,7 +23,7 @@ def smooth_points(
     k = np.ascontiguousarray(k, np.float32)
     limits = np.float32(edge_m), np.float32(far_m)
     given = (depth, np.ascontiguousarray(hand), *corner, k, *limits, points, count)
-    called(fill_points, _COMPILING, *given)
+    fill_points(*given)
     return points[: count[0]]
 
 
@@ -33,11 +31,11 @@ def nearest_of_labels(labels: np.ndarray, solid: np.ndarray, corner: tuple[int, 
     """See seen_points.nearest_of_labels."""
     nearest = np.empty((*solid.shape, 2), np.float32)
     solid = np.ascontiguousarray(solid)
-    called(fill_nearest, _COMPILING, np.ascontiguousarray(labels), solid, *corner, nearest)
+    fill_nearest(np.ascontiguousarray(labels), solid, *corner, nearest)
     return nearest
 
 
-@_cached
+@entry_point
 def fill_points(depth, hand, top, left, k, edge, far, points, count):
     """points: (h * w, 3) and count: (1,), written."""
     height, width = depth.shape
@@ -61,7 +59,7 @@ def fill_points(depth, hand, top, left, k, edge, far, points, count):
     count[0] = found
 
 
-@_cached
+@entry_point
 def fill_nearest(labels, solid, top, left, nearest):
     """nearest: (h, w, 2), written."""
     height, width = solid.shape

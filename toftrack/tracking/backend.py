@@ -115,7 +115,7 @@ def _compiled() -> _Beside:
     from toftrack.compute import rigid_numba
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 
-    return _Beside(motions=rigid_numba.motions(), make_refiner=CompiledRefiner)
+    return _Beside(motions=rigid_numba.MOTIONS, make_refiner=CompiledRefiner)
 
 
 def _numba(device: torch.device) -> Backend:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy import empty
 
-from toftrack.compute.compiling import called, compiled, empty, entry_point
+from toftrack.compute.compiling import compiled, entry_point
 
-_cached = entry_point(__file__)
-_COMPILING = "tracker: compiling what reads the image at joints (once, about 1 s)"
 _AROUND = 9
 """Readings about a joint."""
 
@@ -16,7 +15,7 @@ def count_out_of_sight(joints_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray)
     """(2,) how many joints are outside of the image, and behind something; see out_of_sight."""
     counts = np.zeros(2, np.int64)
     joints, depth = _readable(joints_m, np.float32), _readable(depth_m, np.float32)
-    called(count_joints, _COMPILING, joints, depth, _readable(k, np.float32), counts)
+    count_joints(joints, depth, _readable(k, np.float32), counts)
     return counts
 
 
@@ -30,7 +29,7 @@ def seen_around(
     """
     found, depth = np.empty((len(joints_m), 3)), _readable(depth_m, np.float32)
     joints, k = _readable(joints_m, np.float64), _readable(k, np.float64)
-    called(read_around, _COMPILING, joints, nearest_m, step_m, depth, k, found)
+    read_around(joints, nearest_m, step_m, depth, k, found)
     return found
 
 
@@ -46,7 +45,7 @@ def _pixel(place, middle, size):
     return np.int64(at) if 0 <= at < size else np.int64(-1)
 
 
-@_cached
+@entry_point
 def count_joints(joints, depth, k, counts):
     """See out_of_sight; counts: (2,), written."""
     height, width = depth.shape
@@ -60,7 +59,7 @@ def count_joints(joints, depth, k, counts):
             counts[1] += 1
 
 
-@_cached
+@entry_point
 def read_around(joints, nearest_m, step_m, depth, k, found):
     """found: (N, 3), written."""
     height, width = depth.shape

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from toftrack.compute.compiling import called, entry_point
+from toftrack.compute.compiling import entry_point
 
 _ONE, _LEAST_M = np.float32(1), np.float32(1e-3)
 
@@ -23,9 +23,7 @@ def evidence_images(
     low, high, front = (np.empty(depth_m.shape, np.float32) for _ in range(3))
     given = (np.ascontiguousarray(one) for one in (depth_m, hand, occluder))
     none = np.zeros((0, 0), bool)
-    called(
-        fill_bands,
-        "renderer: compiling what reads evidence (once, about 1 s)",
+    fill_bands(
         *given,
         none if other is None else np.ascontiguousarray(other),
         np.float32(tolerance_m),
@@ -36,7 +34,7 @@ def evidence_images(
     return low, high, front
 
 
-@entry_point(__file__)
+@entry_point
 def fill_bands(depth, hand, occluder, other, tolerance, low, high, front):
     """low, high, front: (H, W), written."""
     known = len(other) > 0

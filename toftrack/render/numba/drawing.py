@@ -7,7 +7,7 @@ import numpy as np
 from toftrack.compute.compiling import entry_point
 
 
-@entry_point(__file__)
+@entry_point
 def draw(
     linear: np.ndarray,
     quadratic: np.ndarray,

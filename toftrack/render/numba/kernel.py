@@ -7,11 +7,10 @@ each row; then the tile is compared with the evidence, which leaves the silhouet
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, empty, entry_point, take, zeros
+from toftrack.compute.compiling import compiled, entry_point, take
 from toftrack.render.numba.hand import (
     BOTTOM,
     DU,
@@ -52,7 +51,6 @@ from toftrack.render.numba.vector import (
 from toftrack.render.numba.words import WORDS, no_rows, store_rows
 
 _PARTS = ("hand", "kernel", "missed", "vector", "words")
-_cached = entry_point(*(Path(__file__).with_name(f"{part}.py") for part in _PARTS))
 
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _LAST = 8
@@ -76,7 +74,7 @@ def blocks(width):
 @compiled
 def _zeros(size):
     """A flat array of float32 that begins where a line of the cache does."""
-    numbers = zeros(size + BLOCK, np.float32)
+    numbers = np.zeros(size + BLOCK, np.float32)
     skip = (-numbers.ctypes.data >> 2) & (BLOCK - 1)
     return numbers[skip : skip + size]
 
@@ -188,7 +186,7 @@ def _compare(tile, stride, spans, box, origin, images, width, model, above):
     return total(correct), total(false), total(residual)
 
 
-@_cached
+@entry_point
 def pack_evidence(low, high, occluder, hand):
     """Evidence as flat float32 blocks of three images and (words + 1, H + WORDS) bits of the hand.
 
@@ -198,7 +196,7 @@ def pack_evidence(low, high, occluder, hand):
     height, width = hand.shape
     pitch = blocks(width)
     images = _zeros(height * pitch * _IMAGES * BLOCK)
-    bits = zeros((((width + 63) >> 6) + 1, height + WORDS), np.uint64)
+    bits = np.zeros((((width + 63) >> 6) + 1, height + WORDS), np.uint64)
     for v in range(height):
         for block in range(pitch):
             at = (v * pitch + block) * _IMAGES * BLOCK
@@ -220,7 +218,7 @@ def pack_evidence(low, high, occluder, hand):
     return images, bits
 
 
-@_cached
+@entry_point
 def score_hands(
     states,
     k,
@@ -250,17 +248,17 @@ def score_hands(
     for i in range(steps.shape[0]):
         reach = max(reach, steps[i, 1])
     whole = max(states.shape[0] // LANES - 2, 0)
-    x = empty(27 * LANES, np.float32)
-    frames = empty((16, 12 * LANES), np.float32)
-    valid = empty(LANES, np.uint8)
-    conics = empty((index.shape[0], TERMS * LANES), np.float32)
-    boxes = empty(4 * LANES, np.float32)
+    x = np.empty(27 * LANES, np.float32)
+    frames = np.empty((16, 12 * LANES), np.float32)
+    valid = np.empty(LANES, np.uint8)
+    conics = np.empty((index.shape[0], TERMS * LANES), np.float32)
+    boxes = np.empty(4 * LANES, np.float32)
     tile = _zeros(0)
-    spans = empty(2 * (height + BLOCK), np.float32)
-    lines, places = empty(5 * _LISTED, np.float32), empty(_LISTED, np.int32)
-    model = empty((parts + 3, height + 2 * (reach + WORDS)), np.uint64)
-    wanted = empty((parts + 1, height + WORDS), np.uint64)
-    buffer = empty((2, (parts + 3) * WORDS), np.uint64)
+    spans = np.empty(2 * (height + BLOCK), np.float32)
+    lines, places = np.empty(5 * _LISTED, np.float32), np.empty(_LISTED, np.int32)
+    model = np.empty((parts + 3, height + 2 * (reach + WORDS)), np.uint64)
+    wanted = np.empty((parts + 1, height + WORDS), np.uint64)
+    buffer = np.empty((2, (parts + 3) * WORDS), np.uint64)
     while True:
         task, count = take(counter), LANES
         first = task * LANES

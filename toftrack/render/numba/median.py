@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from llvmlite import ir
-from numba.core import types
+from numba import types
 from numba.extending import intrinsic
 
-from toftrack.compute.compiling import announced, compiled, entry_point
-from toftrack.render.numba import vector
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.render.numba.vector import BLOCK, FLOATS, store
 
 SIDE = 5
@@ -76,7 +75,7 @@ def _take_every(source, start, factor, line, count):
         line[j] = source[last]
 
 
-@entry_point(__file__, vector.__file__)
+@entry_point
 def _thinned(image, factor, offset, out):
     """See `thinned`."""
     height, (rows, columns) = image.shape[0], out.shape
@@ -115,9 +114,5 @@ def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
     """
     rows, columns = (len(range(offset, size, factor)) for size in image.shape)
     out = np.empty((rows, columns), np.float32)
-    if _thinned.overloads:
-        _thinned(image, factor, offset, out)
-    else:
-        with announced("segmentation: compiling the numba kernel (once, about 2 s)"):
-            _thinned(image, factor, offset, out)
+    _thinned(image, factor, offset, out)
     return out

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import announced
 from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
@@ -29,10 +28,7 @@ class NumbaScorer:
     name = "numba"
 
     def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """Compiles the kernel if need be, some seconds once on a machine.
-
-        surface: instead of the shape's own.
-        """
+        """surface: instead of the shape's own."""
         shape = shape.to("cpu", torch.float32)
         surface = (surface or hand_surface(shape)).to("cpu", torch.float32)
         slots = np.full(25, -1, np.int64)
@@ -48,15 +44,6 @@ class NumbaScorer:
             torch.cat((surface.centres_m, covariances[:, rows, columns]), 1).numpy(),
         )
         self._frame: tuple = (None, ())
-        self._compile()
-
-    def _compile(self) -> None:
-        """The first call of a process, with a message if it takes long."""
-        if score_hands.overloads:
-            return
-        with announced("renderer: compiling the numba kernel (once, about 6 s)"):
-            image = torch.zeros(2, 2)
-            self(torch.zeros(1, 27), Evidence(image, image, image, image > 0, torch.eye(3), 0.0))
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""

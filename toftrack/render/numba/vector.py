@@ -11,10 +11,8 @@ from collections.abc import Callable
 from functools import partial
 
 from llvmlite import ir
-from numba.core import cgutils, types
-from numba.core.typing import signature
-from numba.core.typing.templates import ConcreteTemplate, infer_global
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba import types
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 BLOCK = 16
 """Pixels of a row that are worked on at once; images need as much padding on the right."""
@@ -59,13 +57,13 @@ def define(function: Callable, kind: Vector, number: types.Type, emit: Callable)
     """
     pairs = [(kind, kind), (kind, number), (number, kind)]
 
-    class Template(ConcreteTemplate):
-        cases = [signature(kind, *pair) for pair in pairs]
+    @type_callable(function)
+    def _(context):
+        return lambda left, right: kind if (left, right) in pairs else None
 
     def lowered(context, builder, sig, args):
         return emit(builder, *(spread(builder, value, kind.lltype) for value in args))
 
-    infer_global(function)(Template)
     for pair in pairs:
         lower_builtin(function, *pair)(lowered)
 
@@ -85,10 +83,13 @@ def pointer(context, builder, array_type, array, index, lltype=_VECTOR):
 def call(builder, name, *args):
     """An intrinsic function of LLVM whose result is of its arguments' type."""
     kinds = [arg.type for arg in args]
-    function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(kinds[0], kinds), f"llvm.{name}"
-    )
-    return builder.call(function, args)
+    return builder.call(declared(builder, f"llvm.{name}", kinds[0], kinds), args)
+
+
+def declared(builder, name, result, kinds):
+    """A function of LLVM's, known to the module once."""
+    known = builder.module.globals.get(name)
+    return known or ir.Function(builder.module, ir.FunctionType(result, kinds), name)
 
 
 def _unary(name: str):
@@ -200,11 +201,8 @@ def _root_estimate(context, builder, square):
     if "+avx512f" not in features:
         return call(builder, f"sqrt.v{BLOCK}f32", square)
     mask = ir.IntType(BLOCK)
-    estimate = cgutils.get_or_insert_function(
-        builder.module,
-        ir.FunctionType(_VECTOR, [_VECTOR, _VECTOR, mask]),
-        "llvm.x86.avx512.rsqrt14.ps.512",
-    )
+    name, kinds = "llvm.x86.avx512.rsqrt14.ps.512", (_VECTOR, _VECTOR, mask)
+    estimate = declared(builder, name, _VECTOR, kinds)
     none = ir.Constant(_VECTOR, [0.0] * BLOCK)
     return builder.fmul(square, builder.call(estimate, [square, none, mask(-1)]), flags=_FAST)
 

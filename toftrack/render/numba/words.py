@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 
 from llvmlite import ir
-from numba.core import types
+from numba import types
 from numba.extending import intrinsic
 
 from toftrack.render.numba.vector import Vector, call, define, spread
