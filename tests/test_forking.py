@@ -150,7 +150,10 @@ def test_a_program_that_forks_goes_on_in_both_processes(when: str) -> None:
 def test_after_a_fork_of_a_process_with_a_gpu_it_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(torch.cuda, "_is_in_bad_fork", lambda: True)
+    def init() -> None:
+        raise RuntimeError("Cannot re-initialize CUDA in forked subprocess")
+
+    monkeypatch.setattr(torch.cuda, "init", init)
     with pytest.raises(ToftrackError, match="multiprocessing's spawn, or give compute=cpu"):
         compute_device("cuda")
     for name in ("auto", "cpu"):

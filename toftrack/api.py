@@ -170,15 +170,20 @@ def compute_device(name: str) -> torch.device:
     """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
     import torch
 
-    if name == "cuda" and torch.cuda._is_in_bad_fork():
-        raise ToftrackError(
-            f"compute={name}: the process that this one was forked from has used the GPU, which "
-            "CUDA does not allow; start it by multiprocessing's spawn, or give compute=cpu"
-        )
     if name == "auto":  # a GPU is right, and not faster: docs/lab/gpu.md
         return torch.device("cpu")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ToftrackError("compute=cuda, but torch finds no CUDA GPU here; give compute=cpu")
+    if name == "cuda":
+        try:
+            torch.cuda.init()
+        except (AssertionError, RuntimeError) as error:
+            if "fork" not in str(error):
+                raise ToftrackError(
+                    "compute=cuda, but torch finds no CUDA GPU here; give compute=cpu"
+                ) from None
+            raise ToftrackError(
+                "compute=cuda: the process that this one was forked from has used the GPU, which "
+                "CUDA does not allow; start it by multiprocessing's spawn, or give compute=cpu"
+            ) from None
     if name not in ("cpu", "cuda"):
         raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
     return torch.device(name)

@@ -328,6 +328,7 @@ def pretended_device() -> Iterator[Counts]:
     with (
         patch("torch.cuda._lazy_init", lambda: None),
         patch("torch.cuda.is_available", lambda: True),
+        patch("torch.cuda.init", lambda: None),
         # What torch does is seen in the thread that asks for it.
         patch("toftrack.compute.threads.threads", lambda: 1),
         patch("torch.Generator", _generator),

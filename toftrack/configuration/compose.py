@@ -7,11 +7,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.singleton import Singleton
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
 from hydra.version import VersionBase
@@ -92,16 +90,17 @@ def devices_of_files() -> frozenset[str]:
 @contextmanager
 def _own_hydra() -> Iterator[None]:
     """Hydra has one state a process, which may be that of an application around us."""
-    kinds = (GlobalHydra, JobRuntime, VersionBase)
-    instances: dict[Any, Any] = Singleton._instances
     with _composing:
-        kept = {kind: instances.pop(kind) for kind in kinds if kind in instances}
+        application, job = GlobalHydra.instance().hydra, JobRuntime.instance().conf
+        version = VersionBase.instance().version_base
+        GlobalHydra.instance().clear()
+        JobRuntime.instance().conf = job.copy()
         try:
             yield
         finally:
-            for kind in kinds:
-                instances.pop(kind, None)
-            instances.update(kept)
+            GlobalHydra.instance().hydra = application
+            JobRuntime.instance().conf = job
+            VersionBase.instance().version_base = version
 
 
 @contextmanager

@@ -80,7 +80,8 @@ def _of_key(chain: Sequence[BaseException]) -> str | None:
 def _unknown_key(key: str, parent: DictConfig) -> str:
     root = parent._get_root()
     assert isinstance(root, DictConfig)
-    keys = [name for name in _keys(root) if not name.startswith("hydra.") or key[:5] == "hydra"]
+    known = OmegaConf.to_container(root)
+    keys = [name for name in _keys(known) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]
     likely = nearest(key, [name for name in keys if not key.startswith(f"{name}.")]) or (
@@ -101,14 +102,10 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
     return f"{text}; {where or 'the configuration'} has {', '.join(some)}"
 
 
-def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:
-    """Every group and setting of a configuration, dotted."""
-    for name in config:
-        if name == "_target_":
-            continue
-        key = prefix + str(name)
-        yield key
-        if not OmegaConf.is_missing(config, name):
-            node = config._get_node(name)
-            if isinstance(node, DictConfig) and not node._is_none():
-                yield from _keys(node, f"{key}.")
+def _keys(config: object, prefix: str = "") -> Iterator[str]:
+    """Every group and setting of a configuration's plain dictionary, dotted."""
+    if isinstance(config, dict):
+        for name, value in config.items():
+            if name != "_target_":
+                yield f"{prefix}{name}"
+                yield from _keys(value, f"{prefix}{name}.")

@@ -46,52 +46,38 @@ class Muon(torch.optim.Optimizer):
     def step(self, closure: Any = None) -> Any:
         """One step along the gradients that are there; `closure` is not asked for.
 
-        What is done to many weights is one operation of torch's for all of them, and nothing is
-        read back: on a GPU, telling it what to do takes longer than doing it.
+        Nothing is read back from a GPU, which replays a step as a graph.
         """
         for group in self.param_groups:
             weights = [weight for weight in group["params"] if weight.grad is not None]
-            if not weights:
-                continue
-            along = self._inner(weights) if group["inner"] else self._adam(weights)
-            torch._foreach_mul_(weights, 1 - group["lr"] * group["weight_decay"])
-            torch._foreach_mul_(along, group["lr"])
-            torch._foreach_sub_(weights, along)
+            if weights and not group["inner"]:
+                count = self.state[weights[0]].setdefault("count", weights[0].new_zeros(()))
+                count.add_(1)
+            for weight in weights:
+                if group["inner"]:
+                    along = self._inner(weight, weight.grad)
+                else:
+                    along = self._adam(weight, weight.grad, count)
+                weight.mul_(1 - group["lr"] * group["weight_decay"])
+                weight.sub_(group["lr"] * along)
 
-    def _inner(self, weights: list[Tensor]) -> list[Tensor]:
-        gradients = [_gradient(weight) for weight in weights]
-        averages = self._kept(weights, "exp_avg")
-        torch._foreach_lerp_(averages, gradients, 1 - _MOMENTUM)
-        nesterov = torch._foreach_lerp(gradients, averages, _MOMENTUM)
-        return [_along(one) for one in nesterov]
+    def _inner(self, weight: Tensor, gradient: Tensor) -> Tensor:
+        average = self._kept(weight, "exp_avg").lerp_(gradient, 1 - _MOMENTUM)
+        return _along(gradient.lerp(average, _MOMENTUM))
 
-    def _adam(self, weights: list[Tensor]) -> list[Tensor]:
-        gradients = [_gradient(weight) for weight in weights]
-        means = self._kept(weights, "exp_avg")
-        squares = self._kept(weights, "exp_avg_sq")
-        count = self.state[weights[0]].setdefault("count", weights[0].new_zeros(()))
-        count.add_(1)
-        torch._foreach_lerp_(means, gradients, 1 - _BETAS[0])
-        torch._foreach_mul_(squares, _BETAS[1])
-        torch._foreach_addcmul_(squares, gradients, gradients, 1 - _BETAS[1])
-        sizes = torch._foreach_div(squares, 1 - torch.pow(_BETAS[1], count))
-        torch._foreach_sqrt_(sizes)
-        torch._foreach_add_(sizes, _EPS)
-        along = torch._foreach_div(means, 1 - torch.pow(_BETAS[0], count))
-        torch._foreach_div_(along, sizes)
-        return list(along)
+    def _adam(self, weight: Tensor, gradient: Tensor, count: Tensor) -> Tensor:
+        mean = self._kept(weight, "exp_avg").lerp_(gradient, 1 - _BETAS[0])
+        square = self._kept(weight, "exp_avg_sq").mul_(_BETAS[1])
+        square.addcmul_(gradient, gradient, value=1 - _BETAS[1])
+        size = (square / (1 - torch.pow(_BETAS[1], count))).sqrt() + _EPS
+        return mean / (1 - torch.pow(_BETAS[0], count)) / size
 
-    def _kept(self, weights: list[Tensor], name: str) -> list[Tensor]:
-        """A state of each weight, 0 at first."""
-        for weight in weights:
-            if name not in self.state[weight]:
-                self.state[weight][name] = torch.zeros_like(weight)
-        return [self.state[weight][name] for weight in weights]
-
-
-def _gradient(weight: Tensor) -> Tensor:
-    assert weight.grad is not None
-    return weight.grad
+    def _kept(self, weight: Tensor, name: str) -> Tensor:
+        """A state of a weight, 0 at first."""
+        if name not in self.state[weight]:
+            self.state[weight][name] = torch.zeros_like(weight)
+        kept: Tensor = self.state[weight][name]
+        return kept
 
 
 def _along(gradient: Tensor) -> Tensor:

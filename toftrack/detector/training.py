@@ -399,12 +399,9 @@ def _check_length(counted: str, progress: Progress, schedule: Schedule) -> None:
 @torch.no_grad()
 def _average(averaged: nn.Module, network: nn.Module, share: Tensor) -> None:
     """Move all weights and statistics towards another network's by a () share of the way."""
-    pairs = list(zip(averaged.state_dict().values(), network.state_dict().values(), strict=True))
+    pairs = zip(averaged.state_dict().values(), network.state_dict().values(), strict=True)
     for old, new in pairs:
-        if not old.is_floating_point():
+        if old.is_floating_point():
+            old.lerp_(new, share)
+        else:
             old.copy_(new)
-    olds = [old for old, _ in pairs if old.is_floating_point()]
-    news = [new for _, new in pairs if new.is_floating_point()]
-    away = torch._foreach_sub(news, olds)
-    torch._foreach_mul_(away, share)
-    torch._foreach_add_(olds, away)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -40,8 +39,6 @@ class Backend:
     make_refiner: Callable[[HandShape], Refiner]
 
 
-log = logging.getLogger(__name__)
-
 BACK_ENDS = ("torch", "numba", "triton")
 
 
@@ -63,13 +60,10 @@ def choose_backend(renderer: str, device: torch.device | str = "cpu") -> Backend
     try:
         return _MAKERS[wanted](device)
     except ImportError as error:
-        if renderer != "auto" or device.type != "cpu":
-            raise ToftrackError(
-                f"renderer={wanted} cannot run here ({error}); install it or give renderer=torch"
-                + ("" if device.type == "cpu" else ", which is slow, or compute=cpu")
-            ) from None
-        log.info("renderer: %s is not available (%s), using torch", wanted, error)
-        return _torch(device)
+        raise ToftrackError(
+            f"renderer={wanted} cannot run here ({error}); install it or give renderer=torch"
+            + ("" if device.type == "cpu" else ", which is slow, or compute=cpu")
+        ) from None
 
 
 def make_scorer(renderer: str, shape: HandShape, device: torch.device | str = "cpu") -> Scorer:
