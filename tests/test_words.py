@@ -20,7 +20,7 @@ OTHERS = {
     "settled contest turns": "select, hysteresis, schedule, rotations",
     "worn": "applied",
     "room rooms": "package, layer",
-    "ending endings ahead spending": "shutdown, precompile, at_quality",
+    "ending endings ahead spending": "shutdown, at_quality",
     "lasted longer": "Duration",
 }
 """Words that are in no name, and what to say instead."""

@@ -33,6 +33,7 @@ compiled: Any = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=
 
 _SILENT_S = 1.0
 """Taking a kernel from the cache is faster than this, compiling it is slower."""
+_config: Any = numba.config
 lock = threading.RLock()
 """Of the thread that compiles."""
 _said: set[str] = set()
@@ -90,10 +91,10 @@ entry_point = Kernel
 
 def _cached(function: Callable) -> Any:
     """numba's function with a cache, or without one where it cannot be trusted or written."""
-    before = numba.config.CACHE_DIR
+    before = _config.CACHE_DIR
     try:
         folder = _private_folder() / _fingerprint(function)
-        numba.config.CACHE_DIR = str(folder)
+        _config.CACHE_DIR = str(folder)
         dispatcher = numba.njit(**OPTIONS, cache=True)(function)
         if not Path(dispatcher.stats.cache_path).is_relative_to(folder):
             raise PermissionError(f"'{folder}' cannot be written")
@@ -102,13 +103,13 @@ def _cached(function: Callable) -> Any:
         _say_once(error)
         return numba.njit(**OPTIONS)(function)
     finally:
-        numba.config.CACHE_DIR = before
+        _config.CACHE_DIR = before
 
 
 def _private_folder() -> Path:
     """The folder of this user's kernels, made if need be. Raises OSError or RuntimeError."""
     given = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
-    caches = numba.config.CACHE_DIR or given or Path.home() / ".cache"
+    caches = _config.CACHE_DIR or given or Path.home() / ".cache"
     folder = Path(caches).absolute() / "toftrack" / "kernels"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = os.stat(folder)
@@ -174,7 +175,7 @@ def _announced(dispatcher: Any) -> Iterator[None]:
 def _announce(often: str) -> None:
     if "compiling" not in _said:
         _said.add("compiling")
-        log.info(f"compiling kernels ({often}, about 20 s)")
+        log.info(f"compiling kernels ({often}, about 25 s)")
 
 
 if hasattr(os, "register_at_fork"):

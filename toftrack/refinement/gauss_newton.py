@@ -137,7 +137,7 @@ class Refiner(Protocol):
 
 
 class TorchRefiner:
-    """The reference, which runs everywhere."""
+    """The reference, which runs on any device."""
 
     def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
         """shape: on the device of the states to come.  surface: instead of the shape's own."""
