@@ -88,6 +88,7 @@ def test_no_particles_and_those_that_are_no_numbers() -> None:
     rows = particles(3, 0.5, 7)
     expected = compiled.difference(rows, reference)
     rows[1] = math.nan
+    assert compiled.mean(rows, torch.full((3,), 1 / 3)).isnan().all()
     found = compiled.difference(rows, reference)
     assert found[1].isnan().all()
     assert torch.equal(found[::2], expected[::2])
@@ -153,11 +154,12 @@ def test_a_hand_that_is_no_number_is_none() -> None:
 
 def test_the_mean_rotation_is_nearest_to_all() -> None:
     rotvec = torch.tensor([[0.0, 0.0, 0.2], [0.0, 0.0, -0.2], [0.0, 0.0, 0.6]])
-    found = rigid.mean_rotation(rotvec, torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64))
-    torch.testing.assert_close(found, torch.zeros(3), atol=1e-6, rtol=0)
+    weights = torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64)
+    found = rigid.main_rotation(rigid.rotation_scatter(rotvec, weights))
+    torch.testing.assert_close(found, torch.zeros(3).double(), atol=1e-6, rtol=0)
     # Across half a turn, where the vectors themselves point the other way.
     near_pi = torch.tensor([[math.pi - 0.1, 0.0, 0.0], [-math.pi + 0.1, 0.0, 0.0]])
-    found = rigid.mean_rotation(near_pi, torch.tensor([0.5, 0.5], dtype=torch.float64))
+    found = rigid.main_rotation(rigid.rotation_scatter(near_pi, weights[:2]))
     assert float(found.norm()) == pytest.approx(math.pi, abs=1e-5)
 
 

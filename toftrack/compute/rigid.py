@@ -71,22 +71,14 @@ def _pivot(particles: Tensor) -> Tensor:
     return particles[:, :3] + rotated_pivot(particles[:, 3:6])
 
 
-def mean_rotation(rotvec: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean on SO(3), (N, 3) and (N,) to (3,).
-
-    The rotation nearest to the mean matrix (chordal L2 mean; Hartley et al., "Rotation averaging",
-    IJCV 2013).
-    """
-    return main_rotation(rotation_scatter(rotvec, weights)).to(rotvec.dtype)
-
-
 def rotation_scatter(rotvec: Tensor, weights: Tensor) -> Tensor:
     """What `main_rotation` needs to know of (N, 3) rotations of (N,) weights, (4, 4) float64."""
     half = 0.5 * rotvec.double()
     angle = half.norm(dim=1, keepdim=True)
     q = torch.cat((half * (angle / torch.pi).sinc(), angle.cos()), 1)
-    # The nearest rotation's quaternion is the main axis of all quaternions (Markley et al., JGCD
-    # 2007), whatever their signs.
+    # The quaternion of the rotation nearest to the mean matrix (chordal L2 mean; Hartley et al.,
+    # "Rotation averaging", IJCV 2013) is the main axis of all quaternions, whatever their signs
+    # (Markley et al., JGCD 2007).
     return (q * weights[:, None]).mT @ q
 
 

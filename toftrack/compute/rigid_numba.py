@@ -17,8 +17,6 @@ from toftrack.compute.motions import Motions
 from toftrack.compute.rigid import PIVOT_M
 
 _PIVOT = np.array(PIVOT_M)
-_SWEEPS = 8
-"""Of Jacobi's method, which doubles the number of exact digits in each."""
 
 
 @compiled
@@ -211,60 +209,6 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
                         frames_out[i, j, row, column] = frames[j, row, column]
 
 
-@entry_point
-def mean_of_rows(particles, weights, out):
-    """See rigid.mean; particles: (N, 6 + d), out: (1, 6 + d), float32.  weights: (N,) float64."""
-    scatter, total = np.zeros((4, 4), np.float64), np.zeros(out.shape[1], np.float64)
-    for n in range(len(particles)):
-        p = particles[n]
-        for j in range(len(total)):
-            total[j] += weights[n] * p[j]
-        q = quaternion(np.float64(p[3]), np.float64(p[4]), np.float64(p[5]))
-        for i in range(4):
-            for j in range(4):
-                scatter[i, j] += weights[n] * q[i] * q[j]
-    main = main_axis(scatter)
-    vector = rotation_vector((main[0], main[1], main[2], main[3]))
-    for j in range(len(total)):
-        out[0, j] = total[j]
-    for i in range(3):
-        out[0, 3 + i] = vector[i]
-
-
-@compiled
-def main_axis(symmetric):
-    """The eigenvector (4,) of the largest eigenvalue of (4, 4), by Jacobi's rotations; overwrites.
-
-    Golub and Van Loan, "Matrix computations", section 8.5.
-    """
-    axes = np.zeros((4, 4), np.float64)
-    for i in range(4):
-        axes[i, i] = 1.0
-    for _ in range(_SWEEPS):
-        for p in range(3):
-            for q in range(p + 1, 4):
-                if symmetric[p, q] == 0.0:
-                    continue
-                tau = (symmetric[q, q] - symmetric[p, p]) / (2 * symmetric[p, q])
-                t = 1 / (abs(tau) + math.sqrt(1 + tau * tau))
-                t = t if tau >= 0 else -t
-                cosine = 1 / math.sqrt(1 + t * t)
-                sine = t * cosine
-                for k in range(4):
-                    a, b = symmetric[k, p], symmetric[k, q]
-                    symmetric[k, p], symmetric[k, q] = cosine * a - sine * b, sine * a + cosine * b
-                for k in range(4):
-                    a, b = symmetric[p, k], symmetric[q, k]
-                    symmetric[p, k], symmetric[q, k] = cosine * a - sine * b, sine * a + cosine * b
-                    a, b = axes[k, p], axes[k, q]
-                    axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
-    largest = 0
-    for i in range(1, 4):
-        if symmetric[i, i] > symmetric[largest, largest]:
-            largest = i
-    return axes[:, largest]
-
-
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """See rigid.compose; on the CPU, in float32."""
     left, right = np.broadcast_arrays(_rows(reference), _rows(tangent))
@@ -307,9 +251,21 @@ def redraw(
 
 def mean(particles: Tensor, weights: Tensor) -> Tensor:
     """See rigid.mean; on the CPU, in float32."""
-    out = np.empty((1, particles.shape[1]), np.float32)
-    mean_of_rows(_rows(particles), np.ascontiguousarray(weights.numpy(), np.float64), out)
-    return torch.from_numpy(out)
+    rows, shares = particles.double().numpy(), weights.double().numpy()
+    found = shares @ rows
+    half = 0.5 * rows[:, 3:6]
+    angle = np.sqrt((half * half).sum(1, keepdims=True))
+    q = np.concatenate((np.sinc(angle / math.pi) * half, np.cos(angle)), 1)
+    scatter = (q * shares[:, None]).T @ q
+    # The mean rotation's quaternion is the main axis of all, see rigid.rotation_scatter.
+    found[3:6] = np.nan
+    if np.isfinite(scatter).all():
+        main = np.linalg.eigh(scatter)[1][:, -1]
+        main *= 1.0 if main[3] >= 0 else -1.0
+        sine = math.sqrt(main[:3] @ main[:3])
+        # At a small angle, 2 atan(sine / cosine) / sine is 2 / cosine.
+        found[3:6] = main[:3] * (2 * math.atan2(sine, main[3]) / sine if sine > 1e-9 else 2.0)
+    return torch.from_numpy(found[None].astype(np.float32))
 
 
 def _rows(tensor: Tensor) -> np.ndarray:

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
-from toftrack.render.numba.bands import evidence_images
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.segmentation import Observation
 
+_LEAST_M = np.float32(1e-3)
 Values = TypeVar("Values", Tensor, np.ndarray)
 NAMINGS = ("printed", "standard")
 
@@ -70,7 +70,7 @@ class FMeasure:
         depth, hand, occluder = (one.cpu().numpy() for one in given)
         if observation.thing is not None:
             occluder = occluder | observation.thing.cpu().numpy()
-        images = evidence_images(depth, hand, occluder, other, self.tolerance_m)
+        images = _images(depth, hand, occluder, other, np.float32(self.tolerance_m))
         device = observation.depth_m.device
         low, high, front = (torch.from_numpy(image).to(device) for image in images)
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
@@ -113,6 +113,26 @@ class FMeasure:
         rest = b2 * false + missed if printed else false + b2 * missed
         weighted = (1 + b2) * correct
         return weighted / (weighted + rest).clip(min=1e-9)
+
+
+def _images(
+    depth_m: np.ndarray,
+    hand: np.ndarray,
+    occluder: np.ndarray,
+    other: np.ndarray | None,
+    tolerance_m: np.float32,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Low, high and occluder of Evidence, (H, W) float32, of masks (H, W)."""
+    low, high = np.full_like(depth_m, np.inf), np.full_like(depth_m, -np.inf)
+    z = depth_m[hand]
+    low[hand] = 1 / (z + tolerance_m)
+    high[hand] = 1 / np.maximum(z - tolerance_m, _LEAST_M)
+    front = np.zeros_like(depth_m)
+    if other is not None:
+        read = other & (depth_m > 0)
+        front[read] = 1 / depth_m[read]
+    front[occluder] = np.inf
+    return low, high, front
 
 
 def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
