@@ -156,12 +156,10 @@ def test_settings_are_checked() -> None:
     for name, value in {
         "places": 0,
         "hypotheses": 1.5,
-        "candidates": -1,
         "least": 2.0,
         "merit": math.nan,
         "every": 0,
         "sure": 0.4,
-        "crops": 3,
         "keypoint_m": 0.0,
     }.items():
         with pytest.raises(ToftrackError, match=f"detector.{name}="):

@@ -325,7 +325,7 @@ def concluded(choice: Choice, track: Track, probability: float) -> HandState:
 
 
 def chosen(pose: torch.Tensor, moved: bool) -> Choice:
-    return Choice(pose, moved, torch.zeros(0, 27), 0.0, Duration())
+    return Choice(pose, moved, Duration())
 
 
 def test_a_pose_of_another_place_begins_a_track_there() -> None:
