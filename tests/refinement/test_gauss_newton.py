@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 LIMITS = torch.tensor(ANGLE_LIMITS)
-SETTINGS = refinement()
+SETTINGS = refinement(iterations=5)
 FRAMES = range(0, 100, 9)
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from unittest.mock import patch
 
 import numpy as np
 
 from toftrack.hand import shape
+from toftrack.tracking import confidence
 
 INDEX = 1
 OTHER_SIDE = {"left": "right", "right": "left"}
@@ -24,7 +26,7 @@ class Break:
 
     about: str
     overrides: tuple[str, ...] = ()
-    patched: Callable[[], AbstractContextManager[None]] = nullcontext
+    patched: Callable[[], AbstractContextManager[object]] = nullcontext
     k_scale: float = 1.0
     other_side: bool = False
 
@@ -43,6 +45,16 @@ def _turned_index(degrees: float) -> Iterator[None]:
         shape._REST_DEGREES = kept
 
 
+_judge = confidence.JointConfidence.judge
+
+
+def _doubled(
+    model: confidence.JointConfidence, features: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    sigma, near = _judge(model, features)
+    return 2 * sigma, near
+
+
 BREAKS = {
     "keypoints off": Break(
         "the networks' keypoints neither judge nor pull a pose",
@@ -53,7 +65,8 @@ BREAKS = {
         patched=lambda: _turned_index(5.0),
     ),
     "sigma doubled": Break(
-        "all joints' standard deviations twice as large", ("lost.joints.scale=2",)
+        "all joints' standard deviations twice as large",
+        patched=lambda: patch.object(confidence.JointConfidence, "judge", _doubled),
     ),
     "other side": Break("the other hand's side is given", other_side=True),
     "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),

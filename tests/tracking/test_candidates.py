@@ -17,9 +17,6 @@ from toftrack.detector.crops import crop_rotation
 from toftrack.detector.hand_detector import Detection
 from toftrack.detector.network import PARTS
 from toftrack.detector.parts import (
-    ANOTHER_PART,
-    BACKGROUND_PART,
-    FOREARM_PART,
     HAND_PART,
     THING_PART,
     Parts,
@@ -34,9 +31,8 @@ from toftrack.tracking.candidates import (
     posterior_of,
     propose,
 )
-from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.pixels import with_own_arm, without_things
+from toftrack.tracking.pixels import without_things
 from toftrack.tracking.select import Source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -50,7 +46,6 @@ def model_with(**settings: float) -> TrackerModel:
 def filtered(
     x: float,
     seed: int = 0,
-    covered: bool = False,
     detection: Detection | None = None,
     **changes: object,
 ) -> FilteredFrame:
@@ -59,9 +54,6 @@ def filtered(
     track = track_of(hand_at(x), **({"log_odds": 0.0} | changes))
     detection = detection_of(truth) if detection is None else detection
     frame = frame_of(image_of(truth), track, detection, model=model_with())
-    if covered:
-        depth = torch.full_like(frame.observation.depth_m, 0.3)
-        frame = replace(frame, observation=replace(frame.observation, depth_m=depth))
     return FilteredFrame.of(frame, track.mean)
 
 
@@ -98,71 +90,6 @@ def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(
     standing = table.source <= Source.DYNAMICS
     torch.testing.assert_close(table.pose[standing, :3], hand.pose[:, :3].repeat(2, 1))
     assert bool(table.log_posterior[standing].isneginf().all())
-
-
-def test_a_covered_hand_is_held_where_it_was() -> None:
-    covered = filtered(0.0, covered=True)
-    table = propose(covered)
-    assert table.source.tolist() == [Source.HELD]
-    assert torch.equal(table.pose, covered.frame.track.pose)
-
-
-def emerging(
-    beside_m: float = 0.02,
-    other_m: float | None = None,
-    log_odds: float = -4.0,
-    **changes: object,
-) -> FilteredFrame:
-    """A hand that is covered where it was, and that the detector sees before that.
-
-    other_m: where another hand is, likewise; None = there is none.
-    """
-    hand = filtered(0.0, covered=True, log_odds=log_odds)
-    detection = replace(detection_of(hand_at(beside_m, 0.29)), **changes)
-    frame = replace(hand.frame, detection=detection)
-    if other_m is not None:
-        none = np.zeros(frame.observation.depth_m.shape, bool)
-        joints = detection_of(hand_at(other_m, 0.29)).joints_m[0]
-        other = OtherHand(joints, joints[9].numpy(), True, True, none, none)
-        frame = replace(frame, others=(other,))
-    return FilteredFrame.of(frame, frame.track.mean)
-
-
-def test_a_covered_hand_that_the_detector_surely_sees_emerges() -> None:
-    found = emerging()
-    assert found.emerges and not found.covered and not found.hidden
-    assert Source.DETECTOR in propose(found).source.tolist()
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"present": 0.5}, {"other_m": 0.04}, {"beside_m": 0.5}, {"log_odds": 1.0}],
-    ids=["it is not sure", "it sees the other hand", "beside the image", "it was not lost"],
-)
-def test_else_it_stays_covered(changes: dict[str, float]) -> None:
-    found = emerging(**changes)
-    assert not found.emerges and found.covered and found.detection.empty
-    assert propose(found).source.tolist() == [Source.HELD]
-    assert emerging(other_m=-0.2).emerges, "the other hand is elsewhere"
-
-
-def test_a_hand_mostly_out_of_sight_is_not_compared_with_the_detector() -> None:
-    assert filtered(0.0, covered=True).detection.empty
-    assert not filtered(0.0).detection.empty
-    far = filtered(0.35)  # most of it is beside the image
-    assert far.detection.empty and not far.covered
-    assert Source.DETECTOR not in propose(far).source.tolist()
-
-
-def test_a_hand_that_comes_into_the_image_is_compared_with_it_until_it_is_believed() -> None:
-    detection = detection_of(bent(hand_at(0.35), 0, 0.4))
-    coming = filtered(0.35, believed=False)
-    assert not coming.detection.empty and Source.DETECTOR in propose(coming).source.tolist()
-    assert filtered(0.35, believed=True).detection.empty
-    unsure, elsewhere = replace(detection, present=0.5), detection_of(hand_at(0.1))
-    for other in (unsure, elsewhere):
-        assert filtered(0.35, believed=False, detection=other).detection.empty
-    assert filtered(0.0, believed=False, covered=True).detection.empty, "something hides it"
 
 
 def test_without_refinement_the_filter_alone_proposes() -> None:
@@ -266,68 +193,3 @@ def test_without_a_thing_all_stays_as_it_is() -> None:
     assert rest is whole
     parts[0, :3] = THING_PART
     assert seen_with(parts)[1].thing is None, "too little for a thing"
-
-
-def hidden_by(
-    kind: int, visible: int = HAND_PART
-) -> tuple[Observation, Observation, Detection, torch.Tensor]:
-    """A hand and what lies beside it nearer to the camera, which the network says is `kind`: the
-    image as it is segmented, and with the own arm told; the detection, and the pixels beside it.
-    """
-    truth = hand_at()
-    image = image_of(truth)
-    detection = detection_of(truth)
-    centre = detection.keypoints.points_m[9].double().numpy()
-    track = track_of(truth)
-    before = frame_of(image, track, detection).observation
-    rows, columns = before.hand.nonzero().unbind(1)
-    beside = torch.zeros_like(before.hand)
-    beside[int(rows.min()) : int(rows.max()), : int(columns.min()) - 1] = True
-    beside[:, : int(columns.min()) - 12] = False
-    parts = np.full((PARTS, PARTS), visible, np.uint8)
-    whole = Parts(parts, crop_rotation(centre), centre, False)
-    depth = torch.where(beside, float(centre[2]) - 0.06, before.depth_m)
-    observation = replace(before, depth_m=depth, occluder=beside)
-    at = whole.at(points_at(beside, observation), outside=255)
-    assert (at != 255).any(), "the network sees some of it"
-    middle = PARTS // 2
-    parts[:, : middle - 1] = kind
-    detection = replace(detection, parts=whole)
-    return observation, with_own_arm(observation, detection), detection, beside
-
-
-def points_at(mask: torch.Tensor, observation: Observation) -> np.ndarray:
-    """(P, 3) what is seen at a mask's pixels."""
-    row, column = mask.nonzero().unbind(1)
-    z, k = observation.depth_m[row, column], observation.k
-    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
-    return torch.stack((x, y, z), 1).double().numpy()
-
-
-def test_the_own_arm_before_the_hand_hides_nothing_of_it() -> None:
-    segmented, known, _, beside = hidden_by(FOREARM_PART)
-    assert bool(segmented.occluder[beside].all()) and not known.occluder.any()
-    assert torch.equal(known.hand, segmented.hand | beside)
-    assert bool((known.hiding_m[beside] == 0).all())
-
-
-@pytest.mark.parametrize("kind", [BACKGROUND_PART, HAND_PART, ANOTHER_PART, THING_PART])
-def test_whatever_else_is_before_the_hand_hides_it(kind: int) -> None:
-    segmented, known, _, beside = hidden_by(kind)
-    assert torch.equal(known.occluder, segmented.occluder)
-    assert torch.equal(known.hand, segmented.hand)
-    assert bool((known.hiding_m[beside] > 0).all())
-
-
-def test_a_hand_does_not_hide_its_own_fingers() -> None:
-    truth = bent(hand_at(), 3, 1.4)
-    detection, image = detection_of(truth), image_of(truth)
-    centre = detection.keypoints.points_m[9].double().numpy()
-    kind = np.full((PARTS, PARTS), HAND_PART, np.uint8)
-    detection = replace(detection, parts=Parts(kind, crop_rotation(centre), centre, False))
-    seen = frame_of(image, track_of(truth), detection).observation
-    known = with_own_arm(seen, detection)
-    assert bool((known.hiding_m[seen.hand] == 0).all()) and bool(
-        (seen.hiding_m[seen.hand] > 0).all()
-    )
-    assert torch.equal(known.hand, seen.hand) and torch.equal(known.occluder, seen.occluder)

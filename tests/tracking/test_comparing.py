@@ -5,16 +5,14 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import cast
 
-import hydra
 import pytest
-from helpers.tracking import configuration
 
 from toftrack.tracking.comparing import comparison_due
-from toftrack.tracking.handedness import HandednessEstimate
+from toftrack.tracking.handedness import HandednessEstimate, HandednessSettings
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import HandState
 
-SETTINGS = hydra.utils.instantiate(configuration()["hand"]["sides"])
+SETTINGS = HandednessSettings()
 
 
 def due(given: bool, believed: bool, log_odds: float) -> bool:

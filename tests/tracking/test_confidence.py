@@ -18,7 +18,7 @@ from toftrack.tracking.confidence import (
     NO_FEATURES,
     ConfidenceFeatures,
     ConfidenceModel,
-    WholeHand,
+    LogOdds,
     confidence_features,
 )
 from toftrack.tracking.lifecycle import judge
@@ -45,14 +45,9 @@ K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 
 def model_of(**changes: object) -> ConfidenceModel:
     """Of the score alone: log odds 4 at a good score, 0 at 2 below, and so on; no memory."""
-    usual = {"memory": 0.0, "intercept": 4.0, "weights": {"log_score": 2.0}}
-    numbers = {
-        "confidence": 0.5,
-        "give_up": 0.1,
-        "patience": 5,
-        "whole": WholeHand(0.0, 0.0, 0.0, 1.0, 0.0, {}),
-    }
-    return confidence_model(**(usual | numbers | changes))
+    odds = LogOdds(4.0, {"log_score": 2.0})
+    usual = {"memory": 0.0, "confidence": 0.5, "give_up": 0.1, "patience": 5, "log_odds": odds}
+    return confidence_model(**(usual | changes))
 
 
 def with_odds(log_odds: float, **changes: float) -> ConfidenceFeatures:
@@ -67,8 +62,8 @@ def followed() -> Track:
 
 
 def test_a_weight_of_an_unknown_feature_is_refused() -> None:
-    with pytest.raises(ToftrackError, match="lost.weights.luck is unknown; the features are log_"):
-        model_of(weights={"luck": 1.0})
+    with pytest.raises(ToftrackError, match="weights.luck is unknown; the features are log_"):
+        LogOdds(0.0, {"luck": 1.0})
 
 
 @pytest.mark.parametrize(
@@ -79,9 +74,6 @@ def test_a_weight_of_an_unknown_feature_is_refused() -> None:
         ("memory", 1.0),
         ("patience", -1),
         ("patience", 2.5),
-        ("probation", -1),
-        ("intercept", math.nan),
-        ("weights", {"young": math.inf}),
     ],
 )
 def test_settings_that_cannot_be_are_refused(name: str, value: object) -> None:
@@ -93,14 +85,14 @@ def test_settings_that_cannot_be_are_refused(name: str, value: object) -> None:
 def test_log_odds_rise_and_fall_with_a_feature_as_its_weight_says(name: str) -> None:
     more = replace(GOOD, **{name: getattr(GOOD, name) + 1.0})
     for weight in (-0.7, 0.4):
-        model = model_of(weights={name: weight})
-        assert model.log_odds(more) - model.log_odds(GOOD) == pytest.approx(weight)
-    assert model_of(weights={}).log_odds(more) == 4.0
+        log_odds = LogOdds(4.0, {name: weight})
+        assert log_odds(more) - log_odds(GOOD) == pytest.approx(weight)
+    assert LogOdds(4.0, {})(more) == 4.0
 
 
 @pytest.mark.parametrize("log_odds", [-1e9, -40.0, -2.0, 0.1, 3.0, 1e9])
 def test_the_confidence_is_the_probability_of_the_log_odds(log_odds: float) -> None:
-    found = judge(followed(), with_odds(log_odds), FRAME_S, 1.0, 0.0, 1.0, model_of())
+    found = judge(followed(), with_odds(log_odds), FRAME_S, 1.0, 0.0, model_of())
     assert found.confidence == pytest.approx(1 / (1 + math.exp(-max(min(log_odds, 50), -50))))
     assert 0 <= found.confidence <= 1
     assert found.lost == (found.confidence < 0.5)
@@ -164,25 +156,3 @@ def test_joints_out_of_sight_are_counted() -> None:
     u = (200.0 * joints[:, 0] / joints[:, 2] + 87.5).round()
     half[:, : int(u.median())] = 0.3
     assert 0.2 < features_of(joints, half).hidden < 0.8
-
-
-def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:
-    whole = WholeHand(0.5, 0.5, 0.0, 1.0, 3.0, {"other_side": -2.0})
-    model = model_of(whole=whole)
-    for other_side, lost in ((0.0, False), (1.4, False), (1.6, True)):
-        found = judge(
-            followed(), with_odds(4.0, other_side=other_side), FRAME_S, 1.0, 0.0, 1.0, model
-        )
-        assert found.lost == lost and found.whole_odds == pytest.approx(3.0 - 2.0 * other_side)
-        assert found.confidence == pytest.approx(1 / (1 + math.exp(-4.0)))
-    with pytest.raises(ToftrackError, match="lost.whole.weights.luck is unknown"):
-        WholeHand(0.5, 0.5, 0.0, 1.0, 0.0, {"luck": 1.0})
-    with pytest.raises(ToftrackError, match=r"lost\.whole\.least"):
-        WholeHand(1.5, 0.5, 0.0, 1.0, 0.0, {})
-
-
-def test_odds_of_the_whole_hand_are_smoothed_like_the_others() -> None:
-    model = model_of(whole=WholeHand(0.0, 0.0, 0.0, 1.0, 0.0, {"other_side": -1.0}), memory=0.75)
-    track = replace(followed(), whole_odds=4.0)
-    found = judge(track, with_odds(0.0, other_side=0.0), FRAME_S, 1.0, 0.0, 1.0, model)
-    assert found.whole_odds == pytest.approx(3.0)

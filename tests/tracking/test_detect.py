@@ -19,7 +19,7 @@ from helpers.rendered import (
     track_of,
 )
 
-from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.compute.pace import FRAME_S
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.detector.proposals import SAME_PLACE_M
@@ -33,7 +33,6 @@ from toftrack.tracking.detect import (
     search,
     search_due,
     start_detection,
-    was_beside,
 )
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
@@ -73,32 +72,6 @@ def likely_for(hand: HandState, *others: OtherHand):
 # What was there before.
 
 
-@pytest.mark.parametrize(
-    ("moved_m", "there", "beside"),
-    [
-        ((0.16, 0.0), True, True),
-        ((0.16, 0.0), False, False),
-        ((0.0, 0.0), True, False),
-        ((0.0, 0.11), True, False),
-    ],
-    ids=["it was there", "nothing was there", "where the hand was", "where its arm was"],
-)
-def test_a_hand_that_was_beside_the_one_that_left_is_not_one_that_comes(
-    moved_m: tuple[float, float], there: bool, beside: bool
-) -> None:
-    model, here = right_hand_model(), hand_at()
-    other = here.clone()
-    other[0, :2] += torch.tensor(moved_m)
-    image = image_of(here, other) if there else image_of(here)
-    scene = model.segmentation(image.depth_m, image.k, None, None)
-    seen = seen_at(here, 0.4)
-    assert was_beside(detection_of(other), replace(seen, scene=scene)) is beside
-    later = replace(seen, scene=scene).after(0.2)
-    assert was_beside(detection_of(other), later) is beside, "it is known as time goes on"
-    assert not was_beside(detection_of(other), seen), "nobody says what was there"
-    assert not was_beside(NO_DETECTION, replace(seen, scene=scene))
-
-
 # When it is asked.
 
 
@@ -131,9 +104,8 @@ def test_the_whole_image_is_searched_while_no_hand_is_believed(
         ({}, 2, True),
         ({"log_odds": 0.0}, 0, True),
         ({"doubted": True}, 0, True),
-        ({"challenged": Duration(FRAME_S)}, 0, True),
     ],
-    ids=["sure", "sure, later", "in time", "unsure", "doubted", "challenged"],
+    ids=["sure", "sure, later", "in time", "unsure", "doubted"],
 )
 def test_the_detector_is_asked_about_a_sure_hand_only_every_few_frames(
     changes: dict[str, object], unseen_frames: int, due: bool
@@ -210,32 +182,13 @@ def test_what_is_expected_of_a_hand_that_is_not_tracked_yet() -> None:
 
 def searched(found: list[Detection], any_side: bool = False, **changes: object) -> Detection:
     model = model_with(FixedDetector(found), any_side)
-    return search(slot_of(None, model, **changes), IMAGE, (), model).best
+    return search(slot_of(None, model, **changes), IMAGE, (), model)
 
 
 def test_the_best_of_all_places_is_taken() -> None:
     hands = [detection_of(hand_at(0.1)), detection_of(hand_at(-0.1, z=0.3))]
     assert searched(hands) is hands[0]
     assert searched([]).empty
-
-
-def test_the_likeliest_place_is_guessed_where_there_is_no_hand() -> None:
-    def place(x: float, heat: float, merit: float) -> Detection:
-        return replace(detection_of(hand_at(x)), heat=heat, merit=merit)
-
-    cut = 0.35  # most of it is beside the image
-    likely, likelier = place(-cut, 0.3, -9.0), place(cut, 0.4, -12.0)
-    unlikely, impossible = place(cut, 0.1, -8.0), place(cut, 0.9, -math.inf)
-    in_view = place(0.0, 0.9, -6.0)
-    model = model_with(FixedDetector([in_view, likely, likelier, unlikely, impossible]))
-    found = search(slot_of(None, model), IMAGE, (), model)
-    assert found.best.empty and found.guess is likelier
-    model = model_with(FixedDetector([likely, place(0.2, 0.3, -1.0)]))
-    found = search(slot_of(None, model), IMAGE, (), model)
-    assert not found.best.empty and found.guess.empty
-    model = model_with(FixedDetector([unlikely, impossible, in_view]))
-    found = search(slot_of(None, model), IMAGE, (), model)
-    assert found.best.empty and found.guess.empty
 
 
 def test_a_hand_that_nobody_described_is_the_one_that_is_held_out() -> None:
@@ -258,10 +211,10 @@ def test_the_hand_that_is_held_out_is_found_whichever_side_it_is_of() -> None:
 
     detector = OneOfEachSide([near])
     model = model_with(detector, any_side=True)
-    assert search(slot_of(None, model), IMAGE, (), model).best is not far
+    assert search(slot_of(None, model), IMAGE, (), model) is not far
     np.testing.assert_allclose(detector.centres_m[0][0], near.centre_m.numpy(), atol=1e-6)
     given = model_with(detector, any_side=False)
-    assert search(slot_of(None, given), IMAGE, (), given).best is far, "its side was given"
+    assert search(slot_of(None, given), IMAGE, (), given) is far, "its side was given"
 
 
 def test_where_no_hand_of_a_side_is_found_one_of_the_other_side_may_be_it() -> None:
@@ -273,7 +226,7 @@ def test_where_no_hand_of_a_side_is_found_one_of_the_other_side_may_be_it() -> N
     for any_side, sides in ((True, ["right", "left"]), (False, ["right"])):
         detector = LeftHands([detection_of(hand_at(0.1), side="left")])
         model = model_with(detector, any_side)
-        found = search(slot_of(None, model), IMAGE, (), model).best
+        found = search(slot_of(None, model), IMAGE, (), model)
         assert detector.searched == sides and found.empty == (not any_side)
     assert len(detector.centres_m) == 0
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.configured import confidence_model
 from helpers.tracking import configuration, follow, sample
 from helpers.two_hands import TwoHands, beside_its_mirror
 
@@ -133,8 +132,3 @@ def test_other_numbers_of_hands_are_refused(hands: float) -> None:
 def test_two_hands_without_networks_are_refused() -> None:
     with pytest.raises(ToftrackError, match="hands=2 .*leave experiment=paper out"):
         tracker_of("hands=2", "experiment=paper")
-
-
-def test_beside_another_hand_one_that_comes_back_has_to_convince_more() -> None:
-    lost = confidence_model()
-    assert lost.second > lost.again

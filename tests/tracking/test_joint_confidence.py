@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.configured import confidence_model
 from helpers.detection import detection_of
-from helpers.tracking import configuration, make_tracker, sample
+from helpers.tracking import make_tracker, sample
 
 from toftrack.detector.hand_detector import NO_DETECTION
 from toftrack.errors import ToftrackError
@@ -57,21 +57,17 @@ def features_of(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"scale": 0.0}, "lost.joints.scale"),
-        ({"odds": math.nan}, "lost.joints.odds"),
+        ({"scale": 0.0}, "joints.scale"),
+        ({"odds": math.nan}, "joints.odds"),
         ({"kinds": {"wrist": [0, 0, 0, 0]}}, "kinds must have a row for each of wrist, thumb_cmc"),
         ({"weights": {"luck": [0, 0, 0, 0]}}, "weights must have a row for each of unsure"),
         ({"weights": dict.fromkeys(JOINT_FEATURES, [1, 2])}, "unsure must be 4 numbers: ray"),
-        ({"kinds": dict.fromkeys(KINDS, [0, 0, 0, math.inf])}, "lost.joints.kinds.wrist"),
+        ({"kinds": dict.fromkeys(KINDS, [0, 0, 0, math.inf])}, "joints.kinds.wrist"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
         replace(model(), **changes)
-
-
-def test_a_scale_is_taken_from_the_command_line() -> None:
-    assert configuration("lost.joints.scale=2").lost.joints.scale == 2
 
 
 @pytest.mark.parametrize("name", JOINT_FEATURES)

@@ -22,8 +22,7 @@ from helpers.rendered import (
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
-from toftrack.tracking import lifecycle
-from toftrack.tracking.confidence import NO_FEATURES, ConfidenceModel, WholeHand
+from toftrack.tracking.confidence import NO_FEATURES, ConfidenceModel, LogOdds
 from toftrack.tracking.filter import Filtered, Found
 from toftrack.tracking.handedness import HandednessEstimate
 from toftrack.tracking.hands import OtherHand
@@ -48,8 +47,7 @@ def image() -> DepthImage:
 
 
 LOST = confidence_model(memory=0.0, confidence=0.3, believe=0.6, second=0.8, give_up=0.1)
-WHOLE = WholeHand(0.0, 0.0, 0.0, 1.0, 0.0, {})
-PLAIN = replace(LOST, intercept=0.0, weights={"log_score": 1.0}, patience=5, whole=WHOLE)
+PLAIN = replace(LOST, log_odds=LogOdds(0.0, {"log_score": 1.0}), patience=5)
 """Log odds are just the feature log_score."""
 HIDDEN = {"hidden": 0.5}
 
@@ -67,7 +65,7 @@ def judged(
     features = replace(NO_FEATURES, log_score=log_odds, **features)
     new = PLAIN.second if second else PLAIN.believe
     model = replace(PLAIN, patience=patience)
-    return judge(track, features, dt_s, side, new, PLAIN.whole.believe, model)
+    return judge(track, features, dt_s, side, new, model)
 
 
 def frames_until_end(
@@ -164,7 +162,7 @@ def test_the_log_odds_are_smoothed_over_time_but_in_a_first_frame() -> None:
     features = replace(NO_FEATURES, log_score=2.0)
     older, new = track_of(HERE, log_odds=-2.0), track_of(HERE, age=Duration(), log_odds=-2.0)
     found = [
-        judge(track, features, dt_s, 1.0, 0.0, 1.0, model).log_odds
+        judge(track, features, dt_s, 1.0, 0.0, model).log_odds
         for track, dt_s in ((older, FRAME_S), (older, 2 * FRAME_S), (new, FRAME_S))
     ]
     assert found == pytest.approx([0.0, 1.0, 2.0])
@@ -210,47 +208,6 @@ def test_a_track_is_believed_once_and_doubted_while_it_is_lost(
     assert hand.seen.ever == (not lost), "remembered as last believed"
 
 
-def believed_as(probability: float, as_whole: float, seen: LastSeen = NOWHERE) -> bool:
-    """Whether a new hand is believed that is right, and right as a whole, so probably."""
-    odds = math.log(as_whole / (1 - as_whole))
-    whole = WholeHand(0.0, 0.0, 0.0, 0.9, 0.0, {"other_side": odds})
-    return not closed(
-        track_of(HERE, believed=False),
-        probability,
-        model=replace(PLAIN, whole=whole),
-        seen=seen,
-        other_side=1.0,
-    )[0].lost
-
-
-def test_a_new_hand_is_believed_that_is_right_or_else_right_as_a_whole() -> None:
-    assert believed_as(0.7, 0.5) and believed_as(0.4, 0.95)
-    assert not believed_as(0.4, 0.85)
-    assert not believed_as(0.2, 0.95), "what would be flagged later is flagged now"
-
-
-def test_one_that_was_believed_before_is_believed_sooner_but_not_one_that_was_only_followed() -> (
-    None
-):
-    between = 0.5 * (PLAIN.again + PLAIN.believe)
-    before = LastSeen(track_of(HERE).mean, 1.0)
-    assert believed_as(between, 0.5, before)
-    assert not believed_as(between, 0.5, replace(before, surest=-math.inf))
-
-
-@pytest.mark.parametrize(
-    ("flagged_s", "believed", "lost"), [(0.0, True, False), (0.5, True, True), (0.5, False, False)]
-)
-def test_after_a_hand_was_flagged_for_long_it_must_be_surer_as_a_whole(
-    flagged_s: float, believed: bool, lost: bool
-) -> None:
-    whole = WholeHand(0.5, 0.9, 0.4, 1.0, math.log(0.8 / 0.2), {})
-    track = track_of(HERE, believed=believed, flagged_s=flagged_s, doubted=flagged_s > 0)
-    status, after, _ = closed(track, 0.95, model=replace(PLAIN, whole=whole))
-    assert status.lost == lost
-    assert after.flagged_s == pytest.approx(flagged_s + FRAME_S if lost else 0.0)
-
-
 def beside(watched: bool) -> OtherHand:
     """Another hand that is believed."""
     none = np.zeros((2, 2), bool)
@@ -263,7 +220,7 @@ def test_beside_another_hand_a_new_one_must_be_surer_whether_that_is_reported_or
     watched: bool,
 ) -> None:
     track = track_of(HERE, believed=False)
-    between = 0.5 * (max(PLAIN.believe, PLAIN.again) + PLAIN.second)
+    between = 0.5 * (PLAIN.believe + PLAIN.second)
     assert not closed(track, between)[0].lost
     assert closed(track, between, (beside(watched),))[0].lost
     assert not closed(track, 0.97, (beside(watched),))[0].lost
@@ -282,24 +239,6 @@ def test_the_second_of_two_hands_is_asked_for_less_than_a_first_one() -> None:
     assert lost(0, beside(False)) and lost(1), "the first hand is not"
 
 
-def test_what_lies_on_a_watched_hand_s_forearm_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lifecycle, "on_forearm", lambda joints, other: True)
-    track = track_of(HERE, believed=True)
-    assert closed(track, 0.9, (beside(True),))[0].lost
-    assert not closed(track, 0.9, (beside(False),))[0].lost
-
-
-def test_a_new_hand_that_seems_to_be_the_other_one_is_doubted_unless_that_is_followed() -> None:
-    """Of two hands that are asked for, the one that is followed says which one comes."""
-    track = track_of(HERE, believed=False)
-    like_a_left_one = HandednessEstimate(given=True, prior=4.0, fits=-0.8, comparisons=1)
-    others = {"alone": (), "watched": (beside(True),), "reported": (beside(False),)}
-    lost = {
-        name: closed(track, 0.95, there, like_a_left_one)[0].lost for name, there in others.items()
-    }
-    assert lost == {"alone": True, "watched": True, "reported": False}
-
-
 def test_the_particles_follow_the_pose_that_was_found() -> None:
     _, after, _ = closed(track_of(HERE), 0.9)
     assert float(after.mean[0, 0]) == pytest.approx(0.01, abs=1e-4)
@@ -307,16 +246,9 @@ def test_the_particles_follow_the_pose_that_was_found() -> None:
     assert after.velocity[0] > 0
 
 
-def test_a_hand_is_not_remembered_before_its_probation_is_over() -> None:
-    for frames in range(1, 8):
-        track = track_of(HERE, age=Duration((frames - 1) * FRAME_S))
-        _, _, hand = closed(track, 0.9)
-        assert hand.seen.ever == (frames > PLAIN.probation)
-
-
 def concluded(choice: Choice, track: Track, probability: float) -> HandState:
     """The slot's hand after a frame with such a choice."""
-    lost = replace(PLAIN, weights={}, intercept=math.log(probability / (1 - probability)))
+    lost = replace(PLAIN, log_odds=LogOdds(math.log(probability / (1 - probability)), {}))
     frame = frame_of(
         image(), track, detection_of(HERE), model=replace(right_hand_model(), lost=lost)
     )
@@ -325,7 +257,7 @@ def concluded(choice: Choice, track: Track, probability: float) -> HandState:
 
 
 def chosen(pose: torch.Tensor, moved: bool) -> Choice:
-    return Choice(pose, moved, Duration())
+    return Choice(pose, moved)
 
 
 def test_a_pose_of_another_place_begins_a_track_there() -> None:

@@ -13,7 +13,7 @@ from toftrack.frames import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.model_image import model_range_image
 from toftrack.render.reference import ReferenceScorer
-from toftrack.tracking.hands import OtherHand, explained, on_forearm, pixels_of, without
+from toftrack.tracking.hands import OtherHand, explained, pixels_of, without
 from toftrack.tracking.posterior import touching
 
 K = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
@@ -100,20 +100,3 @@ def another(joints_m: np.ndarray, certain: bool = True) -> OtherHand:
     return OtherHand(
         torch.from_numpy(joints_m), joints_m[:10].mean(0), True, certain, none, none, True
     )
-
-
-@pytest.mark.parametrize(
-    ("wrist_m", "fingers", "lies"),
-    [
-        ((0.0, 0.06, 0.5), (0.0, 1.0, 0.0), True),  # down its arm
-        ((0.04, 0.07, 0.52), (0.4, 1.0, 0.1), True),
-        ((0.0, 0.06, 0.5), (0.0, -1.0, 0.0), False),  # in it, and as it
-        ((0.10, 0.06, 0.5), (0.0, 1.0, 0.0), False),  # beside its arm
-        ((-0.12, 0.08, 0.5), (1.0, 0.0, 0.0), False),  # a hand that holds its arm
-        ((0.0, 0.30, 0.5), (0.0, 1.0, 0.0), False),  # farther away than a forearm is seen
-    ],
-)
-def test_the_forearm_of_another_hand_is_no_hand(wrist_m, fingers, lies: bool) -> None:
-    upright = straight_hand((0.0, 0.0, 0.5), (0.0, -1.0, 0.0))
-    assert on_forearm(straight_hand(wrist_m, fingers), another(upright)) is lies
-    assert not on_forearm(straight_hand(wrist_m, fingers), another(upright, certain=False))

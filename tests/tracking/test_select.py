@@ -1,19 +1,14 @@
-"""Which hypothesis becomes the pose: against a plain reference, and as sequences of frames."""
+"""Which hypothesis becomes the pose: against a plain reference, and case by case."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 import torch
 
-from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.tracking.select import Choice, Hypotheses, Hysteresis, Incumbent, Source, select
-
-SETTINGS = Hysteresis()
+from toftrack.tracking.select import _ELSEWHERE_M, _MARGIN, Hypotheses, Source, select
 
 
 def joints_of(poses: torch.Tensor) -> torch.Tensor:
@@ -23,146 +18,65 @@ def joints_of(poses: torch.Tensor) -> torch.Tensor:
     return joints
 
 
-def pose(place: float = 0.0, finger: float = 0.0) -> torch.Tensor:
-    """(1, 27)"""
-    state = torch.zeros(1, 27)
-    state[0, 0], state[0, 6] = place, finger
-    return state
+def table_of(*rows: tuple[float, float, Source, float]) -> Hypotheses:
+    """Hypotheses by their place, finger, source and log posterior."""
+    poses = torch.zeros(len(rows), 27)
+    poses[:, 0] = torch.tensor([place for place, _, _, _ in rows])
+    poses[:, 6] = torch.tensor([finger for _, finger, _, _ in rows])
+    sources = torch.tensor([int(source) for _, _, source, _ in rows])
+    return Hypotheses(poses, sources, torch.tensor([value for _, _, _, value in rows]))
 
 
-OTHER_FINGER = pose(finger=0.06)
-OTHER_PLACE = pose(place=0.05)
+def chosen(table: Hypotheses, hidden: bool = False) -> tuple[int, bool]:
+    """The row, and whether it is of another place."""
+    choice = select(table, joints_of(table.pose), hidden)
+    (row,) = (table.pose == choice.pose).all(1).nonzero()[:1].tolist()
+    return row[0], choice.moved
 
 
-def random_table(draw: np.random.Generator) -> Hypotheses:
-    """A few poses near one another, of which one at least is the filter's."""
-    n = int(draw.integers(1, 10))
-    poses = torch.zeros(n, 27)
-    poses[:, 0] = torch.from_numpy(draw.choice((0, 0, 0.006, 0.05), n) + draw.normal(0, 1e-3, n))
-    poses[:, 6] = torch.from_numpy(draw.choice((0, 0, 0.02, 0.06), n) + draw.normal(0, 1e-3, n))
-    sources = torch.from_numpy(draw.choice([int(source) for source in Source], n))
-    sources[draw.integers(n)] = int(draw.choice((Source.PREVIOUS, Source.DYNAMICS)))
-    values = torch.from_numpy(draw.normal(0, 0.05, n)).float()
-    return Hypotheses(poses, sources, values)
-
-
-def reference(
-    table: Hypotheses, track: Incumbent, dt_s: float, detected: bool, hidden: bool
-) -> tuple[int, bool, Duration]:
-    """The row of the pose by plain loops, whether it is of another place, and `challenged`."""
-    value, joints = table.log_posterior.tolist(), joints_of(table.pose).double().numpy()
-    sources, rows, s = table.source.tolist(), range(len(table)), SETTINGS
-    base = max((i for i in rows if sources[i] <= Source.DYNAMICS), key=lambda i: value[i])
-    away = [np.linalg.norm(joints[i] - joints[base], axis=1).mean() for i in rows]
-    places = [i for i in rows if sources[i] == Source.DETECTOR and away[i] >= s.place_m]
-    best = max(places, key=lambda i: value[i], default=base)
-    challenged = track.challenged
-    if detected:
-        gain = value[best] - value[base]
-        leads = gain > s.place_lead and (not hidden or gain > 2.0)
-        challenged = challenged.extended(dt_s) if leads else Duration()
-        if leads and (track.new or track.emerges or challenged.reached(s.place_frames)):
-            return best, True, Duration()
-    near = [i for i in rows if i not in places]
-    margin = [s.margin if sources[i] == Source.DETECTOR else 0.0 for i in rows]
-    return max(near, key=lambda i: value[i] - margin[i]), False, challenged
-
-
-@pytest.mark.parametrize("detected", [True, False])
-@pytest.mark.parametrize("hidden", [True, False])
-def test_the_choice_is_that_of_a_plain_reference(detected: bool, hidden: bool) -> None:
+def test_the_choice_is_that_of_a_plain_reference() -> None:
     draw, seen = np.random.default_rng(0), set()
-    for _ in range(250):
-        table = random_table(draw)
-        challenged = Duration(float(draw.choice((0.0, 0.04, 0.08))))
-        track = Incumbent(challenged, bool(draw.random() < 0.15), bool(draw.random() < 0.3))
-        dt_s, joints = float(draw.choice((0.02, 0.04, 0.2))), joints_of(table.pose)
-        choice = select(table, joints, track, dt_s, detected, hidden, SETTINGS)
-        row, moved, challenged = reference(table, track, dt_s, detected, hidden)
-        assert torch.equal(choice.pose, table.pose[[row]])
-        assert choice.moved == moved and choice.challenged == challenged
-        seen.add((Source(int(table.source[row])), moved))
-    assert {source for source, _ in seen} == set(Source)
-    assert any(moved for _, moved in seen) == (detected and not hidden)
-
-
-@dataclass
-class Followed:
-    """A track over frames: what was chosen in one stands in the next."""
-
-    new: bool = False
-    detected: bool = True
-    hidden: bool = False
-    emerges: bool = False
-    pose: torch.Tensor = field(default_factory=pose)
-    challenged: Duration = Duration()
-    frames: int = 0
-
-    def frame(self, others: Sequence[tuple[torch.Tensor, Source, float]]) -> Choice:
-        """A frame in which other poses (1, 27) are better than the standing one by so much."""
-        tables = [Hypotheses.of(self.pose, Source.PREVIOUS)]
-        tables += [Hypotheses.of(other, source) for other, source, _ in others]
-        gains = torch.tensor([0.0] + [gain for _, _, gain in others])
-        table = replace(Hypotheses.joined(tables), log_posterior=gains)
-        incumbent = Incumbent(self.challenged, self.new and not self.frames, self.emerges)
-        joints = joints_of(table.pose)
-        found = select(table, joints, incumbent, FRAME_S, self.detected, self.hidden, SETTINGS)
-        self.challenged, self.pose, self.frames = found.challenged, found.pose, self.frames + 1
-        return found
-
-    def until(self, wanted: torch.Tensor, source: Source, gain: float, most: int = 30) -> int:
-        """In which frame a pose takes over that is better by as much; 0 = in none."""
-        for number in range(1, most + 1):
-            if torch.equal(self.frame([(wanted, source, gain)]).pose, wanted):
-                return number
-        return 0
+    for _ in range(500):
+        n = int(draw.integers(1, 10))
+        places = draw.choice((0, 0, 0.006, 0.05), n) + draw.normal(0, 1e-3, n)
+        fingers = draw.choice((0, 0, 0.02, 0.06), n) + draw.normal(0, 1e-3, n)
+        sources = [Source(int(draw.integers(3))) for _ in range(n)]
+        sources[0] = Source(int(draw.integers(2)))
+        table = table_of(*zip(places, fingers, sources, draw.normal(0, 0.05, n), strict=True))
+        value, joints = table.log_posterior.tolist(), joints_of(table.pose).double().numpy()
+        filters = [i for i in range(n) if sources[i] != Source.DETECTOR]
+        base = max(filters, key=lambda i: value[i])
+        margins = [_MARGIN if source == Source.DETECTOR else 0.0 for source in sources]
+        away = np.linalg.norm(joints - joints[base], axis=2).mean(1)
+        moves = [sources[i] == Source.DETECTOR and away[i] >= _ELSEWHERE_M for i in range(n)]
+        hidden = bool(draw.random() < 0.3)
+        rows = [i for i in range(n) if not (hidden and moves[i])]
+        best = max(rows, key=lambda i: value[i] - margins[i])
+        assert chosen(table, hidden) == (best, moves[best])
+        seen.add((sources[best], moves[best], hidden))
+    assert (Source.DETECTOR, True, False) in seen and (Source.DETECTOR, True, True) not in seen
+    assert {source for source, _, _ in seen} == set(Source)
 
 
 @pytest.mark.parametrize(
-    ("source", "margin"), [(Source.DYNAMICS, 0.0), (Source.DETECTOR, SETTINGS.margin)]
+    ("place", "source", "gain", "taken", "moved"),
+    [
+        (0.0, Source.DYNAMICS, 1e-4, True, False),
+        (0.0, Source.DYNAMICS, -1e-4, False, False),
+        (0.0, Source.DETECTOR, _MARGIN + 1e-3, True, False),
+        (0.0, Source.DETECTOR, _MARGIN - 1e-3, False, False),
+        (0.05, Source.DETECTOR, _MARGIN + 1e-3, True, True),
+        (0.05, Source.DYNAMICS, 1.0, True, False),
+    ],
 )
-def test_other_fingers_take_over_when_they_are_better(source: Source, margin: float) -> None:
-    assert Followed().until(OTHER_FINGER, source, margin + 1e-4) == 1
-    assert Followed().until(OTHER_FINGER, source, margin - 1e-4) == 0
+def test_the_detector_needs_a_margin_and_alone_moves_a_hand(
+    place: float, source: Source, gain: float, taken: bool, moved: bool
+) -> None:
+    table = table_of((0.0, 0.0, Source.PREVIOUS, 0.0), (place, 0.06, source, gain))
+    assert chosen(table) == (int(taken), moved)
 
 
-def test_another_place_needs_as_many_frames_as_set_without_a_break() -> None:
-    track, better = Followed(), [(OTHER_PLACE, Source.DETECTOR, 5.0)]
-    for interrupting in ([], [(OTHER_PLACE, Source.DETECTOR, 0.9 * SETTINGS.place_lead)]):
-        for _ in range(SETTINGS.place_frames - 1):
-            assert track.frame(better).challenged.begun
-        assert not track.frame(interrupting).challenged.begun
-    assert torch.equal(track.pose, pose())
-    assert track.until(OTHER_PLACE, Source.DETECTOR, 0.04) == SETTINGS.place_frames
-
-
-def test_frames_in_which_the_detector_was_not_asked_change_nothing_of_a_challenge() -> None:
-    track, better = Followed(), [(OTHER_PLACE, Source.DETECTOR, 0.1)]
-    for _ in range(SETTINGS.place_frames - 1):
-        challenged = track.frame(better).challenged
-        track.detected = False
-        assert track.frame([]).challenged == challenged
-        track.detected = True
-    assert track.frame(better).moved
-
-
-def test_another_place_wins_with_a_large_lead_alone_while_the_hand_is_hidden() -> None:
-    assert Followed(hidden=True).until(OTHER_PLACE, Source.DETECTOR, 1.9) == 0
-    assert Followed(hidden=True).until(OTHER_PLACE, Source.DETECTOR, 2.1) == SETTINGS.place_frames
-
-
-@pytest.mark.parametrize("track", [Followed(new=True), Followed(emerges=True)])
-def test_a_new_or_emerging_hand_goes_to_a_better_place_at_once(track: Followed) -> None:
-    assert track.until(OTHER_PLACE, Source.DETECTOR, 1.1 * SETTINGS.place_lead) == 1
-
-
-def test_a_hand_that_is_held_or_explains_nothing_stays_as_it_is() -> None:
-    table = replace(Hypotheses.of(OTHER_FINGER, Source.HELD), log_posterior=torch.tensor([-9.0]))
-    none = Incumbent(Duration(), False)
-    choice = select(table, joints_of(table.pose), none, FRAME_S, True, True, SETTINGS)
-    assert torch.equal(choice.pose, OTHER_FINGER) and not choice.moved
-    poses = torch.cat((pose(), OTHER_FINGER))
-    sources = torch.tensor([int(Source.PREVIOUS), int(Source.DETECTOR)])
-    nothing = Hypotheses(poses, sources, torch.full((2,), -math.inf))
-    choice = select(nothing, joints_of(poses), none, FRAME_S, False, False, SETTINGS)
-    assert torch.equal(choice.pose, pose())
+def test_where_no_pose_explains_anything_the_last_frame_s_fingers_stay() -> None:
+    nothing = -math.inf
+    table = table_of((0, 0, Source.PREVIOUS, nothing), (0, 0.06, Source.DETECTOR, nothing))
+    assert chosen(table) == (0, False)

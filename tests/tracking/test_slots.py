@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.rendered import (
-    frame_of,
     hand_at,
-    image_of,
     right_hand_model,
     track_of,
 )
@@ -21,7 +19,7 @@ from toftrack.tracking.handedness import OTHER_SIDE, HandednessEstimate
 from toftrack.tracking.hands import PlacedHand
 from toftrack.tracking.lifecycle import reconcile
 from toftrack.tracking.seeking import due_slots, since_search
-from toftrack.tracking.state import HandState, LastSeen, Track, TrackerState
+from toftrack.tracking.state import HandState, Track, TrackerState
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -108,17 +106,6 @@ def test_of_two_tracks_on_one_hand_the_less_sure_one_ends(
     tracks: tuple[str | None, str | None], frames: int, expected: list[bool]
 ) -> None:
     assert followed_after(frames, *tracks) == expected
-
-
-def test_of_a_hand_whose_track_was_on_another_one_nothing_lay_beside_it() -> None:
-    state = two("less sure", "sure")
-    scene = frame_of(image_of(HERE), known_tracks()["sure"]).observation
-    seen = LastSeen(state.hands[0].seen.particle, 0.1, scene)
-    hands = tuple(replace(hand, seen=seen) for hand in state.hands)
-    state = replace(state, hands=hands)
-    for _ in range(4):
-        state = afterwards(state)[0]
-    assert state.hands[0].seen.scene is None and state.hands[1].seen.scene is scene
 
 
 def test_tracks_that_come_apart_for_a_frame_may_be_on_one_hand_anew() -> None:

@@ -9,14 +9,10 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 import pytest
 import torch
-from helpers.rendered import frame_of, hand_at, image_of, track_of
 from helpers.tracking import Scene, errors_mm, make_tracker, sample
 
-from toftrack.compute.pace import FRAME_S, Duration, elapsed_s
-from toftrack.compute.spans import Spans
+from toftrack.compute.pace import FRAME_S, elapsed_s
 from toftrack.estimate import Estimate
-from toftrack.tracking.candidates import HandFrame
-from toftrack.tracking.step import filtered_frame
 from toftrack.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -175,24 +171,3 @@ def test_elapsed_time_is_kept_within_reason() -> None:
     assert elapsed_s(1.0, 0.5) == elapsed_s(1.0, math.nan) == elapsed_s(math.nan, 1.0) == FRAME_S
     assert elapsed_s(1.0, 1.0) == pytest.approx(1 / 120)
     assert elapsed_s(1.0, 1e9) == 0.5 and elapsed_s(0.0, math.inf) == FRAME_S
-
-
-def test_a_hidden_hand_is_searched_for_less_far_away() -> None:
-    """Else it is taken for what is seen beside what hides it."""
-    track = track_of(hand_at(), log_odds=-4.0, doubted=True, doubtful=Duration(10 * FRAME_S))
-    frame = frame_of(image_of(hand_at()), track)
-    everything = torch.ones_like(frame.observation.occluder)
-    hidden = replace(frame, observation=replace(frame.observation, occluder=everything))
-    assert hidden.hidden and not frame.hidden
-
-    def spread(of: HandFrame) -> float:
-        """Of what the particles were scattered to, over those of a track that nobody doubts."""
-        surely = replace(of, track=replace(track, doubtful=Duration()))
-        both = (
-            filtered_frame(one, FRAME_S, torch.Generator().manual_seed(0), Spans()).particles
-            for one in (of, surely)
-        )
-        wide, narrow = (float(particles[:, :3].std(0).norm()) for particles in both)
-        return wide / narrow
-
-    assert 1.0 < spread(hidden) < 0.6 * spread(frame)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from helpers.detection import FixedDetector, detection_of
-from helpers.rendered import hand_at, image_of, right_hand_model
 from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 
 from toftrack.camera import Camera
@@ -250,14 +247,3 @@ def test_a_filter_of_another_size_tracks_too() -> None:
     assert float(tracker.track.weights.sum()) == pytest.approx(1)
     assert found[-1].covariance.shape == (12, 12)
     assert errors_mm(found, scene)[-3:].mean() < 20
-
-
-def test_a_hand_that_is_hardly_seen_is_guessed_where_none_was_seen_before() -> None:
-    """Where the border of the image cuts off what is too little for a hand."""
-    place = replace(detection_of(hand_at(0.35)), heat=0.3, merit=-9.0)
-    tracker = Tracker(replace(right_hand_model(), detector=FixedDetector([place])), seed=0)
-    image = image_of(hand_at(0.1))
-    found = tracker.step(image.depth_m, image.k, 0, 0.0)
-    assert found.lost and found.state_name == "lost" and found.confidence == 0
-    np.testing.assert_allclose(found.joints_m, place.joints_m[0].numpy(), atol=0.005)
-    assert np.isfinite(found.state).all() and not found.joint_ok.any()

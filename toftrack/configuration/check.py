@@ -37,7 +37,6 @@ _ABOVE_ZERO = frozenset(
     hands
     hand.length_m
     likelihood.beta likelihood.tolerance_m
-    lost.joints.scale
     pose_space.dims
     record_limit_gb
     refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
@@ -53,18 +52,11 @@ _AT_MOST = {"hands": 2, "filter.particles": 100_000, "filter.passes": 1000, "see
 """More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""
-_LOG_ODDS = (
-    "lost.intercept",
-    "lost.weights.",
-    "lost.whole.intercept",
-    "lost.whole.weights.",
-    "lost.joints.odds",
-    "detector.merit",
-)
+_LOG_ODDS = ("detector.merit",)
 """How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
 _OF_NETWORKS = {
-    "lost._target_": ("toftrack.tracking.confidence.ConfidenceModel", "lost=calibrated"),
+    "lost._target_": ("toftrack.tracking.confidence.make_confidence", "lost=calibrated"),
     "hand.shape": ("auto", "hand.shape=auto"),
     "hand.side": ("auto", "hand.side=auto"),
 }

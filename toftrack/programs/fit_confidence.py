@@ -9,8 +9,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.programs import command_line
 from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
 from toftrack.safe_files import write_whole
-from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES, ConfidenceModel
+from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES, ConfidenceModel, JointConfidence
 from toftrack.tracking.model import TrackerModel
 from toftrack.views.pictures import write_picture
 
@@ -45,28 +45,26 @@ _HELD_OUT = 5
 class Observed:
     """What the tracker's estimates of T frames were formed from, and how right they were.
 
-    features: (T, S).  right: (T,) every joint is within 40 mm.  whole: (T,) they are on average.
+    features: (T, S).  right: (T,) every joint is within 40 mm.
     joints: of each joint.  sequence: (T,) numbers of the sequences.
     """
 
     features: np.ndarray
     right: np.ndarray
-    whole: np.ndarray
     joints: JointRows
     sequence: np.ndarray
 
     def of(self, rows: np.ndarray) -> Observed:
         """Some of the frames."""
         joints = self.joints.of(rows)
-        here = self.features[rows], self.right[rows], self.whole[rows]
-        return Observed(*here, joints, self.sequence[rows])
+        return Observed(self.features[rows], self.right[rows], joints, self.sequence[rows])
 
 
 def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(
         prog="python -m toftrack.programs.fit_confidence",
-        description="Fit lost=calibrated: prints what is fitted of its configuration.",
+        description="Fit lost=calibrated: writes the file of lost.fitted.",
     )
     parser.add_argument("overrides", nargs="*", default=[], help="of the tracker, as for track.py")
     parser.add_argument("--sequences", type=int, default=200, help="how many are rendered (200)")
@@ -100,31 +98,23 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     seen = _together([part for part in parts if part is not None])
     kept = seen.sequence % _HELD_OUT == 0
-    log_odds, summary, lines = _fitted_frames(seen, seen.right, kept)
-    _, of_whole, whole_lines = _fitted_frames(seen, seen.whole, kept)
-    summary["whole"] = of_whole
+    log_odds, summary = _fitted_frames(seen, kept)
     settings = _settings(asked.overrides)
-    lines += [
-        "whole: # whether the hand as a whole is right: its mean joint error is below 40 mm",
-        "  _target_: toftrack.tracking.confidence.WholeHand",
-        f"  least: {settings.whole.least} # not fitted: what stands there may stay",
-        f"  again: {settings.whole.again} # likewise",
-        f"  after_s: {settings.whole.after_s} # likewise",
-        f"  believe: {settings.whole.believe} # likewise",
-        *("  " + line for line in whole_lines),
-    ]
     seen = with_doubt(seen, log_odds, settings.memory)
-    more, joint_lines = _fitted_joints(seen, kept)
+    belief, more = _fitted_joints(seen, kept)
     summary |= more
-    write_whole(asked.output / "confidence.json", json.dumps(summary, indent=1) + "\n")
-    pasted = "\n".join(lines + joint_lines)
-    write_whole(asked.output / "confidence.yaml", pasted + "\n")
+    write_whole(asked.output / "summary.json", json.dumps(summary, indent=1) + "\n")
+    fitted = {name: summary[name] for name in ("intercept", "weights")}
+    # Scale and odds of the joints are not fitted on rendered sequences: they stay.
+    joints = replace(belief, scale=settings.joints.scale, odds=settings.joints.odds)
+    content = json.dumps(fitted | {"joints": asdict(joints)}, indent=1)
+    write_whole(asked.output / "confidence.json", content + "\n")
     picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
     write_picture(asked.output / "reliability.png", picture)
-    arrays = {name: getattr(seen, name) for name in ("features", "right", "whole", "sequence")}
+    arrays = {name: getattr(seen, name) for name in ("features", "right", "sequence")}
     arrays |= {f"joint_{name}": values for name, values in seen.joints._asdict().items()}
     write_archive(asked.output / "features.npz", arrays)
-    print(f"{pasted}\n\n{_words(summary)}\nresults: {asked.output}")
+    print(f"{_words(summary)}\nlost.fitted={asked.output / 'confidence.json'}")
 
 
 def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
@@ -147,11 +137,9 @@ def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
     return asked.sequences, rendered()
 
 
-def _fitted_frames(
-    seen: Observed, y: np.ndarray, kept: np.ndarray
-) -> tuple[np.ndarray, dict[str, Any], list[str]]:
-    """Log odds (T,) of y, figures about the kept frames, and the lines of the configuration."""
-    x = seen.features
+def _fitted_frames(seen: Observed, kept: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+    """Log odds (T,) that frames are right, the model, and figures about the kept frames."""
+    x, y = seen.features, seen.right
     intercept, weights = fitted_weights(x[~kept], y[~kept])
     log_odds = intercept + x @ weights
     p = expit(log_odds[kept])
@@ -165,9 +153,7 @@ def _fitted_frames(
         "intercept": round(intercept, 3),
         "weights": fitted,
     }
-    lines = [f"intercept: {summary['intercept']} # log odds where all features are 0; fitted"]
-    lines += ["weights: # of the features, see toftrack/tracking/confidence.py"]
-    return log_odds, summary, lines + [f"  {name}: {value}" for name, value in fitted.items()]
+    return log_odds, summary
 
 
 def _settings(overrides: list[str]) -> ConfidenceModel:
@@ -193,8 +179,8 @@ def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
     return replace(seen, joints=seen.joints._replace(features=features))
 
 
-def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], list[str]]:
-    """Figures about joints in kept frames, and the lines of the configuration."""
+def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[JointConfidence, dict[str, Any]]:
+    """What was fitted, and figures about joints in kept frames."""
     belief = fitted_joint_belief(seen.joints.of(~kept))
     check = seen.joints.of(kept)
     reported = [belief.judge(features) for features in check.features]
@@ -207,22 +193,7 @@ def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[dict[str, Any], li
         "held_out_joints_said_near": round(float(near.mean()), 3),
         "held_out_joints_log_loss": round(-float(np.log(right.clip(1e-9)).mean()), 4),
     }
-    lines = [
-        "joints: # how far off each joint may be; see toftrack/tracking/confidence.py",
-        "  _target_: toftrack.tracking.confidence.JointConfidence",
-        # Not fitted on rendered sequences: what stands there may stay.
-        "  scale: 1.0 # times all standard deviations; larger holds joints oftener",
-        "  odds: 1.5 # added to all log odds; larger trusts joints more",
-        "  kinds: # log cm along ray, finger, across; log odds of being within 40 mm; fitted",
-        *_table(belief.kinds),
-        "  weights: # of the features, see JOINT_FEATURES, likewise; fitted",
-        *_table(belief.weights),
-    ]
-    return summary, lines
-
-
-def _table(rows: Mapping[str, Iterable[float]]) -> list[str]:
-    return [f"    {name}: {list(row)}" for name, row in rows.items()]
+    return belief, summary
 
 
 def _words(summary: dict[str, Any]) -> str:
@@ -269,22 +240,20 @@ def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -
         off = sequence.joints_m[index] - joints
         far = np.linalg.norm(off, axis=1)
         near = there & (far < RIGHT_M)
-        whole = there & (far.mean() < RIGHT_M)
         error_cm = 100 * np.einsum("jab,jb->ja", joint_axes(joints), off)
         counted = there and not estimate.lost
         rows.append(
             (
                 info.features.values(),
                 near.all(),
-                whole,
                 *(info.joint_features, error_cm, near, counted),
             )
         )
     if not rows:
         return None
-    features, right, whole, *joint_rows = map(np.array, zip(*rows, strict=True))
+    features, right, *joint_rows = map(np.array, zip(*rows, strict=True))
     of_joints = JointRows(*joint_rows)
-    return Observed(features, right, whole, of_joints, np.full(len(rows), number))
+    return Observed(features, right, of_joints, np.full(len(rows), number))
 
 
 def _together(parts: list[Observed]) -> Observed:
@@ -292,7 +261,6 @@ def _together(parts: list[Observed]) -> Observed:
     return Observed(
         np.concatenate([part.features for part in parts]),
         np.concatenate([part.right for part in parts]),
-        np.concatenate([part.whole for part in parts]),
         JointRows(*map(np.concatenate, joints)),
         np.concatenate([part.sequence for part in parts]),
     )

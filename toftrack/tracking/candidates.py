@@ -15,14 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.hand_detector import Detection
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.confidence import out_of_sight
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
-from toftrack.tracking.pixels import with_own_arm, without_things
+from toftrack.tracking.pixels import without_things
 from toftrack.tracking.posterior import (
     ImageTerm,
     KeypointsTerm,
@@ -33,25 +32,13 @@ from toftrack.tracking.posterior import (
 from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import HandState, Track
 
-_SURELY_PRESENT = 0.97
-"""Probability of a hand from which on the network is believed which pixels are the hand's own: a
-chair's back was taken for a hand otherwise."""
 _HIDDEN = 0.03
 """Share of the hand's pixels that must be hidden for it to matter."""
-_COVERED = 0.6
-"""Share of the joints behind something from which on a hand is held where it was."""
-_UNSEEN = 0.3
-"""Share of the joints out of sight from which on the detector is not considered."""
-_HOPELESS = -2.4
-"""Log odds below which the last estimate was surely wrong: 8 %."""
-_PRESENT, _APART_M = 0.9, 0.06
-"""After such an estimate it is nevertheless, where it surely sees a hand in sight whose joints are,
-on average, so far from those of the other hand."""
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no candidates."""
-_BENT, _BENT_STEPS, _BENT_M, _BENT_RAD = 2, 6, 0.010, 0.8
-"""How many hypotheses are bent to the keypoints, in how many steps; how sure the keypoints are at
-best, and how far an angle may go."""
+_BENT_STEPS, _BENT_M, _BENT_RAD = 6, 0.010, 0.8
+"""In how many steps a pose is bent to the keypoints; how sure the keypoints are at best, and how
+far an angle may go."""
 _NO_WEIGHT = 1e-6
 """Instead of 0, so that deviations stay numbers: kilometres."""
 
@@ -87,65 +74,30 @@ class HandFrame:
         hand, occluder = self.observation.hand.numpy(), self.observation.occluder.numpy()
         return int(np.count_nonzero(occluder)) > _HIDDEN * int(np.count_nonzero(hand))
 
-    def out_of_sight(self, pose: Tensor) -> tuple[float, float]:
-        """Shares of the joints of a hand (1, 27) outside of the image, and behind something."""
-        return self.joints_out_of_sight(self.fitted.refiner.joints(pose)[0].cpu())
-
-    def joints_out_of_sight(self, joints_m: Tensor) -> tuple[float, float]:
-        """The same of joints (21, 3)."""
-        return out_of_sight(joints_m, self.observation.hiding_m, self.observation.k)
-
 
 @dataclass(frozen=True, eq=False)
 class FilteredFrame:
     """A hand's frame after the filter, with what its candidates are compared by.
 
     pose: (1, 27) the filter's estimate.
-    detection: as far as it is considered: not of a hand that is mostly out of sight, where the
-        detector sees another one in the rest.
     keypoints: as the refinement takes them.
-    emerges: it was hidden and lost, and the detector surely sees it.
     """
 
     frame: HandFrame
     pose: Tensor
-    detection: Detection
     keypoints: Keypoints
     posterior: Posterior
     seen: SeenPoints
-    emerges: bool = False
 
     @classmethod
     def of(cls, frame: HandFrame, mean: Tensor) -> FilteredFrame:
         """mean: (1, 6 + d) of the particles."""
-        pose = frame.model.decode(mean)
-        outside, behind = frame.out_of_sight(pose)
-        unseen = outside + behind > _UNSEEN
-        if unseen and behind <= _UNSEEN:
-            unseen = not _comes_in(frame.detection, frame, pose)
-        emerges = (unseen or frame.hidden) and _emerges(frame.detection, frame)
-        detection = frame.detection if emerges or not unseen else NO_DETECTION
+        detection, model = frame.detection, frame.model
         posterior = posterior_of(
-            frame.observation,
-            frame.fitted,
-            detection,
-            frame.others,
-            frame.model,
-            frame.image,
+            frame.observation, frame.fitted, detection, frame.others, model, frame.image
         )
-        keypoints = keypoints_of(detection, frame.model)
-        seen = seen_points(frame.observation)
-        return cls(frame, pose, detection, keypoints, posterior, seen, emerges)
-
-    @property
-    def covered(self) -> bool:
-        """Whether so much of the hand is hidden that it is held where it was."""
-        return not self.emerges and self.frame.out_of_sight(self.frame.track.pose)[1] > _COVERED
-
-    @property
-    def hidden(self) -> bool:
-        """Whether something hides part of the hand, and not even the detector sees it."""
-        return self.frame.hidden and not self.emerges
+        keypoints = keypoints_of(detection, model)
+        return cls(frame, model.decode(mean), keypoints, posterior, seen_points(frame.observation))
 
     def refined(self, poses: Tensor) -> Tensor:
         """Hands (N, 27) brought onto the seen points and the keypoints."""
@@ -153,15 +105,9 @@ class FilteredFrame:
         return refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
 
 
-def with_parts(frame: HandFrame) -> HandFrame:
-    """The frame with what the pose network says of its pixels: those of a thing in the hand are not
-    the hand's, and where something seems to hide the hand, those of its own arm hide nothing.
-    """
+def without_held_things(frame: HandFrame) -> HandFrame:
+    """The frame without the pixels that the pose network says are of a thing in the hand."""
     seen = without_things(frame.observation, frame.detection)
-    held = replace(frame, observation=seen)
-    surely = frame.detection.present >= _SURELY_PRESENT
-    if surely and (held.hidden or held.out_of_sight(held.track.pose)[1] > _UNSEEN):
-        seen = with_own_arm(seen, frame.detection)
     if seen is frame.observation:
         return frame
     return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
@@ -205,26 +151,6 @@ def posterior_of(
     return Posterior(image, fitted.refiner.joints, terms)
 
 
-def _comes_in(detection: Detection, frame: HandFrame, pose: Tensor) -> bool:
-    """Whether the detector sees a hand that comes into the image at a border: one that was not
-    believed yet, where it is followed (1, 27).
-    """
-    if frame.track.believed or detection.empty or detection.present < _PRESENT:
-        return False
-    away = frame.fitted.refiner.joints(pose)[0].cpu() - detection.joints_m[0]
-    return float(away.norm(dim=1).mean()) < _APART_M
-
-
-def _emerges(detection: Detection, frame: HandFrame) -> bool:
-    """Whether the detector surely sees a hand again whose last estimates were wrong or hidden."""
-    if frame.track.log_odds > _HOPELESS or detection.empty or detection.present < _PRESENT:
-        return False
-    joints = detection.joints_m[0]
-    away = [float((other.joints_m - joints).norm(dim=1).mean()) for other in frame.others]
-    in_sight = sum(frame.joints_out_of_sight(joints)) <= _UNSEEN
-    return in_sight and all(one > _APART_M for one in away)
-
-
 def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
     """The detector's keypoints as the refinement takes them."""
     cfg, found = model.detector.settings, detection.keypoints
@@ -245,7 +171,7 @@ def detected_poses(
     model: TrackerModel,
     count: int,
 ) -> Tensor:
-    """(H, 27) the detector's poses: the likeliest bent to the keypoints, and as they are.
+    """(1 + H, 27) the detector's poses: the likeliest bent to the keypoints, and all as they are.
 
     The keypoints are more exact than the hypotheses where a finger is seen, but no pose by
     themselves. None where nothing was detected.
@@ -255,7 +181,7 @@ def detected_poses(
     states = hypotheses_of(detection, fitted, count)
     if not model.refinement.iterations:
         return states
-    bent = states[:_BENT]
+    bent = states[:1]
     nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), observation.k, (0, 0))
     weight = max(model.detector.settings.keypoint_weight, _NO_WEIGHT)
     sigma = detection.keypoints.sigma_m.clamp(min=_BENT_M) / weight
@@ -286,16 +212,12 @@ def best_start(
 def propose(filtered: FilteredFrame) -> Hypotheses:
     """The scored hypotheses of a frame's hand: the last frame's fingers where the filter has the
     hand, the filter's estimate, and the detector's likeliest pose; refined.
-
-    A hand that is mostly hidden is held where it was.
     """
     frame, track, state = filtered.frame, filtered.frame.track, filtered.pose
     model = frame.model
     if not model.refinement.iterations:
         return _refined(Hypotheses.of(state, Source.DYNAMICS), filtered)
-    if filtered.covered:
-        return _refined(Hypotheses.of(track.pose, Source.HELD), filtered)
-    detected = detected_poses(filtered.detection, frame.observation, frame.fitted, model, 1)
+    detected = detected_poses(frame.detection, frame.observation, frame.fitted, model, 1)
     previous = torch.cat((state[:, :6], track.pose[:, 6:]), 1)
     tables = [
         Hypotheses.of(previous, Source.PREVIOUS),
@@ -306,13 +228,13 @@ def propose(filtered: FilteredFrame) -> Hypotheses:
 
 
 def _refined(table: Hypotheses, filtered: FilteredFrame) -> Hypotheses:
-    """The same table, refined, but for a pose that is held, and scored.
+    """The same table, refined and scored.
 
     Poses that then explain nothing of the image stay as they were proposed: of a hand that leaves
     the image a few points are left, which may draw it anywhere.
     """
     pose = table.pose
-    if filtered.frame.model.refinement.iterations and table.source[0] != Source.HELD:
+    if filtered.frame.model.refinement.iterations:
         pose = filtered.refined(pose)
     values = filtered.posterior(pose)
     pose = torch.where(values.isneginf()[:, None], table.pose, pose)

@@ -20,7 +20,7 @@ from toftrack.tracking.candidates import (
     posterior_of,
     without_things,
 )
-from toftrack.tracking.detect import expected_of, was_beside
+from toftrack.tracking.detect import expected_of
 from toftrack.tracking.filter import new_track
 from toftrack.tracking.handedness import OTHER_SIDE, body_offset_m
 from toftrack.tracking.hands import OtherHand, pixels_of, without
@@ -66,8 +66,6 @@ def compared(
     due = comparison_due(hand, model, dt_s)
     if hand.track is None and (before.given or hand.seen.age_s > _GONE_S):
         before = before.left(settings)  # what comes may be the other hand
-        if before.given and was_beside(detection, hand.seen):
-            before = before.stranger(hand.side)
     hand = replace(hand, handedness=before.waited(dt_s))
     if detection.present < _LEAST_PRESENT or not due:
         return hand, detection

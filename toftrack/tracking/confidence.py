@@ -12,6 +12,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +24,10 @@ from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError
 from toftrack.hand.regions import joint_axes
+from toftrack.json_text import read_json
 from toftrack.tracking.confidence_numba import count_out_of_sight, seen_around
 
+_FITTED = Path(__file__).parents[1] / "data" / "confidence.json"
 _LEAST = 1e-3
 _LIKELY = 0.03
 
@@ -180,7 +184,7 @@ _LEAST_CM, _MOST_CM = 0.1, 30.0
 
 @dataclass(frozen=True)
 class JointConfidence:
-    """What makes a joint's standard deviations and probability; see conf/lost/calibrated.yaml.
+    """What makes a joint's standard deviations and probability; see data/confidence.json.
 
     scale: times all standard deviations.  odds: added to all log odds.
     kinds: what each kind of joint begins with, in the order of COLUMNS.
@@ -193,22 +197,20 @@ class JointConfidence:
     weights: Mapping[str, Sequence[float]]
 
     def __post_init__(self) -> None:
-        check_number("lost.joints.scale", self.scale, 0, above=True)
-        check_number("lost.joints.odds", self.odds)
+        check_number("joints.scale", self.scale, 0, above=True)
+        check_number("joints.odds", self.odds)
         for name, known in (("kinds", KINDS), ("weights", JOINT_FEATURES)):
             rows = getattr(self, name)
             if set(rows) != set(known):
-                raise ToftrackError(
-                    f"lost.joints.{name} must have a row for each of {', '.join(known)}"
-                )
+                raise ToftrackError(f"joints.{name} must have a row for each of {', '.join(known)}")
             for key, row in rows.items():
-                if isinstance(row, str) or len(row) != len(COLUMNS):
+                if not isinstance(row, Sequence) or len(row) != len(COLUMNS):
+                    wanted = ", ".join(COLUMNS)
                     raise ToftrackError(
-                        f"lost.joints.{name}.{key} must be {len(COLUMNS)} numbers:"
-                        f" {', '.join(COLUMNS)}"
+                        f"joints.{name}.{key} must be {len(COLUMNS)} numbers: {wanted}"
                     )
                 for value in row:
-                    check_number(f"lost.joints.{name}.{key}", value)
+                    check_number(f"joints.{name}.{key}", value)
 
     @cached_property
     def _kinds(self) -> np.ndarray:
@@ -287,65 +289,23 @@ class LogOdds:
     """A logistic model of a frame's features.
 
     intercept: log odds where all features are 0.  weights: of the features, by name.
-    name: of its settings, for errors.
     """
 
     intercept: float
     weights: Mapping[str, float]
-    name: str
 
     def __post_init__(self) -> None:
-        check_number(f"{self.name}.intercept", self.intercept)
+        check_number("intercept", self.intercept)
         for name, value in self.weights.items():
             if name not in FEATURES:
                 raise ToftrackError(
-                    f"{self.name}.weights.{name} is unknown; the features are {', '.join(FEATURES)}"
+                    f"weights.{name} is unknown; the features are {', '.join(FEATURES)}"
                 )
-            check_number(f"{self.name}.weights.{name}", value)
+            check_number(f"weights.{name}", value)
 
     def __call__(self, features: ConfidenceFeatures) -> float:
         """From one frame."""
-        return self.intercept + sum(w * getattr(features, name) for name, w in self._weights)
-
-    @cached_property
-    def _weights(self) -> list[tuple[str, float]]:
-        # A mapping out of a configuration takes microseconds for each of its items.
-        return [(name, float(weight)) for name, weight in self.weights.items()]
-
-
-@dataclass(frozen=True)
-class WholeHand:
-    """Whether the hand as a whole is where it is said to be: its mean joint error is below 40 mm.
-
-    A hidden thumb that nobody can know makes an estimate not wholly right; it is to be used all the
-    same, but for that joint (`joint_ok`). A hand taken for another one, or turned round, is not.
-
-    least: estimates that are right as a whole with a lower probability are flagged lost.
-    again: likewise after the hand was flagged for `after_s`, until one is not: a wrong pose that
-        has lasted is confirmed by a network that is asked about where it is.
-    believe: a new hand that is right as a whole with this probability is believed, whatever the
-        confidence: of a hand that holds a thing a joint is often far off.
-    intercept, weights: of the features, by name.
-    """
-
-    least: float
-    again: float
-    after_s: float
-    believe: float
-    intercept: float
-    weights: Mapping[str, float]
-
-    def __post_init__(self) -> None:
-        check_number("lost.whole.least", self.least, 0, 1)
-        check_number("lost.whole.again", self.again, 0, 1)
-        check_number("lost.whole.after_s", self.after_s, 0)
-        check_number("lost.whole.believe", self.believe, 0, 1)
-        _ = self.log_odds
-
-    @cached_property
-    def log_odds(self) -> LogOdds:
-        """From one frame."""
-        return LogOdds(self.intercept, self.weights, "lost.whole")
+        return self.intercept + sum(w * getattr(features, n) for n, w in self.weights.items())
 
 
 @dataclass(frozen=True)
@@ -353,40 +313,47 @@ class ConfidenceModel:
     """When an estimate is not to be used, and when its track is given up; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time (but see WholeHand).  again: or
-        of a hand that was believed before.  second: or of the second of two hands that are asked
-        for while the first one is believed; any hand beside another one needs at least this.
+    believe: likewise, until a track was believed for the first time.  second: or of the second of
+        two hands that are asked for while the first one is believed; any hand beside another one
+        needs at least this.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     memory: part of the log odds that comes from the frames before.
     joint_ok: joints of an estimate that are near with a lower probability are not ok.
-    probation: frames after a start during which the hand is not remembered as seen.
-    intercept, weights: of the features, by name.
-    whole: of the hand as a whole.  joints: of each joint.
+    log_odds: that every joint is within 40 mm, from one frame.  joints: of each joint.
     """
 
     confidence: float
     believe: float
-    again: float
     second: float
     give_up: float
     patience: int
     memory: float
     joint_ok: float
-    probation: int
-    intercept: float
-    weights: Mapping[str, float]
-    whole: WholeHand
+    log_odds: LogOdds
     joints: JointConfidence
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "again", "second", "give_up", "joint_ok"):
+        for name in ("confidence", "believe", "second", "give_up", "joint_ok"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
-        for name in ("patience", "probation"):
-            check_number(f"lost.{name}", getattr(self, name), 0, whole=True)
-        _ = self.log_odds
+        check_number("lost.patience", self.patience, 0, whole=True)
 
-    @cached_property
-    def log_odds(self) -> LogOdds:
-        """That every joint is within 40 mm, from one frame."""
-        return LogOdds(self.intercept, self.weights, "lost")
+
+def make_confidence(fitted: str | None = None, **thresholds: Any) -> ConfidenceModel:
+    """The confidence of a configuration.
+
+    fitted: a file of fit_confidence; None = the package's.
+    thresholds: the fields of ConfidenceModel that are numbers.
+    Raises ToftrackError when the file cannot be used.
+    """
+    path = _FITTED if fitted is None else Path(fitted)
+    try:
+        content = read_json(path)
+        log_odds = LogOdds(float(content["intercept"]), dict(content["weights"]))
+        joints = JointConfidence(**content["joints"])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, ToftrackError) as error:
+        raise ToftrackError(
+            f"lost.fitted='{path}' is no confidence that was fitted ({error}); give a file of"
+            " python -m toftrack.programs.fit_confidence, or leave it out"
+        ) from None
+    return ConfidenceModel(**thresholds, log_odds=log_odds, joints=joints)

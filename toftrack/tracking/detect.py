@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 from toftrack.compute.pace import Duration
-from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.hand_detector import NO_DETECTION, Detection, DetectorSettings
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
@@ -19,7 +17,7 @@ from toftrack.tracking.filter import predicted_palm
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.state import HandState, LastSeen, Track
+from toftrack.tracking.state import HandState, Track
 
 _AS_WELL = 1.3
 """Hands are seen about as well when their expected errors differ by less than this factor ..."""
@@ -33,29 +31,8 @@ _ANYWHERE = -1.5
 """Log probability of a place if the hand was not where it was last believed."""
 FORGOTTEN_S = 1.0
 """After so long nothing is known of where a hand is that was believed."""
-_OTHER_PLACE_M = 0.1
-"""A hand that is so far from where the one that was believed was seen last may be another one."""
-_NEAR_M, _DEPTH_M, _MOST = 0.03, 0.05, 0.5
-"""It was there already where so many of its joints had a surface so near to them, across the view
-and along it: hands move a little meanwhile."""
-_ARM_M, _BENT = 0.05, 0.6
-"""Half of a forearm's breadth, and the tangent of how far a wrist bends: the arm is the hand's."""
 _AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
 """What was taken for a hand and was none is left alone for so long, if it stays where it is."""
-_GUESSED, _CUT = 0.2, 0.3
-"""Probability of the finder from which on a place is guessed to be a hand, where so many of its
-joints are outside of the image. What is in full view and no hand to the pose network is none."""
-
-
-class Searched(NamedTuple):
-    """What a search has found.
-
-    best: the best hand that may be the one that is meant, or NO_DETECTION.
-    guess: where there is none, the likeliest place of one that the image's border cuts off.
-    """
-
-    best: Detection
-    guess: Detection = NO_DETECTION
 
 
 def search_due(hand: HandState, model: TrackerModel) -> bool:
@@ -70,17 +47,17 @@ def detection_due(track: Track, settings: DetectorSettings, dt_s: float) -> bool
     """Whether the pose network is asked about a hand that is followed; not always if it is sure."""
     sure = not track.doubted and track.log_odds > log_odds(settings.sure)
     waited = Duration(track.unseen_s + dt_s).reached(settings.every)
-    return not sure or waited or track.challenged.begun
+    return not sure or waited
 
 
 def search(
     hand: HandState, image: DepthImage, others: Sequence[OtherHand], model: TrackerModel
-) -> Searched:
-    """The hand in the whole image that may be this one."""
+) -> Detection:
+    """The hand in the whole image that may be this one, or NO_DETECTION."""
     detector, side, least = model.detector, hand.side, model.detector.settings.merit
     likely = partial(reachable, hand, [other.centre_m for other in others])
-    places = detector.search(image.depth_m, image.k, side, likely)
-    found = [one for one in places if one.merit > least]
+    found = detector.search(image.depth_m, image.k, side, likely)
+    found = [one for one in found if one.merit > least]
     undecided = not hand.handedness.given
     alone = hand.track is None and not any(other.believed for other in others)
     of_other: list[Detection] = []
@@ -93,22 +70,11 @@ def search(
     if undecided and not hand.seen.ever:
         found = held_out(found)
     if not found:
-        possible = [one for one in places if one.heat >= _GUESSED and one.merit > -np.inf]
-        possible = [one for one in possible if _is_cut_off(one, image)]
-        return Searched(NO_DETECTION, max(possible, key=lambda one: one.heat, default=NO_DETECTION))
+        return NO_DETECTION
     if not any(found[0] is one for one in of_other):
-        return Searched(found[0])
+        return found[0]
     centre, up = found[0].centre_m.numpy()[None], np.asarray(found[0].up)[None]
-    return Searched(detector.detect(image.depth_m, image.k, centre, side, up)[0])
-
-
-def _is_cut_off(detection: Detection, image: DepthImage) -> bool:
-    """Whether the border of the image cuts off much of a hand."""
-    joints = detection.joints_m[0].numpy()
-    place = joints[:, :2] / joints[:, 2:] * image.k[:2, :2].diagonal() + image.k[:2, 2]
-    size = np.array(image.depth_m.shape[::-1])
-    outside = ((place < -0.5) | (place > size - 0.5)).any(1)
-    return bool(outside.mean() > _CUT)
+    return detector.detect(image.depth_m, image.k, centre, side, up)[0]
 
 
 def _same_place(one: Detection, other: Detection) -> bool:
@@ -142,33 +108,6 @@ def is_elsewhere(
         return False
     centre = predicted_palm(track, dt_s, model.hand(hand.side, hand.shape), model)[0][0]
     return bool(np.linalg.norm(detection.centre_m.numpy() - centre) > SAME_PLACE_M)
-
-
-def was_beside(detection: Detection, seen: LastSeen) -> bool:
-    """Whether what is detected was beside a hand and its arm already when that was seen last."""
-    if detection.empty or seen.scene is None:
-        return False
-    particle, centre = seen.particle.numpy(), detection.centre_m.numpy()
-    palm = pivot_offset(particle[:, 3:6])[0]
-    off, arm = centre - particle[0, :3], -palm / np.linalg.norm(palm)
-    along = max(0.0, float(off @ arm))
-    if np.linalg.norm(off - palm) < _OTHER_PLACE_M:
-        return False
-    if np.linalg.norm(off - along * arm) < _ARM_M + _BENT * along:
-        return False
-    depth, k = seen.scene.depth_m.cpu().numpy(), seen.scene.k.cpu().numpy()
-    joints = detection.joints_m[0].double().numpy()
-    return sum(_had_surface(joint, depth, k) for joint in joints) > _MOST * len(joints)
-
-
-def _had_surface(point_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> bool:
-    """Whether an image (H, W) has a surface near a point (3,)."""
-    u, v = k[:2, :2].diagonal() * point_m[:2] / point_m[2] + k[:2, 2]
-    reach_px = _NEAR_M * k[0, 0] / point_m[2]
-    rows, columns = (
-        slice(max(0, round(c - reach_px)), max(0, round(c + reach_px) + 1)) for c in (v, u)
-    )
-    return bool((np.abs(depth_m[rows, columns] - point_m[2]) < _DEPTH_M).any())
 
 
 def expected_of(detection: Detection) -> Expected:

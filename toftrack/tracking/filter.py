@@ -78,11 +78,8 @@ def run_filter(
     model: FilterModel,
     generator: torch.Generator,
     spans: Spans,
-    width: float = 1.0,
 ) -> Filtered:
     """The filter's particles of a frame, weighed by the image.
-
-    width: times as far the particles are diffused as usual.
 
     Nothing within waits for the device, so that it is not held up between passes.
     """
@@ -95,7 +92,7 @@ def run_filter(
 
     moved = predicted_motion(track, dt_s, model.filter)
     particles = motions.compose(track.particles, on_device(moved[None], model.device))
-    sigmas = width * particle_filter.widened(
+    sigmas = particle_filter.widened(
         model.sigmas, dt_s / FRAME_S, moved, model.filter.rest, model.filter.speed_gain
     )
     particles, weights = particle_filter.annealed(

@@ -19,8 +19,6 @@ _BODY_COMPARISONS = 20
 """Comparisons over which the body's place is averaged."""
 _FIRST_COMPARISONS = 5
 """Whatever a given side is taken for, a new hand is compared so often before it is sure."""
-_AGAINST = -0.2
-"""Log odds from which on the first comparisons speak against the given side."""
 _OF_EITHER = 0.25
 """So much of the user's word is left where two hands are seen: it does not say which one it is of.
 """
@@ -28,8 +26,6 @@ _BEHIND_M = (0.12, 0.55)
 """The body lies so far behind a hand that is raised before it."""
 _BODY_M2, _BODY_ROWS = 0.03, 72
 """Its least area that is seen, and rows of the image that it is searched in."""
-_STRANGER = 4.0
-"""Log odds that a thing which was seen beside the hand is not the hand."""
 OTHER_SIDE = {"right": "left", "left": "right"}
 
 
@@ -80,7 +76,6 @@ class HandednessEstimate:
     prior: by the user's word, where it was given.
     fits: by how much better a right hand explains the image than a left one, summed up.
     shoulder: by where the body is.  partner: by which hand the other one is that is tracked.
-    beside_it: by whether what is followed was seen beside the hand before that left.
     body_m: how far the body is to the image's right of the hand, on average.
     comparisons: how many there were.  age_s: how long ago the last one was.
     """
@@ -90,7 +85,6 @@ class HandednessEstimate:
     fits: float = 0.0
     shoulder: float = 0.0
     partner: float = 0.0
-    beside_it: float = 0.0
     body_m: float = 0.0
     comparisons: int = 0
     age_s: float = 0.0
@@ -98,7 +92,7 @@ class HandednessEstimate:
     @property
     def log_odds(self) -> float:
         """That it is a right hand, by all this."""
-        return self.prior + self.fits + self.shoulder + self.partner + self.beside_it
+        return self.prior + self.fits + self.shoulder + self.partner
 
     def probability(self, side: str) -> float:
         """That the hand is of a side; 1 where it was given."""
@@ -118,12 +112,6 @@ class HandednessEstimate:
         """Probability that what is followed is of a side, also where the side was given."""
         log_odds = self.log_odds if side == "right" else -self.log_odds
         return 1 / (1 + math.exp(-log_odds))
-
-    def doubtful(self, side: str) -> bool:
-        """Whether the first comparisons of a new hand speak against the side that was given."""
-        new = self.given and self.comparisons < _FIRST_COMPARISONS
-        compared = self.fits + self.partner
-        return new and (compared if side == "right" else -compared) < _AGAINST
 
     def contradicted(self, side: str, settings: HandednessSettings) -> bool:
         """Whether what is followed is surely the other hand than the one that was given."""
@@ -154,10 +142,6 @@ class HandednessEstimate:
         kept = 0.0 if self.given else kept  # which hand it was says nothing of which one it is
         fresh = HandednessEstimate(self.given, self.prior, partner=self.partner, age_s=self.age_s)
         return replace(fresh, fits=kept)
-
-    def stranger(self, side: str) -> HandednessEstimate:
-        """Where what comes was there already when the hand of a side was seen last."""
-        return replace(self, beside_it=-_STRANGER if side == "right" else _STRANGER)
 
     def alone(self, settings: HandednessSettings) -> HandednessEstimate:
         """The same where no other hand is tracked."""

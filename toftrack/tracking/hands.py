@@ -33,9 +33,6 @@ _BELIEVED = 20.0
 """A hand that was believed once comes before one that never was, log odds."""
 _KNOWN = 0.5
 """Log odds from which on a slot's side is known."""
-_ARM_M, _THROUGH_M, _OPPOSITE = 0.16, 0.075, -0.5
-"""A forearm is seen so far from the wrist; it goes through a palm whose middle is so near to its
-axis; the cosine below which two hands point away from each other."""
 ONE_HAND_M, _ONE = 0.045, 0.3
 """Two tracks are of one hand where their palms are so near, and so much of one is in the other."""
 _SAME_PALM_M = 0.022
@@ -254,22 +251,6 @@ def on_one_hand(first: PlacedHand, second: PlacedHand) -> bool:
     if apart > ONE_HAND_M:
         return False
     return float(touching(first.joints_m[None], second.joints_m)) > _ONE
-
-
-def on_forearm(joints_m: np.ndarray, other: OtherHand) -> bool:
-    """Whether what is taken for a hand (21, 3) is the forearm of another one: a forearm of its own
-    would go through that one's palm, and both point away from each other.
-    """
-    if not other.certain:
-        return False
-    theirs = other.joints_m.numpy()
-    mine, their = joints_m[9] - joints_m[0], theirs[9] - theirs[0]
-    mine, their = mine / np.linalg.norm(mine), their / np.linalg.norm(their)
-    if mine @ their > _OPPOSITE:
-        return False
-    from_wrist = other.centre_m - joints_m[0]
-    along = float(np.clip(-from_wrist @ mine, 0.0, _ARM_M))
-    return bool(np.linalg.norm(from_wrist + along * mine) < _THROUGH_M)
 
 
 def known_side(hand: HandState) -> str:

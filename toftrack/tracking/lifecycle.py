@@ -8,7 +8,7 @@
 | nothing in the image can be a hand | ends |
 | doubted, and a hand is detected elsewhere | ends, and one begins there in this frame |
 | the other side has become the likelier one | ends, and one of that side begins in this frame |
-| a pose at another place was better for a while | ends, and one begins with it (select.py) |
+| a pose at another place is better | ends, and one begins with it (select.py) |
 | doubtful for longer than `lost.patience` | ends |
 | two tracks on one hand for a while | the less sure one ends |
 | a second hand that was never believed | ends after a while; not the one that is asked for |
@@ -45,7 +45,6 @@ from toftrack.tracking.hands import (
     exchanged,
     in_wrong_slot,
     known_side,
-    on_forearm,
     on_one_hand,
     pixels_of,
     sureness,
@@ -84,7 +83,7 @@ class Status:
 
     state_name, lost: as Estimate has them.  ends: the track does not go on.
     confidence: probability that every joint is within 40 mm; NaN where nothing says.
-    log_odds: the same, smoothed over time.  whole_odds: likewise of the mean joint error.
+    log_odds: the same, smoothed over time.
     doubtful: as Track has it, with this frame.
     """
 
@@ -93,7 +92,6 @@ class Status:
     ends: bool = False
     confidence: float = math.nan
     log_odds: float = 0.0
-    whole_odds: float = 0.0
     doubtful: Duration = Duration()
 
 
@@ -181,8 +179,8 @@ def _detected(
         best = detect_again(hand, hand.seeking, image, others, model)
         hand = replace(hand, seeking=None)
     elif search_due(hand, model):
-        best, guess = search(hand, image, others, model)
-        hand = replace(hand, searched_s=0.0, guess=guess)
+        best = search(hand, image, others, model)
+        hand = replace(hand, searched_s=0.0)
     if track is None:
         return hand, best
     if not detection_due(track, model.detector.settings, dt_s):
@@ -215,9 +213,7 @@ def close(
     """What is thought of a frame's estimate, the track as of the frame, and the hand last seen."""
     model, track = frame.model, frame.track
     whose = frame.hand.handedness
-    new, as_whole = model.lost.believe, model.lost.whole.believe
-    if frame.hand.seen.believed:
-        new, as_whole = model.lost.again, math.inf
+    new = model.lost.believe
     seems = whose.seems(frame.hand.side) if whose.given else 1.0
     # Of two hands that are asked for, the one that is followed says which one comes.
     partner = any(other.believed and not other.watched for other in frame.others)
@@ -225,17 +221,10 @@ def close(
         new = model.lost.second
     elif any(other.believed for other in frame.others):
         new = max(new, model.lost.second)
-    if whose.doubtful(frame.hand.side) and not partner:
-        new = as_whole = math.inf
     side = whose.probability(frame.hand.side)
-    status = judge(track, features, dt_s, side, new / max(seems, 1e-3), as_whole, model.lost)
+    status = judge(track, features, dt_s, side, new / max(seems, 1e-3), model.lost)
     if seems < OTHER_HAND and status.confidence >= model.lost.confidence:
         status = replace(status, lost=True, state_name="other hand")
-    watched = [other for other in frame.others if other.watched]
-    if watched and not status.lost:
-        joints = frame.fitted.refiner.joints(found.pose)[0].cpu().numpy()
-        if any(on_forearm(joints, other) for other in watched):
-            status = replace(status, lost=True, state_name="searching")
     # Without refinement the particles stay where they are.
     followed = drawn_to(found, model) if model.refinement.iterations else found.filtered
     track = replace(
@@ -249,20 +238,15 @@ def close(
         age=track.age.extended(dt_s),
         doubtful=status.doubtful,
         log_odds=status.log_odds,
-        whole_odds=status.whole_odds,
         surest=max(track.surest, status.log_odds),
         doubted=status.lost,
-        flagged_s=track.flagged_s + dt_s if status.lost else 0.0,
         believed=track.believed or not status.lost,
         unseen_s=track.unseen_s + dt_s if frame.detection.empty else 0.0,
         features=features,
         nearest_m=frame.expected_m if frame.hidden else 0.0,
     )
-    remembered = not status.lost and track.age.reached(model.lost.probation + 1)
-    # What was beside it says which hand comes later, but not where that was the other one of two.
-    alone = not any(other.certain and not other.watched for other in frame.others)
-    now = LastSeen(track.mean, 0.0, frame.observation if alone else None, track.surest)
-    seen = now if remembered else frame.hand.seen
+    now = LastSeen(track.mean, 0.0, track.surest)
+    seen = frame.hand.seen if status.lost else now
     return status, track, seen
 
 
@@ -272,18 +256,15 @@ def judge(
     dt_s: float,
     side: float,
     new: float,
-    as_whole: float,
     model: ConfidenceModel,
 ) -> Status:
     """What is thought of an estimate, dt_s after the last, and whether its track goes on.
 
     side: probability that it is of the right side; of the other one every finger is wrong.
-    new: confidence that a track needs which was not believed yet.  as_whole: or the probability
-        that the hand as a whole is right.
+    new: confidence that a track needs which was not believed yet.
     """
     kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
     smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
-    whole = kept * track.whole_odds + (1 - kept) * model.whole.log_odds(features)
     confidence = _probability(smooth)
     # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
     passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
@@ -293,13 +274,10 @@ def judge(
     doubtful = doubtful if confidence < model.give_up else Duration()
     ends = model.patience > 0 and doubtful.begun and doubtful.reached(model.patience)
     # Whether it is a hand at all does not depend on whose it is.
-    probable = _probability(whole)
-    believed = track.believed or confidence >= new or probable >= as_whole
-    long = track.believed and track.flagged_s >= model.whole.after_s
-    least = model.whole.again if long else model.whole.least
-    lost = not believed or side * confidence < model.confidence or probable < least
+    believed = track.believed or confidence >= new
+    lost = not believed or side * confidence < model.confidence
     name = _state_name(features) if lost else "tracking"
-    return Status(name, lost, ends, side * confidence, smooth, whole, doubtful)
+    return Status(name, lost, ends, side * confidence, smooth, doubtful)
 
 
 def _probability(log_odds: float) -> float:
@@ -332,8 +310,7 @@ def reconcile(
     sure = all(hand.believed for hand in before.hands)
     if merged.begun and (merged.reached(_ONE_FRAMES) or not sure):
         worse = min((0, 1), key=lambda slot: sureness(hands[slot]))
-        ended = hands[worse]  # what lay beside the other hand lay not beside this one
-        hands[worse] = replace(ended, track=None, seen=replace(ended.seen, scene=None))
+        hands[worse] = replace(hands[worse], track=None)
         merged = Duration()
     for slot, hand in enumerate(hands):
         track = hand.track

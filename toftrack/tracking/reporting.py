@@ -17,8 +17,6 @@ from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
 from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
-from toftrack.tracking.candidates import hypotheses_of
-from toftrack.tracking.detect import FORGOTTEN_S
 from toftrack.tracking.filter import Found
 from toftrack.tracking.lifecycle import Absence, Status
 from toftrack.tracking.model import FilterModel, FittedHand
@@ -86,34 +84,13 @@ def emitted(
 
 
 def no_hand(absence: Absence, image: DepthImage, model: FilterModel) -> Concluded:
-    """Nothing in the frame is surely a hand: the last estimate stands, and is lost. Where there is
-    none, or it was long ago, the likeliest place of a hand does.
-    """
+    """Nothing in the frame is surely a hand: the last estimate stands, and is lost."""
     hand = absence.hand
     estimate = lost_estimate(hand.last, image.index, image.timestamp_s, math.nan)
-    if not hand.guess.empty and hand.seen.age_s >= FORGOTTEN_S:
-        estimate = guessed(hand, estimate, image, model)
     gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
     none = torch.zeros(0, 6 + model.space.dims, device=model.device)
     info = StepInfo(absence.observation, none, none[:, 0], {})
     return absence.slot, replace(hand, gesture=gesture), info, _sided(estimate, hand)
-
-
-def guessed(hand: HandState, estimate: Estimate, image: DepthImage, model: FilterModel) -> Estimate:
-    """An estimate of a frame without a hand with what the network says of the likeliest place."""
-    fitted = model.hand(hand.side, hand.shape)
-    pose = hypotheses_of(hand.guess, fitted, 1)
-    estimate = replace(
-        estimate,
-        joints_m=_host(fitted.refiner.joints(pose)[0]),
-        state=_host(pose[0]),
-        latent=_host(model.space.encode(pose[:, 6:])[0]),
-        covariance=np.full_like(estimate.covariance, np.nan),
-        effective_sample_size=0.0,
-        outside_rad=math.nan,
-    )
-    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
-    return in_all_conventions(_sided(estimate, hand), fitted.shape, image.k, size_px)
 
 
 def unseen(hand: HandState, image: DepthImage, model: FilterModel) -> Estimate:

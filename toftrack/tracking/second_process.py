@@ -248,7 +248,7 @@ def _parts(hand: HandState) -> tuple[object, ...]:
     """What often stays as it is from one message to the next."""
     seen, tried = hand.seen, hand.tried
     whole = hand.track, hand.shape, hand.gesture, hand.last, hand.seeking, hand.handedness
-    return *whole, seen.particle, seen.scene, tried.particle
+    return *whole, seen.particle, tried.particle
 
 
 def _asked(task: HandTask) -> tuple[object, ...]:

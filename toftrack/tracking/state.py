@@ -12,7 +12,7 @@ from torch import Tensor
 
 from toftrack.compute.pace import Duration, elapsed_s
 from toftrack.compute.rigid import pivot_offset
-from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.hand_detector import Detection
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import GestureState
@@ -33,12 +33,9 @@ class Track:
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
     age: how long it has been followed.
     doubtful: how long its confidence has been below what a track is kept for.
-    challenged: how long a pose of another place has been better.
-    log_odds: that the estimate is right, smoothed over time.  whole_odds: that its mean error is
-        below 40 mm, likewise.
+    log_odds: that the estimate is right, smoothed over time.
     surest: the highest log odds so far.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
-    flagged_s: for how long estimates have been flagged without a break.
     unseen_s: how long ago the pose network was asked about it.
     features, joint_features: of the last estimate, (21, J); see confidence.py.
     nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
@@ -53,12 +50,9 @@ class Track:
     trend: Tensor = field(default_factory=lambda: torch.full((27,), math.nan))
     age: Duration = Duration()
     doubtful: Duration = Duration()
-    challenged: Duration = Duration()
     log_odds: float = 0.0
-    whole_odds: float = 0.0
     surest: float = -math.inf
     doubted: bool = False
-    flagged_s: float = 0.0
     believed: bool = False
     unseen_s: float = 0.0
     features: ConfidenceFeatures = NO_FEATURES
@@ -71,13 +65,11 @@ class LastSeen:
     """A hand as it was last believed.
 
     particle: (1, 6 + d).  age_s: how long ago; inf = it never was.
-    scene: what was seen then; None where nobody says.
     surest: the highest log odds of its track that an estimate was right; -inf = none was believed.
     """
 
     particle: Tensor
     age_s: float
-    scene: Observation | None = None
     surest: float = math.inf
 
     @property
@@ -148,7 +140,6 @@ class HandState:
     beside: it was believed while the first hand was, too, so that it is another one.
     seeking: the search for this hand that goes on beside the other one.
     tried: where a track ended last that was never believed.
-    guess: what the last search took for the likeliest place, where it found no hand.
     """
 
     side: str
@@ -163,7 +154,6 @@ class HandState:
     beside: bool = False
     seeking: Seeking | None = None
     tried: LastSeen = NOWHERE
-    guess: Detection = NO_DETECTION
 
     @property
     def believed(self) -> bool:

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 import torch
 
-from toftrack.compute.pace import FRAME_S
 from toftrack.compute.spans import Spans
 from toftrack.compute.threads import at_most, small_operations, threads
 from toftrack.estimate import Estimate
@@ -21,7 +20,7 @@ from toftrack.tracking.candidates import (
     HandFrame,
     keypoints_of,
     propose,
-    with_parts,
+    without_held_things,
 )
 from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
@@ -44,12 +43,10 @@ from toftrack.tracking.reporting import (
     vacant,
 )
 from toftrack.tracking.seeking import since_search, sought, start_seeking, taking_part
-from toftrack.tracking.select import Choice, Hypotheses, Incumbent, select
+from toftrack.tracking.select import Choice, select
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
 from toftrack.tracking.watching import first_estimate, watched_over
 
-_HIDDEN_WIDER = 2.0
-"""By so many times at most a hidden hand is searched farther away than one that is followed."""
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state, and for each slot what was seen, None where nobody asked, and the estimate."""
 
@@ -188,7 +185,8 @@ def concluded(
             filtered = filtered_frame(frame, dt_s, generator, spans)
     with spans("refinement"):
         candidates = FilteredFrame.of(frame, filtered.mean)
-        choice = choose(candidates, propose(candidates), dt_s)
+        table = propose(candidates)
+        choice = select(table, frame.fitted.refiner.joints(table.pose), frame.hidden)
     return conclude(frame, filtered, choice, image, dt_s)
 
 
@@ -196,12 +194,7 @@ def filtered_frame(
     frame: HandFrame, dt_s: float, generator: torch.Generator, spans: Spans
 ) -> Filtered:
     """The particles of a hand in a frame."""
-    model, track = frame.model, frame.track
-    # A hand that was nearly lost is searched farther away, but not ever farther; one that is hidden
-    # not far, or it would be taken for what is seen beside it: its own forearm, first of all.
-    wider = track.doubtful.seconds / FRAME_S if model.lost.patience else 0.0
-    width = 1.0 + (min(wider, _HIDDEN_WIDER) if frame.hidden else wider)
-    return run_filter(track, dt_s, frame.image, model, generator, spans, width)
+    return run_filter(frame.track, dt_s, frame.image, frame.model, generator, spans)
 
 
 def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
@@ -214,16 +207,7 @@ def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
         frame = replace(frame, hand=hand, detection=detection)
         if frame.mirrored is not None:
             frame = compared_beside(frame, frame.mirrored(), image)
-    return with_parts(frame)
-
-
-def choose(filtered: FilteredFrame, table: Hypotheses, dt_s: float) -> Choice:
-    """One of the table's poses."""
-    frame, track = filtered.frame, filtered.frame.track
-    joints = frame.fitted.refiner.joints
-    incumbent = Incumbent(track.challenged, not track.age.begun, filtered.emerges)
-    asked = not frame.detection.empty
-    return select(table, joints(table.pose), incumbent, dt_s, asked, filtered.hidden)
+    return without_held_things(frame)
 
 
 def conclude(
@@ -234,11 +218,10 @@ def conclude(
     pose, trend = choice.pose, track.trend
     if choice.moved:
         begun = new_track(pose, model)
-        track = replace(begun, believed=track.believed, flagged_s=track.flagged_s)
+        track = replace(begun, believed=track.believed)
         trend = begun.trend
     elif model.refinement.iterations:
         pose, trend = steadied(pose, track.pose, trend, dt_s, model.backend.motions)
-    track = replace(track, challenged=choice.challenged)
     found = Found(filtered, pose, trend, *model.nearest(pose))
     score, joints = frame.image.score(pose), frame.fitted.refiner.joints(pose)[0]
     age_s, last = track.age.seconds, track.features

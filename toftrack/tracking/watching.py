@@ -114,7 +114,7 @@ def _passed_on(first: HandState, other: HandState, track: Track) -> HandState:
     return replace(
         other,
         side=OTHER_SIDE[first.side],
-        handedness=replace(first.handedness, given=False, prior=0.0, beside_it=0.0),
+        handedness=replace(first.handedness, given=False, prior=0.0),
         shape=first_shape(),
         seen=LastSeen(track.mean, 0.0, surest=track.surest if track.believed else -math.inf),
         track=None,
