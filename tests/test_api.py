@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import os
 import subprocess
 import sys
 import threading
-import zipfile
 from pathlib import Path
 
 import hydra
 import numpy as np
 import pytest
 import torch
-from helpers.tracking import CONF, ROOT, sample
+from helpers.tracking import sample
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
@@ -269,33 +267,6 @@ def test_a_thread_that_begins_while_another_one_computes_gets_all_of_torch_s_thr
         torch.set_num_threads(before)
 
 
-def test_an_installed_package_brings_its_configuration(tmp_path: Path) -> None:
-    """Built from the checkout as an installer does, and imported from there, in another folder."""
-    pytest.importorskip("setuptools", minversion="77")
-    code = f"""
-import os, sys
-os.chdir({str(ROOT)!r})
-folders = ["build", "-b", {str(tmp_path / "build")!r}, "egg_info", "-e", {str(tmp_path)!r}]
-sys.argv = ["setup.py", "-q", *folders]
-exec(compile(open("setup.py").read(), "setup.py", "exec"))
-"""
-    python(code, folder=tmp_path)
-    built = tmp_path / "build" / "lib"
-    files = {path.relative_to(CONF) for path in CONF.rglob("*.yaml")}
-    inside = built / "toftrack" / "conf"
-    assert {path.relative_to(inside) for path in inside.rglob("*.yaml")} == files
-    code = f"""
-import sys
-sys.path.insert(0, {str(built)!r})
-sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder)]
-import toftrack
-from toftrack.configuration.compose import configuration
-print(toftrack.__file__, configuration("smooth=one_euro").smooth.results)
-"""
-    path, smooth = python(code, folder=tmp_path).split()
-    assert Path(path).is_relative_to(built) and smooth == "False"
-
-
 def test_help_shows_every_field_with_what_is_written_below_it() -> None:
     shown = inspect.getdoc(toftrack.Estimate) or ""
     for field in dataclasses.fields(toftrack.Estimate):
@@ -343,30 +314,3 @@ def _estimate() -> toftrack.Estimate:
     joints = sample().joints_m[0].astype(np.float32)
     nothing = no_estimate(0, 0.0, "tracking", 4, 0.0)
     return dataclasses.replace(nothing, lost=False, joints_m=joints)
-
-
-@pytest.mark.slow
-def test_a_type_checker_in_another_folder_knows_the_types_of_a_wheel(tmp_path: Path) -> None:
-    """Unpacked, which is what installing a wheel does."""
-    pytest.importorskip("mypy")
-    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*pip, "-w", str(tmp_path), str(ROOT)], check=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
-    (tmp_path / "client.py").write_text(
-        "import toftrack\n"
-        "estimate = toftrack.make_tracker().step([[0.5]], [[1.0]])\n"
-        "reveal_type(estimate.confidence)\n"
-        "reveal_type(toftrack.read_run('x').camera)\n"
-        "estimate.no_such_field\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "client.py"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
-        capture_output=True,
-        text=True,
-    )
-    assert 'Revealed type is "float"' in done.stdout, done.stdout + done.stderr
-    assert 'Revealed type is "toftrack.camera.Camera"' in done.stdout
-    assert '"Estimate" has no attribute "no_such_field"' in done.stdout

@@ -1,22 +1,93 @@
-"""What a wheel and a source archive hold."""
+"""What a wheel, a source archive and an editable installation hold."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
-from helpers.tracking import ROOT
+
+pytest.importorskip("hatchling", reason="hatchling is not installed")
+from hatchling import build
+from hatchling.builders.sdist import SdistBuilder
+
+ROOT = Path(__file__).parents[1]
 
 
-def test_no_recording_of_the_tests_is_distributed(tmp_path: Path) -> None:
-    """The list that setuptools makes both archives from."""
-    pytest.importorskip("setuptools", minversion="77")
-    command = [sys.executable, "setup.py", "-q", "egg_info", "-e", str(tmp_path)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    listed = next(tmp_path.glob("*.egg-info")) / "SOURCES.txt"
-    files = listed.read_text(encoding="utf-8").splitlines()
-    assert "toftrack/data/sample.npz" in files and "conf/config.yaml" in files
-    assert "toftrack/benchmark/peer_mediapipe.py" in files
-    assert not [name for name in files if name.startswith(("tests/", "docs/"))]
+def _files(folder: str) -> set[str]:
+    paths = (path for path in (ROOT / folder).rglob("*") if path.is_file())
+    return {str(path.relative_to(ROOT)) for path in paths if "__pycache__" not in path.parts}
+
+
+def _names(wheel: zipfile.ZipFile) -> set[str]:
+    return {name for name in wheel.namelist() if ".dist-info/" not in name}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the wheel unpacked, which is what installing one does."""
+    folder = tmp_path_factory.mktemp("wheel")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        wheel = zipfile.ZipFile(folder / build.build_wheel(str(folder)))
+    package = _files("toftrack")
+    assert {"toftrack/py.typed", "toftrack/data/sample.npz", "toftrack/data/detector.npz"} < package
+    assert _names(wheel) == package | {f"toftrack/{name}" for name in _files("conf")}
+    wheel.extractall(folder / "site")
+    return folder / "site"
+
+
+def _python(site: Path, folder: Path, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+    )
+    return done.stdout + done.stderr
+
+
+def test_an_installed_package_brings_its_configuration(site: Path, tmp_path: Path) -> None:
+    code = """
+import toftrack
+from toftrack.configuration.compose import configuration
+print(toftrack.__file__, configuration("smooth=one_euro").smooth.results)
+"""
+    path, smooth = _python(site, tmp_path, "-c", code).split()
+    assert Path(path).is_relative_to(site) and smooth == "False"
+
+
+@pytest.mark.slow
+def test_a_type_checker_in_another_folder_knows_the_types(site: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mypy")
+    (tmp_path / "client.py").write_text(
+        "import toftrack\n"
+        "estimate = toftrack.make_tracker().step([[0.5]], [[1.0]])\n"
+        "reveal_type(estimate.confidence)\n"
+        "reveal_type(toftrack.read_run('x').camera)\n"
+        "estimate.no_such_field\n"
+    )
+    said = _python(site, tmp_path, "-m", "mypy", "--strict", "client.py")
+    assert 'Revealed type is "float"' in said, said
+    assert 'Revealed type is "toftrack.camera.Camera"' in said
+    assert '"Estimate" has no attribute "no_such_field"' in said
+
+
+def test_an_editable_installation_is_the_path_of_the_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that type checkers and editors find the package."""
+    monkeypatch.chdir(ROOT)
+    with zipfile.ZipFile(tmp_path / build.build_editable(str(tmp_path))) as wheel:
+        [path] = _names(wheel)
+        assert path.endswith(".pth") and wheel.read(path).decode().strip() == str(ROOT)
+
+
+def test_the_source_archive_holds_no_tests_and_no_pages() -> None:
+    held = {file.distribution_path for file in SdistBuilder(str(ROOT)).recurse_included_files()}
+    programs = {"track.py", "train_pose_space.py"}
+    assert held == _files("toftrack") | _files("conf") | programs

@@ -57,7 +57,7 @@ def test_an_interrupt_while_tracking_is_loaded(
 )
 def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
     moment = "toftrack.benchmark.speed" if name == "benchmark" else "hydra"
-    reported = interrupted(tmp_path, moment, "-m", f"toftrack.{name}", "x")
+    reported = interrupted(tmp_path, moment, "-m", "toftrack", name, "x")
     assert (reported.returncode, reported.stderr) == (130, "interrupted\n")
 
 
@@ -73,7 +73,9 @@ def test_an_ignored_interrupt_stays_ignored(tmp_path: Path) -> None:
     """As after nohup, or in the background of a script."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        reported = interrupted(tmp_path, "hydra", "-m", "toftrack.report", str(tmp_path / "none"))
+        reported = interrupted(
+            tmp_path, "hydra", "-m", "toftrack", "report", str(tmp_path / "none")
+        )
     finally:
         signal.signal(signal.SIGINT, before)
     assert reported.returncode == 1 and "no folder" in reported.stderr

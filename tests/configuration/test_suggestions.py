@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import pytest
 
-from toftrack.configuration.compose import configuration
+from toftrack import make_tracker
+from toftrack.configuration.compose import configuration, configuration_folder
 from toftrack.errors import ToftrackError
 
 
@@ -25,21 +29,52 @@ from toftrack.errors import ToftrackError
         ("view=quux", "there is no view=quux; give one of browser, none, rerun, video"),
         ("device.path=a (1).npz", "give the recording by its name alone: toftrack track 'a (1)"),
         ("seed=[1", "'seed=[1' cannot be read as a setting"),
-        ("start=search", "there is no start=search any more, since the networks find hands: leave"),
-        ("lost=score", "there is no lost=score any more, since the networks' features count"),
-        ("start.hypotheses=9", "or give detector.hypotheses"),
-        ("start.islands=9", "there is no setting start.islands any more, since the networks"),
         (
-            "lost.score=0.5",
-            "lost.confidence says which estimates count: give that, or give experiment",
+            "start=rough",
+            "start belongs to experiment=paper; give experiment=paper as well, or leave",
         ),
-        (
-            "hand.fit.prior=0.1",
-            "no setting hand.fit.prior any more, since the whole shape",
-        ),
+        ("start.pose=0.1", "start.pose belongs to experiment=paper; "),
     ],
 )
 def test_a_misspelt_override_gets_the_nearest_one(override: str, reported: str) -> None:
     with pytest.raises(ToftrackError) as error:
         configuration(override)
     assert reported in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_misspelt_setting_of_the_papers_tracker_gets_the_nearest_one() -> None:
+    with pytest.raises(ToftrackError, match="no setting start.psoe; did you mean start.pose?"):
+        configuration("experiment=paper", "start.psoe=0.1")
+
+
+@pytest.mark.parametrize(
+    ("file", "words", "reported"),
+    [
+        (
+            "lost/calibrated.yaml",
+            ("toftrack.tracking.confidence.JointC", "toftrack.tracking.mine.JointC"),
+            "the _target_ toftrack.tracking.mine.JointConfidence cannot be imported",
+        ),
+        (
+            "refine/gauss_newton.yaml",
+            ("damping:", "nope: 3\ndamping:"),
+            "argument 'nope' .* refine",
+        ),
+        (
+            "config.yaml",
+            ("  - posterior: default\n", ""),
+            "the configuration has no posterior; add '- posterior: default' to the defaults",
+        ),
+    ],
+)
+def test_what_is_wrong_in_a_folder_of_ones_own_is_named(
+    file: str, words: tuple[str, str], reported: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "conf"
+    shutil.copytree(configuration_folder(), folder)
+    text = (folder / file).read_text(encoding="utf-8")
+    assert words[0] in text
+    (folder / file).write_text(text.replace(*words), encoding="utf-8")
+    with pytest.raises(ToftrackError, match=reported) as error:
+        make_tracker(config_dir=folder)
+    assert "\n" not in str(error.value)

@@ -22,9 +22,9 @@ from toftrack.detector.crops import (
     crop_rotation,
     wide,
 )
-from toftrack.detector.network import STRIDE, Finder, Found, PoseNet
+from toftrack.detector.network import STRIDE, Finder, Found
 from toftrack.detector.proposals import NetworkOutput, find_hands, mirrored
-from toftrack.detector.weights import load_weights, make_ready
+from toftrack.detector.weights import load_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 run_pose_network = proposals_numba.run_pose_network
@@ -172,14 +172,10 @@ def distinct(log_probability: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize("network", ["trained", "random", "older"])
+@pytest.mark.parametrize("network", ["trained", "random"])
 def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> None:
     """Of hands, of places at the border, and of places beside the image."""
     pose = load_weights()[0] if network == "trained" else small_networks()[0]
-    if network == "older":
-        torch.manual_seed(0)
-        pose = PoseNet(4, 3, 4)
-        make_ready(pose)
     for frame in (0, 30, 60):
         scene = sample().cut(frame)
         centres = np.concatenate((scene.joints_m[0, [0, 9]], [[0.2, 0.0, 0.45], [2.0, 0.1, 0.3]]))

@@ -16,7 +16,7 @@ from helpers.detection import small_networks
 from helpers.tracking import sample
 
 from toftrack.detector import onnx_export, onnx_networks, proposals, quantisation
-from toftrack.detector.crops import CROP, wide
+from toftrack.detector.crops import CROP, CROP_CHANNELS, wide
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import DIGEST, OnnxFinder, OnnxPoseNet, digest, load_networks
@@ -64,7 +64,7 @@ def test_a_file_of_weights_is_exported_and_answers_like_torch_at_any_size(weight
     assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
     draw = torch.Generator().manual_seed(0)
     for count in (1, 4):
-        crops = torch.rand(count, pose.inputs, CROP, CROP, generator=draw)
+        crops = torch.rand(count, CROP_CHANNELS, CROP, CROP, generator=draw)
         expected = pose.reference.features(crops)
         for one, two in zip(pose.outputs(crops.numpy()), expected, strict=False):
             away = torch.from_numpy(one) - two
@@ -108,7 +108,7 @@ def test_the_file_is_in_8_bits_and_says_so_and_bad_ones_are_refused(exported: Pa
     model = onnx.load(onnx_networks.onnx_file(exported, "pose"))
     kinds = [part.data_type for part in model.graph.initializer if len(part.dims) == 4]
     assert kinds.count(onnx.TensorProto.INT8) == len(kinds) - 3, "all but the first and the last"
-    crops = quantisation.example_crops(pose.inputs)[:4]
+    crops = quantisation.example_crops()[:4]
     quantisation.compare(pose.reference, model, crops)
     other, _ = small_networks()
     with pytest.raises(ToftrackError, match=r"mm away .* give --float"):
@@ -180,7 +180,7 @@ def test_outputs_of_another_shape_never_reach_compiled_code(weights: Path) -> No
             maps = (np.zeros((1, count, 16, 16), np.float32) for count in (105, 20))
             return [np.zeros((1, 7), np.float32), *maps]
 
-    crops = np.zeros((1, pose.inputs, CROP, CROP), np.float32)
+    crops = np.zeros((1, CROP_CHANNELS, CROP, CROP), np.float32)
     with pytest.raises(ToftrackError, match="is of another network"):
         OnnxPoseNet(pose.reference, Other()).outputs(crops)
 
@@ -228,5 +228,5 @@ def test_an_export_that_does_not_agree_with_torch_is_an_error(exported: Path) ->
     other, _ = small_networks()
     with pytest.raises(ToftrackError, match="away from torch's"):
         onnx_export._compare(
-            onnx_export._Features(other), model, "crops", (other.inputs, CROP, CROP)
+            onnx_export._Features(other), model, "crops", (CROP_CHANNELS, CROP, CROP)
         )

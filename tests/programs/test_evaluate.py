@@ -1,4 +1,4 @@
-"""`python -m toftrack.evaluate` on a tiny data set."""
+"""`toftrack evaluate` on a tiny data set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m toftrack.gesture`: gestures of one's own from a recording, and their file."""
+"""`toftrack gesture`: gestures of one's own from a recording, and their file."""
 
 from __future__ import annotations
 

@@ -241,7 +241,7 @@ def test_after_kill_9_the_frames_until_then_are_recovered(
 ) -> None:
     path, part = tmp_path / "hand.npz", tmp_path / "hand.npz.part"
     settings = ("device=sr3000", "device.transport=emulated", "device.emulated.fps=200")
-    command = [sys.executable, "-m", "toftrack.record", str(path), *settings]
+    command = [sys.executable, "-m", "toftrack", "record", str(path), *settings]
     quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     process = subprocess.Popen([*command, "device.emulated.loop=true"], cwd=ROOT, **quiet)
     try:

@@ -288,8 +288,8 @@ def test_a_link_to_a_device_is_not_written(tmp_path: Path) -> None:
 
 
 def test_kill_9_while_recording_keeps_every_whole_frame(path: Path) -> None:
-    command = [sys.executable, "-m", "toftrack.record", str(path), "device.transport=emulated"]
-    options = ["device.emulated.fps=200", "device.emulated.loop=true"]
+    command = [sys.executable, "-m", "toftrack", "record", str(path)]
+    options = ["device.transport=emulated", "device.emulated.fps=200", "device.emulated.loop=true"]
     process = subprocess.Popen(
         command + options, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )

@@ -1,1 +1,1 @@
-"""How long scoring, decoding and whole frames take: `python -m toftrack.benchmark`."""
+"""How long scoring, decoding and whole frames take: `toftrack benchmark`."""

@@ -20,7 +20,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from toftrack.checks import check_number
-from toftrack.configuration.renamed import MOVED, answer
 from toftrack.errors import ToftrackError
 
 _ABOVE_ZERO = frozenset(
@@ -68,7 +67,6 @@ _OF_PAPER = {
 """Likewise the paper's."""
 _GROUPS = {"detector": "network", "posterior": "default"}
 """Groups that a tracker needs, and their usual choices; the paper's needs the first alone."""
-_NOWHERE = object()
 _NO_NETWORKS = "toftrack.detector.hand_detector.no_detector"
 
 
@@ -91,19 +89,12 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
         default = loader.load_configuration(name, lines, RunMode.RUN)
     except (HydraException, OmegaConfBaseException):
         return  # options that exclude each other unless something is deleted: nothing to compare
-    for override in parsed:  # with a + any name composes
-        key = override.key_or_group
-        if OmegaConf.select(default, key, default=_NOWHERE) is _NOWHERE and (old := answer(key)):
-            raise ToftrackError(old)
     for key, value, usual in _pairs(config, default):
         check_value(key, value, usual)
 
 
 def check_groups(config: DictConfig) -> None:
-    """Raise ToftrackError where a folder of somebody's own lacks a group, or has an old one."""
-    for group in MOVED:
-        if group in config and group not in _GROUPS:
-            raise ToftrackError(str(answer(group)))
+    """Raise ToftrackError where a folder of somebody's own lacks a group."""
     paper = OmegaConf.select(config, "detector._target_") == _NO_NETWORKS
     for group, choice in _GROUPS.items():
         if group not in config and not (paper and choice == "default"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +15,6 @@ from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toftrack.configuration import renamed
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
@@ -63,21 +61,17 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
 
 def configuration_folder() -> Path:
     """toftrack's own conf/: in the package where a wheel was installed, beside it in a checkout."""
-    # An editable installation in strict mode has links to the files of the checkout.
     package = Path(__file__).resolve().parents[1]
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
 
 
 def setting_names() -> frozenset[str]:
-    """The groups, and the settings that stand in none: how the keys of overrides begin, also of
-    groups that are gone.
-    """
+    """The groups, and the settings that stand in none: how the keys of overrides begin."""
     folder = configuration_folder()
     own = [str(name) for path in folder.glob("*.yaml") for name in OmegaConf.load(path)]
     groups = [path.name for path in folder.iterdir() if path.is_dir()]
-    old = [re.split(r"[.=]", name)[0] for name in renamed.MOVED]
-    return frozenset({*own, *groups, *old, "hydra"})
+    return frozenset({*own, *groups, "hydra"})
 
 
 def devices_of_files() -> frozenset[str]:

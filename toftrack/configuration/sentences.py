@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import yaml
 from hydra.errors import HydraException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from toftrack.configuration.renamed import answer, target_answer
 from toftrack.configuration.suggestions import better_sentence
 from toftrack.errors import ToftrackError
 
@@ -35,12 +34,10 @@ def sentence(error: BaseException) -> str:
     if any(isinstance(cause, RecursionError) for cause in chain):
         return "a setting or a file is nested too deeply; take out what is not meant"
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
-        return target_answer(target[1]) or (
+        return (
             f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "
             "name, and that its module lies beside the program or on PYTHONPATH"
         )
-    if old := _of_argument(error, chain):
-        return old
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         reported = next((cause for cause in chain if str(cause).strip()), error)
         return better_sentence(chain) or _of_config(reported) or type(error).__name__
@@ -75,13 +72,6 @@ def _of_system(error: OSError) -> str:
 def _of_missing_value(error: MissingMandatoryValue) -> str:
     name = error.full_key or str(error).rpartition(" ")[2]
     return f"the value of {name} is missing; give it on the command line as {name}=VALUE"
-
-
-def _of_argument(error: BaseException, chain: Sequence[BaseException]) -> str | None:
-    """Of a file of somebody's that gives a class a setting which is gone."""
-    group = re.search(r"full_key: (\S+)", str(error))
-    unknown = re.search(r"unexpected keyword argument '([^']+)'", str(chain[-1]))
-    return answer(f"{group[1]}.{unknown[1]}") if group and unknown else None
 
 
 def _of_config(error: BaseException) -> str:

@@ -10,12 +10,12 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toftrack.configuration.renamed import answer
-
 _ALIKE = 0.6
 """How much of a name must be right, 0..1."""
 _MOST = 12
 """So many names are listed at most."""
+_PAPERS_GROUP = "start"
+"""A group that experiment=paper alone has."""
 
 
 def nearest(word: str, names: Sequence[str]) -> str | None:
@@ -52,8 +52,6 @@ def _of_syntax(error: OverrideParseException) -> str:
 
 def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     group, _, word = missing.rpartition("/")
-    if old := answer(group, word):
-        return old
     if not group or not options:
         return None
     likely = nearest(word, options)
@@ -63,23 +61,25 @@ def _of_choice(missing: str, options: Sequence[str]) -> str | None:
 
 def _of_key(chain: Sequence[BaseException]) -> str | None:
     reported = re.match(r"Could not override '([^']+)'", str(chain[0]))
-    proposed = re.search(r" use \+[^=]+=(.*)", str(chain[0]))
-    if reported and (old := answer(reported[1], proposed[1].strip() if proposed else "")):
-        return old
+    if not reported:
+        return None
+    key = reported[1]
     for error in chain:
         parent = getattr(error, "parent_node", None)
-        if (
-            reported
-            and isinstance(error, OmegaConfBaseException)
-            and isinstance(parent, DictConfig)
-        ):
-            return _unknown_key(reported[1], parent)
-    return None
+        if isinstance(error, OmegaConfBaseException) and isinstance(parent, DictConfig):
+            return _unknown_key(key, parent)
+    return _of_paper(key) if key == _PAPERS_GROUP else None
+
+
+def _of_paper(key: str) -> str:
+    return f"{key} belongs to experiment=paper; give experiment=paper as well, or leave {key} out"
 
 
 def _unknown_key(key: str, parent: DictConfig) -> str:
     root = parent._get_root()
     assert isinstance(root, DictConfig)
+    if key.partition(".")[0] == _PAPERS_GROUP and _PAPERS_GROUP not in root:
+        return _of_paper(key)
     known = OmegaConf.to_container(root)
     keys = [name for name in _keys(known) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]

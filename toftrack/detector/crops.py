@@ -18,7 +18,7 @@ CROP_M = 0.30
 CROP = 64
 """Cells of a crop, each of 2 x 2 readings."""
 CROP_CHANNELS = 8
-"""Of a crop, see `channels`; older weights see the first three or four."""
+"""Of a crop, see `channels`."""
 WIDE_F_PX = 100.0
 """Focal length of the whole image that the finder sees, pixels."""
 WIDE_MULTIPLE = 16

@@ -53,9 +53,8 @@ def _read_crop(depth, flip, mapping, slope, scale, distance, image):
     mapping: (3, 3) float32 from the crop's samples to pixels.
     slope: (3,) float32, of a sample: its Z over its z along the crop's axis.
     scale: from metres to half cubes.  distance: of the crop's centre, metres.
-    image: (C, CROP, CROP) float32, written: the first 3, 4 or all of crops.CROP_CHANNELS.
+    image: (CROP_CHANNELS, CROP, CROP) float32, written.
     """
-    border, each = image.shape[0] > 3, image.shape[0] > 4
     size = image.shape[1]
     samples = 2 * size
     places, share = np.empty(samples, np.int64), np.empty(samples, np.float32)
@@ -66,8 +65,7 @@ def _read_crop(depth, flip, mapping, slope, scale, distance, image):
             _place(depth.shape, flip, mapping, slope, np.float32(line), places, share)
             for sample in range(samples):
                 if places[sample] < 0:
-                    if border:
-                        image[3, row, sample // 2] += np.float32(0.25)
+                    image[3, row, sample // 2] += np.float32(0.25)
                     continue
                 z = depth.flat[places[sample]] * share[sample]
                 if z > _ZERO:
@@ -75,8 +73,7 @@ def _read_crop(depth, flip, mapping, slope, scale, distance, image):
                     column = sample // 2
                     clipped = min(max(relative, -_ONE), _ONE)
                     image[0, row, column] += clipped
-                    if each:
-                        image[4 + 2 * (line - 2 * row) + sample % 2, row, column] = clipped
+                    image[4 + 2 * (line - 2 * row) + sample % 2, row, column] = clipped
                     image[1, row, column] += np.float32(0.25) * (abs(relative) < _ONE)
                     image[2, row, column] += np.float32(0.25)
         for column in range(size):

@@ -66,7 +66,7 @@ class Proposed(NamedTuple):
     log_probability: (N, 24).  error_m: (N, 24) expected mean error of the joints.
     joints_m: (N, 21, 3) and sigma_m: (N, 21), by the keypoints of the cells.
     right: (N,) logit of a right hand.  present: (N,) logit of a hand near the centre.
-    parts: (N, segments, PARTS, PARTS) logits.
+    parts: (N, SEGMENTS, PARTS, PARTS) logits.
     """
 
     rotation: Tensor
@@ -104,23 +104,17 @@ class Residual(nn.Module):
 
 
 class PoseNet(nn.Module):
-    """Crops (N, inputs, 64, 64) to Proposed.
-
-    inputs: the first channels of crops.channels that it sees.  segments: the first classes of
-    SEGMENTS that it tells apart. Both are told by a file's weights, see weights.load_weights.
-    """
+    """Crops (N, CROP_CHANNELS, 64, 64) to Proposed."""
 
     anchors: Tensor
     limits: Tensor
     cells: Tensor
 
-    def __init__(
-        self, width: int = 24, inputs: int = CROP_CHANNELS, segments: int = SEGMENTS
-    ) -> None:
+    def __init__(self, width: int = 24) -> None:
         super().__init__()
         w1, w2, w3, w4 = width, 2 * width, 4 * width, 6 * width
         self.stem = nn.Sequential(
-            nn.Conv2d(inputs, w1, 5, 2, 2, bias=False), nn.BatchNorm2d(w1), nn.ReLU()
+            nn.Conv2d(CROP_CHANNELS, w1, 5, 2, 2, bias=False), nn.BatchNorm2d(w1), nn.ReLU()
         )
         self.fine = Residual(w1, w2, 2)  # 16 x 16
         self.middle = nn.Sequential(Residual(w2, w3, 2), Residual(w3, w3))  # 8 x 8
@@ -140,17 +134,10 @@ class PoseNet(nn.Module):
             nn.ReLU(),
         )
         self.keypoints = nn.Conv2d(2 * width, 5 * JOINTS, 1)
-        self.painted = nn.Conv2d(2 * width, 4 * segments, 1)
+        self.painted = nn.Conv2d(2 * width, 4 * SEGMENTS, 1)
         steps = (torch.arange(CELLS) + 0.5) / CELLS - 0.5
         cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy")) * CROP_M
         self.register_buffer("cells", cells)  # (2, 16, 16) metres across, x then y
-
-    @property
-    def inputs(self) -> int:
-        """Channels of a crop that it sees."""
-        stem = self.stem[0]
-        assert isinstance(stem, nn.Conv2d)
-        return stem.in_channels
 
     @property
     def device(self) -> torch.device:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from toftrack.detector.crops import CROP, WIDE_MULTIPLE
+from toftrack.detector.crops import CROP, CROP_CHANNELS, WIDE_MULTIPLE
 from toftrack.detector.network import Found, PoseNet
 from toftrack.detector.onnx_networks import (
     DIGEST,
@@ -60,7 +60,7 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     if missing := missing_packages():
         raise ToftrackError(needed(missing))
     loaded = load_weights(weights)
-    crops = torch.zeros(2, loaded.pose.inputs, CROP, CROP)
+    crops = torch.zeros(2, CROP_CHANNELS, CROP, CROP)
     several = torch.export.Dim("n", min=1, max=1 << 16)
     # In multiples, as `crops.wide` makes them.
     rows, columns = (
@@ -84,7 +84,7 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     _compare(loaded.finder, contents["finder"], "images", (2, 3 * WIDE_MULTIPLE, 4 * WIDE_MULTIPLE))
     precision = dict.fromkeys(contents, FLOAT)
     if whole_numbers:
-        examples = example_crops(loaded.pose.inputs)
+        examples = example_crops()
         contents["pose"] = quantised(contents["pose"], examples[:-COMPARED])
         compare(loaded.pose, contents["pose"], examples[-COMPARED:])
         precision["pose"] = WHOLE

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.detector.network import CELLS, JOINTS, REPORTED, Finder, Found, PoseNet
+from toftrack.detector.network import CELLS, JOINTS, REPORTED, SEGMENTS, Finder, Found, PoseNet
 from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
 from toftrack.safe_files import open_to_read
@@ -48,17 +48,12 @@ class OnnxPoseNet:
         return torch.device("cpu")
 
     @functools.cached_property
-    def inputs(self) -> int:
-        """Channels of a crop that it sees."""
-        return self.reference.inputs
-
-    @functools.cached_property
     def precision(self) -> str:
         """FLOAT or WHOLE."""
         return str(_properties(self.session).get("precision", FLOAT))
 
     def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of crops (N, inputs, 64, 64): what PoseNet.features returns; without the lock.
+        """Of crops (N, CROP_CHANNELS, 64, 64): what PoseNet.features returns; without the lock.
 
         Raises ToftrackError for a file of a network with other outputs.
         """
@@ -66,7 +61,7 @@ class OnnxPoseNet:
         heads, keypoints, parts = outputs
         n = len(crops)
         # Compiled code reads them, and believes their shapes.
-        shapes = (n, REPORTED), (n, 5 * JOINTS, CELLS, CELLS), (n, *parts.shape[1:2], CELLS, CELLS)
+        shapes = (n, REPORTED), (n, 5 * JOINTS, CELLS, CELLS), (n, 4 * SEGMENTS, CELLS, CELLS)
         if any(one.dtype != np.float32 for one in outputs) or shapes != tuple(
             one.shape for one in outputs
         ):

@@ -162,7 +162,7 @@ def run_pose_network(
     crops, crop_rotations = zip(
         *(crop(depth_m, k, *at) for at in zip(centres_m, ups, strict=True)), strict=True
     )
-    image = torch.from_numpy(np.stack(crops)[:, : pose.inputs])
+    image = torch.from_numpy(np.stack(crops))
     image = image.to(memory_format=torch.channels_last)
     p = Proposed(*on_host(*pose(on_device(image, pose.device))))
     turn = torch.from_numpy(np.stack(crop_rotations)).float()  # (C, 3, 3)

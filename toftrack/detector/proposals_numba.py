@@ -14,7 +14,7 @@ import torch
 
 from toftrack.compute.threads import beside, run_shared
 from toftrack.detector import proposals
-from toftrack.detector.crops import CROP, crop_rotation
+from toftrack.detector.crops import CROP, CROP_CHANNELS, crop_rotation
 from toftrack.detector.crops_numba import crop_at
 from toftrack.detector.decoding_numba import decode_at
 from toftrack.detector.network import ANGLES, JOINTS, PARTS, PoseNet
@@ -71,7 +71,7 @@ def start_pose_network(
     task = _prepared(pose, depth_m, k, centres_m, side, up)
     _, depth, left, k, centres, rotations, hand, out, rows = task.args
     places = list(zip(rows, rotations, centres, strict=False))
-    images = [_crop(pose, depth, left, k, centre, turn) for _, turn, centre in places]
+    images = [_crop(depth, left, k, centre, turn) for _, turn, centre in places]
     wait = beside(lambda: [pose.outputs(image) for image in images])
 
     def reported() -> NetworkOutput:
@@ -144,20 +144,19 @@ def _propose(
     Each by itself: a batch takes as long, and what is said of a crop would depend on the others.
     """
     for row in rows:
-        image = _crop(pose, depth, left, k, centres[row], rotations[row])
+        image = _crop(depth, left, k, centres[row], rotations[row])
         _decode(_outputs(pose, image), image, rotations[row], centres[row], left, hand, out, row)
 
 
 def _crop(
-    pose: PoseNet | OnnxPoseNet,
     depth: np.ndarray,
     left: bool,
     k: np.ndarray,
     centre: np.ndarray,
     turn: np.ndarray,
 ) -> np.ndarray:
-    """A crop's image (1, inputs, CROP, CROP)."""
-    image = np.empty((1, pose.inputs, CROP, CROP), np.float32)
+    """A crop's image (1, CROP_CHANNELS, CROP, CROP)."""
+    image = np.empty((1, CROP_CHANNELS, CROP, CROP), np.float32)
     crop_at(depth, left, k, centre, turn, image[0])
     return image
 

@@ -34,12 +34,11 @@ _SPREAD = 0.1
 """How far heads may be from torch's, RMS in parts of their spread; three times the package's."""
 
 
-def example_crops(inputs: int) -> np.ndarray:
-    """(CALIBRATION + COMPARED, inputs, CROP, CROP) float32, the same ones every time."""
+def example_crops() -> np.ndarray:
+    """(CALIBRATION + COMPARED, CROP_CHANNELS, CROP, CROP) float32, the same ones every time."""
     generator = torch.Generator().manual_seed(_SEED)
     bank = shape_bank(_SHAPES, generator)
-    crops = crop_images(CALIBRATION + COMPARED, bank, generator).image
-    return crops[:, :inputs].contiguous().numpy()
+    return crop_images(CALIBRATION + COMPARED, bank, generator).image.numpy()
 
 
 def quantised(model: Any, crops: np.ndarray) -> Any:
@@ -47,7 +46,7 @@ def quantised(model: Any, crops: np.ndarray) -> Any:
 
     The first and the last layers stay as they are, which decide on depths and places, and of the
     dense layers all but the first, on which the hypotheses depend: they take no time.
-    crops: (N, inputs, CROP, CROP) that the ranges are measured on.
+    crops: (N, CROP_CHANNELS, CROP, CROP) that the ranges are measured on.
     """
     import onnx
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static

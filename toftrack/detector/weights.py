@@ -13,26 +13,16 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from toftrack.archives import read_archive, write_archive
-from toftrack.detector.crops import CROP_CHANNELS
-from toftrack.detector.network import SEGMENTS, Finder, PoseNet, Residual
+from toftrack.detector.network import Finder, PoseNet, Residual
 from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
 
 FORMAT = "toftrack-detector"
 VERSION = 1
-_FORMATS = (FORMAT, "toftrack-relocaliser")
-"""As files say it; the second one until the detector had its name."""
-_RENAMED = {"pose.votes.": "pose.keypoints."}
-"""Arrays of older files, and what they are called now."""
 DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
 _LARGEST_BYTES = 64 << 20
 _WIDEST = 256
 """Channels; ten times those of the package's networks."""
-_OLD_FINDER = "finder.body.0.weight"
-"""Files that have this hold a finder of before it had maps of several sizes; the package's is used
-instead."""
-_NEW_CLASS = -4.0
-"""Bias of the logits of a class that was not known before: at first it is hardly ever said."""
 _AGAIN = "train them anew with python -m toftrack.programs.train_detector, or install again"
 
 
@@ -73,10 +63,8 @@ def load_weights(path: str | Path | None = None) -> Weights:
     """
     path = DEFAULT_FILE if path is None else Path(path)
     arrays, metadata = _read(path)
-    if _OLD_FINDER in arrays:
-        arrays, metadata = _with_package_finder(arrays, metadata)
     try:
-        pose = PoseNet(_width(metadata, "pose"), *_pose_channels(arrays))
+        pose = PoseNet(_width(metadata, "pose"))
         finder = Finder(_width(metadata, "finder"))
         for name, network in (("pose", pose), ("finder", finder)):
             network.load_state_dict(_tensors(arrays, name))
@@ -90,9 +78,9 @@ def load_weights(path: str | Path | None = None) -> Weights:
 def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> str:
     """Give a new network, "pose" or "finder" of a width, the weights of a file to train on from.
 
-    What the file's network lacks begins without effect on what is there: channels of the crop,
-    classes of parts, and a wider network's channels (as Chen et al., "Net2Net: accelerating
-    learning via knowledge transfer", ICLR 2016, with new channels instead of copies).
+    A wider network's further channels begin without effect on what is there (as Chen et al.,
+    "Net2Net: accelerating learning via knowledge transfer", ICLR 2016, with new channels instead
+    of copies).
     Returns the checksum of the file's arrays. Raises ToftrackError as load_weights does, and for a
     narrower network.
     """
@@ -100,8 +88,6 @@ def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> s
     try:
         before = _width(metadata, name)
         tensors = _tensors(arrays, name)
-        if name == "pose":
-            _extend(tensors, *_pose_channels(arrays))
         if before > width:
             raise ToftrackError(
                 f"{path} holds weights for a width of {before}, and the width to train is {width};"
@@ -111,16 +97,6 @@ def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> s
     except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
     return str(metadata["sha256"])
-
-
-def _with_package_finder(
-    arrays: dict[str, np.ndarray], metadata: dict[str, Any]
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The pose network of a file and the package's finder."""
-    own, about = _read(DEFAULT_FILE)
-    arrays = {name: array for name, array in arrays.items() if not name.startswith("finder.")}
-    arrays |= {name: array for name, array in own.items() if name.startswith("finder.")}
-    return arrays, metadata | {"finder_width": about["finder_width"]}
 
 
 def _widened(tensors: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -136,29 +112,6 @@ def _widened(tensors: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, 
         out[tuple(slice(size) for size in old.shape)] = old
         widened[key] = out
     return widened
-
-
-def _pose_channels(arrays: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Channels of the crop and classes of parts that a pose network's arrays are for.
-
-    Raises KeyError or ValueError where they are for none.
-    """
-    stem, painted = arrays["pose.stem.0.weight"], arrays["pose.painted.weight"]
-    inputs, segments = stem.shape[1], painted.shape[0] // 4
-    if not (inputs in (3, 4, CROP_CHANNELS) and 4 <= segments <= SEGMENTS):
-        raise ValueError(f"{inputs} channels of a crop and {segments} classes of parts")
-    return inputs, segments
-
-
-def _extend(tensors: dict[str, Tensor], inputs: int, segments: int) -> None:
-    """Give a pose network's weights the channels and the classes that they lack, in place."""
-    stem = tensors["stem.0.weight"]
-    added = stem.new_zeros(len(stem), CROP_CHANNELS - inputs, *stem.shape[2:])
-    tensors["stem.0.weight"] = torch.cat((stem, added), 1)
-    new = 4 * (SEGMENTS - segments)
-    weight, bias = tensors["painted.weight"], tensors["painted.bias"]
-    tensors["painted.weight"] = torch.cat((weight, weight.new_zeros(new, *weight.shape[1:])))
-    tensors["painted.bias"] = torch.cat((bias, bias.new_full((new,), _NEW_CLASS)))
 
 
 def _width(metadata: dict[str, Any], name: str) -> int:
@@ -193,7 +146,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise ToftrackError(
             f"{path} is no file of the detector's weights ({error}); {_AGAIN}"
         ) from None
-    if not isinstance(metadata, dict) or metadata.get("format") not in _FORMATS:
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise ToftrackError(f"{path} is no file of the detector's weights; {_AGAIN}")
     if metadata.get("version") != VERSION:
         raise ToftrackError(
@@ -202,8 +155,6 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         )
     if metadata.get("sha256") != checksum(arrays):
         raise ToftrackError(f"{path} is damaged, its checksum is wrong; {_AGAIN}")
-    for before, now in _RENAMED.items():
-        arrays = {name.replace(before, now): array for name, array in arrays.items()}
     return arrays, metadata
 
 

@@ -6,7 +6,7 @@
                {"name": "fist", "angles": [null, null, null, null, null, 0, 88, 100, 50, ...]}]}
     `angles` is an object with names of hand.skeleton.ANGLE_NAMES, or a list of all 21 in their
     order. `spread`, likewise and beside it, says by how much the angles vary (standard deviation)
-    where somebody has seen; `python -m toftrack.gesture add` writes it.
+    where somebody has seen; `toftrack gesture add` writes it.
 
 .csv: a first line `# units: degrees` or `# units: radians`, a header with `name` and any of the 21
 angle names, one pose a row.

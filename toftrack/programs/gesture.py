@@ -1,4 +1,4 @@
-"""Your own gestures: `python -m toftrack.gesture add NAME RECORDING --from 2.0 --to 3.0`.
+"""Your own gestures: `toftrack gesture add NAME RECORDING --from 2.0 --to 3.0`.
 
 `add` tracks that part of a recording, takes the pose that the hand holds there, and writes it into
 a file of gestures, which `gestures.file=FILE` gives to the tracker. `list` names those that are
@@ -173,7 +173,7 @@ def _remove(path: Path, poses: Sequence[NamedPose], name: str) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m toftrack.gesture",
+        prog="toftrack gesture",
         description="Your own gestures: learn one from a recording, list or remove them.",
         usage="%(prog)s add NAME RECORDING --from S --to S [OVERRIDE ...] | list | remove NAME",
     )

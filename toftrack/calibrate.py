@@ -1,9 +1,0 @@
-"""Calibrate a camera: `python -m toftrack.calibrate`."""
-
-import sys
-
-import toftrack.early_interrupt  # noqa: F401  # before all others
-from toftrack.programs.main import main
-
-if __name__ == "__main__":
-    sys.exit(main(["calibrate", *sys.argv[1:]]))

@@ -1,9 +1,0 @@
-"""Convert a recording: `python -m toftrack.convert`."""
-
-import sys
-
-import toftrack.early_interrupt  # noqa: F401  # before all others
-from toftrack.programs.main import main
-
-if __name__ == "__main__":
-    sys.exit(main(["convert", *sys.argv[1:]]))
