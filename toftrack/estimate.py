@@ -79,7 +79,7 @@ class Estimate:
     """(21,) float32 probabilities that the joints are within 40 mm; NaN where nothing says."""
     joint_ok: np.ndarray = field(default_factory=lambda: np.ones(21, bool))
     """(21,) bool: the joint may be used. False for all of a hand that is lost, and for those joints
-    of another one that are likely off by more than 40 mm: see `lost.joints.ok` in conf/lost."""
+    of another one that are likely off by more than 40 mm: see `lost.joint_ok` in conf/lost."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, with or without
     the thumb stretched away, else NaN."""

@@ -8,14 +8,13 @@ import numba
 import numpy as np
 import pytest
 import torch
-from helpers.detection import clean_picture, dice, intrinsics, small_bank
+from helpers.detection import clean_picture, dice, intrinsics, plain_scenes, small_bank
 
 from toftrack.detector import grasps as grasping
 from toftrack.detector import hands as module
 from toftrack.detector.grasps import Grasps, random_grasps
 from toftrack.detector.hands import HAND, THING, posed_hands
 from toftrack.detector.held_things import _PHONE_M
-from toftrack.detector.scenes import plain_scenes
 from toftrack.detector.things_numba import BALL, BOX, CONE, RING, part_distance
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics

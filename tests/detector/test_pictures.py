@@ -14,13 +14,14 @@ from helpers.detection import (
     intrinsics,
     lens_of,
     one_hand,
+    plain_scenes,
     small_bank,
 )
 
 from toftrack.detector import pictures
 from toftrack.detector.hands import BACKGROUND, FOREARM, HAND, THING, posed_hands
 from toftrack.detector.pictures import random_sensors, take_pictures
-from toftrack.detector.scenes import Scenes, plain_scenes, surroundings, things
+from toftrack.detector.scenes import Scenes, surroundings, things
 from toftrack.hand.surface import Ellipsoids
 from toftrack.render.closed_form import render_range_images
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.detection import clean_picture, dice, intrinsics, small_bank
+from helpers.detection import clean_picture, dice, intrinsics, plain_scenes, small_bank
 
 from toftrack.detector.hands import FOREARM, HAND, Hands, posed_hands
-from toftrack.detector.scenes import Scenes, moved, plain_scenes
+from toftrack.detector.scenes import Scenes, moved
 from toftrack.detector.shapes import shape_bank
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.pose_space.data.shown_poses import SHOWN, shown_only, within_limits

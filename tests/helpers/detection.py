@@ -17,8 +17,9 @@ from toftrack.detector.hands import HAND, Hands, posed_hands
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
 from toftrack.detector.proposals import Places
-from toftrack.detector.scenes import Scenes, plain_scenes
+from toftrack.detector.scenes import Scenes
 from toftrack.detector.shapes import ShapeBank, shape_bank
+from toftrack.detector.things_numba import PART
 from toftrack.detector.weights import make_ready
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -156,3 +157,11 @@ class FixedDetector:
     def start(self, depth_m, k, centre_m, side, up=None) -> Callable[[], Detection]:
         found = self.detect(depth_m, k, np.asarray(centre_m)[None], side)[0]
         return lambda: found
+
+
+def plain_scenes(
+    centres_m: torch.Tensor, axes_m: torch.Tensor, labels: torch.Tensor, planes: torch.Tensor
+) -> Scenes:
+    """Ellipsoids and planes alone."""
+    skinned, parts = torch.zeros_like(labels, dtype=torch.bool), torch.zeros(len(labels), 0, PART)
+    return Scenes(centres_m, axes_m, labels, planes, skinned, (), parts)

@@ -40,7 +40,7 @@ _nearest = entry_point(lambda *a: compiled.nearest_ellipsoids(*a))
 _add_wrench = entry_point(lambda *a: compiled.add_wrench(*a))
 _add_points = entry_point(lambda *a: compiled.add_points(*a))
 _add_silhouette = entry_point(lambda *a: compiled.add_silhouette(*a))
-_add_landmarks = entry_point(lambda *a: compiled.add_landmarks(*a))
+_add_keypoints = entry_point(lambda *a: compiled.add_keypoints(*a))
 _assemble = entry_point(lambda *a: compiled.assemble(*a))
 _solve = entry_point(lambda *a: solve(*a))
 
@@ -227,7 +227,7 @@ def test_landmarks_add_up_as_in_the_reference(side: str) -> None:
     sigma[0, 5], points[0, 9] = torch.inf, torch.nan
     marks = Keypoints(points, sigma)
     wrenches = no_wrenches()
-    _add_landmarks(points[0].numpy(), sigma[0].numpy(), posed.hand, wrenches)
+    _add_keypoints(points[0].numpy(), sigma[0].numpy(), posed.hand, wrenches)
     expected = keypoint_residuals(posed.pose, marks.of_each(1), posed.shape)
     check_sums(assembled(wrenches, posed), expected, 1e-5)
 

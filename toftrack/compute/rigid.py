@@ -83,7 +83,11 @@ def rotation_scatter(rotvec: Tensor, weights: Tensor) -> Tensor:
 
 
 def main_rotation(scatter: Tensor) -> Tensor:
-    """The mean rotation (3,) of what `rotation_scatter` has summed up, float64."""
+    """The mean rotation (3,) of what `rotation_scatter` has summed up, float64.
+
+    The rotation nearest to the mean matrix (chordal L2 mean; Hartley et al., "Rotation averaging",
+    IJCV 2013).
+    """
     return unitquat_to_rotvec(torch.linalg.eigh(scatter).eigenvectors[:, -1])
 
 

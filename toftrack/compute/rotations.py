@@ -49,13 +49,6 @@ def rotvec_composition(*rotvecs: Tensor) -> Tensor:
     return unitquat_to_rotvec(functools.reduce(_product, map(_rotvec_to_unitquat, rotvecs)))
 
 
-def rotvec_geodesic_distance(first: Tensor, second: Tensor) -> Tensor:
-    """(...,) radians between the rotations of vectors (..., 3)."""
-    p, q = _rotvec_to_unitquat(first), _rotvec_to_unitquat(second)
-    chord = torch.min(torch.linalg.norm(q - p, dim=-1), torch.linalg.norm(q + p, dim=-1))
-    return 4.0 * torch.asin(0.5 * chord)
-
-
 def _product(p: Tensor, q: Tensor) -> Tensor:
     p, q = torch.broadcast_tensors(p, q)
     cross = torch.cross(p[..., :3], q[..., :3], dim=-1)

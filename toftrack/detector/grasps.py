@@ -34,7 +34,7 @@ _OPPOSED_SHARE = 0.5
 _DEEPEST_M = 0.004
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grasps:
     """N hands with things in the frame of a right hand whose wrist is the origin.
 

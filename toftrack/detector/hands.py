@@ -39,7 +39,7 @@ _FOREARM_M = 0.25
 _ALONG = FOREARM_PIECES - 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hands:
     """A batch of posed hands.
 

@@ -81,7 +81,7 @@ _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Crops:
     """Crops and what is in them, in the crop's frame about its centre.
 
@@ -103,7 +103,7 @@ class Crops:
     joints_m: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CropScenes:
     """What crops show, before they are taken; N of each.
 
@@ -127,7 +127,7 @@ class CropScenes:
     joints_m: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WideImages:
     """Whole images and the hands in them: the first is raised, the second another's.
 

@@ -43,7 +43,7 @@ def _mean_hand(device: torch.device) -> HandShape:
     return default_hand_shape().to(device)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseLosses:
     """Sums to the loss, and what is reported; all () tensors on the network's device.
 

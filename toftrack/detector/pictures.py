@@ -17,7 +17,7 @@ from torch import Tensor
 
 from toftrack.compute.compiling import compiled, entry_point
 from toftrack.detector.dice import Dice
-from toftrack.detector.hands import THING
+from toftrack.detector.hands import FOREARM, THING
 from toftrack.detector.scenes import Scenes
 from toftrack.detector.skin import PRIMITIVE
 from toftrack.detector.skin_numba import draw_skin
@@ -35,7 +35,7 @@ _LATEST = 1.2
 """By what part of its depth a hollow seems deeper, at most."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lens:
     """Pinholes of a batch: f_px, cx, cy (N,), width, height (N,) of what each sees, in pixels."""
 
@@ -81,7 +81,7 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     return terms
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shots:
     """All that pictures of N scenes are made of, as float32 but for what is said.
 
@@ -309,7 +309,7 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
                     z += _random(state) * (min(other, z + 2.0) - z)
             elif blur:
                 z = 0.5 * (z + other)
-            if sensor[DARK] > 0 and labels[v, u] == 2:
+            if sensor[DARK] > 0 and labels[v, u] == FOREARM:
                 depth[v, u] = 0.0
                 continue
             if z > sensor[RANGE] or _random(state) < sensor[HOLES]:

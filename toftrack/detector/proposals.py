@@ -40,7 +40,7 @@ MIRROR = torch.tensor([-1.0, 1.0, 1.0])
 MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Places:
     """Where hands may be, likeliest first.
 
@@ -51,7 +51,7 @@ class Places:
     probability: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NetworkOutput:
     """What the pose network says of C crops, in the camera frame.
 

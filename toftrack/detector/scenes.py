@@ -15,10 +15,9 @@ from torch import Tensor
 from toftrack.detector.dice import Dice
 from toftrack.detector.hands import ABOVE, BACKGROUND, FRONT, HEAD, THING, Hands, turn
 from toftrack.detector.skin import Skins
-from toftrack.detector.things_numba import PART
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scenes:
     """What a batch of pictures is taken of.
 
@@ -36,20 +35,6 @@ class Scenes:
     skinned: Tensor
     skins: tuple[tuple[Skins, Tensor], ...]
     parts: Tensor
-
-
-def plain_scenes(centres_m: Tensor, axes_m: Tensor, labels: Tensor, planes: Tensor) -> Scenes:
-    """Ellipsoids and planes alone."""
-    n = len(labels)
-    return Scenes(
-        centres_m,
-        axes_m,
-        labels,
-        planes,
-        torch.zeros_like(labels, dtype=torch.bool),
-        (),
-        torch.zeros(n, 0, PART),
-    )
 
 
 def moved(scenes: Scenes, by_m: Tensor) -> Scenes:

@@ -35,7 +35,7 @@ _THINNER, _THICKER, _NARROWER = 0.5, 0.7, 0.4
 narrower then."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ShapeBank:
     """B right hands, stacked so that kinematics and surfaces of a batch need no loop.
 

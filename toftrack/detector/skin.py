@@ -29,7 +29,7 @@ radius 1 in its own frame, has a length below 0, and its longest half-axis as th
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Skins:
     """Of N hands, each with P primitives in the camera frame.
 

@@ -34,7 +34,6 @@ _READABLE = (1, 2)
 """Version 1 has nothing of how the shape was fitted."""
 
 # Everything below is in millimetres for a hand of 190 mm and scaled from there.
-_REFERENCE_LENGTH_MM = 190.0
 # Thumb CMC and the four knuckles in the hand frame. The transverse arch of the palm sets the
 # index and little knuckles towards the palm (-z).
 _BASE_MM = (

@@ -144,7 +144,7 @@ class Ellipsoids(NamedTuple):
     axes_m: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HandSurface:
     """Ellipsoids attached to the 16 frames of a HandPose; the last one is the wrist's.
 

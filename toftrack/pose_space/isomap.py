@@ -20,7 +20,7 @@ from toftrack.pose_space.neighbours import NeighbourSpace, fit_neighbour_space
 _NEIGHBOURS = (5, 8, 12, 16, 24, 32, 48)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class IsomapPoseSpace(NeighbourSpace):
     """Coordinates in radians of movement along the training poses."""
 

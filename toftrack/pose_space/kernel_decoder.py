@@ -39,7 +39,7 @@ class Regression(NamedTuple):
     error_rad: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KernelDecodedSpace(TensorSpace):
     """A space whose map back to angles is a fitted kernel regression.
 

@@ -26,7 +26,7 @@ from toftrack.pose_space.kernel_decoder import (
 _WIDTHS = (0.7, 1.0, 1.5, 2.5)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KernelPCAPoseSpace(KernelDecodedSpace):
     """latent = k(x) projection + shift, angles by kernel regression.
 

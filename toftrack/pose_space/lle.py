@@ -18,7 +18,7 @@ from toftrack.pose_space.neighbours import NeighbourSpace, fit_neighbour_space
 _NEIGHBOURS = (6, 8, 12, 16, 24)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LLEPoseSpace(NeighbourSpace):
     """Locally linear coordinates; each has unit deviation over the training poses."""
 

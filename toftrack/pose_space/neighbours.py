@@ -23,7 +23,7 @@ RIDGE = 1e-2
 """Regularises the weights of neighbours, in parts of their squared distances."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NeighbourSpace(KernelDecodedSpace):
     """latent = weighted mean of the nearest poses' latents, angles by kernel regression.
 

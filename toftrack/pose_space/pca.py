@@ -13,7 +13,7 @@ from toftrack.errors import ToftrackError
 from toftrack.pose_space.base import TensorSpace
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PCAPoseSpace(TensorSpace):
     """A linear space: angles = mean + latent components.
 

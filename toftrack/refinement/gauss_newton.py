@@ -331,7 +331,7 @@ def silhouette_residuals(
 def keypoint_residuals(pose: HandPose, keypoints: Keypoints, shape: HandShape) -> Residuals:
     """Of the joints: how far they are from their keypoints, along each of the camera's axes.
 
-    keypoints: of each of the N hands, see Landmarks.of_each.
+    keypoints: of each of the N hands, see Keypoints.of_each.
     """
     gap = pose.joints_m - keypoints.points_m
     sigma = keypoints.sigma_m

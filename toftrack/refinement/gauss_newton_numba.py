@@ -21,7 +21,7 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.residuals_numba import (
-    add_landmarks,
+    add_keypoints,
     add_points,
     add_silhouette,
     assemble,
@@ -110,7 +110,7 @@ def _refine(state, prior, keypoints, seen, shape, surface, settings, work):
         nearest_ellipsoids(xyz, count, posed, distance, nearest)
         add_points(matched, count, index, posed, hand, settings, wrenches)
         add_silhouette(seen, lengths, hand, deviation, wrenches)
-        add_landmarks(keypoints[0], keypoints[1], hand, wrenches)
+        add_keypoints(keypoints[0], keypoints[1], hand, wrenches)
         assemble(wrenches, hand, twists, sums)
         _move(state, prior, settings, sums)
 

@@ -221,7 +221,7 @@ def add_silhouette(seen, lengths, hand, deviation, wrenches):
 
 
 @compiled
-def add_landmarks(points, sigmas, hand, wrenches):
+def add_keypoints(points, sigmas, hand, wrenches):
     """The keypoints' part of the normal equations, see gauss_newton.keypoint_residuals."""
     joints = hand[1]
     for j in range(21):

@@ -16,7 +16,7 @@ from torch import Tensor
 from toftrack.compute.transfer import on_device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What a frame says of every pixel, in inverse depth u = 1/Z (1/m); all on one device.
 

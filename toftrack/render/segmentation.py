@@ -18,7 +18,7 @@ _NEAREST_M = 0.05
 """No camera sees anything nearer."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observation:
     """What the likelihood sees of one frame.
 

@@ -17,9 +17,6 @@ from toftrack.recordings.sr_frame import (
     unambiguous_range_m,
 )
 
-KNOWN_IDS = ("0852:0074", "1ad2:0074", "1ad2:0075")
-"""Vendor and product of the early SR3000, the SR3000, and the SR4000."""
-
 
 class CameraError(Exception):
     """Something went wrong that may pass; the reader tries again and never shows this to a user."""

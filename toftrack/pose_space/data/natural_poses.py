@@ -81,11 +81,6 @@ def natural_poses() -> Tensor:
         return torch.cat((recorded_poses(), torch.from_numpy(content["sampled_rad"])))
 
 
-def sampled_poses() -> Tensor:
-    """(M, 21) radians: those that are kept beside the recorded ones, as drawing takes a second."""
-    return sample_poses(len(recorded_poses()), torch.Generator().manual_seed(0))
-
-
 def sample_poses(n: int, generator: torch.Generator) -> Tensor:
     """(n, 21) natural joint angles, radians, within the joint limits."""
 

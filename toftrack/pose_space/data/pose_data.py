@@ -16,7 +16,7 @@ CLIP = 80
 """Natural poses in a row that are held out together."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseData:
     """Hand poses for learning a pose space.
 

@@ -1,0 +1,30 @@
+"""Objects that hold arrays are equal only to themselves: `==` of tensors has no truth value."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1] / "toftrack"
+BY_FIELDS = {"HandShape"}
+"""A copy of it that tells more of its fit has the same surface, which is kept for both."""
+
+
+def _dataclasses() -> Iterator[tuple[str, bool, bool]]:
+    """Name, whether it holds arrays, and whether it is compared by its fields."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            decorators = map(ast.unparse, getattr(node, "decorator_list", ()))
+            made = [text for text in decorators if text.startswith("dataclass")]
+            if isinstance(node, ast.ClassDef) and made:
+                fields = [one.annotation for one in node.body if isinstance(one, ast.AnnAssign)]
+                kinds = {ast.unparse(kind) for kind in fields}
+                arrays = bool(kinds & {"Tensor", "np.ndarray"})
+                yield node.name, arrays, "eq=False" not in made[0]
+
+
+def test_classes_that_hold_arrays_are_compared_by_identity() -> None:
+    found = list(_dataclasses())
+    assert sum(arrays for _, arrays, _ in found) > 20
+    assert {name for name, arrays, by_fields in found if arrays and by_fields} == BY_FIELDS
