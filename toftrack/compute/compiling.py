@@ -162,7 +162,11 @@ def _say_once(error: Exception) -> None:
 @contextmanager
 def _announced(dispatcher: Any) -> Iterator[None]:
     """Around the first call of a kernel: says once a process that compiling takes long."""
-    often = "once on a machine" if dispatcher.stats.cache_path else "in every run"
+    folder = dispatcher.stats.cache_path
+    if folder and any(os.scandir(folder)):  # it is only loaded
+        yield
+        return
+    often = "once on a machine" if folder else "in every run"
     timer = threading.Timer(_SILENT_S, _announce, (often,))
     timer.daemon = True
     timer.start()
