@@ -17,22 +17,12 @@ from toftrack.errors import ToftrackError
 
 WRONG = (
     ("detector.hypotheses=0", "detector.hypotheses=0 .*whole number above 0"),
-    ("refine.points=0", "refine.points=0 .*above 0"),
-    ("segmentation.max_pixels=0", "max_pixels=0 .*above 0"),
     ("filter.spread.depth_m=-0.1", "filter.spread.depth_m=-0.1 .*at least 0"),
     ("filter.particles=many", "filter.particles=many .*a whole number"),
-    ("filter.particles=2.5", "filter.particles=2.5 .*a whole number"),
     ("filter.exponent=nan", "filter.exponent=nan .*a number"),
-    ("filter.passes=null", "filter.passes=None .*a whole number"),
     ("refine.damping=[1]", "refine.damping=.*a number"),
     ("device.repeat=5", "device.repeat=5 .*true or false"),
-    ("detector.places=0", "detector.places=0 .*whole number above 0"),
-    ("detector.least=-0.1", "detector.least=-0.1 .*at least 0"),
-    ("segmentation.reach_m=0", "segmentation.reach_m=0 .*above 0"),
     ("hands=3", "hands=3 .*whole number above 0 and at most 2"),
-    ("hands=0", "hands=0 .*at most 2"),
-    ("hands=both", "hands=both .*at most 2"),
-    ("lost.memory=much", "lost.memory=much .*a number"),
 )
 
 
@@ -76,14 +66,6 @@ def test_a_right_value_passes(overrides: tuple[str, ...]) -> None:
             "lost=calibrated goes with these alone; leave lost=calibrated out",
         ),
         (
-            ("experiment=paper", "hand.shape=auto"),
-            "hand.shape=auto goes with these alone; leave hand.shape=auto out",
-        ),
-        (
-            ("experiment=paper", "hand.side=auto"),
-            "hand.side=auto goes with these alone; leave hand.side=auto out",
-        ),
-        (
             ("experiment=paper", "refine=gauss_newton"),
             "refine=gauss_newton goes with these alone; leave refine=gauss_newton out",
         ),
@@ -106,9 +88,6 @@ def test_what_a_part_of_somebody_else_s_accepts_is_not_judged(tmp_path) -> None:
     "text",
     [
         "a: [",
-        "a: 1\na: 2\n",
-        "\ta",
-        "a: *b",
         "defaults: 5",
         "a: ${ 5://b}",
         "seed: " + "9" * 5000,
