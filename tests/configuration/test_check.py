@@ -20,7 +20,7 @@ WRONG = (
     ("filter.spread.depth_m=-0.1", "filter.spread.depth_m=-0.1 .*at least 0"),
     ("filter.particles=many", "filter.particles=many .*a whole number"),
     ("filter.exponent=nan", "filter.exponent=nan .*a number"),
-    ("refine.damping=[1]", "refine.damping=.*a number"),
+    ("refine.point_m=[1]", "refine.point_m=.*a number"),
     ("device.repeat=5", "device.repeat=5 .*true or false"),
     ("hands=3", "hands=3 .*whole number above 0 and at most 2"),
 )

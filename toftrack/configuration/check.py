@@ -38,7 +38,7 @@ _ABOVE_ZERO = frozenset(
     likelihood.beta likelihood.tolerance_m
     pose_space.dims
     record_limit_gb
-    refine.angle_rad refine.point_m refine.points refine.reach_m refine.silhouette_px
+    refine.angle_rad refine.point_m refine.points
     detector.hypotheses detector.keypoint_m detector.keypoint_sigmas detector.places
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
     segmentation.reach_m

@@ -83,18 +83,17 @@ class Refinement:
 
     iterations: int
     points: int
-    reach_m: float
     point_m: float
-    silhouette_px: float
     angle_rad: float
-    damping: float
+    reach_m: float = 0.025
+    silhouette_px: float = 1.0
+    damping: float = 0.001
 
     def __post_init__(self) -> None:
         for name, least in (("iterations", 0), ("points", 1)):
             check_number(f"refine.{name}", getattr(self, name), least, whole=True)
-        for name in ("reach_m", "point_m", "silhouette_px", "angle_rad"):
+        for name in ("point_m", "angle_rad"):
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
-        check_number("refine.damping", self.damping, 0)
 
 
 @dataclass(frozen=True, eq=False)
