@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import multiprocessing
+import pickle
 import subprocess
 import sys
 import threading
@@ -319,10 +320,11 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
         resumed.restore("poses", progress, {"batch": 32, "seed": 0})
     other = torch.nn.Linear(3, 2)
     wrong = Progress(other, other, torch.optim.AdamW(other.parameters()), 24)
-    with pytest.raises(ToftrackError, match=r"poses.checkpoint.npz is no checkpoint"):
+    with pytest.raises(ToftrackError, match=r"poses.checkpoint.pt is no checkpoint"):
         resumed.restore("poses", wrong, {"batch": 24})
-    resumed.path("poses").write_bytes(b"PK no archive")
-    with pytest.raises(ToftrackError, match="is no checkpoint"):
-        resumed.restore("poses", progress, {})
-    with pytest.raises(ToftrackError, match="there is no folder"):
+    for content in (b"PK no archive", pickle.dumps({"settings": Path()}), b""):
+        resumed.path("poses").write_bytes(content)
+        with pytest.raises(ToftrackError, match="is no checkpoint"):
+            resumed.restore("poses", progress, {})
+    with pytest.raises(ToftrackError, match="there is no checkpoint"):
         Checkpoints(tmp_path, 1.0, resume=tmp_path / "gone").restore("poses", progress, {})

@@ -1,13 +1,13 @@
 """The state of a training, written while it goes on, so that it can be gone on with exactly.
 
-Arrays and JSON, as everything here. What is read must be of the same training: the batch,
-the rate, the width, the seed, the number of hands and the weights that it began from, by their
-checksum; it continues where it was.
+A file of `torch.save`, read with `weights_only=True`: tensors and numbers, nothing that runs. What
+is read must be of the same training: the batch, the rate, the width, the seed, the number of hands
+and the weights that it began from, by their checksum; it continues where it was.
 """
 
 from __future__ import annotations
 
-import json
+import pickle
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,17 +15,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
-from toftrack.json_text import parse_json
-from toftrack.safe_files import whole_file
+from toftrack.safe_files import open_to_read, whole_file
 
-FORMAT = "toftrack-detector-training"
-_VERSION = 5
+_SUFFIX = ".checkpoint.pt"
+_STATES = ("network", "averaged", "optimiser")
+_NUMBERS = ("images", "step", "seconds", "course")
+_BROKEN = (
+    *(OSError, EOFError, pickle.UnpicklingError, LookupError, AttributeError),
+    *(TypeError, ValueError, RuntimeError),
+)
 _NEWEST = 0.01
 """Weight of a step in the running means."""
 
@@ -88,18 +90,20 @@ class Checkpoints:
 
     def path(self, name: str, folder: Path | None = None) -> Path:
         """The file of a network's checkpoint."""
-        return (self.folder if folder is None else folder) / f"{name}.checkpoint.npz"
+        return (self.folder if folder is None else folder) / f"{name}{_SUFFIX}"
 
     def restore(self, name: str, progress: Progress, settings: dict[str, Any]) -> None:
         """Bring a network's training to where it was, if it had begun; settings: what it is by.
 
-        Raises ToftrackError where the folder to resume is none, or the checkpoint is damaged or of
-        another training.
+        Raises ToftrackError where the folder to resume has no checkpoint, or this one is damaged or
+        of another training.
         """
         if self.resume is None:
             return
-        if not self.resume.is_dir():
-            raise ToftrackError(f"there is no folder {self.resume} of a training to resume")
+        if not any(self.resume.glob(f"*{_SUFFIX}")):
+            raise ToftrackError(
+                f"there is no checkpoint of a training in {self.resume}; train without resume"
+            )
         path = self.path(name, self.resume)
         if path.exists():
             _restore(path, progress, settings)
@@ -121,65 +125,31 @@ class Checkpoints:
 
 def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
     """Write a checkpoint; an older one there is replaced only by a whole one."""
-    arrays: dict[str, np.ndarray] = {}
-    for name in ("network", "averaged"):
-        for key, tensor in getattr(progress, name).state_dict().items():
-            arrays[f"{name}.{key}"] = tensor.detach().cpu().numpy()
-    for number, state in progress.optimiser.state_dict()["state"].items():
-        for key, tensor in state.items():
-            arrays[f"optimiser.{number}.{key}"] = tensor.detach().cpu().numpy()
-    metadata = {
-        "format": FORMAT,
-        "version": _VERSION,
-        "settings": settings,
-        "images": progress.images,
-        "step": progress.step,
-        "seconds": progress.seconds,
-        "recent": progress.recent.numbers(),
-        "course": progress.course,
-    }
-    content: dict[str, Any] = {"metadata": np.array(json.dumps(metadata)), **arrays}
+    content: dict[str, Any] = {name: getattr(progress, name) for name in _NUMBERS}
+    content |= {name: getattr(progress, name).state_dict() for name in _STATES}
+    content |= {"settings": settings, "recent": progress.recent.numbers()}
     with whole_file(path) as stream:
-        np.savez(stream, **content)
+        torch.save(content, stream)
 
 
 def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
-    broken = f"{path} is no checkpoint of a training of the detector; train without resume"
     try:
-        arrays = read_archive(path)
-        metadata = parse_json(str(arrays.pop("metadata")))
-        if metadata["format"] != FORMAT or metadata["version"] != _VERSION:
-            raise ValueError("another format")
-        before = metadata["settings"]
+        with open_to_read(path) as stream:
+            content = torch.load(stream, map_location="cpu", weights_only=True)
+        before = content["settings"]
         for name, value in settings.items():
             if before[name] != value:
                 raise ToftrackError(
                     f"{path} is a checkpoint of a training with {name}={before[name]}, and now it"
                     f" is {value}; give the same, or train without resume"
                 )
-        for name in ("network", "averaged"):
-            tensors = {key: torch.from_numpy(array) for key, array in _of(arrays, name).items()}
-            getattr(progress, name).load_state_dict(tensors)
-        optimiser = progress.optimiser.state_dict()
-        state: dict[int, dict[str, torch.Tensor]] = {}
-        for key, array in _of(arrays, "optimiser").items():
-            number, name = key.split(".")
-            state.setdefault(int(number), {})[name] = torch.from_numpy(array)
-        progress.optimiser.load_state_dict(
-            {"state": state, "param_groups": optimiser["param_groups"]}
-        )
-        progress.images, progress.step = int(metadata["images"]), int(metadata["step"])
-        progress.seconds = float(metadata["seconds"])
-        progress.recent.set({name: float(mean) for name, mean in metadata["recent"].items()})
-        progress.course = list(metadata["course"])
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ToftrackError(f"{broken} ({error})") from None
-
-
-def _of(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """Arrays of one part, by their names there."""
-    return {
-        key.removeprefix(name + "."): array
-        for key, array in arrays.items()
-        if key.startswith(name + ".")
-    }
+        for name in _STATES:
+            getattr(progress, name).load_state_dict(content[name])
+        for name in _NUMBERS:
+            setattr(progress, name, content[name])
+        progress.recent.set(content["recent"])
+    except _BROKEN as error:
+        why = str(error).partition("\n")[0]
+        raise ToftrackError(
+            f"{path} is no checkpoint of a training of the detector ({why}); train without resume"
+        ) from None
