@@ -28,7 +28,7 @@ from toftrack.detector.network import (
     Proposed,
     cube_rotations,
 )
-from toftrack.pose_space.data.natural_poses import sample_poses
+from toftrack.pose_space.data.shown_poses import shown_poses
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -39,7 +39,7 @@ def truth() -> Crops:
     """Mean hands of several sizes, all right ones that are there."""
     generator = torch.Generator().manual_seed(0)
     rotation = random_rotations(N, dice())
-    angles = sample_poses(N, generator)
+    angles = shown_poses(N, generator)
     log_size = 0.1 * torch.randn(N, generator=generator)
     pivot = 0.02 * torch.randn(N, 3, generator=generator)
     yes = torch.ones(N, dtype=torch.bool)

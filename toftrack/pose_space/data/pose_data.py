@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.data.natural_poses import recorded_poses, sample_poses
+from toftrack.pose_space.data.natural_poses import drawn_poses, recorded_poses
 from toftrack.pose_space.data.training_poses import synthetic_training_poses
 
 CLIP = 80
@@ -57,14 +57,13 @@ def synthetic_data() -> PoseData:
 
 
 def natural_data(poses: int) -> PoseData:
-    """Natural motion: recorded poses and sampled ones of what people show, and the paper's 79.
+    """Natural motion: recorded poses and drawn ones of what people show, and the paper's 79.
 
-    poses: at most so many of the recorded and of the sampled ones, picked to cover them.
+    poses: at most so many of the recorded and of the drawn ones, picked to cover them.
     """
-    recorded = recorded_poses().double()
-    sampled = sample_poses(4 * poses, torch.Generator().manual_seed(0)).double()
     parts = {"synthetic": synthetic_data()}
-    for name, angles in (("recorded", recorded), ("sampled", sampled)):
+    for name, poses_rad in (("recorded", recorded_poses()), ("sampled", drawn_poses())):
+        angles = poses_rad.double()
         source = {"data": "natural", "part": name}
         # Neighbours in time are next to each other among the recorded ones.
         clips = torch.arange(len(angles)) // CLIP

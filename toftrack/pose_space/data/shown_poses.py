@@ -1,13 +1,13 @@
 """Poses that people show a camera or pass through, to train the detector on.
 
 KINDS and SHOWN say how often each is drawn; docs/detector.md has them as a table. Poses of
-hands that hold things follow from the things: detector/grasps.py. The tracker's own set of natural
-poses (natural_poses.py) is another one and stays as it is.
+hands that hold things follow from the things: detector/grasps.py.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import torch
@@ -15,12 +15,7 @@ from torch import Tensor
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
-from toftrack.pose_space.data.natural_poses import (
-    FINGER_OF_ANGLE,
-    any_fingers,
-    fingers_of_two_recorded,
-    near_recorded,
-)
+from toftrack.pose_space.data.natural_poses import recorded_poses
 
 KINDS = {
     "shown": 0.42,  # SHOWN
@@ -57,6 +52,15 @@ _THUMBS = {
     "opposed": (10, 20, 0, 15, 20),
     "folded": (-20, 38, -10, 25, 40),
 }
+# What any finger may do: straight, curled, hooked, half bent, bent at the knuckle.
+_ANY_MEANS = torch.tensor(
+    [(0.0, 3.0, 2.0), (85.0, 98.0, 50.0), (5.0, 90.0, 50.0), (35.0, 40.0, 20.0), (72.0, 8.0, 4.0)]
+)
+_ANY_DEVIATIONS = torch.tensor(
+    [(8.0, 6.0, 5.0), (10.0, 12.0, 14.0), (12.0, 18.0, 18.0), (22.0, 25.0, 14.0), (15.0, 10.0, 6.0)]
+)
+_FINGER_OF_ANGLE = torch.tensor([0] * 5 + [f for f in range(1, 5) for _ in range(4)])
+"""(21,) the finger, thumb 0, that each angle bends."""
 _APART, _TOGETHER, _ANY, _CROSSED = range(4)
 _SPREAD = (12.0, 2.0, -8.0, -16.0)
 """Degrees of abduction of fingers that are spread; about -1 times it, they touch."""
@@ -162,7 +166,48 @@ def on_the_way(first: Tensor, last: Tensor, generator: torch.Generator) -> Tenso
     part = _uniform(generator, n, 1) + 0.15 * _normal(generator, n, 5)
     some = _uniform(generator, n, 1) < 0.5
     part = (part + torch.where(some, one_by_one, 0.0)).clamp(0, 1)
-    return torch.lerp(first, last, part[:, FINGER_OF_ANGLE])
+    return torch.lerp(first, last, part[:, _FINGER_OF_ANGLE])
+
+
+def near_recorded(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, recorded poses, each a little changed; not yet within the limits."""
+    recorded = recorded_poses()
+    rows = torch.randint(len(recorded), (n,), generator=generator)
+    return recorded[rows] + math.radians(3.0) * _normal(generator, n, 21)
+
+
+def fingers_of_two_recorded(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, each finger of one of two recorded poses; not yet within the limits."""
+    first, second = near_recorded(n, generator), near_recorded(n, generator)
+    chosen = _uniform(generator, n, 5)[:, _FINGER_OF_ANGLE] < 0.5
+    return torch.where(chosen, first, second)
+
+
+def any_fingers(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, each finger straight or curled, or in any state, or all closing together;
+    not yet within the limits.
+    """
+    counting = (_uniform(generator, n, 4) < 0.5).long()
+    anything = torch.randint(len(_ANY_MEANS), (n, 4), generator=generator)
+    kind = _uniform(generator, n, 1)
+    state = torch.where(kind < 0.55, counting, anything)
+    flexion = _ANY_MEANS[state] + _ANY_DEVIATIONS[state] * _normal(generator, n, 4, 3)
+    # All four together: from straight to curled, the middle joints ahead of the knuckles.
+    closing = _uniform(generator, n, 1, 1) * 1.2 - 0.1 + 0.08 * _normal(generator, n, 4, 1)
+    exponent = torch.exp(0.35 * _normal(generator, n, 1, 3))
+    straight, curled = _ANY_MEANS[:2]
+    together = straight + (curled - straight) * closing.clamp(0, 1) ** exponent
+    together = together + 5.0 * _normal(generator, n, 4, 3)
+    flexion = torch.where(kind[..., None] > 0.75, together, flexion)
+    thumbs = torch.tensor(list(_THUMBS.values()), dtype=torch.float32)
+    first, last = torch.randint(len(thumbs), (2, n), generator=generator)
+    part = (_uniform(generator, n, 1) * 1.6 - 0.3).clamp(0, 1)
+    thumb = torch.lerp(thumbs[first], thumbs[last], part)
+    spread = torch.tensor(_SPREAD) * (_uniform(generator, n, 1) * 1.6 - 0.4)
+    abduction = spread + 4.0 * _normal(generator, n, 4)
+    fingers = torch.cat((abduction[..., None], flexion), 2).flatten(1)
+    thumb = thumb + 8.0 * _normal(generator, n, 5)
+    return torch.deg2rad(torch.cat((thumb, fingers), 1))
 
 
 def within_limits(angles: Tensor) -> Tensor:
