@@ -259,8 +259,9 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"image_2": np.ones((6, 9), np.uint16)}, "2.png.*9x6"),
-        ({"image_2": np.ones((6, 8), np.uint8)}, "2.png.*16-bit"),
+        ({"image_1": np.ones((6, 9), np.uint16)}, "1.png.*9x6"),
+        ({"image_2": np.ones((6, 9), np.uint16)}, "2.png.*9x6.*but must be 8x6"),
+        ({"image_1": np.ones((6, 8), np.uint8)}, "1.png.*16-bit"),
         ({"image_2": np.ones((6, 8, 3), np.uint16)}, "2.png.*16-bit"),
         ({"camera": {"depth_unit_m": 0}}, "depth_unit_m"),
         ({"camera": {"fps": "fast"}}, "fps"),
@@ -270,7 +271,7 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
 )
 def test_broken_folders_are_reported(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ToftrackError, match=words):
-        read_png_folder(images(tmp_path / "f", **changes))
+        read_png_folder(images(tmp_path / "f", **changes)).image(1)
 
 
 def test_more_broken_folders_are_reported(tmp_path: Path) -> None:
@@ -290,9 +291,10 @@ def test_more_broken_folders_are_reported(tmp_path: Path) -> None:
     (folder / "10.png").write_bytes((folder / "10.png").read_bytes()[:40])
     with pytest.raises(ToftrackError, match="10.png.*damaged"):
         read_png_folder(folder).image(2)
-    (folder / "10.png").write_bytes(b"")
-    with pytest.raises(ToftrackError, match="not a PNG"):
+    (folder / "1.png").write_bytes(b"")
+    with pytest.raises(ToftrackError, match="1.png.*no PNG"):
         read_png_folder(folder)
+    (folder / "1.png").write_bytes((folder / "2.png").read_bytes())
     (folder / "camera.json").write_text("{")
     with pytest.raises(ToftrackError, match="not JSON"):
         read_png_folder(folder)

@@ -270,7 +270,7 @@ def test_colour_images_in_place_of_depth_are_refused(tmp_path: Path) -> None:
     write("ICVL", tmp_path, 1)
     image = tmp_path / "Testing" / "Depth" / "test_seq_1" / "image_0000.png"
     assert cv2.imwrite(str(image), np.zeros((240, 320), np.uint8))
-    assert "uint8 of the shape (240, 320), but must be uint16" in refusal("ICVL", tmp_path)
+    assert "is 320x240 of uint8, but must be 320x240 of uint16" in refusal("ICVL", tmp_path)
 
 
 @pytest.mark.parametrize("name", list(DATA_SETS))

@@ -16,7 +16,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from toftrack.errors import ToftrackError
 from toftrack.json_text import read_json
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
-from toftrack.recordings.png import LARGEST_PIXELS, SIGNATURE, decoded_png
+from toftrack.recordings.png import read_png
 from toftrack.safe_files import open_new, open_to_read, write_whole
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
@@ -76,19 +75,7 @@ class PngFolder:
         """Nothing to close: every image is opened for itself."""
 
     def _read(self, path: Path) -> np.ndarray:
-        try:
-            with open_to_read(path) as stream:
-                content = stream.read()
-        except OSError as error:
-            raise ToftrackError(
-                f"the image '{path}' cannot be read ({error.strerror}); check its permissions"
-            ) from error
-        image = decoded_png(content)
-        if image is None:
-            raise ToftrackError(f"the image '{path}' is damaged; copy or record it again")
-        if image.dtype != np.uint16 or image.shape != (self.camera.height, self.camera.width):
-            raise ToftrackError(f"the image '{path}' changed its kind while the folder was read")
-        return image
+        return read_png(path, np.uint16, (self.camera.height, self.camera.width))
 
 
 def read_png_folder(
@@ -98,7 +85,7 @@ def read_png_folder(
     fps: float | None = None,
     intrinsics: Sequence[float] | None = None,
 ) -> PngFolder:
-    """Open a folder of depth images: names, sizes and kinds are checked, pixels stay on the disk.
+    """Open a folder of depth images: the first one is checked, the others stay on the disk.
 
     Args:
         folder: its path.
@@ -108,8 +95,8 @@ def read_png_folder(
         intrinsics: fx, fy, cx, cy in pixels instead of the camera of `camera.json`.
 
     Raises:
-        ToftrackError: there is no folder, image or camera, images differ in size, or one is not a
-            16-bit grey PNG.
+        ToftrackError: there is no folder, image or camera, or the first image is not a 16-bit grey
+            PNG, or of another size than the camera's; later, another one.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -127,11 +114,12 @@ def read_png_folder(
             f"the folder '{folder}' has {len(depth)} depth and {len(amplitude)} amplitude images; "
             "there must be as many of both, or no amplitude"
         )
+    height, width = read_png(depth[0], np.uint16).shape
     content = _camera_content(folder / _CAMERA)
     facts = _facts(folder / _CAMERA, content, unit_m, fps)
     if camera_file is not None:
         camera = Camera.load(camera_file)
-    elif configured := BareFacts(intrinsics).camera(*_png_size(depth[0])):
+    elif configured := BareFacts(intrinsics).camera(width, height):
         camera = configured
     elif content is not None:
         camera = Camera.from_dict(content, folder / _CAMERA)
@@ -141,13 +129,11 @@ def read_png_folder(
             "has an example), or give another with camera.file=FILE (toftrack convert: --camera "
             "FILE), or the lens with device.intrinsics=[FX,FY,CX,CY] (--intrinsics FX FY CX CY)"
         )
-    for path in (*depth, *amplitude):
-        size = _png_size(path)
-        if size != (camera.width, camera.height):
-            raise ToftrackError(
-                f"the image '{path}' has {size[0]}x{size[1]} pixels, but the camera has "
-                f"{camera.width}x{camera.height}; all images of a folder must be of one size"
-            )
+    if (width, height) != (camera.width, camera.height):
+        raise ToftrackError(
+            f"the image '{depth[0]}' has {width}x{height} pixels, but the camera has "
+            f"{camera.width}x{camera.height}; give the camera of these images"
+        )
     times = _timestamps(folder / _TIMES, len(depth))
     return PngFolder(folder, depth, amplitude, camera, facts, times)
 
@@ -289,26 +275,6 @@ def _timestamps(path: Path, count: int) -> np.ndarray | None:
             "backwards; repair or remove it"
         )
     return times
-
-
-def _png_size(path: Path) -> tuple[int, int]:
-    """Columns and rows of a 16-bit grey PNG, from its header."""
-    try:
-        with open_to_read(path) as stream:
-            start = stream.read(26)
-    except OSError as error:
-        raise ToftrackError(f"the image '{path}' cannot be read ({error.strerror})") from error
-    if len(start) < 26 or start[:8] != SIGNATURE:
-        raise ToftrackError(f"the image '{path}' is not a PNG file, or it was cut off")
-    width, height, bits, colour = struct.unpack(">IIBB", start[16:26])
-    if bits != 16 or colour != 0:
-        raise ToftrackError(
-            f"the image '{path}' is not a 16-bit grey PNG; save the depth as such, in steps of a "
-            "millimetre"
-        )
-    if width * height > LARGEST_PIXELS:
-        raise ToftrackError(f"the image '{path}' claims {width}x{height} pixels; it is damaged")
-    return width, height
 
 
 def _order(path: Path) -> list[tuple[int, int, str]]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.recordings.png import decoded_png
 from toftrack.safe_files import open_to_read
 
 MILLIMETRE = 1e-3
@@ -102,22 +101,6 @@ def read_lines(path: Path) -> list[str]:
     return [line for line in text.splitlines() if line.strip()]
 
 
-def read_png(path: Path, kind: type, shape: tuple[int, ...]) -> np.ndarray:
-    """An image of exactly that type and shape (colours in the order blue, green, red).
-
-    Raises ToftrackError when it is missing, damaged or of another kind.
-    """
-    image = decoded_png(read_bytes(path))
-    if image is None:
-        raise ToftrackError(f"the image '{path}' is damaged; copy the data set again")
-    if image.dtype != kind or image.shape != shape:
-        raise ToftrackError(
-            f"the image '{path}' is {_kind(image)}, but must be {np.dtype(kind)} of the shape "
-            f"{shape}; give the depth images as the authors distribute them"
-        )
-    return image
-
-
 def numbers(text: str, count: int, path: Path, line: int) -> np.ndarray:
     """(count,) float64 of a line of text; ToftrackError names the file and the line."""
     try:
@@ -129,7 +112,3 @@ def numbers(text: str, count: int, path: Path, line: int) -> np.ndarray:
             f"line {line} of '{path}' must consist of {count} numbers; copy the data set again"
         )
     return values
-
-
-def _kind(image: np.ndarray) -> str:
-    return f"{image.dtype} of the shape {image.shape}"

@@ -20,8 +20,8 @@ from toftrack.recordings.datasets.base import (
     LabelledSequence,
     numbers,
     read_lines,
-    read_png,
 )
+from toftrack.recordings.png import read_png
 
 _WIDTH, _HEIGHT = 320, 240
 _CAMERA = Camera(np.array([[241.42, 0, 160], [0, 241.42, 120], [0, 0, 1]]), _WIDTH, _HEIGHT)

@@ -19,9 +19,9 @@ from toftrack.recordings.datasets.base import (
     MILLIMETRE,
     DataSet,
     LabelledSequence,
-    read_png,
 )
 from toftrack.recordings.datasets.mat_file import read_numbers
+from toftrack.recordings.png import read_png
 
 _WIDTH, _HEIGHT = 640, 480
 _CAMERA = Camera(np.array([[588.036865, 0, 320], [0, 587.075073, 240], [0, 0, 1]]), _WIDTH, _HEIGHT)
