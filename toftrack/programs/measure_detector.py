@@ -4,9 +4,7 @@ python -m toftrack.programs.measure_detector FOLDER_OR_FILE ... --weights FILE -
 
 Nothing is tracked and nothing searched for: the crop lies about the true middle of the palm, the
 fingers point up in it (unless --as-held is given), the side is told, and the keypoints are compared
-with the true joints, in frames in which the hand is visible. With --redrawn the same is measured
-beside it on images whose hand is redrawn as ellipsoids, so that what is missed on the first alone
-is due to the look of the hand. The network runs as the tracker runs
+with the true joints, in frames in which the hand is visible. The network runs as the tracker runs
 it: in ONNX Runtime if its file lies beside the weights, else in torch, which is said.
 """
 
@@ -15,12 +13,11 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from toftrack.checks import check_number
 from toftrack.compute.rigid import PIVOT_M
@@ -31,7 +28,6 @@ from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.programs import command_line
-from toftrack.programs.redrawn_hands import fitted_hands, redrawn
 from toftrack.recordings.npz import Recording, read_recording
 from toftrack.safe_files import write_whole
 
@@ -72,23 +68,18 @@ class Misses:
 
 
 def misses(
-    pose: PoseNet | OnnxPoseNet,
-    paths: Sequence[Path],
-    every: int,
-    as_held: bool = False,
-    redraw: bool = False,
+    pose: PoseNet | OnnxPoseNet, paths: Sequence[Path], every: int, as_held: bool = False
 ) -> Misses:
     """Errors of a network's keypoints in every so manieth visible frame of recordings.
 
     as_held: crops as the camera is held, and not turned so that the fingers point up.
-    redraw: images with hands of ellipsoids in the recorded ones' place, see redrawn_hands.
     Raises ToftrackError for a recording without truth or without a side.
     """
     errors, recordings, poses = [], [], []
     for path in paths:
         recording, truth = _with_truth(path)
-        rows = np.flatnonzero(truth.visible)
-        for frame, depth, joints in (_redrawn if redraw else _as_it_is)(recording, rows, every):
+        for frame in np.flatnonzero(truth.visible)[::every]:
+            depth, joints = recording.image(int(frame))[0], truth.joints_m[frame]
             centre = joints[0] + _MIDDLE * (joints[9] - joints[0])
             up = None if as_held else (joints[9] - joints[0])[None]
             seen = run_pose_network(pose, depth, recording.camera.K, centre[None], truth.side, up)
@@ -108,31 +99,6 @@ def _with_truth(path: Path) -> tuple[Recording, Truth]:
     return recording, truth
 
 
-def _as_it_is(
-    recording: Recording, rows: np.ndarray, every: int
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Every so manieth of the frames `rows`: its number, depth and true joints."""
-    assert recording.truth is not None
-    for frame in rows[::every]:
-        yield int(frame), recording.image(int(frame))[0], recording.truth.joints_m[frame]
-
-
-def _redrawn(
-    recording: Recording, rows: np.ndarray, every: int
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """The same with the hand redrawn; the joints are those of the drawn one."""
-    truth, generator = recording.truth, torch.Generator().manual_seed(0)
-    assert truth is not None
-    if not len(rows):
-        return
-    hands = fitted_hands(truth.joints_m[rows], truth.side)
-    for row in range(0, len(rows), every):
-        frame, state = int(rows[row]), hands.states[row]
-        depth, _ = recording.image(frame)
-        image = redrawn(depth, recording.camera.K, state, hands.shape, generator)
-        yield frame, image, hands.joints_m[row]
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, measure, print the table. Raises ToftrackError."""
     options = _parser().parse_args(arguments)
@@ -143,9 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for file in weights:
         pose, _ = load_networks(file)
         name = "the package's" if file is None else str(file)
-        for redraw in (False, True)[: 1 + options.redrawn]:
-            found = misses(pose, paths, options.every, options.as_held, redraw)
-            tables[name + ", redrawn" * redraw] = found.tables()
+        tables[name] = misses(pose, paths, options.every, options.as_held).tables()
     _print(tables)
     if options.json is not None:
         write_whole(options.json, json.dumps(tables, indent=1) + "\n")
@@ -187,11 +151,6 @@ def _parser() -> argparse.ArgumentParser:
         "--as-held",
         action="store_true",
         help="look as at a new hand: crops as the camera is held, not turned upright",
-    )
-    parser.add_argument(
-        "--redrawn",
-        action="store_true",
-        help="beside the images as they are: the same with ellipsoids in the hand's place",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
     return parser
