@@ -21,7 +21,7 @@ from helpers.tracking import ROOT
 
 from toftrack.detector import batches, checkpoints, images, training
 from toftrack.detector.batches import tensors_of
-from toftrack.detector.checkpoints import Checkpoints, Progress, RunningMeans, save
+from toftrack.detector.checkpoints import Checkpoints, Progress, save
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.training import Schedule, train_finder, train_poses
@@ -51,11 +51,7 @@ def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -
     ("change", "words"),
     [
         ({"images": 0}, "images of a network must be a whole number above 0"),
-        ({"batch": 2.5}, "batch of a network must be"),
-        ({"width": -1}, "width of a network must be"),
         ({"rate": 1.5}, "rate of a network must be between 0 and 1"),
-        ({"restart_images": -1}, "restart_images of a network must be a whole number, 0 or more"),
-        ({"restart_rate": 0.0}, "restart_rate of a network must be between 0 and 1"),
         ({"start": "w.npz", "start_share": 1.0}, "start_share of a network must be at least 0"),
         ({"start_share": 0.5}, "start_share of a network needs weights to start from"),
     ],
@@ -183,17 +179,6 @@ def test_scenes_that_were_sent_to_another_process_give_the_same_crops() -> None:
     sent = through_a_queue(scenes)
     for one, other in zip(tensors_of(crops), tensors_of(images.crops_of(sent)), strict=True):
         assert torch.equal(one, other)
-
-
-def test_running_means_are_kept_by_a_checkpoint(tmp_path: Path) -> None:
-    means = RunningMeans()
-    for value in (1.0, 2.0):
-        means.add({"a": torch.tensor(value), "b": torch.tensor(-value)})
-    assert means.numbers() == pytest.approx({"a": 1.01, "b": -1.01})
-    again = RunningMeans()
-    again.set(means.numbers())
-    again.add({"a": torch.tensor(2.01), "b": torch.tensor(0.0)})
-    assert again.numbers() == pytest.approx({"a": 1.02, "b": -0.9999})
 
 
 def test_the_rate_rises_stays_and_falls_to_nothing() -> None:

@@ -297,35 +297,3 @@ def _bags(folder: Path) -> list[Reader]:
         files = [path] if path.is_file() else sorted(path.iterdir())
         readers += [Reader(f"bag .{kind}: {file.suffix}", file, path, play) for file in files]
     return readers
-
-
-def odd_json(random: np.random.Generator, text: bytes) -> bytes:
-    """JSON of which one value is another, or missing."""
-    content = json.loads(text)
-    holder, key = _some_place(random, content)
-    if holder is None:
-        return json.dumps(ODD_VALUES[random.integers(len(ODD_VALUES))]).encode()
-    if random.random() < 0.15:
-        del holder[key]
-    else:
-        holder[key] = ODD_VALUES[random.integers(len(ODD_VALUES))]
-    return json.dumps(content).encode()
-
-
-ODD_VALUES: tuple[Any, ...] = (
-    *(None, True, False, 0, -1, 1, 1e308, -1e308, 1e-308, 2**63, 10**29, float("nan")),
-    *(float("inf"), "", "a", "\ud800", "\0", [], [[]], {}, [None], [1, 2], {"": None}, "right"),
-    *(3, 21, 0.5, [0.5] * 3, [[1.0, 0, 0]] * 3, [["a"]], "nan", "1e999", [{}], [[1], [1, 2]]),
-)
-
-
-def _some_place(random: np.random.Generator, content: Any) -> tuple[Any, Any]:
-    """A random place in JSON: who holds it, and by which key or index."""
-    holder, key, node = None, None, content
-    while isinstance(node, (dict, list)) and node:
-        if holder is not None and random.random() < 0.2:
-            break
-        keys = list(node) if isinstance(node, dict) else range(len(node))
-        holder, key = node, keys[int(random.integers(len(keys)))]
-        node = holder[key]
-    return holder, key

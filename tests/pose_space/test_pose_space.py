@@ -1,7 +1,6 @@
 """Pose spaces: training poses, PCA, model files."""
 
 import json
-import math
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import torch
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
-from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.data.training_poses import GESTURES, basic_pose, synthetic_training_poses
 from toftrack.pose_space.files import (
@@ -56,28 +54,11 @@ def test_a_transformation_moves_every_finger_all_the_time_from_end_to_end() -> N
     assert (path[:, flexions].diff(dim=0) > 0).all()
 
 
-def test_the_thumb_of_a_thumb_configuration_is_not_where_the_transformation_has_it() -> None:
-    poses = synthetic_training_poses()
-    configurations = [i for i, label in enumerate(poses.labels) if "+" in label]
-    assert len(configurations) == 16
-    others = poses.angles_rad[[i for i in range(79) if i not in configurations]]
-    off = (poses.angles_rad[configurations, None] - others)[..., :5].norm(dim=-1)
-    nearest = (poses.angles_rad[configurations, None] - others)[..., 5:].norm(dim=-1).argmin(1)
-    assert (off.gather(1, nearest[:, None]) > 0.2).all()
-
-
 def test_all_components_reproduce_every_training_pose() -> None:
     poses = synthetic_training_poses()
     space = fit_pca(poses.angles_rad, poses.labels, 21)
     angles = poses.angles_rad.float()
     torch.testing.assert_close(space.decode(space.encode(angles)), angles, atol=1e-5, rtol=0)
-
-
-def test_four_components_reproduce_the_training_poses_within_three_degrees() -> None:
-    space = fit_pose_space("pca", 4)
-    angles = synthetic_training_poses().angles_rad.float()
-    residual = space.decode(space.encode(angles)) - angles
-    assert math.degrees(float(residual.square().mean().sqrt())) < 3.0
 
 
 def test_encoding_what_was_decoded_gives_the_latent_back_where_no_joint_limit_interferes() -> None:
@@ -91,26 +72,6 @@ def test_the_bounds_are_the_extremes_of_the_training_poses() -> None:
     latents = space.encode(synthetic_training_poses().angles_rad.float())
     torch.testing.assert_close(space.lower, latents.amin(0), atol=1e-5, rtol=0)
     torch.testing.assert_close(space.upper, latents.amax(0), atol=1e-5, rtol=0)
-
-
-def test_decoding_far_outside_the_bounds_stays_within_the_joint_limits() -> None:
-    space = fit_pose_space("pca", 4)
-    angles = space.decode(50 * torch.randn(100, 4, generator=torch.Generator().manual_seed(0)))
-    assert (angles >= LIMITS[:, 0]).all() and (angles <= LIMITS[:, 1]).all()
-
-
-def test_a_model_file_round_trips(tmp_path) -> None:
-    space = fit_pose_space("pca", 3)
-    save_pose_space(space, tmp_path / "model.npz")
-    loaded = load_pose_space(tmp_path / "model.npz")
-    assert isinstance(loaded, PoseSpace)
-    assert (loaded.kind, loaded.dims, loaded.training_labels) == (
-        "pca",
-        3,
-        space.training_labels,
-    )
-    for name, tensor in space.arrays().items():
-        torch.testing.assert_close(loaded.arrays()[name], tensor)
 
 
 def rewrite(path, **changes) -> None:
@@ -127,21 +88,14 @@ def rewrite(path, **changes) -> None:
     [
         ({"header": {"version": 99}}, "version 99"),
         ({"header": {"format": "other"}}, "not a pose-space file"),
-        ({"header": {"version": 0}}, "version 0 and this toftrack reads version 1"),
         ({"header": {"kind": "hologram"}}, "unknown kind 'hologram'; known: isomap"),
         ({"header": {"angle_names": ["a", "b"]}}, "other joint angles"),
-        ({"header": {"kind": "files"}}, "unknown kind"),
-        ({"header": {"kind": ["pca"]}}, "unknown kind"),
         ({"mean": None}, "no array 'mean'"),
-        ({"more": np.zeros(3)}, "an array 'more' too many"),
         ({"lower": np.full(4, 9, np.float32)}, "bounds or labels do not fit"),
         ({"header": {"training_labels": ["palm"]}}, "bounds or labels do not fit"),
-        ({"header": {"training_labels": 3}}, "no labels"),
-        ({"header": {"angle_names": 3}}, "other joint angles"),
         ({"upper": np.full(21, 9, np.float32)}, "of another size"),
         ({"mean": np.full(21, np.nan, np.float32)}, "damaged"),
         ({"components": np.zeros((4, 20), np.float32)}, "damaged"),
-        ({"lower": np.zeros(2, np.float32)}, "another size"),
         ({"mean": np.array([{}], dtype=object)}, "'mean' holds pickled objects"),
     ],
 )

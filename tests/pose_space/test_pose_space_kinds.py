@@ -166,17 +166,6 @@ def test_impossible_numbers_of_neighbours_are_refused(module, neighbours: int) -
         module.fit(data.angles_rad, data.labels, 4, neighbours=neighbours)
 
 
-def test_a_kernel_width_that_is_none_is_refused() -> None:
-    data = synthetic_data()
-    with pytest.raises(ToftrackError, match="gamma"):
-        kernel_pca.fit(data.angles_rad, data.labels, 4, gamma=-1.0)
-
-
-def test_an_unknown_kind_names_the_known_ones() -> None:
-    with pytest.raises(ToftrackError, match="isomap, kernel_pca, lle, pca"):
-        fit_pose_space("hologram")
-
-
 def test_a_setting_of_another_kind_is_one_clear_error() -> None:
     with pytest.raises(ToftrackError, match="pose_space.neighbours is no setting of pca"):
         fit_pose_space("pca", 4, neighbours=8)

@@ -77,19 +77,6 @@ def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
     assert (camera.width, camera.height) == size
 
 
-def test_a_published_calibration_gives_the_published_intrinsics(tmp_path: Path) -> None:
-    # Of one Azure Kinect, narrow and unbinned: fx, fy, cx, cy as its SDK tells them.
-    lens = ABOUT["CalibrationInformation"]["Cameras"][1]["Intrinsics"]
-    reported = (0.51296979188919067, 0.51692354679107666, 0.4927808940410614, 0.49290284514427185)
-    about = calibration(K, 1024, (192, 180))
-    lens = about["CalibrationInformation"]["Cameras"][1]["Intrinsics"]
-    lens["ModelParameters"][:4] = reported
-    path = write_kinect(tmp_path / "a.mkv", np.ones((1, 576, 640), np.uint16), about=about)
-    camera = open_recording(path).camera
-    expected = [[504.6076, 0, 332.7811], [0, 504.7325, 348.8297], [0, 0, 1]]
-    np.testing.assert_allclose(camera.K, expected, atol=1e-3)
-
-
 def test_a_plane_seen_through_a_kinects_lens_is_one_again(tmp_path: Path) -> None:
     camera = Camera(K, 320, 288, np.array(RATIONAL))
     pinhole = Camera(K, 320, 288)
@@ -319,8 +306,3 @@ def test_damaged_stacks_are_reported(tmp_path: Path) -> None:
 def test_of_other_kinds_the_error_says_how_to_convert_them(tmp_path: Path, name: str) -> None:
     with pytest.raises(ToftrackError, match=rf"{name}' is not read: .*(PNG|npy|folder|points)"):
         open_recording(tmp_path / name)
-
-
-def test_a_topic_of_what_is_no_bag_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ToftrackError, match="no ROS bag, and has no topic /depth"):
-        open_recording(tmp_path / "a.npz", topic="/depth")

@@ -62,13 +62,9 @@ class PngFolder:
     def __len__(self) -> int:
         return len(self._depth)
 
-    def words(self, index: int) -> np.ndarray:
-        """A depth image as it lies in the file, (H, W) uint16; ToftrackError when damaged."""
-        return self._read(self._depth[index])
-
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """A frame's depth, (H, W) float32 metres, and amplitude, (H, W) uint16; new arrays."""
-        depth = self.words(index).astype(np.float32) * np.float32(self.unit_m)
+        depth = self._read(self._depth[index]).astype(np.float32) * np.float32(self.unit_m)
         return depth, self._read(self._amplitude[index]) if self._amplitude else None
 
     def close(self) -> None:
