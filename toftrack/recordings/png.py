@@ -11,7 +11,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.safe_files import open_to_read
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _LARGEST_PIXELS = 64_000_000
 """A damaged header must not make us allocate gigabytes."""
 _LENGTH, _SIZE = struct.Struct(">I"), struct.Struct(">II")
@@ -51,7 +51,7 @@ def decoded_png(content: bytes) -> np.ndarray | None:
 
     None where they are damaged, cut off, or none of a PNG.
     """
-    if not content.startswith(_SIGNATURE) or not _whole(content):
+    if not content.startswith(SIGNATURE) or not _whole(content):
         return None
     width, height = _SIZE.unpack_from(content, 16)
     if not 0 < width * height <= _LARGEST_PIXELS:
@@ -65,7 +65,7 @@ def decoded_png(content: bytes) -> np.ndarray | None:
 def _whole(content: bytes) -> bool:
     """Whether all chunks are there: the decoder allocates whatever length one claims, and fills up
     what was cut off."""
-    at = len(_SIGNATURE)
+    at = len(SIGNATURE)
     # A chunk: its length, its kind, so many bytes, and a checksum.
     while at + 12 <= len(content):
         (length,) = _LENGTH.unpack_from(content, at)
