@@ -13,7 +13,8 @@ from toftrack.detector.hands import FOREARM, HAND, Hands, posed_hands
 from toftrack.detector.scenes import Scenes, moved
 from toftrack.detector.shapes import shape_bank
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.pose_space.data.shown_poses import SHOWN, shown_only, within_limits
+from toftrack.pose_space.base import clamp_to_joint_limits
+from toftrack.pose_space.data.shown_poses import SHOWN, shown_only
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -25,7 +26,7 @@ N = 6
 def hands(name: str, seed: int = 0, left: bool = False) -> Hands:
     """Several hands that show something, their palms to the camera."""
     rows = torch.full((N,), [shown.name for shown in SHOWN].index(name))
-    angles = within_limits(shown_only(N, torch.Generator().manual_seed(seed), rows))
+    angles = clamp_to_joint_limits(shown_only(N, torch.Generator().manual_seed(seed), rows))
     place = torch.tensor([[0.0, 0.0, 0.45]]).expand(N, 3)
     sides = torch.full((N,), left)
     rotation = torch.eye(3).expand(N, 3, 3)

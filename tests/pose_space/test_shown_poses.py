@@ -7,6 +7,7 @@ import torch
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
+from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.data import shown_poses as poses
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -22,7 +23,7 @@ def generator(seed: int = 0) -> torch.Generator:
 def joints(name: str) -> torch.Tensor:
     """(N, 21, 3) of default hands that show something, metres."""
     rows = torch.full((N,), NAMES.index(name))
-    angles = poses.within_limits(poses.shown_only(N, generator(), rows))
+    angles = clamp_to_joint_limits(poses.shown_only(N, generator(), rows))
     state = torch.cat((torch.zeros(N, 6), angles), 1)
     return forward_kinematics(state, default_hand_shape()).joints_m
 
@@ -43,7 +44,7 @@ def test_the_kinds_are_all_that_is_drawn() -> None:
 
 def test_the_tips_of_a_fist_lie_on_the_palm_also_over_knuckles_that_are_hardly_bent() -> None:
     """Palms are 13 mm and tips 7 mm thick on that side of the bones, of a hand of 190 mm."""
-    bent = poses.within_limits(
+    bent = clamp_to_joint_limits(
         poses.shown_only(N, generator(), torch.full((N,), NAMES.index("fist")))
     )[:, 6::4].rad2deg()
     flat = bent.mean(1) < 55

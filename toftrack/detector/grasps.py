@@ -21,7 +21,8 @@ from toftrack.detector.held_things import (
 )
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import HandSurface
-from toftrack.pose_space.data.shown_poses import shown_poses, within_limits
+from toftrack.pose_space.base import clamp_to_joint_limits
+from toftrack.pose_space.data.shown_poses import shown_poses
 
 POWER_SHARE = 0.52
 """Of all grasps; the others are precision grasps."""
@@ -64,7 +65,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     tasks = torch.where(power[:, None], torch.full((n, 5), CLOSE), tips)
     said = torch.zeros(n, 2, dtype=torch.float64)
     most = torch.tensor([35, 45, 15, 55, 60] + [0, 82, 100, 55] * 4) + 6.0 * dice.normal(n, 21)
-    most = within_limits(torch.deg2rad(most)).double()
+    most = clamp_to_joint_limits(torch.deg2rad(most)).double()
     angles, parts = angles.double().contiguous(), parts.double().contiguous()
     flesh = ((0.013 + 0.0015 * dice.normal(n)) * size).double()
     grasp(
@@ -89,7 +90,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     opened[:, 5:] = torch.minimum(opened[:, 5:], angles[:, 5:])
     angles = torch.lerp(angles, opened, away)
     parts[..., 0] = torch.where(held[:, None], parts[..., 0], -1.0)
-    return Grasps(within_limits(angles), parts, held)
+    return Grasps(clamp_to_joint_limits(angles), parts, held)
 
 
 def _doubles(tensor: Tensor):

@@ -16,7 +16,7 @@ from toftrack.detector.dice import Dice
 from toftrack.detector.things_numba import BALL, BOX, CONE, RING
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
-from toftrack.pose_space.data.shown_poses import within_limits
+from toftrack.pose_space.base import clamp_to_joint_limits
 
 IN_PALM = {
     "cylinder": 0.24,
@@ -187,7 +187,9 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     spread = torch.tensor([12.0, 2.0, -8.0, -16.0]) * dice.uniform(n, 1, low=-1.8, high=0.8)
     fingers[..., 0] += spread
     angles = torch.cat((torch.zeros(n, 5), fingers.flatten(1)), 1)
-    return within_limits(torch.deg2rad(angles)), _chosen([things[name] for name in IN_PALM], which)
+    return clamp_to_joint_limits(torch.deg2rad(angles)), _chosen(
+        [things[name] for name in IN_PALM], which
+    )
 
 
 def open_thumbs(n: int, tries: int, dice: Dice) -> Tensor:

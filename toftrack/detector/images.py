@@ -37,7 +37,7 @@ from toftrack.detector.scenes import (
     things,
 )
 from toftrack.detector.shapes import ShapeBank
-from toftrack.pose_space.data.shown_poses import within_limits
+from toftrack.pose_space.base import clamp_to_joint_limits
 
 _SAMPLES = 2 * CROP
 _WHOLE = math.ceil(_SAMPLES * 2**0.5) + 1
@@ -384,7 +384,7 @@ def other_hands(hands: Hands, bank: ShapeBank, dice: Dice, touching: Tensor) -> 
     pivot[:, 2] = pivot[:, 2].clamp(min=0.22)
     left = torch.where(twins, ~hands.left, dice.chance(0.5, n))
     alike = hands.rotation @ turn(0.25 * dice.normal(n), 2) @ turn(0.25 * dice.normal(n), 1)
-    angles = within_limits(hands.angles + 0.1 * dice.normal(n, 21))
+    angles = clamp_to_joint_limits(hands.angles + 0.1 * dice.normal(n, 21))
     return posed_hands(bank, pivot, left, dice, OTHER_HAND, alike, angles, known=twins)
 
 

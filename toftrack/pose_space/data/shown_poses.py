@@ -15,6 +15,7 @@ from torch import Tensor
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
+from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.data.natural_poses import recorded_poses
 
 KINDS = {
@@ -154,7 +155,7 @@ def shown_poses(n: int, generator: torch.Generator) -> Tensor:
     }
     kind = torch.multinomial(torch.tensor(list(KINDS.values())), n, True, generator=generator)
     angles = torch.stack([poses[name] for name in KINDS])[kind, torch.arange(n)]
-    return within_limits(angles)
+    return clamp_to_joint_limits(angles)
 
 
 def on_the_way(first: Tensor, last: Tensor, generator: torch.Generator) -> Tensor:
@@ -208,12 +209,6 @@ def any_fingers(n: int, generator: torch.Generator) -> Tensor:
     fingers = torch.cat((abduction[..., None], flexion), 2).flatten(1)
     thumb = thumb + 8.0 * _normal(generator, n, 5)
     return torch.deg2rad(torch.cat((thumb, fingers), 1))
-
-
-def within_limits(angles: Tensor) -> Tensor:
-    """The nearest joint angles (N, 21) that a hand can have."""
-    low, high = angles.new_tensor(ANGLE_LIMITS).unbind(1)
-    return torch.minimum(torch.maximum(angles, low), high)
 
 
 def shown_only(n: int, generator: torch.Generator, rows: Tensor | None = None) -> Tensor:
