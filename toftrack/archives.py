@@ -197,15 +197,20 @@ def write_archive(path: str | Path, arrays: Mapping[str, Any], level: int | None
         zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as archive,
     ):
         for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                if not isinstance(array, Pieces):
-                    np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
-                    continue
-                described = np.lib.format.dtype_to_descr(array.kind)
-                header = {"descr": described, "fortran_order": False, "shape": array.shape}
-                np.lib.format.write_array_header_1_0(member, header)
-                for piece in array.pieces:
-                    member.write(piece.astype(array.kind, copy=False).tobytes())
+            add_array(archive, name, array)
+
+
+def add_array(archive: zipfile.ZipFile, name: str, array: Any) -> None:
+    """Write one more array, whatever numpy makes one of, or `Pieces`, into an open archive."""
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        if not isinstance(array, Pieces):
+            np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+            return
+        described = np.lib.format.dtype_to_descr(array.kind)
+        header = {"descr": described, "fortran_order": False, "shape": array.shape}
+        np.lib.format.write_array_header_1_0(member, header)
+        for piece in array.pieces:
+            member.write(piece.astype(array.kind, copy=False).tobytes())
 
 
 @contextmanager

@@ -267,7 +267,7 @@ IMAGES = np.ones((T, H, W), np.float32)
         ("depth_m", IMAGES.astype("m8[s]"), "float32"),
         ("depth_m", (500 * IMAGES).astype(np.uint16), "millimetres.*/ 1000"),
         ("depth_m", 480 * IMAGES, "millimetres.*/ 1000"),
-        ("depth_m", 40 * IMAGES, "neither metres nor millimetres"),
+        ("depth_m", 40 * IMAGES, "centimetres.*/ 100"),
         ("depth_m", 1e-6 * IMAGES, "neither metres nor millimetres"),
         ("depth_m", (40_000 * IMAGES).astype(np.uint16), "neither metres nor millimetres"),
         ("K", np.eye(4), "3x3"),

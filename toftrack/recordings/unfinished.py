@@ -24,6 +24,7 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
+from toftrack.archives import add_array
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
@@ -224,9 +225,7 @@ def _make_npz(target: BinaryIO, source: BinaryIO, facts: Facts, frames: Sequence
             checksum = frames[-1].sums[kind]
             add_pieces(archive, target, name, shape, IMAGE_TYPES[kind], pieces, size, checksum)
         for name, value in arrays.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, np.asanyarray(value), allow_pickle=False)
-            archive.writestr(f"{name}.npy", content.getvalue())
+            add_array(archive, name, value)
 
 
 def _pieces(source: BinaryIO, frames: Sequence[_Kept], kind: int) -> Iterator[bytes]:
