@@ -109,7 +109,7 @@ class Archive:
             header = _header(stream)
             _check(name, header, self._entries[name], most_bytes)
             content = bytearray()
-            while piece := stream.read(_PIECE_BYTES):
+            while piece := stream.read(min(_PIECE_BYTES, header.size - len(content))):
                 content += piece
             if len(content) < header.size:
                 raise EOFError("it is shorter than the archive says")
