@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_groups, check_tracker
 from toftrack.configuration.compose import configuration, one_sentence
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from toftrack.compute.quality import Pace
     from toftrack.devices.base import Device
     from toftrack.tracking.model import FilterModel
-    from toftrack.tracking.second_process import SecondProcess
     from toftrack.tracking.tracker import HandsTracker, Tracker
 
 
@@ -98,31 +97,7 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
     hands = config.get("hands", 1)
     with small_operations():
         model, pace = build_model(config), _pace(config)
-        second = _second_process(config) if hands == 2 else None
-        return HandsTracker(model, config.seed, hands, pace, second=second)
-
-
-_PARTS = (
-    "hand pose_space segmentation likelihood filter gestures renderer compute detector"
-    " lost start refine posterior"
-).split()
-"""Of a configuration, what build_model makes a model of."""
-
-
-def _second_process(config: DictConfig) -> SecondProcess | None:
-    """What follows the second one of two hands; it begins when it is needed."""
-    # A configuration of one's own may do without.
-    if not (config.get("tracker") or {}).get("second_process"):
-        return None
-    from toftrack.tracking.second_process import SecondProcess
-
-    parts = {name: config[name] for name in _PARTS if name in config}
-    return SecondProcess(
-        {
-            name: OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
-            for name, part in parts.items()
-        }
-    )
+        return HandsTracker(model, config.seed, hands, pace)
 
 
 def _pace(config: DictConfig) -> Pace:

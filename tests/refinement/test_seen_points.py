@@ -12,7 +12,6 @@ from helpers.tracking import sample
 from torch import Tensor
 
 from toftrack.refinement import seen_points as seen_points_of
-from toftrack.refinement import seen_points_numba
 from toftrack.refinement.seen_points import REACH_M, SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 
@@ -57,21 +56,27 @@ def test_the_nearest_pixel_of_the_background_is_on_the_silhouette() -> None:
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (1, 1), (1, 7), (60, 80)])
-def test_the_compiled_loops_find_what_the_reference_finds(shape: tuple[int, int]) -> None:
+def test_points_and_nearest_pixels_are_those_of_plain_loops(shape: tuple[int, int]) -> None:
     draw = np.random.default_rng(0)
     depth = 0.5 + 0.02 * draw.random(shape, np.float32)
     depth[draw.random(shape) < 0.1] = 0
     hand = (draw.random(shape) < 0.7) & (depth > 0)
     k = np.array([[200.0, 0, 44], [0, 210, 33], [0, 0, 1]], np.float32)
-    expected = seen_points_of.smooth_points(depth, hand, (3, 4), k, 0.03, 10.0)
-    found = seen_points_numba.smooth_points(depth, hand, (3, 4), k, 0.03, 10.0)
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
+    expected = []
+    for v, u in zip(*hand.nonzero(), strict=True):
+        around = depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
+        if np.ptp(np.where(around > 0, around, 10.0)) < 0.03:
+            z = depth[v, u]
+            expected.append(((u + 4 - 44) / 200 * z, (v + 3 - 33) / 210 * z, z))
+    found = seen_points_of.smooth_points(depth, hand, (3, 4), k, 0.03, 10.0)
+    np.testing.assert_allclose(found, np.reshape(expected, (-1, 3)), rtol=1e-5, atol=1e-6)
     labels = np.zeros(shape, np.int32)
     labels[hand] = draw.permutation(np.count_nonzero(hand)) + 1
     labels[~hand] = draw.integers(0, np.count_nonzero(hand) + 1, np.count_nonzero(~hand))
-    expected = seen_points_of.nearest_of_labels(labels, hand, (3, 4))
-    found = seen_points_numba.nearest_of_labels(labels, hand, (3, 4))
-    np.testing.assert_array_equal(found, expected)
+    place = {labels[v, u]: (u + 4, v + 3) for v, u in zip(*hand.nonzero(), strict=True)}
+    found = seen_points_of.nearest_of_labels(labels, hand, (3, 4))
+    expected = [place.get(label, (0, 0)) for label in labels.ravel()]
+    np.testing.assert_array_equal(found, np.reshape(expected, (*shape, 2)))
 
 
 def by_a_loop(points: Tensor, middle: Tensor, count: int) -> Tensor:

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.refinement import seen_points_numba
 from toftrack.render.segmentation import Observation
 
 REACH_M = 0.16
@@ -81,7 +80,7 @@ def seen_points(observation: Observation) -> SeenPoints:
     part = slice(top, bottom), slice(left, right)
     k = observation.k.cpu().numpy()
     depth = observation.depth_m.cpu().numpy()[part]
-    points = seen_points_numba.smooth_points(depth, hand[part], (top, left), k, _EDGE_M, _FAR_M)
+    points = smooth_points(depth, hand[part], (top, left), k, _EDGE_M, _FAR_M)
     nearest = np.zeros((0, 0, 2), np.float32)
     if solid[part].size:
         labels = cv2.distanceTransformWithLabels(
@@ -90,7 +89,7 @@ def seen_points(observation: Observation) -> SeenPoints:
             cv2.DIST_MASK_5,
             labelType=cv2.DIST_LABEL_PIXEL,
         )[1]
-        nearest = seen_points_numba.nearest_of_labels(labels, solid[part], (top, left))
+        nearest = nearest_of_labels(labels, solid[part], (top, left))
     device = observation.depth_m.device
     return SeenPoints(
         torch.from_numpy(points).to(device),

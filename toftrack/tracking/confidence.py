@@ -25,11 +25,12 @@ from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError
 from toftrack.hand.regions import joint_axes
 from toftrack.json_text import read_json
-from toftrack.tracking.confidence_numba import count_out_of_sight, seen_around
 
 _FITTED = Path(__file__).parents[1] / "data" / "confidence.json"
 _LEAST = 1e-3
 _LIKELY = 0.03
+_NEAREST_M, _BEHIND_M = 0.05, 0.04
+"""No joint is nearer; and by how much a surface is nearer that hides one."""
 
 
 @dataclass(frozen=True)
@@ -132,8 +133,40 @@ def _surprise(probability: float) -> float:
 
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
     """Shares of the joints (21, 3) outside of the image (H, W), and of those behind something."""
-    outside, behind = count_out_of_sight(joints.numpy(), depth_m.cpu().numpy(), k.cpu().numpy())
-    return float(outside) / len(joints), float(behind) / len(joints)
+    at, z = joints.numpy(), np.maximum(joints[:, 2].numpy(), _NEAREST_M)
+    seen = _readings(at[:, 0] / z, at[:, 1] / z, depth_m.cpu().numpy(), k.cpu().numpy())
+    behind = (seen > 0) & (seen < z - _BEHIND_M)
+    return float(np.isnan(seen).mean()), float(behind.mean())
+
+
+def seen_around(
+    joints_m: np.ndarray, nearest_m: float, step_m: float, depth_m: np.ndarray, k: np.ndarray
+) -> np.ndarray:
+    """(N, 3) parts of a joint's surroundings outside and without reading, median depth or NaN.
+
+    joints_m: (N, 3).  step_m: from one of the 3 x 3 readings about a joint to the next.
+    nearest_m: depth of a joint that is nearer.
+    """
+    z = np.maximum(joints_m[:, 2:], nearest_m)
+    down, right = (side.ravel() * step_m for side in np.mgrid[-1:2, -1:2])
+    x, y = (joints_m[:, :1] + right) / z, (joints_m[:, 1:2] + down) / z
+    seen = _readings(x, y, depth_m, k)
+    outside, unread = np.isnan(seen), seen == 0
+    count = (seen > 0).sum(1)
+    ordered = np.sort(np.where(seen > 0, seen, np.inf), 1)  # the lower middle is the median
+    median = ordered[np.arange(len(count)), np.maximum(count - 1, 0) // 2]
+    median = np.where(count > 0, median, np.nan)
+    return np.stack((outside.mean(1), unread.mean(1), median), 1)
+
+
+def _readings(x: np.ndarray, y: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """(N, ...) what an image has at points of the plane z = 1: NaN outside, 0 without reading."""
+    height, width = depth_m.shape
+    column, row = np.rint(k[0, 0] * x + k[0, 2]), np.rint(k[1, 1] * y + k[1, 2])
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    rows, columns = (np.where(inside, one, 0).astype(np.intp) for one in (row, column))
+    seen = depth_m[rows, columns].astype(np.float64)
+    return np.where(inside, np.where(seen > 0, seen, 0.0), np.nan)
 
 
 JOINT_FEATURES = (
@@ -176,8 +209,6 @@ _BELOW_M = np.array([0.012, 0.010, 0.010, 0.008, 0.004] + 4 * [0.010, 0.008, 0.0
 """How far joints are below the surface that a camera sees, roughly."""
 _AROUND_M = 0.006
 """Distance of the readings about a joint."""
-_NEAREST_M = 0.05
-"""No joint is nearer."""
 _LEAST_CM, _MOST_CM = 0.1, 30.0
 """Standard deviations are never smaller or larger."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from toftrack.compute.spans import Spans
-from toftrack.compute.threads import at_most, small_operations, threads
+from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
@@ -66,15 +66,8 @@ class HandTask:
     generator: torch.Generator
 
 
-Beside = Callable[[HandTask], Callable[[], Concluded | None] | None]
-"""Begins a hand's part of a frame elsewhere; what it returns waits, and may have failed: None. It
-returns None itself where nothing can be begun."""
-
-
 @small_operations()
-def step(
-    state: TrackerState, image: DepthImage, model: TrackerModel, beside: Beside | None = None
-) -> Stepped:
+def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped:
     """One frame of one hand or two; a pure function: the state given stays as it is.
 
     A particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and
@@ -91,15 +84,12 @@ def step(
     6. *Close*: steady the pose, judge it, carry the track on or end it, learn the hand's shape.
 
     Two hands know of each other where they are predicted; at the end their slots are reconciled.
-
-    beside: where the second of two hands may be followed meanwhile; None = nowhere. The estimates
-        are the same.
     """
     spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     before = state.at(image)
     with spans("detector"):
         before, seeking = start_seeking(before, image, model, dt_s)
-    found = followed(before, image, model, dt_s, generator, spans, beside)
+    found = followed(before, image, model, dt_s, generator, spans)
     with spans("detector"):
         before = sought(before, seeking, model)
     if seeking is not None:
@@ -115,7 +105,6 @@ def followed(
     dt_s: float,
     generator: torch.Generator,
     spans: Spans,
-    beside: Beside | None,
 ) -> list[Concluded]:
     """The hands that a frame is about after it, the surest first."""
     hands = partnered(state.hands, model)
@@ -130,16 +119,6 @@ def followed(
     with spans("detector"):
         todo = tasks()
     both_go_on = len(todo) == 2 and all(goes_on(task.hand, task.others) for task in todo)
-    wait = None
-    if both_go_on and beside is not None:
-        with spans("the other hand"):
-            wait = beside(todo[1])
-    if wait is not None:
-        with at_most(max(1, threads() - 1)):
-            first = follow_hand(todo[0], model, spans)
-        with spans("the other hand"):
-            second = wait()
-        return [first, second or follow_hand(todo[1], model, spans)]
     opened = list[HandFrame | Absence]()
     for number, slot in enumerate(slots):
         with spans("detector"):
@@ -154,13 +133,6 @@ def followed(
 def _seeded_by(generator: torch.Generator) -> torch.Generator:
     """Another one: a hand's random numbers do not depend on how many the other one uses."""
     return torch.Generator().manual_seed(int(torch.randint(2**62, (1,), generator=generator)))
-
-
-def follow_hand(task: HandTask, model: TrackerModel, spans: Spans) -> Concluded:
-    """A hand's part of a frame, where that does not depend on what becomes of another's track."""
-    with spans("detector"):
-        opened = opened_by(task, model)
-    return concluded(opened, task, model, spans)
 
 
 def opened_by(task: HandTask, model: TrackerModel) -> HandFrame | Absence:

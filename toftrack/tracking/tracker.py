@@ -5,14 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import Protocol
 
 import numpy as np
 import torch
 
 from toftrack.checks import check_number
-from toftrack.compute.quality import Pace, Quality, Timekeeper
+from toftrack.compute.quality import Pace, Timekeeper
 from toftrack.compute.threads import at_most, small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
@@ -26,23 +24,12 @@ from toftrack.render.scoring import Scorer
 from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
-from toftrack.tracking.reporting import Concluded
 from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
-from toftrack.tracking.step import Beside, HandTask, Stepped, step
+from toftrack.tracking.step import Stepped, step
 
 AUTO = "auto"
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
-
-
-class SecondHand(Protocol):
-    """Follows the second one of two hands elsewhere; see second_process.py."""
-
-    def begin(self, quality: Quality, task: HandTask) -> Callable[[], Concluded | None] | None:
-        """See step.Beside."""
-
-    def close(self) -> None:
-        """End it."""
 
 
 class HandsTracker:
@@ -60,10 +47,8 @@ class HandsTracker:
         hands: int = 1,
         pace: Pace | None = None,
         clock: Callable[[], float] = time.perf_counter,
-        second: SecondHand | None = None,
     ) -> None:
         """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`.
-        second: follows the second hand, where there are two.
 
         Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without a detector.
         """
@@ -74,7 +59,6 @@ class HandsTracker:
                 " give hands=1, or leave experiment=paper out"
             )
         self.model, self.time = model, Timekeeper(pace, clock)
-        self._second = second if hands == 2 and model.device.type == "cpu" else None
         self.state = model.first_state(seed, hands)
         self.infos: tuple[StepInfo | None, ...] = (None,) * hands
 
@@ -104,17 +88,9 @@ class HandsTracker:
         image = DepthImage(depth_m, k, index, timestamp_s)
         with at_most(quality.threads):
             model = self.model.at_quality(quality)
-            beside = None if self._second is None else partial(self._second.begin, quality)
-            self.state, self.infos, estimates = _stepped(self.state, image, model, beside)
+            self.state, self.infos, estimates = _stepped(self.state, image, model)
         took_s = self.time.took_s()
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
-
-    def close(self) -> None:
-        """End the second process now, and not with the tracker; a frame of two hands begins it
-        anew.
-        """
-        if self._second is not None:
-            self._second.close()
 
     @small_operations()
     def prepare(self) -> None:
@@ -260,14 +236,12 @@ class Tracker:
         return self.hands.device
 
 
-def _stepped(
-    state: TrackerState, image: DepthImage, model: FilterModel, beside: Beside | None = None
-) -> Stepped:
+def _stepped(state: TrackerState, image: DepthImage, model: FilterModel) -> Stepped:
     """One frame, by the tracker that a model is of: see step and paper_step."""
     if isinstance(model, PaperModel):
         return paper_step(state, image, model)
     assert isinstance(model, TrackerModel)
-    return step(state, image, model, beside)
+    return step(state, image, model)
 
 
 def restarted(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
