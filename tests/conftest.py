@@ -29,7 +29,7 @@ ALLOWED_SKIPS = (
     r"rosbags is not installed",
     r"rerun-sdk is not installed|of the extra rerun|this rerun-sdk reads files in another way",
     r"pip install '.\[browser-test\]'|needs chromium and chromedriver",
-    r"pip install '.\[(osc|web|export)\]'",
+    r"pip install '.\[(osc|export)\]'",
     r"needs npm|npm could not install three",
     r"jsonschema is not installed",
     r"there is no C compiler",

@@ -33,7 +33,6 @@ OF_TRAINING = ("data",)
 
 OF_EXTRAS = {
     ("stream", "osc"): ("pythonosc", "osc"),
-    ("stream", "websocket"): ("websockets", "web"),
 }
 """The package and the extra that an option needs."""
 # Without it the kernels' widths are cross-validated, which takes seconds.

@@ -26,10 +26,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from typing import TypeVar
-from urllib.parse import urlsplit
 
 import numpy as np
 from websockets.exceptions import WebSocketException
@@ -315,24 +313,20 @@ def _converse(address: str, arrivals: list[Arrival], ended: threading.Event) -> 
 
 def _watch(url: str, counts: list[int], ended: threading.Event) -> None:
     """Ask for one picture after the other, as the page does; count pictures and visits."""
-    host = urlsplit(url).netloc
+    address = f"ws{url.removeprefix('http').partition('#')[0]}live"
     while not ended.is_set():
-        connection = HTTPConnection(host, timeout=10)
         counts[1] += 1
-        run, version = "", 0
         try:
-            for _ in range(_PICTURES_A_VISIT):
-                connection.request("GET", f"/moment?run={run}&after={version}")
-                answer = connection.getresponse()
-                counts[0] += bool(answer.read())
-                facts = json.loads(answer.headers["X-Moment"])
-                run, version = facts["run"], facts["version"]
-                if ended.is_set():
-                    break
-        except (OSError, HTTPException):
+            with connect(address) as connection:
+                for _ in range(_PICTURES_A_VISIT):
+                    connection.send('{"command": "picture"}')
+                    while isinstance(connection.recv(10.0), str):
+                        pass  # facts
+                    counts[0] += 1
+                    if ended.is_set():
+                        break
+        except (OSError, TimeoutError, WebSocketException):
             ended.wait(0.2)  # the program ends, or is busy
-        finally:
-            connection.close()
 
 
 def main() -> int:

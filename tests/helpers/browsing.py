@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
-from urllib.error import HTTPError
-from urllib.parse import urlsplit
-from urllib.request import Request, urlopen
+from typing import Any
 
 from helpers.moments import one_hand, with_hand
 from helpers.settings import browser_view
 from helpers.tracking import make_tracker
+from websockets.sync.client import connect
 
 from toftrack.devices.sample import Sample
 from toftrack.views.base import TrackedFrame
@@ -41,49 +39,42 @@ def made(**settings: float) -> BrowserView:
     return browser_view("", 25.0, None, port=0, **settings)
 
 
-def get(view: BrowserView, path: str) -> tuple[dict, bytes]:
-    """The facts and the body of an answer."""
-    with urlopen(view.url + path, timeout=PATIENCE_S) as answer:
-        return json.loads(answer.headers["X-Moment"] or "{}"), answer.read()
+class Visitor:
+    """The page, without a browser: closed at the end of the `with`."""
 
+    def __init__(self, url: str, **headers: str) -> None:
+        url = f"ws{url.removeprefix('http').partition('#')[0]}live"
+        self._stack = ExitStack()
+        self.socket = self._stack.enter_context(connect(url, additional_headers=headers))
+        self.first = self.facts()
 
-def next_picture(view: BrowserView, facts: dict) -> tuple[dict, bytes]:
-    """Ask, as the page does, until there is a newer picture."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        facts, body = get(
-            view, f"moment?run={facts.get('run', '')}&after={facts.get('version', 0)}"
-        )
-        if body:
-            return facts, body
-    raise AssertionError("no picture came")
+    def __enter__(self) -> Visitor:
+        return self
 
+    def __exit__(self, *exception: object) -> None:
+        self._stack.close()
 
-def post(view: BrowserView, body: object, path: str = "command", **headers: str) -> int:
-    """The status of a POST as the page sends it, but for the given headers."""
-    token = view.address.partition("#")[2]
-    headers = {"Content-Type": "application/json", "X-Token": token} | {
-        name.replace("_", "-"): value for name, value in headers.items()
-    }
-    data = body if isinstance(body, bytes) else json.dumps(body).encode()
-    try:
-        with urlopen(Request(view.url + path, data, headers), timeout=PATIENCE_S) as answer:
-            return answer.status
-    except HTTPError as error:
-        return error.code
+    def say(self, **content: Any) -> None:
+        self.socket.send(json.dumps(content))
 
+    def facts(self) -> dict[str, Any]:
+        """The next ones to come."""
+        return json.loads(self.socket.recv(PATIENCE_S))
 
-def raw(view: BrowserView) -> socket.socket:
-    url = urlsplit(view.url)
-    return socket.create_connection((url.hostname, url.port), PATIENCE_S)
+    def picture(self) -> tuple[dict[str, Any], bytes]:
+        """Ask for a picture: its facts and its JPEG."""
+        self.say(command="picture")
+        while not (facts := self.facts()).get("picture"):
+            pass
+        return facts, self.socket.recv(PATIENCE_S)
 
 
 def ours() -> list[str]:
-    return [t.name for t in threading.enumerate() if t.name.startswith("browser-")]
+    return [t.name for t in threading.enumerate() if t.name == "web-server"]
 
 
 def eventually(reported: Callable[[], object]) -> object:
-    """Wait until `told` says something true."""
+    """Wait until something true is reported."""
     deadline = time.monotonic() + PATIENCE_S
     while not (value := reported()):
         assert time.monotonic() < deadline

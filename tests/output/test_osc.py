@@ -1,9 +1,8 @@
-"""`stream=osc`: the documented addresses, read by a reader of our own from the datagrams."""
+"""`stream=osc`: the documented addresses, read from the datagrams."""
 
 from __future__ import annotations
 
 import socket
-import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -20,7 +19,7 @@ from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import line_content
 from toftrack.output.osc import PARTS, OscStream, messages
 
-pytest.importorskip("pythonosc", reason="pip install '.[osc]'")
+OscBundle = pytest.importorskip("pythonosc.osc_bundle", reason="pip install '.[osc]'").OscBundle
 
 
 def osc_stream(**changes: Any) -> OscStream:
@@ -35,37 +34,11 @@ def receiver() -> Iterator[socket.socket]:
         yield listening
 
 
-def text_at(data: bytes, at: int) -> tuple[str, int]:
-    end = data.index(b"\0", at)
-    return data[at:end].decode(), (end // 4 + 1) * 4
-
-
-def read(data: bytes) -> dict[str, list[Any]]:
-    """A bundle's messages by address, as the specification of OSC 1.0 has them."""
-    assert data[:8] == b"#bundle\0"
-    found, at = {}, 16
-    while at < len(data):
-        (size,) = struct.unpack_from(">i", data, at)
-        message, at = data[at + 4 : at + 4 + size], at + 4 + size
-        address, place = text_at(message, 0)
-        kinds, place = text_at(message, place)
-        found[address] = values = []
-        for kind in kinds[1:]:
-            if kind == "s":
-                text, place = text_at(message, place)
-                values.append(text)
-                continue
-            (value,) = struct.unpack_from({"i": ">i", "f": ">f", "d": ">d"}[kind], message, place)
-            values.append(value)
-            place += 8 if kind == "d" else 4
-    return found
-
-
 def sent(receiver: socket.socket, estimate: Estimate, **changes: Any) -> dict[str, list[Any]]:
     host, port = receiver.getsockname()
     with osc_stream(host=host, port=port, **changes) as stream:
         stream.send((estimate,))
-        return read(receiver.recv(65535))
+        return {message.address: message.params for message in OscBundle(receiver.recv(65535))}
 
 
 def test_a_tracked_hand_is_reported_with_all_its_joints(receiver: socket.socket) -> None:

@@ -220,7 +220,7 @@ def test_the_fields_that_the_configuration_advises_fit_into_one_ethernet_frame()
     [
         (["stream=udp", "stream.port=0"], "stream.port=0"),
         (["stream=udp", "stream.port=70000"], "stream.port=70000"),
-        (["stream=udp", "stream.port=none"], "stream.port='none'"),
+        (["stream=udp", "stream.port=none"], "stream.port=none"),
         (["stream=udp", "stream.host=" + "a" * 70], "stream.host=aaa"),
         (["stream=udp", "stream.fields=[joints]"], "'joints'"),
         (["stream=stdout", "stream.fields=[]"], "stream.fields is empty"),

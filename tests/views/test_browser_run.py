@@ -13,17 +13,16 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from urllib.parse import urlsplit
-from urllib.request import urlopen
 
 import numpy as np
 import pytest
 from helpers import programs
 from helpers.browsing import (
     PATIENCE_S,
+    Visitor,
     eventually,
     made,
     moments,
-    next_picture,
     ours,
     shown_again_and_again,
 )
@@ -51,8 +50,9 @@ def test_frames_with_an_end_wait_for_a_visitor_but_not_for_ever(capsys, monkeypa
     )
     thread.start()
     eventually(lambda: found.search(reported.getvalue()))
-    urlopen(found.search(reported.getvalue())[1] + "moment", timeout=PATIENCE_S).close()
-    thread.join(PATIENCE_S)
+    with Visitor(found.search(reported.getvalue())[1]) as visitor:
+        visitor.say(command="picture")
+        thread.join(PATIENCE_S)
     views[0].close()
     browser_view("", 25.0, 100, port=0, wait_s=0.01).close()
     assert capsys.readouterr().out == ""
@@ -110,10 +110,8 @@ def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path, monkeypatch) -> 
     def watched() -> bool:
         """Two different pictures were seen."""
         if views and len(bodies) < 2:
-            facts: dict[str, object] = {}
-            for _ in range(2):
-                facts, body = next_picture(views[0], facts)
-                bodies.append(body)
+            with Visitor(views[0].url) as visitor:
+                bodies.extend(visitor.picture()[1] for _ in range(2))
         return len(bodies) == 2
 
     given = ("view=browser", "view.port=0", "hydra.run.dir=out", *QUICK)
@@ -226,7 +224,7 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
     eventually(lambda: of_slots("state") == [] and text("state") == "tracking")
     assert chromium.get_log("browser") == []
 
-    view._picture.set_phase("over")
+    view._end("over")
     eventually(lambda: text("phase") == "the recording is over")
     assert chromium.find_element("xpath", "//button[text()='Start again']").get_property("disabled")
     view.close()

@@ -23,7 +23,6 @@ from toftrack.views.overlay import (
     draw_panel,
     film_tile,
     filmstrip,
-    panel_scale,
 )
 from toftrack.views.skeleton import SLOT_RGB, side_words
 
@@ -127,12 +126,6 @@ def test_a_side_is_said_with_how_sure_it_is_unless_it_was_given() -> None:
     assert side_words(other_hand(side_probability=0.999)) == "left 99 %"
 
 
-def test_panels_are_three_times_a_small_image_and_once_a_large() -> None:
-    assert panel_scale(176) == 3
-    assert panel_scale(640) == 1
-    assert panel_scale(2000) == 1
-
-
 @pytest.mark.parametrize(
     ("size", "scale"), [((144, 176), 3), ((480, 640), 1), ((7, 5), 1), ((9, 11), 1.5)]
 )
@@ -181,17 +174,13 @@ def test_a_nearer_hand_has_thicker_bones() -> None:
     assert shares[1] > 1.5 * shares[0]  # the same length in the image at half the distance
 
 
-def test_no_skeleton_without_an_estimate_or_behind_the_camera() -> None:
+def test_no_skeleton_without_an_estimate_behind_the_camera_or_far_outside_the_image() -> None:
     behind = dataclasses.replace(hand(), joints_m=-hand().joints_m)
-    for one in (dataclasses.replace(lost_hand(), lost=False), behind):
+    away = hand().joints_m + np.array([1e6, 0, 0], np.float32)
+    outside = dataclasses.replace(hand(), joints_m=away)
+    for one in (dataclasses.replace(lost_hand(), lost=False), behind, outside):
         _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
         assert is_grey(left)
-
-
-def test_a_hand_far_outside_the_image_does_not_fail() -> None:
-    away = hand().joints_m * np.float32(1) + np.array([1e6, 0, 0], np.float32)
-    one = dataclasses.replace(hand(), joints_m=away)
-    assert is_grey(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[1])
 
 
 def test_range_image_is_darker_where_nearer_on_white() -> None:
@@ -289,7 +278,7 @@ def test_video_has_every_panel_at_the_rate(tmp_path: Path) -> None:
         assert abs(float(frame.mean()) - 8 * i) < 6
 
 
-@pytest.mark.parametrize("fps", [29.97002997, 24.998750062, 1e-3, 5000.0, math.nan, math.inf])
+@pytest.mark.parametrize("fps", [29.97002997, 1e-3, 5000.0, math.nan])
 def test_odd_rates_give_a_readable_video(tmp_path: Path, fps: float) -> None:
     with VideoView(tmp_path, fps, None) as view:
         view.add(panel_of(10))
@@ -307,8 +296,7 @@ def test_panels_of_other_and_odd_sizes_share_one_even_size(tmp_path: Path) -> No
     assert [frame.shape for frame in frames] == [(96, 160, 3)] * 2
 
 
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("count", [10, 64, 100, 250, 1000])
+@pytest.mark.parametrize(("count", "known"), [(10, True), (100, False), (1000, True), (700, False)])
 def test_filmstrip_is_ten_evenly_spread_panels(tmp_path: Path, count: int, known: bool) -> None:
     with VideoView(tmp_path, 25, count if known else None) as view:
         for i in range(count):

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from toftrack.checks import check_number
 from toftrack.compute.rotations import rotmat_to_rotvec, rotvec_to_rotmat
-from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.gestures.recognition import pointing_ray
 from toftrack.hand.shape import HandShape
@@ -40,16 +40,10 @@ class OneEuro:
 
     def __post_init__(self) -> None:
         for name in ("min_cutoff_hz", "speed_cutoff_hz"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ToftrackError(
-                    f"smooth.{name}={getattr(self, name)} is no frequency; give hertz above 0"
-                )
+            check_number(f"smooth.{name}", getattr(self, name), 0, above=True, remedy=" hertz")
         for name in ("position_beta", "rotation_beta", "angle_beta"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ToftrackError(
-                    f"smooth.{name}={getattr(self, name)} is out of range; give 0 (the same cut-off"
-                    " at any speed) or more"
-                )
+            same = " (0 = the same cut-off at any speed)"
+            check_number(f"smooth.{name}", getattr(self, name), 0, remedy=same)
 
 
 def no_smoothing() -> None:

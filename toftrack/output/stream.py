@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
+from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.output.lines import LINE_FIELDS, json_line
@@ -79,8 +80,7 @@ class StdoutStream:
 
     def __init__(self, fields: Sequence[str] | None, waiting: int) -> None:
         self._fields = known_fields(fields)
-        if not isinstance(waiting, int) or waiting < 1:
-            raise ToftrackError(f"stream.waiting={waiting!r} is no number of lines; give 1 or more")
+        check_number("stream.waiting", waiting, 1, whole=True)
         if not hasattr(select, "PIPE_BUF"):
             raise ToftrackError(
                 "stream=stdout needs pipes that say whether they are full, which this operating "
@@ -147,8 +147,7 @@ class UdpStream:
 
     def __init__(self, host: str, port: int, fields: Sequence[str] | None) -> None:
         self._fields = known_fields(fields)
-        if not isinstance(port, int) or not 1 <= port <= 65535:
-            raise ToftrackError(f"stream.port={port!r} is no port; give a number from 1 to 65535")
+        check_number("stream.port", port, 1, 65535, whole=True)
         try:
             found = socket.getaddrinfo(str(host), port, type=socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:

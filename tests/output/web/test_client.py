@@ -18,7 +18,6 @@ from helpers.pages import picture, shown
 from helpers.settings import part
 from helpers.tracking import ROOT
 
-pytest.importorskip("websockets", reason="pip install '.[web]'")
 CLIENT = ROOT / "docs" / "examples" / "web_client"
 
 

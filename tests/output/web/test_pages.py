@@ -21,7 +21,6 @@ from toftrack.devices.sample import Sample
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
 
-pytest.importorskip("websockets", reason="pip install '.[web]'")
 WIDTH_M = 0.5
 
 

@@ -6,13 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 
-_RINGS, _SECTORS = 10, 16
+_POINTS = 146
+"""Of an ellipsoid."""
 _WORLD = np.array([1.0, -1.0, -1.0])
 _JOINT_OF_FRAME = [
     OPENXR_JOINT_NAMES.index(name)
@@ -59,25 +61,11 @@ def hand_mesh(shape: HandShape) -> HandMesh:
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:
-    """A unit ball's points (P, 3) and triangles (F, 3); its poles are single points."""
-    up = np.pi * np.arange(1, _RINGS) / _RINGS
-    round_ = 2 * np.pi * np.arange(_SECTORS) / _SECTORS
-    rings = np.stack(
-        (
-            np.outer(np.sin(up), np.cos(round_)),
-            np.outer(np.sin(up), np.sin(round_)),
-            np.outer(np.cos(up), np.ones(_SECTORS)),
-        ),
-        -1,
-    ).reshape(-1, 3)
-    points = np.concatenate(([[0, 0, 1.0]], rings, [[0, 0, -1.0]]))
-    here = np.arange(_SECTORS)
-    after, last = (here + 1) % _SECTORS, len(points) - 1
-    faces = [np.stack((np.zeros_like(here), 1 + here, 1 + after), 1)]
-    for ring in range(_RINGS - 2):
-        a, b = 1 + ring * _SECTORS, 1 + (ring + 1) * _SECTORS
-        faces.append(np.stack((a + here, b + here, b + after), 1))
-        faces.append(np.stack((a + here, b + after, a + after), 1))
-    bottom = last - _SECTORS
-    faces.append(np.stack((np.full_like(here, last), bottom + after, bottom + here), 1))
-    return points, np.concatenate(faces)
+    """A unit ball's points (P, 3), evenly spread on a spiral, and triangles (F, 3)."""
+    z = np.linspace(1, -1, _POINTS)
+    turn = np.pi * (3 - 5**0.5) * np.arange(_POINTS)
+    radius = np.sqrt(1 - z**2)
+    points = np.stack((radius * np.cos(turn), radius * np.sin(turn), z), -1)
+    faces = ConvexHull(points).simplices
+    inwards = np.linalg.det(points[faces]) < 0
+    return points, np.where(inwards[:, None], faces[:, ::-1], faces)

@@ -1,59 +1,66 @@
 """`view=browser`: what the tracker sees, live on a page that it serves itself.
 
-The tracker only leaves the newest moment here. A thread of its own draws it and makes a JPEG of it,
-once for all who watch and not at all when nobody does.
+The tracker only leaves the newest moment here. Another thread draws it and makes a JPEG of it, once
+for all who watch and not at all when nobody does.
+
+The page opens a websocket to `/live`. The server sends it facts, as JSON, and after those whose
+`picture` is true a JPEG. The page sends JSON:
+
+| message | what happens |
+| --- | --- |
+| `{"command": "picture"}` | the next picture is sent; two can be asked for at a time |
+| `{"command": C, "token": T}` | the tracker is told, C being one of COMMANDS; `{"refused": WHY}` \
+comes back where it is not |
+
+Pictures are asked for rather than pushed, so who is slow gets the newest one and skips the others.
+Commands need a token that nothing but the printed address carries: other users of the machine may
+watch, no more. It stands after `#`, which a browser keeps to itself.
 """
 
 from __future__ import annotations
 
+import asyncio
+import json
 import math
+import secrets
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import cv2
 
+from toftrack.checks import check_number
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import is_vacant, state_words
-from toftrack.views.base import TrackedFrame, TrackedHand
-from toftrack.views.browser.server import BrowserServer, News
+from toftrack.json_text import parse_json
+from toftrack.output.web.server import ANY_PORT, WebServer
+from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand
 from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
-_STILL_WATCHED_S = 1.0
-"""Drawing goes on for so long after the last request, so that pictures are ready for the next."""
 _RATE_S = 2.0
 """The frames a second are those of so long."""
 _MOST_COMMANDS = 16
-_GOODBYE_S = 0.3
-"""For the page to fetch the news that the tracker was stopped."""
+_MOST_ASKED = 2
+"""Pictures that a page can ask for at a time: one is on its way, the next one being drawn."""
+_MOST_WAITING = 8
+"""Messages to a page that does not read them."""
 
 
-def browser_view(
-    folder: str | Path,
-    fps: float,
-    frames: int | None = None,
-    *,
-    host: str,
-    port: int,
-    quality: int,
-    most_fps: float,
-    wait_s: float,
-    linger_s: float,
-    live: bool,
-) -> BrowserView:
-    """Serve the page, say on standard error where it is, and wait for a first visitor.
+class BrowserView:
+    """The live page, as a view: served from construction until `close`.
 
-    Only where there is a last frame that could be missed is a visitor waited for.
+    Its address is printed on standard error. Where there is a last frame that could be missed, a
+    first visitor is waited for.
 
     Args:
-        folder: nothing is written into it.
-        fps: not needed.
+        folder, fps: as every view gets them, and of no use here.
         frames: how many there are to come; None = no end is known.
         host: address of the network interface.
         port: 0 = any free one.
@@ -67,54 +74,79 @@ def browser_view(
     Raises:
         ToftrackError: a bad setting, or the page cannot be served there.
     """
-    _check(port, quality, most_fps, wait_s, linger_s)
-    view = BrowserView(host, port, quality, most_fps, linger_s)
-    print(f"live view: {view.address} (Ctrl-C ends)", file=sys.stderr, flush=True)
-    if frames is not None and wait_s > 0:
-        print(f"waiting up to {wait_s:g} s for it to be opened", file=sys.stderr, flush=True)
-        try:
-            view.wait_for_visitor(wait_s)
-        except BaseException:
-            view.close()
-            raise
-    return view
-
-
-class BrowserView:
-    """The live page, as a view. See `browser_view`, which makes it, for arguments and errors."""
 
     def __init__(
-        self, host: str, port: int, quality: int, most_fps: float, linger_s: float
+        self,
+        folder: str | Path,
+        fps: float,
+        frames: int | None = None,
+        *,
+        host: str,
+        port: int,
+        quality: int,
+        most_fps: float,
+        wait_s: float,
+        linger_s: float,
+        live: bool,
     ) -> None:
-        self._picture = LivePicture(quality, most_fps)
-        self._linger_s = linger_s
-        try:
-            self._server = BrowserServer(self._picture, host, port)
-        except BaseException:
-            self._picture.close()
-            raise
+        check_number("view.port", port, 0, 65535, whole=True, remedy=ANY_PORT)
+        check_number("view.quality", quality, 1, 100, whole=True)
+        check_number("view.most_fps", most_fps, 0, above=True)
+        for name, seconds in (("wait_s", wait_s), ("linger_s", linger_s)):
+            if seconds != math.inf:
+                check_number(f"view.{name}", seconds, 0, remedy=" seconds, or inf")
+        self._quality, self._least_s, self._linger_s = quality, 1 / most_fps, linger_s
+        self._newest: tuple[TrackedFrame, float] | None = None
+        """The newest moment, and when the device gave it."""
+        self._times_s: deque[float] = deque(maxlen=200)
+        self._commands: deque[str] = deque(maxlen=_MOST_COMMANDS)
+        self._visited = threading.Event()
+        # What follows belongs to the server's thread.
+        self._work = asyncio.Event()
+        self._phase, self._facts, self._arrived_s = "starting", dict[str, Any](), math.nan
+        self.jpeg, self.version = b"", 0
+        """The picture, and how many there were before it."""
+        self.token = secrets.token_urlsafe(12)
+        """What commands must carry."""
+        self._server = WebServer(
+            *("view", host, port, "toftrack.views.browser", {"/": "page.html"}, "/live"),
+            lambda: _Visitor(self),
+        )
+        self._drawing = self._server.begin(self._draw_all())
         self.url = self._server.url
         """Where the page is; without its commands."""
-        self.address = f"{self.url}#{self._server.token}"
+        self.address = f"{self.url}#{self.token}"
         """Where it is with them."""
-
-    def wait_for_visitor(self, timeout_s: float) -> bool:
-        """Wait until somebody has opened the page; False when nobody did in time."""
-        return self._picture.visited.wait(min(timeout_s, threading.TIMEOUT_MAX))
+        print(f"live view: {self.address} (Ctrl-C ends)", file=sys.stderr, flush=True)
+        if frames is not None and wait_s > 0:
+            print(f"waiting up to {wait_s:g} s for it to be opened", file=sys.stderr, flush=True)
+            try:
+                self._visited.wait(min(wait_s, threading.TIMEOUT_MAX))
+            except BaseException:
+                self.close()
+                raise
 
     def show(self, tracked: TrackedFrame) -> None:
-        """Leave the moment for those who watch; returns at once."""
-        self._picture.put(tracked)
+        """Leave the moment for those who watch; returns at once. Raises what went wrong when the
+        last one was drawn.
+        """
+        if self._drawing.done():
+            self._drawing.result()
+        now_s, took_s = time.monotonic(), tracked.hands[0].estimate.compute_s
+        self._times_s.append(now_s)
+        self._newest = tracked, now_s - (took_s if math.isfinite(took_s) else 0.0)
+        self._phase = "live"
+        if self._server.clients:
+            self._server.call(self._work.set)
 
     def commands(self) -> Sequence[str]:
         """What the visitors asked for since the last call."""
-        return self._picture.commands()
+        return [self._commands.popleft() for _ in range(len(self._commands))]
 
     def close(self) -> None:
-        """End the page and its threads; a second call does nothing."""
-        self._picture.set_phase("stopped")
+        """End the page and its thread; a second call does nothing."""
+        self._end("stopped")
         self._server.close()
-        self._picture.close()
 
     def __enter__(self) -> Self:
         return self
@@ -128,13 +160,22 @@ class BrowserView:
         """Close; after an ordinary end the page stays for a while, until Ctrl-C at the longest."""
         try:
             if kind is None:
-                self._picture.set_phase("over")
+                self._end("over")
                 self._linger()
-            elif self._picture.watched:
-                self._picture.set_phase("stopped")
-                time.sleep(_GOODBYE_S)
         finally:
             self.close()
+
+    def _end(self, phase: str) -> None:
+        """Tell the visitors why there are no more frames, unless they know."""
+        if self._phase in ("over", "stopped"):
+            return
+        self._phase = phase
+
+        def tell() -> None:
+            for visitor in self._server.clients:
+                visitor.tell(self.facts())
+
+        self._server.call(tell)
 
     def _linger(self) -> None:
         if self._linger_s == 0:
@@ -147,125 +188,95 @@ class BrowserView:
         except KeyboardInterrupt:
             pass  # everything was done by then
 
+    def facts(self, picture: bool = False) -> dict[str, Any]:
+        """What the page is told; a `picture` follows."""
+        age = {"age_ms": round(1e3 * (time.monotonic() - self._arrived_s), 1)} if self.jpeg else {}
+        return {"phase": self._phase, "picture": picture} | self._facts | age
 
-class LivePicture:
-    """The newest moment as a picture for any number of visitors, drawn by a thread of its own.
-
-    quality: of the JPEGs, 1 to 100.  most_fps: pictures a second at most.
-    """
-
-    def __init__(self, quality: int, most_fps: float) -> None:
-        self.visited = threading.Event()
-        """Somebody has asked for news."""
-        self._quality, self._least_s = quality, 1 / most_fps
-        self._lock = threading.Lock()
-        self._work = threading.Condition(self._lock)  # the drawing thread waits for it
-        self._news = threading.Condition(self._lock)  # visitors wait for it
-        self._tracked: TrackedFrame | None = None
-        self._times_s: deque[float] = deque(maxlen=200)
-        self._undrawn, self._closed = False, False
-        self._phase, self._version = "starting", 0
-        self._jpeg, self._jpeg_version, self._facts = b"", 0, dict[str, Any]()
-        self._waiting, self._asked_s = 0, -math.inf
-        self._newest_s = self._arrived_s = time.monotonic()  # when the device gave the frame
-        self._commands: deque[str] = deque(maxlen=_MOST_COMMANDS)
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._draw_all, name="browser-drawing", daemon=True)
-        self._thread.start()
-
-    @property
-    def watched(self) -> bool:
-        """Somebody waits for news, or asked a moment ago."""
-        return self._waiting > 0 or time.monotonic() - self._asked_s < _STILL_WATCHED_S
-
-    def put(self, tracked: TrackedFrame) -> None:
-        """Make a moment the newest one; raises what went wrong when the last one was drawn."""
-        with self._lock:
-            if self._error is not None:
-                raise self._error
-            self._tracked, self._undrawn, self._phase = tracked, True, "live"
-            now_s, took_s = time.monotonic(), tracked.hands[0].estimate.compute_s
-            self._newest_s = now_s - (took_s if math.isfinite(took_s) else 0.0)
-            self._times_s.append(now_s)
-            self._work.notify()
-
-    def set_phase(self, phase: str) -> None:
-        """Tell the visitors: 'starting', 'live', 'over' or 'stopped'; the last two are final."""
-        with self._lock:
-            if self._phase not in ("over", "stopped"):
-                self._phase = phase
-                self._version += 1
-                self._news.notify_all()
-
-    def after(self, version: int, wait_s: float) -> News:
-        """What is newer than a version; waits for it, but no longer than `wait_s`."""
-        self.visited.set()
-        with self._lock:
-            self._waiting += 1
-            self._work.notify()
-            try:
-                self._news.wait_for(lambda: self._version > version or self._closed, wait_s)
-            finally:
-                self._waiting -= 1
-                self._asked_s = time.monotonic()
-            jpeg = self._jpeg if self._jpeg_version > version else None
-            age = {"age_ms": round(1e3 * (time.monotonic() - self._arrived_s), 1)}
-            return News(self._version, jpeg, {"phase": self._phase} | self._facts | age)
-
-    def ask(self, command: str) -> None:
+    def asked(self, command: str) -> None:
         """Keep a visitor's command; the oldest are forgotten when nobody fetches them."""
-        with self._lock:
-            self._commands.append(command)
+        self._commands.append(command)
 
-    def commands(self) -> list[str]:
-        """The commands since the last call, in order."""
-        with self._lock:
-            commands = list(self._commands)
-            self._commands.clear()
-        return commands
+    def wanted(self) -> None:
+        """A visitor waits for a picture."""
+        self._visited.set()
+        self._work.set()
 
-    def close(self) -> None:
-        """End the drawing thread and let nobody wait any longer."""
-        with self._lock:
-            self._closed = True
-            self._work.notify_all()
-            self._news.notify_all()
-        self._thread.join()
-
-    def _draw_all(self) -> None:
-        with small_operations():
-            while (tracked := self._next()) is not None:
-                began, arrived_s = time.monotonic(), self._newest_s
-                try:
-                    jpeg = _encode(tracked, self._quality)
-                except Exception as error:  # the tracker's thread raises it
-                    with self._lock:
-                        self._error = error
-                    return
-                self._publish(tracked, jpeg, arrived_s)
-                with self._lock:
-                    rest = began + self._least_s - time.monotonic()
-                    self._work.wait_for(lambda: self._closed, max(0.0, rest))
-                    # Then the next moment to come: the tracker is between two frames just then, and
-                    # drawing takes no time from it. None may come any more, so not for long.
-                    self._undrawn, before = False, self._undrawn
-                    self._work.wait_for(lambda: self._closed or self._undrawn, self._least_s)
-                    self._undrawn |= before
-
-    def _next(self) -> TrackedFrame | None:
-        """Wait for a moment that somebody wants to see; None at the end."""
-        with self._lock:
-            self._work.wait_for(lambda: self._closed or (self._undrawn and self.watched))
-            self._undrawn = False
-            return None if self._closed else self._tracked
-
-    def _publish(self, tracked: TrackedFrame, jpeg: bytes, arrived_s: float) -> None:
-        with self._lock:
+    async def _draw_all(self) -> None:
+        drawn, loop = None, asyncio.get_running_loop()
+        while True:
+            await self._newer_than(drawn, asked_for=True)
+            # Then the next moment to come: the tracker is between two frames just then, and
+            # drawing takes no time from it. None may come any more, so not for long.
+            with suppress(TimeoutError):
+                async with asyncio.timeout(self._least_s):
+                    await self._newer_than(self._newest, asked_for=False)
+            began, drawn = loop.time(), self._newest
+            assert drawn is not None
+            tracked, arrived_s = drawn
+            self.jpeg = await asyncio.to_thread(_encode, tracked, self._quality)
             self._arrived_s = arrived_s
-            self._version += 1
-            self._jpeg, self._jpeg_version = jpeg, self._version
-            self._facts = _facts(tracked) | {"fps": _rate(self._times_s)}
-            self._news.notify_all()
+            self._facts = _facts(tracked) | {"fps": _rate(list(self._times_s))}
+            self.version += 1
+            for visitor in self._server.clients:
+                visitor.news.set()
+            await asyncio.sleep(began + self._least_s - loop.time())
+
+    async def _newer_than(self, moment: object, asked_for: bool) -> None:
+        """Wait until there is another moment, which somebody waits for if it is to be asked for."""
+        clients = self._server.clients
+        while self._newest is moment or (asked_for and not any(v.asked for v in clients)):
+            self._work.clear()
+            await self._work.wait()
+
+
+class _Visitor:
+    """The page of one visitor."""
+
+    def __init__(self, view: BrowserView) -> None:
+        self._view = view
+        self.asked, self._version = 0, 0
+        """Pictures that the page waits for."""
+        self._messages: deque[str | bytes] = deque()
+        self.news = asyncio.Event()
+        self.tell(view.facts())
+
+    def tell(self, facts: dict[str, Any]) -> None:
+        """Send facts, unless too much waits already."""
+        if len(self._messages) < _MOST_WAITING:
+            self._messages.append(json.dumps(facts, allow_nan=False))
+            self.news.set()
+
+    def take(self) -> str | bytes | None:
+        view = self._view
+        if not self._messages and self.asked and view.version > self._version:
+            self.asked, self._version = self.asked - 1, view.version
+            self.tell(view.facts(picture=True))
+            self._messages.append(view.jpeg)
+        return self._messages.popleft() if self._messages else None
+
+    def receive(self, message: str | bytes) -> None:
+        try:
+            content = parse_json(message)
+        except ValueError:
+            content = None
+        content = content if isinstance(content, dict) else {}
+        command, token = content.get("command"), str(content.get("token"))
+        if command == "picture":
+            self.asked = min(self.asked + 1, _MOST_ASKED)
+            self.news.set()
+            self._view.wanted()
+        elif command not in COMMANDS:
+            self.tell({"refused": f"a command is one of {', '.join(COMMANDS)}"})
+        elif not secrets.compare_digest(
+            token.encode("utf-8", "replace"), self._view.token.encode()
+        ):
+            self.tell({"refused": "commands need the whole address that the tracker printed"})
+        else:
+            self._view.asked(command)
+
+    def __len__(self) -> int:
+        return len(self._messages)
 
 
 def _stay(seconds: float) -> None:
@@ -274,7 +285,8 @@ def _stay(seconds: float) -> None:
 
 def _encode(tracked: TrackedFrame, quality: int) -> bytes:
     # The page writes larger and sharper what the caption says.
-    panel = draw_tracked(tracked)[CAPTION_PX:]
+    with small_operations():
+        panel = draw_tracked(tracked)[CAPTION_PX:]
     done, jpeg = cv2.imencode(".jpg", panel, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ToftrackError("the picture cannot be encoded as JPEG; choose view=none")
@@ -328,26 +340,3 @@ def _rate(times_s: Sequence[float]) -> float | None:
     recent = [t for t in times_s if t > times_s[-1] - _RATE_S]
     span_s = recent[-1] - recent[0]
     return round((len(recent) - 1) / span_s, 1) if span_s > 0 else None
-
-
-def _check(port: int, quality: int, most_fps: float, wait_s: float, linger_s: float) -> None:
-    def whole(value: object, low: int, high: int) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
-
-    def number(value: object) -> bool:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and value >= 0
-
-    for name, value, right, wanted in (
-        ("port", port, whole(port, 0, 65535), "a whole number from 0 (any free one) to 65535"),
-        ("quality", quality, whole(quality, 1, 100), "a whole number from 1 to 100"),
-        (
-            "most_fps",
-            most_fps,
-            number(most_fps) and 0 < most_fps < math.inf,
-            "a number above 0",
-        ),
-        ("wait_s", wait_s, number(wait_s), "a number of seconds, 0 or above"),
-        ("linger_s", linger_s, number(linger_s), "a number of seconds, 0 or above, or inf"),
-    ):
-        if not right:
-            raise ToftrackError(f"view.{name}={value} is not possible; give {wanted}")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.hand.shape import HandShape, default_hand_shape
+from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.pose_space.base import PoseSpace
@@ -30,9 +30,9 @@ _NEAR_DEGREES = 15.0
 """A pose is coloured as the gesture that it is within this root mean square distance of."""
 
 
-def pose_picture(angles: Tensor, size: int = 200, shape: HandShape | None = None) -> np.ndarray:
+def pose_picture(angles: Tensor, size: int) -> np.ndarray:
     """Range image of an upright hand, nearer is darker: (21,) rad to (size, size) uint8."""
-    shape = shape or default_hand_shape()
+    shape = default_hand_shape()
     state = torch.cat((torch.tensor([0.0, 0.085, 0.5, -0.25, -0.3, 0.0]), angles.float().cpu()))
     both = hand_surface(shape).pose(forward_kinematics(state[None], shape))
     hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])

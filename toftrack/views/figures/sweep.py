@@ -12,13 +12,13 @@ Point = tuple[str, float, float, float | None]
 """(settings, cost in ms, error, spread of the error over seeds or None)"""
 
 
-def sweep_figure(points: Sequence[Point], label: str, width: int = 900) -> np.ndarray:
+def sweep_figure(points: Sequence[Point], label: str) -> np.ndarray:
     """Numbered dots with bars of one deviation over seeds, a legend below; BGR.
 
     points: at least one.  label: of the error's axis, which starts at zero. The axis of the cost is
         logarithmic.
     """
-    figure = chart.new_figure(width, 500 + 22 * len(points))
+    figure = chart.new_figure(900, 500 + 22 * len(points))
     axes = figure.subplots()
     chart.label(axes, "ms a frame", label)
     for number, (settings, cost_ms, error, spread) in enumerate(points, 1):

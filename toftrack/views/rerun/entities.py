@@ -22,8 +22,8 @@ import itertools
 
 import cv2
 import numpy as np
-import roma
 import torch
+from scipy.spatial.transform import Rotation
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
@@ -273,7 +273,7 @@ def ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
     return rr.Ellipsoids3D(
         centers=hand.centres_m[0].numpy(),
         half_sizes=sizes.numpy(),
-        quaternions=roma.rotmat_to_unitquat(rotations).numpy(),
+        quaternions=Rotation.from_matrix(rotations.numpy()).as_quat(),
         colors=[_LOST_RGB] if estimate.lost else colours,
         fill_mode="majorwireframe",
     )

@@ -1,0 +1,316 @@
+"""Pages and a websocket on one port: what `view=browser` and `stream=websocket` are served by.
+
+The server answers only those who call it by an address or as localhost, and opens websockets to
+its own pages, to pages of origins that are named, and to programs that are no browsers; so no
+other web site can reach it under a name of its own. Connections that have not asked for anything
+yet are few and have seconds to ask: when there are too many, the oldest has to go.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import functools
+import ipaddress
+import logging
+import math
+import threading
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from importlib import resources
+from typing import Any, Protocol
+from urllib.parse import urlsplit
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from toftrack.errors import ToftrackError
+
+_log = logging.getLogger(__name__)
+
+_FIXED_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self' 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "Connection": "close",
+}
+_KINDS = {"html": "text/html", "js": "text/javascript"}
+MOST_CLIENTS = 32
+MOST_HALF_OPEN = 32
+"""Connections that are no clients yet, or were answered and not closed."""
+_HANDSHAKE_S = 3.0
+"""How long a request may take to arrive."""
+_BACKLOG = 32
+"""Connections that the system keeps, and that are accepted at a time."""
+_MOST_RECEIVED_BYTES = 4096
+"""In a message of a client; who sends a longer one is cut off."""
+_REPORTED_EVERY_S = 60.0
+_CLOSING_S = 1.0
+"""How long the messages that still wait at the end have to leave."""
+_PAUSE_S = 0.01
+ANY_PORT = " (0 = any free one)"
+"""What is said of a port that cannot be meant."""
+
+
+class Client(Protocol):
+    """What one websocket is sent and says. Called from the server's thread alone."""
+
+    news: asyncio.Event
+    """To be set when `take` has something."""
+
+    def take(self) -> str | bytes | None:
+        """The next message to send; None where there is none."""
+
+    def receive(self, message: str | bytes) -> None:
+        """Look at what was sent by the other side."""
+
+    def __len__(self) -> int:
+        """How many messages wait; at the end of the server they have a second to leave."""
+
+
+class WebServer:
+    """Serves from a thread of its own, from construction until `close`.
+
+    Args:
+        group: whose settings `host` and `port` are, for errors.
+        host: name or address of the network interface.
+        port: 0 = any free one.
+        package: where the files of `pages` are.
+        pages: the names of files by the paths that they are served at.
+        path: where websockets are opened.
+        new_client: makes what talks to a websocket.
+        origins: of pages of other servers that may open one, as "http://localhost:3000".
+
+    Raises:
+        ToftrackError: the port is taken or not allowed, or there is no such host here.
+    """
+
+    def __init__(
+        self,
+        group: str,
+        host: str,
+        port: int,
+        package: str,
+        pages: Mapping[str, str],
+        path: str,
+        new_client: Callable[[], Client],
+        origins: Collection[str] = (),
+    ) -> None:
+        self._host, self._path, self._origins = host, path, origins
+        self._new_client = new_client
+        folder = resources.files(package)
+        self._pages = {
+            at: ((folder / name).read_bytes(), _KINDS[name.rpartition(".")[2]])
+            for at, name in pages.items()
+        }
+        self.clients: set[Any] = set()
+        self._open: set[_Connection] = set()
+        self._half_open: dict[_Connection, None] = {}
+        """The oldest first."""
+        self._reported_s = -math.inf
+        self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(self._trouble)
+        self._thread = threading.Thread(
+            target=self._loop.run_forever, name="web-server", daemon=True
+        )
+        self._thread.start()
+        try:
+            self._server: Server = self.begin(self._serve(port)).result()
+        except OSError as error:
+            self._end_thread()
+            raise _refused(group, host, port, error) from error
+        at, port = next(iter(self._server.sockets)).getsockname()[:2]
+        self.url = f"http://[{at}]:{port}/" if ":" in at else f"http://{at}:{port}/"
+        """Of the first page."""
+
+    def begin(self, work: Any) -> Any:
+        """Run a coroutine in the server's thread; returns its concurrent.futures.Future."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def call(self, function: Callable[..., object], *given: object) -> None:
+        """Call a function in the server's thread, soon; not at all after `close`."""
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(function, *given)
+
+    def close(self) -> int:
+        """End the thread; returns how many messages did not leave. A second call does nothing."""
+        if self._loop.is_closed():
+            return 0
+        left = self.begin(self._close()).result()
+        self._end_thread()
+        return left
+
+    def _end_thread(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _serve(self, port: int) -> Server:
+        return await serve(
+            self._talk,
+            self._host,
+            port,
+            create_connection=functools.partial(_Connection, self),  # type: ignore[arg-type]
+            process_request=self._answer,
+            open_timeout=_HANDSHAKE_S,
+            backlog=_BACKLOG,
+            compression=None,  # of short messages and JPEGs to near clients it would only take time
+            max_size=_MOST_RECEIVED_BYTES,
+            close_timeout=_CLOSING_S,
+            server_header="toftrack",
+            logger=_quiet_log(),
+        )
+
+    async def _close(self) -> int:
+        deadline = self._loop.time() + _CLOSING_S
+        while any(map(len, self.clients)) and self._loop.time() < deadline:
+            await asyncio.sleep(_PAUSE_S)
+        left = sum(map(len, self.clients))
+        for connection in list(self._half_open):
+            connection.transport.abort()
+        self._server.close()
+        try:
+            await asyncio.wait_for(self._server.wait_closed(), _CLOSING_S)
+        except TimeoutError:
+            # Who does not read does not say goodbye either.
+            for connection in list(self._open):
+                connection.transport.abort()
+            await self._server.wait_closed()
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+        await self._loop.shutdown_default_executor()
+        return left
+
+    def opened(self, connection: _Connection) -> None:
+        """Count a connection; too many that are no clients push out the oldest of them."""
+        self._open.add(connection)
+        self._half_open[connection] = None
+        if len(self._half_open) > MOST_HALF_OPEN:
+            oldest = next(iter(self._half_open))
+            del self._half_open[oldest]
+            oldest.transport.abort()
+
+    def closed(self, connection: _Connection) -> None:
+        """Count a connection no more."""
+        self._open.discard(connection)
+        self._half_open.pop(connection, None)
+
+    def _trouble(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """What the event loop complains of, as that there are no descriptors any more."""
+        if loop.time() >= self._reported_s + _REPORTED_EVERY_S:
+            self._reported_s = loop.time()
+            reason = context.get("exception") or "unknown reason"
+            _log.warning("the web server: %s (%s)", context.get("message"), reason)
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        """Send what there is to one client, and read what it sends, until it leaves."""
+        self._half_open.pop(connection, None)
+        client = self._new_client()
+        self.clients.add(client)
+        sending = asyncio.ensure_future(_send(connection, client))
+        try:
+            # Unread messages would hold up a client's pongs.
+            async for message in connection:
+                client.receive(message)
+        except ConnectionClosed:
+            pass
+        finally:
+            sending.cancel()
+            self.clients.discard(client)
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The answer to a request; None lets a websocket be opened."""
+        headers = request.headers
+        if not self._is_called_by_name(headers.get("Host", "")):
+            return _text(403, "this server answers to its address and to localhost only")
+        path = request.path.partition("?")[0]
+        if path in self._pages:
+            return _response(200, *self._pages[path])
+        if path != self._path:
+            return _text(404, f"there is no {path} here; pages are at {', '.join(self._pages)}")
+        origin = headers.get("Origin")
+        if origin not in (None, f"http://{headers.get('Host')}", *self._origins):
+            return _text(
+                403,
+                "pages of other servers may not listen, but for those in stream.origins=[ORIGIN]",
+            )
+        if headers.get("Upgrade", "").lower() != "websocket":
+            return _text(426, f"{path} is for websockets")
+        if len(self.clients) >= MOST_CLIENTS:
+            return _text(503, "too many clients listen already")
+        return None
+
+    def _is_called_by_name(self, host_header: str) -> bool:
+        """Whether a request calls this machine by an address, as localhost, or as `host`."""
+        name = urlsplit(f"//{host_header}").hostname or ""
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return name in ("localhost", self._host.lower())
+        return True
+
+
+class _Connection(ServerConnection):
+    """Tells its server from when on it takes a descriptor, and until when."""
+
+    def __init__(self, owner: WebServer, *given: Any, **settings: Any) -> None:
+        super().__init__(*given, **settings)
+        self._owner = owner
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._owner.opened(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._owner.closed(self)
+
+
+async def _send(connection: ServerConnection, client: Client) -> None:
+    with suppress(ConnectionClosed):
+        while await client.news.wait():
+            client.news.clear()
+            while (message := client.take()) is not None:
+                await connection.send(message)
+
+
+def _text(status: int, sentence: str) -> Response:
+    return _response(status, f"{sentence}\n".encode(), "text/plain")
+
+
+def _response(status: int, body: bytes, kind: str) -> Response:
+    about = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))}
+    return Response(status, "", Headers(_FIXED_HEADERS | about), body)
+
+
+def _quiet_log() -> logging.Logger:
+    """The terminal belongs to the tracker; a client that breaks off is no error."""
+    log = logging.getLogger(f"{__name__}.clients")
+    log.setLevel(logging.CRITICAL)
+    return log
+
+
+def _refused(group: str, host: str, port: int, error: OSError) -> ToftrackError:
+    """What is said when a port cannot be listened at."""
+    if error.errno == errno.EADDRINUSE:
+        return ToftrackError(
+            f"port {port} of {host} is taken, perhaps by another tracker; end that one, or choose "
+            f"another with {group}.port=PORT{ANY_PORT}"
+        )
+    if error.errno == errno.EACCES:
+        return ToftrackError(
+            f"port {port} of {host} may not be used; choose one above 1023 with {group}.port=PORT"
+            f"{ANY_PORT}"
+        )
+    return ToftrackError(
+        f"nothing can be served at {group}.host={host} ({error.strerror or error}); give an "
+        "address of this machine, or leave it at 127.0.0.1"
+    )
