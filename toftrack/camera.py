@@ -181,10 +181,6 @@ class Camera:
         """(H, W, 2) float64: x and y at Z = 1 of each pixel's ray, after undistortion; cached."""
         return self._rays
 
-    def radial_to_z(self, radial: np.ndarray) -> np.ndarray:
-        """Distances along the pixels' rays, (..., H, W) metres, to Z along the optical axis."""
-        return radial / self._ray_lengths
-
     def rectify(self, depth: np.ndarray, radial: bool) -> np.ndarray:
         """A measured image to Z on the undistorted pinhole grid, with 0 for no reading.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from toftrack.benchmark import alternating
-from toftrack.benchmark.alternating import FIRST, PEER_HANDS, Program, Runner, Start, Times, show
+from toftrack.benchmark.alternating import FIRST, PEER_HANDS, Program, Runner, Times, show
 from toftrack.errors import ToftrackError
 
 LEFT = str(Path(alternating.__file__).parents[1] / "data" / "sample_left_hand.npz")
@@ -34,7 +34,11 @@ def test_the_table_has_the_ratios_and_the_starts() -> None:
         times("a, both", 15.0, 16.0),
         times(peer_name, 20.0, 20.0),
     ]
-    begun = [Start(False, 12.0, 14.0, 20.0, 1.7), Start(True, 3.0, 3.9, 4.0, 0.5)]
+    names = ("kernels", "first_s", "wall_s", "user_s", "system_s")
+    begun = [
+        dict(zip(names, values, strict=True))
+        for values in ((False, 12.0, 14.0, 20.0, 1.7), (True, 3.0, 3.9, 4.0, 0.5))
+    ]
     said = show(found, begun).splitlines()
     assert said[1].startswith(FIRST) and "0.28 (0.25, 0.30)" in said[1]
     assert said[5].startswith("a, both over one hand: median 1.55 (1.50, 1.60)")

@@ -195,7 +195,6 @@ def test_other_lenses_are_a_fisheye_none_or_reported(plug: Callable[..., Sdk]) -
     ("changes", "reported"),
     [
         ({"keep": "some"}, "keep=newest or every"),
-        ({"queue_frames": 1}, "queue_frames of at least 2"),
         ({"start": 3, "stop": 3}, "0 <= start < stop"),
         ({"bag": "none.bag"}, "no file 'none.bag'"),
     ],

@@ -24,15 +24,6 @@ def track(folder: Path, *overrides: str) -> tuple[int, str, str]:
     return programs.call(*overrides, "hydra.run.dir=out", folder=folder)
 
 
-def test_without_a_camera_the_user_is_reported_at_once(tmp_path: Path) -> None:
-    status, _, err = track(tmp_path, "device=sr3000", "device.usb.ids=[dead:0001,dead:0002]")
-    assert status == 1
-    assert err.startswith("error: no SR3000")
-    assert err.count("\n") == 1
-    for words in ("dead:0001, dead:0002", "libmesasr", "emulated"):
-        assert words in err
-
-
 def test_tracks_through_faults_and_an_unplugged_cable(tmp_path: Path) -> None:
     faults = "device.emulated.faults=[unplug_during@6,short@9,zeros@12,timeout@14]"
     usual = ("device.keep=every", "device.stop=24", "device.usb.timeout_ms=99")

@@ -6,9 +6,9 @@
 The tracker follows an emulated SR3000 at the camera's pace, in a process of its own. Each 50th
 request to the camera goes wrong, in all ways in turn; a visitor watches the page and comes anew
 after every 100 pictures; a listener takes the datagrams, or the websocket's messages, where it
-sends as well and comes anew after every 500 lines. At the end a table tells of each tenth of the
-time, and how long the ending took. The status is 1 if memory, threads or file handles are more in
-the last quarter than in the first one, or if the run failed. Needs /proc, that is Linux.
+sends as well and comes anew after every 500 lines. The status is 1 if memory, threads or file
+handles are more in the last quarter than in the first one, or if the run failed. Needs /proc, that
+is Linux.
 """
 
 from __future__ import annotations
@@ -61,8 +61,6 @@ _MOST_COUNT = 1
 class Sample:
     """The process at a moment."""
 
-    time_s: float
-    """Unix time."""
     memory_mb: float
     """Resident."""
     threads: int
@@ -70,23 +68,12 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """A datagram, or a message of the websocket."""
-
-    time_s: float
-    """Unix time of its arrival."""
-    index: int
-    frame_s: float
-    """The frame's time stamp."""
-    compute_s: float
-
-
-@dataclass(frozen=True)
 class Observation:
     """What was seen of a run from its hundredth frame on."""
 
     samples: tuple[Sample, ...]
-    arrivals: tuple[Arrival, ...]
+    lines: int
+    """That arrived by datagrams, or by the websocket."""
     pictures: int
     visits: int
     status: int | None
@@ -96,14 +83,10 @@ class Observation:
     written_mb: float
     """Size of the run's files at the end."""
 
-    def part(self, number: int, of: int) -> tuple[list[Sample], list[Arrival]]:
-        """One of so many equal parts of the time; number 0 is the first."""
-        begin, end = self.samples[0].time_s, self.samples[-1].time_s
-        low, high = (begin + (end - begin) * k / of for k in (number, number + 1))
-        return (
-            [sample for sample in self.samples if low <= sample.time_s <= high],
-            [arrival for arrival in self.arrivals if low <= arrival.time_s <= high],
-        )
+    def grown(self) -> list[str]:
+        """What is larger in the last quarter of the time than in the first one."""
+        quarter = max(1, len(self.samples) // 4)
+        return grown(self.samples[:quarter], self.samples[-quarter:])
 
 
 def grown(first: Sequence[Sample], last: Sequence[Sample]) -> list[str]:
@@ -122,41 +105,6 @@ def grown(first: Sequence[Sample], last: Sequence[Sample]) -> list[str]:
     ]
 
 
-def table(observation: Observation, parts: int = 10) -> str:
-    """A row for each part of the time."""
-    length_s = (observation.samples[-1].time_s - observation.samples[0].time_s) / parts
-    rows = [_figures(*observation.part(number, parts)) for number in range(parts)]
-    widths = {name: max(len(name), *(len(row[name]) for row in rows)) + 2 for name in rows[0]}
-    lines = ["minutes     " + "".join(f"{name:>{width}}" for name, width in widths.items())]
-    for number, row in enumerate(rows):
-        begin, end = (k * length_s / 60 for k in (number, number + 1))
-        cells = "".join(f"{row[name]:>{width}}" for name, width in widths.items())
-        lines.append(f"{begin:4.1f} - {end:4.1f} {cells}")
-    return "\n".join(lines)
-
-
-def _figures(samples: Sequence[Sample], arrivals: Sequence[Arrival]) -> dict[str, str]:
-    def spread(values: Sequence[float], parts: Sequence[float]) -> str:
-        return " / ".join(f"{value:.0f}" for value in np.percentile(values, parts))
-
-    def most(values: Sequence[int]) -> str:
-        return str(max(values, default=0))
-
-    parts = (50, 95, 99)
-    indices = [arrival.index for arrival in arrivals]
-    late = [1e3 * (arrival.time_s - arrival.frame_s) for arrival in arrivals]
-    compute = [1e3 * arrival.compute_s for arrival in arrivals]
-    return {
-        "MB": f"{max((sample.memory_mb for sample in samples), default=0):.1f}",
-        "threads": most([sample.threads for sample in samples]),
-        "handles": most([sample.handles for sample in samples]),
-        "compute ms, 50 / 95 / 99 %": spread(compute, parts) if compute else "-",
-        "stamp to arrival ms, 50 / 95 / 99 %": spread(late, parts) if late else "-",
-        "frames": str(len(arrivals)),
-        "missed": str(indices[-1] - indices[0] + 1 - len(arrivals)) if indices else "-",
-    }
-
-
 def soak(
     minutes: float,
     folder: Path,
@@ -169,7 +117,7 @@ def soak(
     told: gets a line a sample.  stream: one of STREAMS.  overrides: of the run besides OVERRIDES.
     """
     ended, pictures = threading.Event(), [0, 0]
-    arrivals: list[Arrival] = []
+    arrivals: list[int] = []
     words = folder / "err.txt"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
@@ -189,9 +137,8 @@ def soak(
             asked_s = time.monotonic()
             status = _ended(program)
             shutdown_s = time.monotonic() - asked_s
-    seen = tuple(arrival for arrival in arrivals if arrival.time_s >= samples[0].time_s)
     written_mb = sum(file.stat().st_size for file in (folder / "run").iterdir()) / 1e6
-    return Observation(tuple(samples), seen, *pictures, status, shutdown_s, written_mb)
+    return Observation(tuple(samples), len(arrivals), *pictures, status, shutdown_s, written_mb)
 
 
 def _ended(program: subprocess.Popen) -> int | None:
@@ -256,7 +203,7 @@ def _found(pattern: str, words: Path) -> str:
 def _samples(
     program: subprocess.Popen,
     seconds: float,
-    arrivals: list[Arrival],
+    arrivals: list[int],
     reported: Callable[[str], None],
 ) -> list[Sample]:
     samples, began = [], time.monotonic()
@@ -280,30 +227,25 @@ def _sample(process: int) -> Sample:
     )
     memory_mb = int(status["VmRSS"].split()[0]) / 1024
     handles = sum(1 for _ in (folder / "fd").iterdir())
-    return Sample(time.time(), memory_mb, int(status["Threads"]), handles)
+    return Sample(memory_mb, int(status["Threads"]), handles)
 
 
-def _listen(listener: socket.socket, arrivals: list[Arrival], ended: threading.Event) -> None:
+def _listen(listener: socket.socket, arrivals: list[int], ended: threading.Event) -> None:
     while not ended.is_set():
         try:
             datagram = listener.recv(65536)
         except TimeoutError:
             continue
-        arrivals.append(_arrived(datagram))
+        arrivals.append(json.loads(datagram)["index"])
 
 
-def _arrived(line: str | bytes) -> Arrival:
-    now, said = time.time(), json.loads(line)
-    return Arrival(now, said["index"], said["timestamp_s"], said["compute_s"])
-
-
-def _converse(address: str, arrivals: list[Arrival], ended: threading.Event) -> None:
+def _converse(address: str, arrivals: list[int], ended: threading.Event) -> None:
     """Listen to the websocket, answer every line, and come anew now and then."""
     while not ended.is_set():
         try:
             with connect(address) as connection:
                 for _ in range(_LINES_A_VISIT):
-                    arrivals.append(_arrived(connection.recv(10.0)))
+                    arrivals.append(json.loads(connection.recv(10.0))["index"])
                     connection.send("thank you")
                     if ended.is_set():
                         break
@@ -348,15 +290,13 @@ def main() -> int:
             overrides,
         )
         words = (Path(folder) / "err.txt").read_text()
-    print(table(observation))
-    print(f"{observation.pictures} pictures were seen in {observation.visits} visits")
+    seen = f"{observation.pictures} pictures were seen in {observation.visits} visits"
+    print(f"{observation.lines} lines came, {seen}")
     print(
         f"the ending took {observation.shutdown_s:.1f} s; {observation.written_mb:.0f} MB of files"
     )
     print(*re.findall(r"sr3000: frames: .*", words)[-1:])
-    problems = [
-        f"{name} grew" for name in grown(observation.part(0, 4)[0], observation.part(3, 4)[0])
-    ]
+    problems = [f"{name} grew" for name in observation.grown()]
     if observation.status != 143:
         problems.append(f"the tracker ended with status {observation.status}\n{words[-5000:]}")
     print("; ".join(problems) or "nothing grew")

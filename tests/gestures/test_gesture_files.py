@@ -118,25 +118,12 @@ def test_a_gesture_that_was_seen_to_vary_forgives_more() -> None:
     ("poses", "units", "words"),
     [
         ([{"name": "v", "angles": ROCK}], None, "does not say its units"),
-        ([{"name": "v", "angles": ROCK}], "turns", "unknown units 'turns'"),
         ([{"name": "v", "angles": ROCK}], "radians", "if they are degrees"),
-        ([{"name": "v", "angles": {"index_mcp_flexion": 1.2}}], "degrees", "if they are radians"),
         ([{"angles": ROCK}], "degrees", "pose 1 has no name"),
         ([{"name": "v", "angles": {"index_flexion": 9}}], "degrees", "unknown angle"),
-        (
-            [{"name": "v", "angles": {"index_mcp_flexion": "bent"}}],
-            "degrees",
-            "'bent', not a finite",
-        ),
-        ([{"name": "v", "angles": [math.nan] * 21}], "degrees", "nan, not a finite"),
-        ([{"name": "v", "angles": [0] * 20}], "degrees", "a list of 21"),
         ([{"name": "v", "angles": {"index_mcp_flexion": -80}}], "degrees", "joint limits"),
-        ([{"name": "v", "angles": {"index_mcp_flexion": 80}}], "degrees", "any finger's flexion"),
         ([{"name": "other", "angles": ROCK}], "degrees", "none of the classes"),
         ([{"name": n, "angles": ROCK} for n in "ab"], "degrees", "too much alike"),
-        ([], "degrees", "names no pose"),
-        ("v", "degrees", "no list 'poses'"),
-        ([{"name": "v", "angles": ROCK, "spread": [1]}], "degrees", "must have 'spread'"),
         ([{"name": "v", "angles": ROCK, "spread": [-1] * 21}], "degrees", "a spread below 0"),
     ],
 )
@@ -155,10 +142,6 @@ def test_bad_json_is_reported_in_one_sentence(
         ("# units: degrees\nindex_mcp_flexion\n80\n", "no column 'name'"),
         ("# units: degrees\nname,index_mcp_flexion\nv\n", "1 values for 2 columns"),
         ("name,index_mcp_flexion\nv,80\n", "does not say its units"),
-        ("# units: degrees\nname,index_mcp_flexion\nv,inf\n", "'inf', not a finite number"),
-        ("# units: degrees\nname,index_mcp_flexion\n", "names no pose"),
-        ("", "no column 'name'"),
-        ("# units: degrees\nname,spread\nv,3\n", "unknown angle 'spread'"),
     ],
 )
 def test_bad_csv_is_reported_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers.settings import gestures, part
 from helpers.shown_gestures import GESTURES, ON, SURE, fingers, label_of, pose, seen
-from helpers.tracking import configuration, make_tracker, sample
 from helpers.tracking import follow as follow_scene
-from hydra.utils import instantiate
+from helpers.tracking import make_tracker, sample
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
@@ -27,7 +24,6 @@ from toftrack.gestures.recognition import (
 )
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.output.results import ResultWriter, read_results
 from toftrack.pose_space.data.training_poses import synthetic_training_poses
 from toftrack.pose_space.files import make_pose_space
 
@@ -261,14 +257,6 @@ def test_a_new_gesture_is_reported_within_three_frames_and_one_odd_frame_changes
     assert labels == ["palm"] * 11
 
 
-def test_update_does_not_change_its_state() -> None:
-    state = update(None, seen(pose("palm")), SURE, ON, GESTURES)[0]
-    before = state.probabilities.copy()
-    update(state, seen(pose("fist")), SURE, ON, GESTURES)
-    assert (state.probabilities == before).all()
-    assert state.probabilities.sum() == pytest.approx(1)
-
-
 def test_the_pointing_ray_runs_along_the_index_finger() -> None:
     _, reported = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
     assert reported.gesture == "pointing_thumb"
@@ -356,44 +344,17 @@ def test_without_gestures_there_are_no_labels() -> None:
     assert state is None and reported.gesture == "" and math.isnan(reported.gesture_probability)
 
 
-def test_results_carry_the_gesture_and_the_ray(tmp_path: Path) -> None:
-    _, reported = tell_gesture(GESTURES, None, estimate(pose("gun")), SPACE)
-    with ResultWriter(tmp_path, {}, ["joint"] * 21) as writer:
-        writer.append((reported,))
-        writer.append((no_estimate(1, 0.04, "lost", 4, 0.0),))
-    found = read_results(tmp_path / "track.npz")
-    assert found["gesture"].tolist() == ["pointing_thumb", ""]
-    assert found["pinch"][0] == pytest.approx(reported.pinch) and np.isnan(found["pinch"][1])
-    assert found["pinching"].tolist() == [False, False]
-    assert found["pointing_direction"][0] == pytest.approx(reported.pointing_direction)
-    assert np.isnan(found["pointing_origin_m"][1]).all()
-    lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
-    assert lines[0]["pointing_origin_m"] == pytest.approx(reported.pointing_origin_m.tolist())
-    assert lines[1]["pointing_direction"] == [None] * 3
-
-
 @pytest.mark.parametrize(
     "bad",
     [
         {"flexion_rad": 0.0},
-        {"other": -1.0},
         {"smoothing": 1.0},
-        {"doubtful_score": 0.8},
-        {"off_rad": 0.0},
         {"known": "most"},
     ],
 )
 def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures"):
         gestures(**bad)
-
-
-def test_the_configurations_make_the_defaults() -> None:
-    made = instantiate(configuration().gestures)
-    assert made.names == GESTURES.names and made.settings == GESTURES.settings
-    assert instantiate(configuration("gestures=none").gestures) is None
-    paper = instantiate(configuration("experiment=paper").gestures)
-    assert paper.names == ("palm", "fist", "pointing", "other") and paper.settings.off_rad
 
 
 def test_the_tracker_tells_the_gestures_of_the_recording() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from toftrack.frames import Truth
-from toftrack.output.coverage import Coverage, coverage
+from toftrack.output.measures import coverage
 
 
 def case() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -28,18 +28,18 @@ def test_shares_are_of_visible_frames_and_of_hidden_joints() -> None:
     sigma[0, 0] = sigma[1, 5] = 0.001
     sigma[3] = 0.001  # the hand is out of view
     found = coverage(joints, sigma, truth_of(joints, hidden, seen=3))
-    assert found.in_region_90_pct == pytest.approx(100 * (1 - 2 / 63))
-    assert found.hidden_in_region_90_pct == pytest.approx(100 * (1 - 1 / 9))
-    assert found.without_region_pct == 0
+    assert found["in_region_90_pct"] == pytest.approx(100 * (1 - 2 / 63))
+    assert found["hidden_in_region_90_pct"] == pytest.approx(100 * (1 - 1 / 9))
+    assert found["without_region_pct"] == 0
 
 
 def test_joints_without_a_region_are_counted_apart() -> None:
     joints, sigma, _ = case()
     sigma[0], joints[1] = np.nan, np.nan
     found = coverage(joints, sigma, truth_of(joints, None))
-    assert found == Coverage(100.0, None, 50.0)
+    assert list(found.values()) == [100.0, None, 50.0]
 
 
 def test_without_a_visible_hand_there_is_no_figure() -> None:
     joints, sigma, hidden = case()
-    assert coverage(joints, sigma, truth_of(joints, hidden, seen=0)) == Coverage(None, None, None)
+    assert set(coverage(joints, sigma, truth_of(joints, hidden, seen=0)).values()) == {None}

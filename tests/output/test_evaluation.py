@@ -139,7 +139,7 @@ def lost_by_loops(
     return hits / flagged if flagged else None, hits / positive if positive else None
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(15))
 def test_agrees_with_a_second_implementation(seed: int) -> None:
     joints, lost, truth = random_case(seed)
     skip, ok, near, hold = (
@@ -166,18 +166,6 @@ def still_hand(count: int, **flags: Any) -> Truth:
     return Truth(**({"joints_m": joints, "visible": ones, "in_space": ones} | flags))
 
 
-def test_a_shift_is_its_length_and_vanishes_when_aligned() -> None:
-    truth = still_hand(10)
-    metrics = evaluate(truth.joints_m + (0.003, 0, 0.004), np.zeros(10, bool), truth)
-    assert metrics["frames"] == 5
-    for name in ("mean_mm", "median_mm", "p90_mm", "fingertip_mm", "mean_not_lost_mm"):
-        assert metrics[name] == pytest.approx(5.0)
-    assert metrics["wrist_aligned_mm"] == pytest.approx(0.0, abs=1e-9)
-    assert metrics["frames_max_below_40mm_pct"] == 100
-    assert metrics["lost_precision"] is None
-    assert metrics["reacquisition"] == []
-
-
 def test_flagging_cannot_improve_the_error() -> None:
     truth = still_hand(20)
     joints = truth.joints_m.copy()
@@ -187,52 +175,6 @@ def test_flagging_cannot_improve_the_error() -> None:
     assert flagged["mean_mm"] == honest["mean_mm"]
     assert flagged["frames_max_below_40mm_pct"] == honest["frames_max_below_40mm_pct"]
     assert flagged["mean_not_lost_mm"] == pytest.approx(0)
-
-
-def test_missing_estimates_count_as_failures() -> None:
-    truth = still_hand(15)
-    joints = truth.joints_m.copy()
-    joints[5:10, 7] = np.nan
-    metrics = evaluate(joints, None, truth)
-    assert metrics["missing_pct"] == 50
-    assert metrics["frames_max_below_40mm_pct"] == 50
-    assert metrics["mean_mm"] == 0
-    assert "lost_precision" not in metrics
-
-
-def test_no_estimate_at_all_has_no_error() -> None:
-    truth = still_hand(10)
-    metrics = evaluate(np.full((10, 21, 3), np.nan), np.ones(10, bool), truth)
-    assert metrics["mean_mm"] is None
-    assert metrics["missing_pct"] == 100
-
-
-def test_reacquisition_counts_frames_until_it_holds() -> None:
-    visible = np.ones(30, bool)
-    visible[10:15] = False
-    truth = still_hand(30, visible=visible, visible_fraction=visible * 1.0)
-    joints = truth.joints_m.copy()
-    joints[10:20] += 0.1
-    joints[21] += 0.1  # one good frame, 20, does not hold
-    assert evaluate(joints, np.zeros(30, bool), truth)["reacquisition"] == [
-        {"event": "return", "frame": 15, "delay": 7},
-        {"event": "entered", "frame": 15, "delay": 7},
-    ]
-    never = evaluate(joints, np.ones(30, bool), truth)["reacquisition"]
-    assert [event["delay"] for event in never] == [None, None]
-
-
-def test_lost_tolerance_forgives_only_near_a_change() -> None:
-    visible = np.ones(30, bool)
-    visible[10:20] = False
-    truth = still_hand(30, visible=visible)
-    late = np.zeros(30, bool)
-    late[13:23] = True  # three frames late at both ends
-    metrics = evaluate(truth.joints_m, late, truth, tolerance=3)
-    assert (metrics["lost_precision"], metrics["lost_recall"]) == (1.0, 1.0)
-    assert (metrics["lost_precision_strict"], metrics["lost_recall_strict"]) == (0.7, 0.7)
-    stricter = evaluate(truth.joints_m, late, truth, tolerance=2)
-    assert stricter["lost_recall"] == pytest.approx(5 / 6)
 
 
 @pytest.mark.parametrize("shape", [(9, 21, 3), (10, 20, 3), (10, 63)])

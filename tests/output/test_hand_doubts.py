@@ -60,9 +60,9 @@ def test_how_long_a_lost_hand_seemed_counts_where_most_was_lost_and_it_was_seen_
     def mean(often: int, seldom: int, tracked: int) -> float | None:
         facts = RunFacts()
         for frame in [seen] * often + [unseen] * seldom:
-            facts = facts.with_lost(frame)
+            facts.add_lost(frame)
         for _ in range(tracked):
-            facts = facts.tracked(None)
+            facts.add_tracked(None)
         return facts.mean_apparent_m()
 
     assert mean(20, 10, 5) == pytest.approx(0.226)

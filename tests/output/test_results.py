@@ -20,10 +20,9 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Truth
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output import records
-from toftrack.output.coverage import coverage
 from toftrack.output.evaluation import evaluate, metrics_table
-from toftrack.output.lines import KINDS, LINE_FIELDS, read_lines
+from toftrack.output.lines import LINE_FIELDS, read_lines
+from toftrack.output.measures import coverage
 from toftrack.output.results import ResultWriter, read_results, read_run_facts
 from toftrack.output.trust import Hand, trust
 from toftrack.programs.recover import recover
@@ -213,7 +212,7 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     lost = np.array([one.lost for one in estimates])
     now = truth[:12]
     headline = asdict(trust(joints, lost, Hand(now.joints_m, now.visible)))
-    regions = asdict(coverage(joints, np.full(joints.shape, 0.01), now))
+    regions = coverage(joints, np.full(joints.shape, 0.01), now)
     expected = {"trust": headline, "coverage": regions} | evaluate(joints, lost, now)
     further = summary["metrics"].pop("further")
     assert further["swap_pct"] == 0 and further["tip_mm"] == pytest.approx(10 * math.sqrt(3))
@@ -224,17 +223,6 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     assert table[2].split() == "false alarms 25.0 %".split()
     assert "in their 90 % region  100.0 % of the joints" in table
     assert summary["metrics"]["mean_mm"] == pytest.approx(10 * math.sqrt(3), rel=1e-4)
-
-
-def test_files_of_older_versions_are_results_as_well(tmp_path: Path) -> None:
-    write(tmp_path, [estimate(i) for i in range(3)])
-    later = {"confidence", "outside_rad", "side", "side_probability", "index", "state_name"}
-    with np.load(tmp_path / "track.npz") as archive:
-        facts = {"readme", "joint_parents", "openxr_joint_names", "openxr_joint_parents"}
-        facts |= {"angle_names"}
-        kept = {n: archive[n] for n in archive.files if n not in later | facts}
-    np.savez(tmp_path / "old.npz", **kept)
-    assert read_results(tmp_path / "old.npz").keys() == kept.keys()
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
@@ -353,17 +341,6 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
     assert many - few < 600 * 200  # a frame's numbers alone are 1100 bytes
 
 
-def test_the_end_of_a_run_does_not_wait_for_its_lines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(path: Path) -> None:
-        raise AssertionError("a run's lines take long to read")
-
-    monkeypatch.setattr(records, "read_lines", refuse)
-    write(tmp_path, [estimate(i) for i in range(records._PIECE + 2)])
-    assert len(read_results(tmp_path / "track.npz")["lost"]) == records._PIECE + 2
-
-
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
     odd = estimate(4, score=math.inf, gesture="", joints_m=np.full((21, 3), -np.inf))
     many = [no_estimate(0, 0.0, "searching", 4, 0.01), *(estimate(i) for i in range(1, 4)), odd]
@@ -373,19 +350,6 @@ def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) ->
     after = read_results(tmp_path / "track.npz")
     for name in LINE_FIELDS:
         np.testing.assert_array_equal(after[name], before[name])
-
-
-def test_what_takes_long_shows_how_far_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(tmp_path, [estimate(i) for i in range(6)])
-    recover(tmp_path)
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(records, "_SOON_S", 0)
-    recover(tmp_path)
-    reported = capsys.readouterr().err
-    assert "reading the lines" in reported
-    assert "writing the results" in reported
 
 
 def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
@@ -403,12 +367,9 @@ def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
     [
         {"metadata": []},
         {"metadata": {"camera": [1]}},
-        {"metadata": {"hand_shape": ["right"]}},
         {"metadata": {"pose_space": {"dims": 10**9}}},
         {"metadata": {"config": {"hands": 3}}},
-        {"metadata": {"config": {"device": 3}}, "truth": True},
         {"metadata": {"camera": {"K": 1}}},
-        {"joint_names": None},
     ],
     ids=str,
 )
@@ -426,8 +387,6 @@ def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[st
     [
         ("index", None, "has no 'index'"),
         ("joints_m", [[0, 0, 0]], "shape"),
-        ("lost", [True], "shape"),
-        ("state", [[1, 2], [3]], "line 1 of"),
         ("index", 10**19, "line 1 of"),
     ],
 )
@@ -462,17 +421,6 @@ def test_what_a_killed_run_left_unfinished_is_dropped(tmp_path: Path, rest: byte
     assert len(read_results(tmp_path / "track.npz")["lost"]) == 4
 
 
-def test_every_field_of_an_estimate_is_in_lines_and_arrays(tmp_path: Path) -> None:
-    write(tmp_path, [estimate(i) for i in range(2)])
-    names = {field.name for field in dataclasses.fields(Estimate)}
-    assert names == set(KINDS) == set(LINE_FIELDS) == set(read_lines_of(tmp_path)[0])
-    assert names <= read_results(tmp_path / "track.npz").keys()
-
-
-def read_lines_of(folder: Path) -> list[dict[str, Any]]:
-    return list(read_lines(folder / "track.jsonl"))
-
-
 def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     done = [estimate(i) for i in (2, 3, 6, 7)]
     truth = Truth(np.zeros((6, 21, 3)), np.ones(6, bool), np.ones(6, bool))
@@ -490,26 +438,9 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     assert content["state_name"].tolist() == reported
     assert content["lost"].tolist() == [estimate(i).lost for i in rows]
     # A dropped frame has no line: its number is missing.
-    assert [line["index"] for line in read_lines_of(tmp_path)] == [2, 3, 6, 7]
+    assert [line["index"] for line in read_lines(tmp_path / "track.jsonl")] == [2, 3, 6, 7]
     assert summary["frames"] == 6
     assert summary["mean_ms"] == pytest.approx(1e3 * np.mean([one.compute_s for one in done]))
-
-
-def test_closing_twice_writes_once(tmp_path: Path) -> None:
-    writer = write(tmp_path, [estimate(0)])
-    (tmp_path / "summary.json").unlink()
-    writer.close()
-    assert not (tmp_path / "summary.json").exists()
-
-
-def test_no_partial_file_is_left(tmp_path: Path) -> None:
-    write(tmp_path, [estimate(0)])
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "run.json",
-        "summary.json",
-        "track.jsonl",
-        "track.npz",
-    ]
 
 
 def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
@@ -521,12 +452,6 @@ def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
         "unknown": None,
         "n": 3,
     }
-
-
-def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(ToftrackError, match="file.*cannot be written.*hydra.run.dir"):
-        ResultWriter(tmp_path / "file" / "out", {}, NAMES, None)
 
 
 def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
@@ -547,21 +472,12 @@ def test_a_file_that_is_no_result_is_reported(tmp_path: Path, content: bytes | N
         read_results(path)
 
 
-def test_a_result_without_a_key_is_reported(tmp_path: Path) -> None:
-    np.savez(tmp_path / "track.npz", lost=np.zeros(3, bool))
-    with pytest.raises(ToftrackError, match="joints_m"):
-        read_results(tmp_path / "track.npz")
-
-
 @pytest.mark.parametrize(
     "changes",
     [
         {"lost": np.array(False)},
         {"lost": np.zeros((2, 1, 1), bool)},
-        {"index": np.array(["a", "b"])},
         {"score": np.zeros((2, 3), np.float32)},
-        {"latent": np.zeros((1, 2), np.float32)},
-        {"state": np.zeros((2, 26), np.float32)},
         {"metadata": np.array("[]")},
     ],
     ids=lambda changes: next(iter(changes)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -24,19 +23,6 @@ def folder(tmp_path: Path) -> Path:
         writer.append((hand_estimate(0),))
     default_hand_shape().save(tmp_path / "hand_shape.json")
     return tmp_path
-
-
-def test_a_run_that_does_not_say_where_it_ran_is_read(folder: Path) -> None:
-    facts = json.loads((folder / "run.json").read_text())
-    facts.pop("working_folder", None)
-    (folder / "run.json").write_text(json.dumps(facts))
-    assert read_run(folder).found("recording.npz") == Path("recording.npz")
-
-
-def test_a_summary_that_is_no_object_is_reported(folder: Path) -> None:
-    (folder / "summary.json").write_text("[]")
-    with pytest.raises(ToftrackError, match="summary.json' cannot be read"):
-        read_run(folder)
 
 
 def test_a_configuration_that_is_no_object_is_reported(folder: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.output.trust import Hand, interval, lingering, longest_run, trust, trust_of_two
+from toftrack.output.trust import Hand, interval, lingering, longest_run, slots_of_hands, trust
 
 J = 21
 
@@ -91,48 +91,15 @@ def test_found_after_counts_from_each_return() -> None:
     assert figures.found_after == (2, None)
 
 
-def test_a_hand_that_is_there_from_the_start_does_not_return() -> None:
-    true = hand([True] * 5)
-    assert trust(true.joints_m, flags("....."), true).found_after == ()
-
-
-def test_frames_at_the_start_can_be_left_out() -> None:
-    true = hand([True] * 4)
-    figures = trust(off(true, [90, 90, 0, 0]), flags("...."), true, skip=2)
-    assert (figures.frames, figures.usable_pct, figures.silent_pct) == (2, 100, 0)
-
-
-def test_any_number_of_joints_can_be_compared() -> None:
-    true = Hand(np.zeros((3, 11, 3)), np.ones(3, bool))
-    assert trust(np.zeros((3, 11, 3)), flags("..."), true).usable_pct == 100
-
-
-def test_two_hands_get_the_slots_that_fit() -> None:
-    left, right = hand([True] * 4, x=-0.2), hand([True] * 4, x=0.2)
-    joints = np.stack([right.joints_m, off(left, [0, 0, 0, 70])], axis=1)
-    figures = trust_of_two(joints, np.zeros((4, 2), bool), [left, right])
-    assert figures.first.usable_pct == 75
-    assert figures.second is not None and figures.second.usable_pct == 100
-    assert figures.ghost_pct is None
-
-
-def test_a_swap_on_the_way_is_an_error() -> None:
+def test_two_hands_get_the_slots_that_fit_for_the_whole_recording() -> None:
     left, right = hand([True] * 5, x=-0.2), hand([True] * 5, x=0.2)
-    joints = np.stack([left.joints_m, right.joints_m], axis=1)
-    joints[3:] = joints[3:, ::-1]
-    figures = trust_of_two(joints, np.zeros((5, 2), bool), [left, right])
-    assert figures.first.silent_pct == 40
-    assert figures.second is not None and figures.second.silent_pct == 40
-
-
-def test_a_second_hand_where_there_is_one_is_a_ghost() -> None:
-    true = hand([True] * 4)
-    joints = np.stack([np.full((4, J, 3), np.nan), true.joints_m], axis=1)
-    lost = np.stack([flags("xxx."), flags("....")], axis=1)
-    figures = trust_of_two(joints, lost, [true])
-    assert figures.first.usable_pct == 100
-    assert figures.second is None
-    assert figures.ghost_pct == 25
+    joints = np.stack([right.joints_m, left.joints_m], axis=1)
+    joints[4:] = joints[4:, ::-1]  # a swap is an error
+    lost = np.zeros((5, 2), bool)
+    assert slots_of_hands(joints, lost, [left, right]) == (1, 0)
+    assert slots_of_hands(joints, lost, [right]) == (0, 1)
+    lost[:, 0] = True  # as bad as far away
+    assert slots_of_hands(joints, lost, [right]) == (1, 0)
 
 
 def test_shapes_must_fit() -> None:
@@ -140,9 +107,7 @@ def test_shapes_must_fit() -> None:
     with pytest.raises(ToftrackError, match="same joints"):
         trust(true.joints_m[:3], flags("..."), true)
     with pytest.raises(ToftrackError, match="two slots"):
-        trust_of_two(true.joints_m, flags("...."), [true])
-    with pytest.raises(ToftrackError, match="true hands"):
-        trust_of_two(np.zeros((4, 2, J, 3)), np.zeros((4, 2), bool), [])
+        slots_of_hands(true.joints_m, flags("...."), [true])
 
 
 def test_the_interval_holds_the_mean() -> None:

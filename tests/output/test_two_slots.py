@@ -218,11 +218,11 @@ def test_advice_counts_a_slot_only_where_it_had_a_hand() -> None:
     nothing = (None, None)
     for i in range(4):
         watch.see((hand(i, 0), vacant(i)), depth, nothing)
-    assert watch.advice(None) == () and watch.facts[1].frames == 0
+    assert watch.advice(None) == () and watch.facts[1].counts["frames"] == 0
     for i in range(6):
         watch.see((vacant(i), vacant(i)), depth, nothing)
         watch.see((hand(i, 0), replace(hand(i, 1), lost=True)), depth, nothing)
-    assert (watch.facts[0].lost, watch.facts[0].frames) == (6, 16)
+    assert [watch.facts[0].counts[name] for name in ("lost", "frames")] == [6, 16]
     reported = watch.advice(None)
     assert reported and all(sentence.startswith("Slot 1: ") for sentence in reported)
     assert not any("hand.side" in sentence for sentence in reported)

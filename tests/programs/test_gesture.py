@@ -87,17 +87,11 @@ def test_what_cannot_be_distinguished_or_was_not_followed_is_refused(shows, here
 @pytest.mark.parametrize(
     ("words", "reported"),
     [
-        (("add", "rock", "sample"), "which part"),
         (("add", "rock", "sample", "--from", "3", "--to", "2"), "no part of a recording"),
         (("add", "rock", "sample", "--from", "3", "--to", "9"), "which lasts 3.96 s"),
-        (("add", "rock", "none.npz", *PART), "none.npz"),
         (("add", "other", "sample", *PART), "give another name"),
-        (("add", " ", "sample", *PART), "no name for a gesture"),
-        (("add", "palm", "sample", *PART), "there is a gesture 'palm' already"),
         (("add", "rock", "sample", *PART, "gestures=none"), "gestures=none knows no gesture"),
-        (("add", "rock", "sample", *PART, "hand.side=both"), "both"),
         (("add", "rock"), "not complete"),
-        (("list", "rock"), "too much"),
         (("list", "--file", "mine.csv"), "no .json"),
         (("remove", "rock"), "there is: mine"),
     ],

@@ -133,25 +133,6 @@ def test_dropped_frames_are_reported_alike_by_lines_results_and_exports(
     assert rows[2 * hands][header.index("state_name")] == "dropped"
 
 
-@pytest.mark.parametrize("hands", [1, 2])
-def test_results_of_older_versions_tell_dropped_frames_too(hands: int, tmp_path: Path) -> None:
-    write(tmp_path / "run", [0, 1, 4, 5], hands)
-    path = tmp_path / "run" / "track.npz"
-    reported = read_results(path)
-    with np.load(path) as archive:
-        older = {name: archive[name] for name in archive.files if name != "dropped"}
-    older["state_name"] = np.where(
-        older["state_name"] == "dropped", "tracking", older["state_name"]
-    )
-    np.savez(path, **older)
-    again = read_results(path)
-    np.testing.assert_array_equal(again["dropped"], reported["dropped"])
-    np.testing.assert_array_equal(again["state_name"], reported["state_name"])
-    del older["index"], older["state_name"]
-    np.savez(path, **older)
-    assert not read_results(path)["dropped"].any()
-
-
 @pytest.mark.parametrize("name", ["track.npz", "summary.json", LINES])
 def test_a_new_run_lets_nothing_go_that_is_no_runs(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(PRECIOUS)

@@ -84,43 +84,16 @@ def test_a_run_writes_its_files_directly_into_its_folder(whole) -> None:
     assert not list(folder.glob("*.part"))
 
 
-def test_track_npz_is_as_promised(whole) -> None:
-    promised = {
-        "joints_m": ((12, 21, 3), np.float32),
-        "lost": ((12,), np.bool_),
-        "state": ((12, 27), np.float32),
-        "latent": ((12, 4), np.float32),
-        "score": ((12,), np.float32),
-        "confidence": ((12,), np.float32),
-        "outside_rad": ((12,), np.float32),
-        "side_probability": ((12,), np.float32),
-        "index": ((12,), np.int64),
-        "covariance": ((12, 10, 10), np.float32),
-        "effective_sample_size": ((12,), np.float32),
-        "gesture_probability": ((12,), np.float32),
-        "pinch": ((12,), np.float32),
-        "pinching": ((12,), np.bool_),
-        "timestamp_s": ((12,), np.float64),
-        "compute_s": ((12,), np.float32),
-    }
+def test_track_npz_says_whose_hand_and_how_it_was_tracked(whole) -> None:
     with np.load(whole[0] / "track.npz", allow_pickle=False) as archive:
-        for key, (shape, kind) in promised.items():
-            assert archive[key].shape == shape, key
-            assert archive[key].dtype == kind, key
-        assert archive["gesture"].shape == (12,) and archive["gesture"].dtype.kind == "U"
         assert archive["joint_names"].tolist() == list(JOINT_NAMES)
         assert (archive["side"] == "right").all()
-        assert ((archive["side_probability"] > 0.5) & (archive["side_probability"] <= 1)).all()
-        sure = archive["confidence"]
-        assert ((sure >= 0) & (sure <= 1)).all()
-        assert (archive["outside_rad"] >= 0).all()
+        for name in ("confidence", "score", "side_probability"):
+            assert ((archive[name] >= 0) & (archive[name] <= 1)).all(), name
         metadata = json.loads(archive["metadata"].item())
         assert np.isfinite(archive["joints_m"]).all()
         assert np.allclose(archive["timestamp_s"], np.arange(12) / 25)
-        assert ((archive["score"] >= 0) & (archive["score"] <= 1)).all()
-    assert {"toftrack", "torch", "numpy", "seed", "device"} <= set(metadata)
-    assert {"pose_space", "hand_shape", "camera"} <= set(metadata)
-    assert metadata["seed"] == 0
+    assert {"toftrack", "torch", "numpy"} <= set(metadata) and metadata["seed"] == 0
     assert metadata["device"]["device"] == "sample" and metadata["device"]["stop"] == 12
     assert metadata["pose_space"] == {"kind": "pca", "dims": 4}
     assert metadata["camera"]["width"] == 176 and metadata["camera"]["K"][0][0] == 200
@@ -267,11 +240,8 @@ MILLIMETRES = np.full((3, 30, 40), 600.0, np.float32)
     [
         ("no depth", ("depth_m",), {}, "'depth_m'"),
         ("no camera", ("K",), {}, "'K'"),
-        ("one image", (), {"depth_m": MILLIMETRES[0] / 1000}, "dimensions"),
-        ("wrong camera", (), {"K": np.eye(4)}, "3x3"),
         ("no frames", (), {"depth_m": np.zeros((0, 30, 40), np.float32)}, "zero frames"),
         ("millimetres", (), {"depth_m": MILLIMETRES}, "/ 1000"),
-        ("whole millimetres", (), {"depth_m": MILLIMETRES.astype(np.uint16)}, "/ 1000"),
         ("pickled", (), {"K": np.array([{"fx": 1}], object)}, "pickled"),
     ],
 )
@@ -291,13 +261,6 @@ def test_a_bad_recording_ends_the_program_before_it_writes(here, tmp_path) -> No
     assert (status, out) == (1, "")
     assert err.startswith("error: ") and err.count("\n") == 1 and "bad.npz" in err
     assert not (tmp_path / "out" / "track.npz").exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut off"])
-def test_what_is_no_archive_is_one_clear_sentence(tmp_path, content: bytes) -> None:
-    (tmp_path / "bad.npz").write_bytes(content)
-    with pytest.raises(ToftrackError, match="bad.npz' is damaged .it is no .npz archive"):
-        Replay(tmp_path / "bad.npz")
 
 
 def test_a_pickle_by_itself_is_refused_and_not_loaded(tmp_path) -> None:
@@ -337,17 +300,10 @@ def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here
     ("overrides", "words"),
     [
         (["device.start=100"], "start=100"),
-        (["device.stop=101"], "stop=101"),
         (["compute=tpu"], "compute=tpu is unknown"),
-        (["renderer=opengl"], "renderer=opengl is unknown"),
         (["hand.shape=gone.json"], "gone.json"),
-        (["hand.side=both"], "hand.side"),
-        (["camera.file=gone.json"], "gone.json"),
         (["filter.particles=0"], "filter.particles"),
         (["device=replay"], "device.path"),
-        (["device=telescope"], "device=telescope"),
-        (["experiment=other"], "experiment=other"),
-        (["particles=3"], "particles"),
         (["hands=3"], "hands=3 is not possible"),
     ],
 )
@@ -367,20 +323,6 @@ def test_an_output_folder_that_cannot_be_written_is_one_clear_sentence(here, tmp
     status, out, err = here("device.stop=2", "view=none")
     assert (status, out) == (1, "")
     assert err.splitlines()[-1].startswith("error: the output folder")
-
-
-def test_a_recording_without_a_hand_is_lost_and_no_error(here, tmp_path) -> None:
-    depth = np.full((3, 30, 40), 1.5, np.float32)
-    depth[1], depth[2] = np.nan, -1
-    save(tmp_path / "empty.npz", depth_m=depth)
-    status, out, _ = here("device=replay", "device.path=empty.npz")
-    assert status == 0
-    result = read_results(tmp_path / "out" / "track.npz")
-    assert result["lost"].all() and np.isnan(result["joints_m"]).all()
-    assert (result["score"] == 0).all()
-    lines = (tmp_path / "out" / "track.jsonl").read_text().splitlines()
-    assert all(json.loads(line)["lost"] for line in lines) and len(lines) == 3
-    assert "3 of them lost" in out
 
 
 def test_what_was_written_before_an_error_is_kept(here, tmp_path) -> None:

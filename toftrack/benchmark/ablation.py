@@ -11,7 +11,6 @@ import argparse
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from toftrack.benchmark.accuracy import add_arguments, divided
@@ -125,9 +124,7 @@ def _differences(done: Mapping[str, list[Row]]) -> dict[str, Any]:
             "overrides": list(VARIANTS[name].overrides),
             "side": VARIANTS[name].side,
             "total": result_of(rows)["total"],
-            "differences": {
-                key: asdict(one) for key, one in compared(rows, done[DEFAULT]).differences.items()
-            },
+            "differences": compared(rows, done[DEFAULT])["differences"],
         }
         for name, rows in done.items()
     }

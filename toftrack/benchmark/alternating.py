@@ -233,18 +233,10 @@ def timed(which: Sequence[Program], rounds: int, peer_python: str | None = None)
     return found
 
 
-@dataclass(frozen=True)
-class Start:
-    """Seconds of one run of the command line on three frames.
-
-    first_s: until its first estimate.  wall_s: until its end.  user_s, system_s: of the processors.
-    """
-
-    kernels: bool
-    first_s: float
-    wall_s: float
-    user_s: float
-    system_s: float
+Start = dict[str, float]
+"""One run of the command line on three frames, seconds: `first_s` until its first estimate,
+`wall_s` until its end, `user_s` and `system_s` of the processors; `kernels`: whether they were
+compiled."""
 
 
 def starts(times: int) -> list[Start]:
@@ -252,11 +244,11 @@ def starts(times: int) -> list[Start]:
     found = []
     for _ in range(times):
         with tempfile.TemporaryDirectory() as folder:
-            found += [_start(folder, kernels) for kernels in (False, True)]
+            found += [_start(folder) | {"kernels": kernels} for kernels in (False, True)]
     return found
 
 
-def _start(folder: str, kernels: bool) -> Start:
+def _start(folder: str) -> Start:
     command = [sys.executable, "-m", "toftrack", "track", *_START, f"hydra.run.dir={folder}/run"]
     before = os.times()
     began = time.perf_counter()
@@ -272,11 +264,12 @@ def _start(folder: str, kernels: bool) -> Start:
     if process.returncode or not line:
         raise ToftrackError(f"{' '.join(command)} ended with status {process.returncode}")
     after = os.times()
-    user, system = (
-        after.children_user - before.children_user,
-        after.children_system - before.children_system,
-    )
-    return Start(kernels, first, wall, user, system)
+    return {
+        "first_s": first,
+        "wall_s": wall,
+        "user_s": after.children_user - before.children_user,
+        "system_s": after.children_system - before.children_system,
+    }
 
 
 def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
@@ -304,13 +297,11 @@ def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
                 f" percentile over that median {_spread(slow, 2)}"
             )
     for kernels in (False, True):
-        some = [start for start in begun if start.kernels == kernels]
+        some = [start for start in begun if start["kernels"] == kernels]
         if some:
             until_first, wall, user, system = (
-                _spread(values, 1)
-                for values in zip(
-                    *((s.first_s, s.wall_s, s.user_s, s.system_s) for s in some), strict=True
-                )
+                _spread([start[name] for start in some], 1)
+                for name in ("first_s", "wall_s", "user_s", "system_s")
             )
             lines.append(
                 f"three frames {'with' if kernels else 'without'} kernels, s: first estimate"
@@ -355,7 +346,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         result = {
             "machine": about,
             "frames": [asdict(times) for times in found],
-            "starts": [asdict(start) for start in begun],
+            "starts": begun,
         }
         write_whole(options.json, json.dumps(result) + "\n")
     return 0

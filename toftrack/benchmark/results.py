@@ -7,7 +7,6 @@ import os
 import platform
 import subprocess
 from collections.abc import Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -106,12 +105,12 @@ def read_rows(path: Path) -> list[Row]:
 def comparison_with(rows: Sequence[Row], others: Sequence[Row], name: str) -> dict[str, Any]:
     """Paired differences, JSON-able; ToftrackError where the two have nothing in common."""
     found = compared(rows, others)
-    if not found.pairs:
+    if not found["pairs"]:
         raise ToftrackError(
             f"'{name}' has none of these recordings with one of these seeds, so that nothing can "
             "be compared; measure the same recordings with the same seeds"
         )
-    return {"with": name, **asdict(found)}
+    return {"with": name, **found}
 
 
 def checked_targets(*paths: Path | None) -> None:

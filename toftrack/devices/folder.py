@@ -39,5 +39,7 @@ class Folder(Replay):
         if not path:
             raise ToftrackError("no folder was given; set device.path=FOLDER")
         store = read_png_folder(path, camera_file, unit_m, fps, intrinsics)
-        self._set_up(store, path, start, stop, realtime, repeat, camera_file, intrinsics)
+        super().__init__(
+            path, start, stop, realtime, repeat, camera_file, intrinsics=intrinsics, store=store
+        )
         self.description |= {"device": "folder", "unit_m": store.unit_m}

@@ -46,6 +46,7 @@ class Replay(BaseDevice):
         camera_file: a calibrated camera instead of the recording's own.
         modulation_mhz: of the SR3000, for a `.srs` that does not state its range.
         intrinsics: fx, fy, cx, cy in pixels, without distortion, instead of the recording's camera.
+        store: the recording, where it is open already.
 
     Raises:
         ToftrackError: the recording or the camera cannot be used, or the range lies outside.
@@ -61,24 +62,13 @@ class Replay(BaseDevice):
         camera_file: str | Path | None = None,
         modulation_mhz: int = DEFAULT_MODULATION_MHZ,
         intrinsics: Sequence[float] | None = None,
+        store: FrameStore | None = None,
     ) -> None:
         if not path:
-            raise ToftrackError("no recording to replay was given; set device.path=FILE.npz")
-        given = BareFacts(intrinsics)
-        store = open_recording(path, camera_file, modulation_mhz, bare=given)
-        self._set_up(store, path, start, stop, realtime, repeat, camera_file, intrinsics)
-
-    def _set_up(
-        self,
-        store: FrameStore,
-        path: str | Path,
-        start: int,
-        stop: int | None,
-        realtime: bool,
-        repeat: bool,
-        camera_file: str | Path | None,
-        intrinsics: Sequence[float] | None = None,
-    ) -> None:
+            raise ToftrackError("no recording to replay was given; set device.path=PATH")
+        if store is None:
+            bare = BareFacts(intrinsics)
+            store = open_recording(path, camera_file, modulation_mhz, bare=bare)
         self._recording = store
         damage = getattr(store, "damage", None)
         if damage:

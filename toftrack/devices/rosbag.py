@@ -36,5 +36,5 @@ class Bag(Replay):
         if not path:
             raise ToftrackError("no bag was given; set device.path=BAG")
         store = read_rosbag(path, topic, camera_file, unit_m)
-        self._set_up(store, path, start, stop, realtime, repeat, camera_file)
+        super().__init__(path, start, stop, realtime, repeat, camera_file, store=store)
         self.description |= {"device": "rosbag", **store.metadata, "unit_m": store.unit_m}

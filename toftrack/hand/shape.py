@@ -30,8 +30,6 @@ DEFAULT_HAND_LENGTH_M = 0.190
 
 _FORMAT = "toftrack-hand-shape"
 _VERSION = 2
-_READABLE = (1, 2)
-"""Version 1 has nothing of how the shape was fitted."""
 
 # Everything below is in millimetres for a hand of 190 mm and scaled from there.
 # Thumb CMC and the four knuckles in the hand frame. The transverse arch of the palm sets the
@@ -184,10 +182,10 @@ class HandShape:
             raise ToftrackError(f"{path} is not a readable hand shape file: {error}") from None
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
-        if content.get("version") not in _READABLE:
+        if content.get("version") != _VERSION:
             raise ToftrackError(
                 f"{path} is a hand shape of version {content.get('version')}, and this toftrack"
-                f" reads versions up to {_VERSION}; write it again with this version"
+                f" reads version {_VERSION}; write it again with this version"
             )
         fitted = content.get("fitted")
         try:

@@ -75,7 +75,7 @@ def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
     if total:
         rows = dict(result["each"])
         all_of = dict(total, first_right=total["median_first_right"])
-        table = _table(_COLUMNS, {**rows, "total": all_of}, "recording")
+        table = table_of(_COLUMNS, {**rows, "total": all_of}, "recording")
         heads = [title for title, _, _ in _COLUMNS if title in table[0]]
         keys = {title: (key, digits) for title, key, digits in _COLUMNS}
         table.append(["90 % interval", *(_interval(total, *keys[head]) for head in heads)])
@@ -88,9 +88,9 @@ def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
         for name, figures in images.items():
             shown[name] = figures
             shown |= {f"  {of}": row for of, row in figures.get("by", {}).items()}
-        tables["labelled images"] = _table(_IMAGE_COLUMNS, shown, "labels")
+        tables["labelled images"] = table_of(_IMAGE_COLUMNS, shown, "labels")
     for kind, found in result.get("groups", {}).items():
-        tables[kind] = _table(_GROUP_COLUMNS, found, kind)
+        tables[kind] = table_of(_GROUP_COLUMNS, found, kind)
     if comparison := result.get("comparison"):
         tables[f"differences to {comparison['with']}"] = difference_table(comparison["differences"])
     return tables
@@ -128,9 +128,10 @@ def markdown(table: Table) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [table[0], rule, *table[1:]])
 
 
-def _table(
+def table_of(
     columns: Sequence[tuple[str, str, int]], rows: Mapping[str, Mapping[str, Any]], first: str
 ) -> Table:
+    """Rows by name; columns (title, key, digits) that no row has anything for are left out."""
     used = [
         column for column in columns if any(r.get(column[1]) is not None for r in rows.values())
     ]

@@ -6,8 +6,9 @@ The facts are gathered while tracking, from lost frames only, so that a good run
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -57,78 +58,63 @@ class LostFrame:
     apparent_m: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass
 class RunFacts:
-    """What is known of a run's lost frames; numbers of frames but for the following.
+    """What is known of a run's lost frames.
 
+    counts: numbers of frames: all (`frames`), `lost` ones, and of these those in which nothing was
+        within segmentation.max_distance_m (`out_of_reach`), something too near to be measured well
+        (`too_near`), something taken for a hand (`with_hand`) that had too few pixels (`small`), in
+        which the networks said which hand it looked like (`judged`), the other one (`other_side`),
+        or how long it looked (`detections`); `tracked_judged`, `tracked_other_side`: the same of
+        frames that were not lost.
     states: lost frames by state name.
-    read: sum of the shares of pixels with a reading.
+    read, apparent_m: sums of the shares of pixels with a reading, and of how long the hand looked.
     nearest_m, farthest_m: between which nearly all readings of all lost frames lie.
     """
 
-    frames: int = 0
-    lost: int = 0
-    states: Mapping[str, int] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    states: Counter[str] = field(default_factory=Counter)
     read: float = 0.0
+    apparent_m: float = 0.0
     nearest_m: float = math.inf
     farthest_m: float = -math.inf
-    out_of_reach: int = 0
-    """Nothing was within segmentation.max_distance_m."""
-    too_near: int = 0
-    """Something was too near to be measured well."""
-    with_hand: int = 0
-    """Something was taken for a hand."""
-    small: int = 0
-    """That had too few pixels."""
-    judged: int = 0
-    """The networks said which hand it looked like."""
-    other_side: int = 0
-    """That was the other one."""
-    detections: int = 0
-    """The networks said how long it looked."""
-    apparent_m: float = 0.0
-    """The sum of that."""
-    tracked_judged: int = 0
-    """The same of frames that were not lost."""
-    tracked_other_side: int = 0
 
-    def tracked(self, other_side: bool | None) -> RunFacts:
-        """With one more frame that was not lost; other_side as in LostFrame."""
-        return replace(
-            self,
-            frames=self.frames + 1,
-            tracked_judged=self.tracked_judged + (other_side is not None),
-            tracked_other_side=self.tracked_other_side + (other_side is True),
-        )
+    def add_tracked(self, other_side: bool | None) -> None:
+        """One more frame that was not lost; other_side as in LostFrame."""
+        judged, other = other_side is not None, other_side is True
+        self.counts.update(frames=1, tracked_judged=judged, tracked_other_side=other)
 
-    def with_lost(self, frame: LostFrame) -> RunFacts:
-        """With one more frame that was."""
-        name = frame.state_name
-        return replace(
-            self,
-            frames=self.frames + 1,
-            lost=self.lost + 1,
-            states={**self.states, name: self.states.get(name, 0) + 1},
-            read=self.read + frame.read,
-            # Without readings both are NaN, which min and max pass over in this order.
-            nearest_m=min(self.nearest_m, frame.nearest_m),
-            farthest_m=max(self.farthest_m, frame.farthest_m),
-            out_of_reach=self.out_of_reach + (frame.within < _HARDLY <= frame.read),
-            too_near=self.too_near + (frame.nearest_m < _TOO_NEAR_M),
-            with_hand=self.with_hand + (frame.hand_px > 0),
-            small=self.small + (0 < frame.hand_px < _FEWEST_PX),
-            judged=self.judged + (frame.other_side is not None),
-            other_side=self.other_side + (frame.other_side is True),
-            detections=self.detections + (frame.apparent_m is not None),
-            apparent_m=self.apparent_m + (frame.apparent_m or 0.0),
+    def add_lost(self, frame: LostFrame) -> None:
+        """One more frame that was."""
+        self.counts.update(
+            frames=1,
+            lost=1,
+            out_of_reach=frame.within < _HARDLY <= frame.read,
+            too_near=frame.nearest_m < _TOO_NEAR_M,
+            with_hand=frame.hand_px > 0,
+            small=0 < frame.hand_px < _FEWEST_PX,
+            judged=frame.other_side is not None,
+            other_side=frame.other_side is True,
+            detections=frame.apparent_m is not None,
         )
+        self.states[frame.state_name] += 1
+        self.read += frame.read
+        self.apparent_m += frame.apparent_m or 0.0
+        # Without readings both are NaN, which min and max pass over in this order.
+        self.nearest_m = min(self.nearest_m, frame.nearest_m)
+        self.farthest_m = max(self.farthest_m, frame.farthest_m)
 
     def mean_apparent_m(self) -> float | None:
         """How long the hand looked, where most of a run was lost and enough was seen to say so."""
-        enough = max(_FEWEST_DETECTIONS, _DETECTIONS * self.lost)
-        if self.lost <= _MOST * self.frames or self.detections < enough:
+        count, lost = self.counts["detections"], self.counts["lost"]
+        if lost <= _MOST * self.counts["frames"]:
             return None
-        return self.apparent_m / self.detections
+        return (
+            self.apparent_m / count
+            if count >= max(_FEWEST_DETECTIONS, _DETECTIONS * lost)
+            else None
+        )
 
 
 def lost_frame(
@@ -165,16 +151,6 @@ def _apparent_m(insight: StepInfo | None) -> float | None:
     return None if detection is None or detection.present < _PRESENT else detection.length_m
 
 
-@dataclass(frozen=True)
-class _Tracked:
-    """A frame that was not lost; other_side as in LostFrame."""
-
-    other_side: bool | None
-
-
-_Frame = LostFrame | _Tracked
-
-
 class Watch:
     """Gathers the facts of a run, of each slot apart.
 
@@ -184,7 +160,7 @@ class Watch:
 
     def __init__(self, reach_m: float, slots: int = 1) -> None:
         self.reach_m = reach_m
-        self.facts = self.recent = self._stretch = (RunFacts(),) * slots
+        self.facts, self.recent, self._stretch = (_nothing(slots) for _ in range(3))
         self._seen = 0
 
     def see(
@@ -197,27 +173,24 @@ class Watch:
         and where there is no hand at all, the first slot misses it.
         """
         vacant = [is_vacant(estimate) for estimate in estimates]
-        missed = [slot > 0 or not all(vacant) for slot in range(len(estimates))]
-        frames = [
-            None if gone and idle else self._frame(estimate, depth_m, insight)
-            for gone, idle, estimate, insight in zip(
-                vacant, missed, estimates, insights, strict=True
-            )
-        ]
-        self.facts, self._stretch = _with(self.facts, frames), _with(self._stretch, frames)
+        for slot, (estimate, insight) in enumerate(zip(estimates, insights, strict=True)):
+            if vacant[slot] and (slot > 0 or not all(vacant)):
+                continue
+            if estimate.lost:
+                frame = lost_frame(estimate, depth_m, insight, self.reach_m)
+                for facts in (self.facts[slot], self._stretch[slot]):
+                    facts.add_lost(frame)
+            else:
+                for facts in (self.facts[slot], self._stretch[slot]):
+                    facts.add_tracked(_other_side(insight))
         self._seen += 1
         if _FEWEST_FRAMES <= self._seen < _STRETCH:
             self.recent = self._stretch
         elif self._seen % _STRETCH == 0:
-            self.recent, self._stretch = self._stretch, (RunFacts(),) * len(frames)
-
-    def _frame(self, estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None) -> _Frame:
-        if estimate.lost:
-            return lost_frame(estimate, depth_m, insight, self.reach_m)
-        return _Tracked(_other_side(insight))
+            self.recent, self._stretch = self._stretch, _nothing(len(estimates))
 
     def apparent_m(self) -> tuple[float | None, ...]:
-        """Of RunFacts.mean_looked_m, for each slot."""
+        """Of RunFacts.mean_apparent_m, for each slot."""
         return tuple(facts.mean_apparent_m() for facts in self.facts)
 
     def advice(self, side: str | None, recent: bool = False) -> tuple[str, ...]:
@@ -232,16 +205,8 @@ class Watch:
         )
 
 
-def _with(every: tuple[RunFacts, ...], frames: Sequence[_Frame | None]) -> tuple[RunFacts, ...]:
-    """Each slot's facts with its frame, None where it missed none."""
-    return tuple(
-        facts.with_lost(frame)
-        if isinstance(frame, LostFrame)
-        else facts
-        if frame is None
-        else facts.tracked(frame.other_side)
-        for facts, frame in zip(every, frames, strict=True)
-    )
+def _nothing(slots: int) -> tuple[RunFacts, ...]:
+    return tuple(RunFacts() for _ in range(slots))
 
 
 def advice(facts: RunFacts, side: str | None, reach_m: float) -> tuple[str, ...]:
@@ -250,24 +215,26 @@ def advice(facts: RunFacts, side: str | None, reach_m: float) -> tuple[str, ...]
     side: of the hand that was looked for; None where either was.
     reach_m: segmentation.max_distance_m.
     """
-    if facts.lost <= _MOST * facts.frames:
+    counts = facts.counts
+    if counts["lost"] <= _MOST * counts["frames"]:
         # A hand of the wrong side may be followed all the same, facing the wrong way.
-        if side is not None and facts.tracked_other_side > _MOST * facts.tracked_judged:
+        if side is not None and counts["tracked_other_side"] > _MOST * counts["tracked_judged"]:
             return (
-                f"In {facts.tracked_other_side} of {facts.frames} frames it looked like the other "
-                f"hand: {_if_it_is_the_other(side)}.",
+                f"In {counts['tracked_other_side']} of {counts['frames']} frames it looked like "
+                f"the other hand: {_if_it_is_the_other(side)}.",
             )
         return ()
     return (_seen(facts), *_remedies(facts, side, reach_m)[:2])
 
 
 def _seen(facts: RunFacts) -> str:
-    by_number = sorted(facts.states.items(), key=lambda state: -state[1])
+    by_number = facts.states.most_common()
     why = ", ".join(f"{STATES.get(name, name)}: {count}" for name, count in by_number)
-    read = facts.read / facts.lost
+    lost = facts.counts["lost"]
+    read = facts.read / lost
     range_m = f", from {facts.nearest_m:.2f} to {facts.farthest_m:.2f} m" if read > 0 else ""
     return (
-        f"{facts.lost} of {facts.frames} frames were lost ({why}), in which "
+        f"{lost} of {facts.counts['frames']} frames were lost ({why}), in which "
         f"{100 * read:.0f} % of the pixels had readings{range_m}."
     )
 
@@ -275,10 +242,12 @@ def _seen(facts: RunFacts) -> str:
 def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     """What to try, the most telling first."""
 
-    def mostly(frames: int, of: int = facts.lost) -> bool:
-        return frames > _MOST * of
+    counts = facts.counts
 
-    if facts.read < _HARDLY * facts.lost:
+    def mostly(what: str, of: str = "lost") -> bool:
+        return counts[what] > _MOST * counts[of]
+
+    if facts.read < _HARDLY * counts["lost"]:
         return [
             "There was hardly anything to see: check that the lens is free, that depth_m is not "
             "empty, and that its readings are not all invalid."
@@ -286,19 +255,19 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     if facts.farthest_m < _NO_CAMERA_M or facts.nearest_m > _NO_HAND_M:
         return ["No hand is tracked there: check the unit, depth_m must be in metres."]
     found = []
-    if mostly(facts.out_of_reach):
+    if mostly("out_of_reach"):
         found.append(
             f"Nothing was within segmentation.max_distance_m={reach_m:g}: hold the hand nearer, "
             "or raise that."
         )
-    if mostly(facts.too_near):
+    if mostly("too_near"):
         found.append(
             f"Something was nearer than {_TOO_NEAR_M:g} m: keep the hand 0.3 to 1 m away, and the "
             "view to it free."
         )
-    if side is not None and facts.judged and mostly(facts.other_side, facts.judged):
+    if side is not None and counts["judged"] and mostly("other_side", "judged"):
         found.append(f"It looked like the other hand: {_if_it_is_the_other(side)}.")
-    if facts.with_hand and mostly(facts.small, facts.with_hand):
+    if counts["with_hand"] and mostly("small", "with_hand"):
         found.append(
             f"What was taken for the hand had fewer than {_FEWEST_PX} pixels: hold it nearer, or "
             "let the camera give larger images."

@@ -222,7 +222,7 @@ def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _region_rows(coverage: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """How often 90 % regions hold, see coverage.py; nothing where there are none."""
+    """How often 90 % regions hold, see measures.py; nothing where there are none."""
     if coverage is None or coverage["in_region_90_pct"] is None:
         return []
     hidden = coverage["hidden_in_region_90_pct"]

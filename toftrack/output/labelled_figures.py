@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from toftrack.output.accuracy_tables import plain, table_of
 from toftrack.output.evaluation import TIPS
-from toftrack.output.trust import OK_MM, Hand, Trust, interval, trust
+from toftrack.output.trust import OK_MM, Hand, interval, trust
 
 _PERCENT = ("within_pct", "usable_pct", "partly_pct", "silent_pct", "false_alarm_pct")
 _COLUMNS = (
@@ -25,33 +25,14 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
-class LabelledFigures:
-    """The figures of one sequence. Errors are over all frames with an estimate, lost or not."""
-
-    frames: int
-    missing_pct: float
-    """Frames without an estimate: left out of the errors, and never within 40 mm."""
-    mean_mm: float | None
-    """Over all compared joints; None: there is no estimate at all."""
-    median_mm: float | None
-    fingertip_mm: float | None
-    within_pct: float
-    """Frames in which every compared joint is within 40 mm, lost or not."""
-    trust: Trust
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON-able, the figures of `trust` among the others; unrounded."""
-        own = {name: value for name, value in vars(self).items() if name != "trust"}
-        not_lost = {"mean_not_lost_mm": self.trust.mean_mm, "first_right": self.trust.first_right}
-        shares = {name: getattr(self.trust, name) for name in _PERCENT if name != "within_pct"}
-        return own | not_lost | shares | {"longest_silent": self.trust.longest_silent}
-
-
 def labelled_figures(
     joints_m: np.ndarray, lost: np.ndarray, true_m: np.ndarray, joints: tuple[int, ...]
-) -> LabelledFigures:
-    """The figures of one sequence in which the hand is always in view.
+) -> dict[str, Any]:
+    """The figures of one sequence in which the hand is always in view, JSON-able, unrounded.
+
+    Errors are over all frames with an estimate, lost or not, None where there is none; frames
+    without one (`missing_pct`) are never `within_pct`, where every joint is within 40 mm. The
+    others are those of trust.py.
 
     Args:
         joints_m: (T, J, 3) estimates in metres, with joints as the labels define them; not finite
@@ -63,25 +44,28 @@ def labelled_figures(
     Raises:
         ToftrackError: the shapes do not fit.
     """
-    figures = trust(joints_m, lost, Hand(true_m, np.ones(len(true_m), bool)))
+    of = trust(joints_m, lost, Hand(true_m, np.ones(len(true_m), bool)))
     finite = np.isfinite(joints_m).all(axis=(1, 2))
     error = 1e3 * np.linalg.norm(joints_m[finite] - true_m[finite], axis=2)
     tips = error[:, np.isin(joints, TIPS)]
     count = max(len(finite), 1)
-    return LabelledFigures(
-        frames=len(finite),
-        missing_pct=100.0 * float((~finite).sum()) / count,
-        mean_mm=float(error.mean()) if error.size else None,
-        median_mm=float(np.median(error)) if error.size else None,
-        fingertip_mm=float(tips.mean()) if tips.size else None,
-        within_pct=100.0 * float((error.max(axis=1) <= OK_MM).sum()) / count,
-        trust=figures,
-    )
+    return {
+        "frames": len(finite),
+        "missing_pct": 100.0 * float((~finite).sum()) / count,
+        "mean_mm": float(error.mean()) if error.size else None,
+        "median_mm": float(np.median(error)) if error.size else None,
+        "fingertip_mm": float(tips.mean()) if tips.size else None,
+        "within_pct": 100.0 * float((error.max(axis=1) <= OK_MM).sum()) / count,
+        "mean_not_lost_mm": of.mean_mm,
+        "first_right": of.first_right,
+        **{name: getattr(of, name) for name in _PERCENT[1:]},
+        "longest_silent": of.longest_silent,
+    }
 
 
-def totals(sequences: Mapping[str, LabelledFigures]) -> dict[str, Any]:
+def totals(sequences: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Means over sequences, JSON-able, with 90 % intervals of the shares usable and silent."""
-    rows = [figures.as_dict() for figures in sequences.values()]
+    rows = list(sequences.values())
     total: dict[str, Any] = {
         "sequences": len(rows),
         "frames": sum(row["frames"] for row in rows),
@@ -96,18 +80,7 @@ def totals(sequences: Mapping[str, LabelledFigures]) -> dict[str, Any]:
     return total
 
 
-def table(sequences: Mapping[str, LabelledFigures]) -> str:
+def table(sequences: Mapping[str, dict[str, Any]]) -> str:
     """One row a sequence and one of their means, without final newline. Shares in per cent."""
-    rows = {name: figures.as_dict() for name, figures in sequences.items()}
-    if len(rows) > 1:
-        rows["mean"] = totals(sequences)
-    width = max(len("sequence"), *(len(name) for name in rows))
-    lines = ["  ".join([f"{'sequence':<{width}}", *(title for title, _, _ in _COLUMNS)])]
-    for name, row in rows.items():
-        cells = [f"{_text(row.get(key), digits):>{len(title)}}" for title, key, digits in _COLUMNS]
-        lines.append("  ".join([f"{name:<{width}}", *cells]))
-    return "\n".join(lines)
-
-
-def _text(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    mean = {"mean": totals(sequences)} if len(sequences) > 1 else {}
+    return plain(table_of(_COLUMNS, {**sequences, **mean}, "sequence"))

@@ -56,6 +56,8 @@ DROPPED = "dropped"
 `state_name` is; they have no line, and their numbers are missing among those of the lines."""
 HAND_FIELDS = tuple(name for name in LINE_FIELDS if name not in FRAME_FIELDS)
 FROM_THE_START = (
+    "index",
+    "state_name",
     "joints_m",
     "lost",
     "state",
@@ -103,6 +105,14 @@ def line_content(
         if not is_vacant(estimate)
     ]
     return of_frame | {"hands": hands}
+
+
+def hands_of(line: dict[str, Any]) -> list[dict[str, Any]]:
+    """A record for each hand of a line, with what the line says of the frame as a whole."""
+    if "hands" not in line:
+        return [line]
+    frame = {name: value for name, value in line.items() if name != "hands"}
+    return [frame | hand for hand in line["hands"]]
 
 
 def hand_content(estimate: Estimate, names: Sequence[str]) -> dict[str, Any]:

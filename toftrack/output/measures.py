@@ -1,7 +1,7 @@
 """All that is measured of a track of one recording, from estimates and truth alone.
 
 A track is plain arrays, so that what any method found is measured alike. Beside the figures of
-trust.py and coverage.py, of each hand, over the frames in which it is visible:
+trust.py, of each hand, over the frames in which it is visible:
 
 - `usable_mean_mm`, `usable_tip_mm`: mean error of joints and of fingertips in usable frames.
 - `tip_mm`: mean error of the fingertips in frames that are not flagged lost, as `mean_mm`.
@@ -14,6 +14,8 @@ trust.py and coverage.py, of each hand, over the frames in which it is visible:
 - `tips_wrong`, `tips_right`: visible fingertips in frames that are not flagged lost, more than
   40 mm off and at most; `tips_wrong_flagged`, `tips_right_flagged`: those of them that `joint_ok`
   flags. Numbers, and none where the truth does not say which joints are visible.
+- `in_region_90_pct`, `hidden_in_region_90_pct`: joints, lost or not, that lie in their 90 % region,
+  of all that have one and of those that are out of sight; `without_region_pct`: that have none.
 - `side_right_end`, `side_right_soon`: whether the last frame in which a side is named, and the
   tenth after the first one, names the right one.
 - `side_wrong_certain_pct`: frames in which the wrong side is named with a probability above 0.9.
@@ -24,20 +26,21 @@ A figure is None where there is nothing that it could be about.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from toftrack.frames import Truth
-from toftrack.output.coverage import coverage
+from toftrack.hand.regions import in_region_90
 from toftrack.output.evaluation import TIPS
-from toftrack.output.trust import OK_MM, Hand, Judged, Trust, judged, trust, trust_of_two
+from toftrack.output.trust import OK_MM, Hand, Judged, Trust, figures_of, judged, slots_of_hands
 
 SWAP_MM = 10.0
 CERTAIN = 0.9
 SOON_FRAMES = 10
 FLAG_COUNTS = ("tips_wrong", "tips_wrong_flagged", "tips_right", "tips_right_flagged")
+REGION_FIGURES = ("in_region_90_pct", "hidden_in_region_90_pct", "without_region_pct")
 POSE_GESTURES = {
     "palm": "palm",
     "spread": "palm",
@@ -89,8 +92,8 @@ class Estimates:
 class Measured:
     """What was measured of one hand.
 
-    trust: its figures.  frames: what each frame is.  figures: see the head of this module, and of
-    coverage.py; JSON-able, unrounded.
+    trust: its figures.  frames: what each frame is.  figures: see the head of this module;
+    JSON-able, unrounded.
     """
 
     trust: Trust
@@ -119,24 +122,21 @@ def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
     Raises ToftrackError when estimates and truth differ in shape.
     """
     if np.ndim(estimates.joints_m) == 3:
-        found = trust(estimates.joints_m, estimates.lost, hand_of(truth))
-        return MeasuredRecording(_of_hand(found, estimates, truth))
+        return MeasuredRecording(_of_hand(estimates, truth))
     truths = [truth] if truth.other is None else [truth, truth.other]
-    both = trust_of_two(estimates.joints_m, estimates.lost, [hand_of(one) for one in truths])
-    first = _of_hand(both.first, estimates.slot(both.slots[0]), truth)
-    if both.second is None:
-        return MeasuredRecording(first, None, both.ghost_pct, both.slots)
-    second = _of_hand(both.second, estimates.slot(both.slots[1]), truths[1])
-    return MeasuredRecording(first, second, None, both.slots)
+    hands = [Hand(one.joints_m, one.visible) for one in truths]
+    slots = slots_of_hands(estimates.joints_m, estimates.lost, hands)
+    first, *second = (
+        _of_hand(estimates.slot(slot), one) for slot, one in zip(slots, truths, strict=False)
+    )
+    if second:
+        return MeasuredRecording(first, second[0], None, slots)
+    there = ~np.asarray(estimates.lost, bool)[:, slots[1]]
+    return MeasuredRecording(first, None, 100.0 * float(there.sum()) / max(len(there), 1), slots)
 
 
-def hand_of(truth: Truth) -> Hand:
-    """The truth of its first hand."""
-    return Hand(truth.joints_m, truth.visible)
-
-
-def _of_hand(found: Trust, estimates: Estimates, truth: Truth) -> Measured:
-    of = judged(estimates.joints_m, estimates.lost, hand_of(truth))
+def _of_hand(estimates: Estimates, truth: Truth) -> Measured:
+    of = judged(estimates.joints_m, estimates.lost, Hand(truth.joints_m, truth.visible))
     good = of.seen & of.said
     figures: dict[str, Any] = {
         "usable_mean_mm": _mean(of.error_mm[of.usable]),
@@ -146,7 +146,7 @@ def _of_hand(found: Trust, estimates: Estimates, truth: Truth) -> Measured:
         "jitter_mm": _jitter_mm(estimates.joints_m, truth, of.said),
     }
     if estimates.joint_sigma_m is not None:
-        figures |= asdict(coverage(estimates.joints_m, estimates.joint_sigma_m, truth))
+        figures |= coverage(estimates.joints_m, estimates.joint_sigma_m, truth)
     if estimates.joint_ok is not None and truth.joint_visible is not None:
         visible = good[:, None] & truth.joint_visible[:, TIPS]
         flagged = ~np.asarray(estimates.joint_ok, bool)[:, TIPS]
@@ -155,7 +155,20 @@ def _of_hand(found: Trust, estimates: Estimates, truth: Truth) -> Measured:
         named, right = gestures_right(estimates.gesture, of, truth)
         figures["gesture_pct"] = _share_pct(right, named)
     figures |= _side_figures(estimates, of, truth)
-    return Measured(found, of, figures)
+    return Measured(figures_of(of), of, figures)
+
+
+def coverage(
+    joints_m: np.ndarray, joint_sigma_m: np.ndarray, truth: Truth
+) -> dict[str, float | None]:
+    """The REGION_FIGURES of estimates (T, 21, 3) with standard deviations, see hand/regions.py."""
+    there = np.asarray(truth.visible, bool)[:, None] & np.ones(joints_m.shape[1], bool)
+    known = np.isfinite(joints_m).all(-1) & np.isfinite(joint_sigma_m).all(-1)
+    inside = in_region_90(joints_m, joint_sigma_m, truth.joints_m)
+    hidden = there & False if truth.joint_visible is None else there & ~truth.joint_visible
+    pairs = (inside, there & known), (inside, hidden & known), (~known, there)
+    shares = (100.0 * float(part[of].mean()) if of.any() else None for part, of in pairs)
+    return dict(zip(REGION_FIGURES, shares, strict=True))
 
 
 def flag_counts(off_mm: np.ndarray, flagged: np.ndarray) -> dict[str, int]:

@@ -27,8 +27,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.hand_records import hands_of
-from toftrack.output.lines import line_content
+from toftrack.output.lines import hands_of, line_content
 from toftrack.output.stream import UdpStream
 
 PARTS = ("joints", "landmarks", "openxr")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -22,35 +22,16 @@ COMPARED = ("longest_silent", "never_right", "first_right")
 """What is compared beside the means."""
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Of one figure: its means over the pairs here and there, and the mean difference (here -
-    there) with its 90 % interval over `recordings`."""
+def compared(here: Sequence[Row], there: Sequence[Row]) -> dict[str, Any]:
+    """The differences of rows by recording and seed, JSON-able.
 
-    here: float
-    there: float
-    mean: float
-    low: float
-    high: float
-    recordings: int
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """All figures that both have.
-
-    pairs: recordings with a seed that both have.  only_here, only_there: what is left out, in
-    words, "crowd/01_back_turn, seed 2".
+    Returns:
+        pairs: recordings with a seed that both have.
+        only_here, only_there: what is left out, in words, "crowd/01_back_turn, seed 2".
+        differences: of each figure that both have, its means over the pairs `here` and `there`, and
+            the `mean` difference (here - there) with its 90 % interval, `low` to `high`, over
+            `recordings`.
     """
-
-    pairs: int
-    only_here: tuple[str, ...]
-    only_there: tuple[str, ...]
-    differences: dict[str, Difference]
-
-
-def compared(here: Sequence[Row], there: Sequence[Row]) -> Comparison:
-    """The differences of rows by recording and seed."""
     mine, theirs = (
         {(row["recording"], row["seed"]): row for row in rows} for rows in (here, there)
     )
@@ -64,21 +45,20 @@ def compared(here: Sequence[Row], there: Sequence[Row]) -> Comparison:
                 both.setdefault(pair[0], []).append((float(values[0]), float(values[1])))
         if both:
             means = np.array([np.mean(values, axis=0) for values in both.values()])
-            share = interval((means[:, 0] - means[:, 1]).tolist())
-            here_mean, there_mean = means.mean(0).tolist()
-            differences[key] = Difference(
-                here=round(here_mean, 4),
-                there=round(there_mean, 4),
-                mean=round(share.mean, 4),
-                low=round(share.low, 4),
-                high=round(share.high, 4),
-                recordings=len(means),
-            )
-    return Comparison(len(common), _named(mine, theirs), _named(theirs, mine), differences)
+            found = dict(zip(("here", "there"), means.mean(0).tolist(), strict=True))
+            found |= asdict(interval((means[:, 0] - means[:, 1]).tolist()))
+            differences[key] = {name: round(value, 4) for name, value in found.items()}
+            differences[key]["recordings"] = len(means)
+    return {
+        "pairs": len(common),
+        "only_here": _named(mine, theirs),
+        "only_there": _named(theirs, mine),
+        "differences": differences,
+    }
 
 
-def _named(these: dict[Any, Row], others: dict[Any, Row]) -> tuple[str, ...]:
-    return tuple(f"{name}, seed {seed}" for name, seed in these if (name, seed) not in others)
+def _named(these: dict[Any, Row], others: dict[Any, Row]) -> list[str]:
+    return [f"{name}, seed {seed}" for name, seed in these if (name, seed) not in others]
 
 
 def rows_of(content: Any) -> list[Row]:

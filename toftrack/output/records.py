@@ -83,7 +83,7 @@ class Records:
         last = 1
         try:
             like = like or vars(no_estimate(0, 0, "", latent_size, 0))
-            _check(like, {*FROM_THE_START, "index"} - set(FRAME_FIELDS if slots > 1 else ()))
+            _check(like, set(FROM_THE_START) - set(FRAME_FIELDS if slots > 1 else ()))
             records = cls(lines.parent, like, slots)
             try:
                 read = read_lines(lines)

@@ -251,11 +251,6 @@ def read_results(path: str | Path) -> dict[str, Any]:
     Of a run with `hands=2` all arrays but index, timestamp_s and compute_s have an axis of two
     slots behind that of the frames.
 
-    A file of an older version lacks what came later (index, state_name, confidence, outside_rad,
-    side, side_probability, the joints' regions, confidence and joint_ok, the pointing ray, the
-    pinch).
-    `dropped`, which also came later, is there nevertheless.
-
     Raises ToftrackError when the file is missing, damaged or not a result.
     """
     path = Path(path).expanduser()
@@ -267,7 +262,10 @@ def read_results(path: str | Path) -> dict[str, Any]:
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
         _check_arrays({name: arrays[name] for name in known}, content["metadata"])
-        content |= _dropped(arrays, content)
+        dropped = arrays[DROPPED]
+        if dropped.dtype != bool or dropped.shape != (len(content["lost"]),):
+            raise ValueError(f"{DROPPED!r} does not fit")
+        content[DROPPED] = dropped
     except OSError as error:
         raise ToftrackError(
             f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
@@ -282,22 +280,6 @@ def read_results(path: str | Path) -> dict[str, Any]:
             f"'{path}' is not a track.npz, or it is damaged; give the path of one"
         ) from error
     return content
-
-
-def _dropped(arrays: dict[str, np.ndarray], content: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Which frames were dropped, (T,), and the names of states where older files do not say so."""
-    count = len(content["lost"])
-    if DROPPED in arrays:
-        if arrays[DROPPED].dtype != bool or arrays[DROPPED].shape != (count,):
-            raise ValueError(f"{DROPPED!r} does not fit")
-        return {DROPPED: arrays[DROPPED]}
-    held = content["metadata"].get("held_frames")
-    if "index" not in content or not isinstance(held, list) or not held:
-        return {DROPPED: np.zeros(count, bool)}
-    dropped = np.isin(content["index"], np.array(held, np.int64))
-    names = content.get("state_name")
-    reported = {} if names is None else {"state_name": _reported_dropped(names, dropped)}
-    return {DROPPED: dropped} | reported
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:

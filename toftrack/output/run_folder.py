@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
 
 from toftrack.camera import Camera
 from toftrack.devices.synthetic import Synthetic
@@ -18,7 +17,7 @@ from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
 from toftrack.help_text import fields_in_help
-from toftrack.json_text import parse_json, read_json
+from toftrack.json_text import read_json
 from toftrack.output.lines import HAND_FIELDS
 from toftrack.output.results import read_results, read_run_facts
 from toftrack.output.summary import shape_file
@@ -31,7 +30,6 @@ from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FIRST_SAMPLE, open_recording, open_sample
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
-from toftrack.safe_files import open_to_read
 
 FILES = ("track.npz", "track.jsonl", "summary.json", "hand_shape.json")
 """What a folder must hold to be a run's."""
@@ -125,8 +123,6 @@ class Run:
             if np.ndim(value) == 0:
                 values[name] = value.item()
         values |= {"index": int(self.frames[row]), "state_name": self.state_names[row]}
-        # Older runs do not say it of the joints.
-        values.setdefault("joint_ok", np.full(21, not values["lost"]))
         return Estimate(**values)
 
     def likelihood(self) -> FMeasure:
@@ -157,13 +153,8 @@ class Run:
     @property
     def _ran_in(self) -> str | None:
         """The working folder of the run; None: nobody knows."""
-        if (self.folder / "run.json").is_file():
-            folder = read_run_facts(self.folder).get("working_folder")
-            return None if folder is None else str(folder)
-        try:  # of an older version
-            return str(OmegaConf.load(self.folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd)
-        except Exception:  # no such file, or whatever a YAML reader may say about it
-            return None
+        folder = read_run_facts(self.folder).get("working_folder")
+        return None if folder is None else str(folder)
 
     def _settings(self, group: str) -> dict[str, Any]:
         settings = self.config.get(group)
@@ -240,15 +231,10 @@ def read_run(folder: str | Path) -> Run:
             f"moved; try `toftrack recover {folder}`"
         )
     results = read_results(folder / "track.npz")
-    rows = len(results["lost"])
-    if not rows:
+    if not len(results["lost"]):
         raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to read")
     slots = 1 if results["lost"].ndim == 1 else results["lost"].shape[1]
-    if {"index", "state_name"} <= results.keys():
-        of_first = results["state_name"] if slots == 1 else results["state_name"][:, 0]
-        frames, names = results["index"], tuple(of_first.tolist())
-    else:  # of an older version
-        frames, names = _lines(folder / "track.jsonl", rows)
+    of_first = results["state_name"] if slots == 1 else results["state_name"][:, 0]
     try:
         summary = read_json(folder / "summary.json")
         if not isinstance(summary, dict):
@@ -258,7 +244,7 @@ def read_run(folder: str | Path) -> Run:
             f"'{folder / 'summary.json'}' cannot be read ({error}); run track.py again"
         ) from None
     shapes = tuple(HandShape.load(folder / shape_file(slot)) for slot in range(slots))
-    return Run(folder, results, frames, names, summary, shapes)
+    return Run(folder, results, results["index"], tuple(of_first.tolist()), summary, shapes)
 
 
 def found_again(path: str | Path, ran_in: str | None) -> Path:
@@ -267,27 +253,6 @@ def found_again(path: str | Path, ran_in: str | None) -> Path:
     if path.exists() or path.is_absolute() or ran_in is None:
         return path
     return Path(ran_in) / path
-
-
-def _lines(path: Path, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Frame numbers and state names for the rows of track.npz, which also has dropped frames."""
-    try:
-        with open_to_read(path) as stream:
-            given = [parse_json(line) for line in stream.read().decode("utf-8").splitlines()]
-        index = np.array([int(line["index"]) for line in given])
-        names = [str(line["state_name"]) for line in given]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ToftrackError(f"'{path}' cannot be read ({error}); run track.py again") from None
-    if len(index) and (np.diff(index) >= 1).all():
-        every = np.arange(index[0], index[-1] + 1)
-        names = [names[i] for i in np.searchsorted(index, every, side="right") - 1]
-        index = every
-    if len(index) != rows:
-        raise ToftrackError(
-            f"'{path}' has {len(index)} frames, but track.npz beside it {rows}: they are of "
-            "different runs; run track.py again"
-        )
-    return index, tuple(names)
 
 
 def open_footage(run: Run, recording: str | Path | None = None) -> Footage | None:

@@ -20,15 +20,13 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
-from toftrack.output.coverage import Coverage
 from toftrack.output.evaluation import evaluate
 from toftrack.output.hand_doubts import apparent_doubt, length_doubt
-from toftrack.output.measures import Estimates, Measured, measured
+from toftrack.output.measures import REGION_FIGURES, Estimates, Measured, measured
 from toftrack.output.records import Records
 from toftrack.recordings.doubts import times_doubt
 
 _MEASURED = tuple(field.name for field in fields(Estimates))
-_REGIONS = tuple(field.name for field in fields(Coverage))
 
 
 def shape_file(slot: int) -> str:
@@ -180,8 +178,8 @@ def _metrics(
     metrics = {"trust": asdict(of.trust)} | evaluate(joints, lost, truth)
     for event in metrics["reacquisition"]:
         event["frame"] = int(position[event["frame"]])
-    regions = {name: of.figures.get(name) for name in _REGIONS}
-    further = {name: value for name, value in of.figures.items() if name not in _REGIONS}
+    regions = {name: of.figures.get(name) for name in REGION_FIGURES}
+    further = {name: value for name, value in of.figures.items() if name not in REGION_FIGURES}
     if "joint_sigma_m" in arrays:
         metrics["coverage"] = regions
     return metrics | {"further": further}

@@ -45,9 +45,8 @@ class Trust:
     """The figures of one track of one hand, see the head of this module. Shares in per cent."""
 
     frames: int
-    """How many count."""
     visible: int
-    """How many of them show the hand."""
+    """How many show the hand."""
     usable_pct: float
     partly_pct: float
     false_alarm_pct: float
@@ -78,9 +77,8 @@ class Hand:
 class Judged:
     """What each of T frames is, see the head of this module: (T,) bool, but for the errors."""
 
-    counted: np.ndarray
     seen: np.ndarray
-    """Counted frames in which the hand is visible."""
+    """The hand is visible."""
     said: np.ndarray
     """There is an estimate that is not flagged lost."""
     usable: np.ndarray
@@ -94,19 +92,6 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class TwoSlots:
-    """The figures of a track of two slots."""
-
-    first: Trust
-    second: Trust | None
-    """None where the recording has one hand."""
-    ghost_pct: float | None
-    """Frames in which the slot without a hand says that it has one; None where both have theirs."""
-    slots: tuple[int, int]
-    """The first hand's and the other one."""
-
-
-@dataclass(frozen=True)
 class Share:
     """A mean over recordings with its 90 % bootstrap interval, per cent."""
 
@@ -115,66 +100,67 @@ class Share:
     high: float
 
 
-def trust(joints_m: np.ndarray, lost: np.ndarray, hand: Hand, skip: int = 0) -> Trust:
+def trust(joints_m: np.ndarray, lost: np.ndarray, hand: Hand) -> Trust:
     """The figures of one track, unrounded.
 
     Args:
         joints_m: (T, J, 3) estimates in metres, camera frame; not finite where there is none.
         lost: (T,) bool.
         hand: the truth about the same T frames and J joints.
-        skip: frames at the start that do not count.
 
     Raises:
         ToftrackError: estimates and truth differ in shape.
     """
-    of = judged(joints_m, lost, hand, skip)
-    average, visible = of.mean_mm, np.asarray(hand.visible, bool)
-    right = _runs(visible & of.said & (average < RIGHT_MM), RIGHT_FRAMES)
-    returns = np.flatnonzero(visible[1:] & ~visible[:-1]) + 1
-    good = of.seen & of.said
+    return figures_of(judged(joints_m, lost, hand))
+
+
+def figures_of(of: Judged) -> Trust:
+    """The figures of a track whose frames were judged."""
+    average, seen = of.mean_mm, of.seen
+    right = _runs(seen & of.said & (average < RIGHT_MM), RIGHT_FRAMES)
+    returns = np.flatnonzero(seen[1:] & ~seen[:-1]) + 1
+    good = seen & of.said
     return Trust(
-        frames=int(of.counted.sum()),
-        visible=int(of.seen.sum()),
-        usable_pct=_share_pct(of.usable, of.seen),
-        partly_pct=_share_pct(of.partly, of.seen),
-        false_alarm_pct=_share_pct(of.false_alarm, of.seen),
-        silent_pct=_share_pct(of.silent, of.counted),
+        frames=len(seen),
+        visible=int(seen.sum()),
+        usable_pct=_share_pct(of.usable, seen),
+        partly_pct=_share_pct(of.partly, seen),
+        false_alarm_pct=_share_pct(of.false_alarm, seen),
+        silent_pct=100.0 * float(of.silent.sum()) / max(len(seen), 1),
         longest_silent=longest_run(of.silent),
         mean_mm=float(average[good].mean()) if good.any() else None,
-        mean_all_mm=float(np.minimum(average[of.seen], MOST_MM).mean()) if of.seen.any() else None,
+        mean_all_mm=float(np.minimum(average[seen], MOST_MM).mean()) if seen.any() else None,
         first_right=_until(right, 0),
         found_after=tuple(_until(right, int(frame)) for frame in returns),
     )
 
 
-def judged(joints_m: np.ndarray, lost: np.ndarray, hand: Hand, skip: int = 0) -> Judged:
+def judged(joints_m: np.ndarray, lost: np.ndarray, hand: Hand) -> Judged:
     """What each frame of a track is; arguments and errors as of `trust`."""
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
     _check(estimate.shape, lost.shape, hand)
-    visible = np.asarray(hand.visible, bool)
+    seen = np.asarray(hand.visible, bool)
     finite = np.asarray(np.isfinite(estimate).all((1, 2)))
     error = _errors_mm(estimate, finite, hand)
     average, largest = error.mean(1), error.max(1)
-    counted = np.arange(len(lost)) >= skip
-    said, seen = ~lost & finite, visible & counted
-    wrong = np.where(visible, average > OK_MM, ~lingering(visible, FORGIVEN_FRAMES))
+    said = ~lost & finite
+    wrong = np.where(seen, average > OK_MM, ~lingering(seen, FORGIVEN_FRAMES))
     return Judged(
-        counted=counted,
         seen=seen,
         said=said,
         usable=seen & said & (largest <= OK_MM),
         partly=seen & said & (average <= OK_MM) & (largest > OK_MM),
         false_alarm=seen & lost & finite & (largest <= OK_MM),
-        silent=counted & said & wrong,
+        silent=said & wrong,
         error_mm=error,
         mean_mm=average,
     )
 
 
-def trust_of_two(
-    joints_m: np.ndarray, lost: np.ndarray, hands: Sequence[Hand], skip: int = 0
-) -> TwoSlots:
-    """The figures of a track of two slots.
+def slots_of_hands(
+    joints_m: np.ndarray, lost: np.ndarray, hands: Sequence[Hand]
+) -> tuple[int, int]:
+    """The slot of the first hand, and the other one.
 
     Each true hand has one slot for the whole recording, the one with the smaller sum of errors; a
     swap on the way counts as error.
@@ -183,10 +169,9 @@ def trust_of_two(
         joints_m: (T, 2, J, 3) metres, camera frame.
         lost: (T, 2) bool.
         hands: one or two.
-        skip: as for `trust`.
 
     Raises:
-        ToftrackError: as `trust`, or there are not two slots, or not one or two hands.
+        ToftrackError: as `trust`, or there are not two slots.
     """
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
     if estimate.ndim != 4 or estimate.shape[1] != 2 or lost.shape != estimate.shape[:2]:
@@ -194,8 +179,6 @@ def trust_of_two(
             "a track of two slots must have joints of the shape (T, 2, J, 3) and lost of (T, 2), "
             f"but they are {estimate.shape} and {lost.shape}"
         )
-    if len(hands) not in (1, 2):
-        raise ToftrackError(f"there are {len(hands)} true hands; one or two can be compared")
     for hand in hands:
         _check(estimate[:, 0].shape, lost[:, 0].shape, hand)
 
@@ -203,15 +186,7 @@ def trust_of_two(
         pairs = zip(order, hands, strict=False)  # one hand leaves a slot over
         return sum(_cost(estimate[:, slot], lost[:, slot], hand) for slot, hand in pairs)
 
-    slots = min(((0, 1), (1, 0)), key=cost)
-    figures = [
-        trust(estimate[:, slot], lost[:, slot], hand, skip)
-        for slot, hand in zip(slots, hands, strict=False)
-    ]
-    if len(hands) == 2:
-        return TwoSlots(first=figures[0], second=figures[1], ghost_pct=None, slots=slots)
-    there = ~lost[skip:, slots[1]]
-    return TwoSlots(figures[0], None, 100.0 * float(there.mean()) if there.size else 0.0, slots)
+    return min(((0, 1), (1, 0)), key=cost)
 
 
 def interval(shares: Sequence[float], draws: int = 2000, seed: int = 0) -> Share:

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from toftrack.api import make_tracker
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.labelled_figures import LabelledFigures, labelled_figures, table, totals
+from toftrack.output.labelled_figures import labelled_figures, table, totals
 from toftrack.programs import command_line
 from toftrack.recordings.datasets import DATA_SETS, open_data_set
 from toftrack.recordings.datasets.base import DataSet, LabelledSequence, compared_joints
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "tips": data_set.tips,
             "tip_inset_mm": 1e3 * inset_m,
             "total": totals(figures),
-            "sequences": {name: values.as_dict() for name, values in figures.items()},
+            "sequences": figures,
         }
         _write(Path(options.json), facts)
 
@@ -57,7 +57,7 @@ def evaluate(
     overrides: Sequence[str],
     tip_inset_m: float,
     frames: int | None = None,
-) -> dict[str, LabelledFigures]:
+) -> dict[str, dict[str, Any]]:
     """Track sequences and compare them with their labels; the figures by the sequences' names.
 
     Args:

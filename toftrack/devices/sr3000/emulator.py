@@ -98,12 +98,6 @@ class EmulatedBackend(IBackend):
             over = not self._settings.loop and self._position >= len(self._source)
             return over and not self._queue
 
-    @property
-    def claimed(self) -> int:
-        """Interfaces that are claimed now."""
-        with self._lock:
-            return sum(handle.claimed for handle in self.open_handles)
-
     def unplug(self, seconds: float | None = None) -> None:
         """Pull the cameras out, for some time or (None) until `plug_in`; the scene goes on."""
         with self._lock:

@@ -6,7 +6,7 @@ Every number below is a setting, because some of them were never tried against a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -199,11 +199,6 @@ def parse_id(text: str) -> tuple[int, int]:
             f"device.usb.ids: '{text}' is not VENDOR:PRODUCT in hexadecimal, as 1ad2:0074"
         ) from None
     return vendor, product
-
-
-def known_ids(ids: Iterable[str]) -> str:
-    """The ids as they stand in messages."""
-    return ", ".join(ids)
 
 
 def _check_whole(name: str, value: object, least: int, most: int) -> None:

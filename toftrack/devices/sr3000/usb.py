@@ -25,7 +25,6 @@ from toftrack.devices.sr3000.transport import (
     NoAnswerError,
     UnpluggedError,
     UsbSettings,
-    known_ids,
     parse_id,
 )
 from toftrack.errors import ToftrackError
@@ -141,7 +140,7 @@ class UsbTransport:
 
     def _find(self) -> usb.core.Device:
         ids = {parse_id(text) for text in self._settings.ids}
-        names = known_ids(self._settings.ids)
+        names = ", ".join(self._settings.ids)
         try:
             found = list(
                 usb.core.find(
