@@ -24,9 +24,7 @@ from toftrack.detector.network import (
     SIGMA_M,
     cube_rotations,
 )
-from toftrack.detector.proposals import DOUBT_M, KEPT
-from toftrack.hand.overlap_numba import add_overlaps
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
+from toftrack.detector.proposals import KEPT
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
 _ANCHORS = cube_rotations().double().numpy()
@@ -43,20 +41,13 @@ def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
     hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
     c, out: the row to write in the arrays of `_empty`.
     """
-    _, _, _, log_size, _, _, _, joints, sigma, present, right = out
+    joints, sigma, present, right = out[7:]
     present[c], right[c] = heads[len(_ANCHORS) * EACH], heads[len(_ANCHORS) * EACH + 1]
     _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
     _decode_keypoints(keypoints, depth, joints[c], sigma[c])
     for j in range(JOINTS):
         p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
         _into_camera(p, turn, centre, mirror, joints[c, j])
-    of_finger = np.zeros(5, np.float64)
-    length = DEFAULT_HAND_LENGTH_M * math.exp(log_size[c, 0])
-    add_overlaps(joints[c], length, of_finger)
-    for finger in range(5):
-        doubt = DOUBT_M * min(of_finger[finger], 1.0)
-        for joint in range(2 + 4 * finger, 5 + 4 * finger):
-            sigma[c, joint] = math.sqrt(sigma[c, joint] ** 2 + doubt * doubt)
 
 
 @compiled

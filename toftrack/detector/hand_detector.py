@@ -26,6 +26,9 @@ _AGAIN = 2.0
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
+_OF_HYPOTHESES = "pivot_m rotvec angles joints_m log_size log_probability error_m".split()
+"""Fields of a Detection that have a row for each hypothesis."""
+
 
 @dataclass(frozen=True)
 class DetectorSettings:
@@ -43,9 +46,7 @@ class DetectorSettings:
     keypoint_weight: float
 
     def __post_init__(self) -> None:
-        for name in ("places", "hypotheses"):
-            check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
-        for name in ("every", "search"):
+        for name in ("places", "hypotheses", "every", "search"):
             check_number(f"detector.{name}", getattr(self, name), 1, whole=True)
         check_number("detector.sure", self.sure, 0.5, 0.999)
         check_number("detector.least", self.least, 0, 1)
@@ -114,17 +115,7 @@ class Detection:
 
     def first(self, count: int) -> Detection:
         """With only so many hypotheses."""
-        kept = slice(None, count)
-        return replace(
-            self,
-            pivot_m=self.pivot_m[kept],
-            rotvec=self.rotvec[kept],
-            angles=self.angles[kept],
-            joints_m=self.joints_m[kept],
-            log_size=self.log_size[kept],
-            log_probability=self.log_probability[kept],
-            error_m=self.error_m[kept],
-        )
+        return replace(self, **{name: getattr(self, name)[:count] for name in _OF_HYPOTHESES})
 
 
 NO_DETECTION = Detection(
@@ -181,8 +172,7 @@ class HandDetector:
         up: np.ndarray | None = None,
     ) -> Callable[[], Detection]:
         """The same at one place (3,), begun beside whatever does not need it."""
-        ups = None if up is None else up[None]
-        wait = start_pose_network(self.pose, depth_m, k, centre_m[None], side, ups)
+        wait = start_pose_network(self.pose, depth_m, k, centre_m, side, up)
         return lambda: _detection(wait(), 0)
 
     def search(
@@ -246,13 +236,7 @@ def doubt_m(detection: Detection) -> float:
 
 def _detection(seen: NetworkOutput, row: int) -> Detection:
     return Detection(
-        pivot_m=seen.pivot_m[row],
-        rotvec=seen.rotvec[row],
-        angles=seen.angles[row],
-        joints_m=seen.joints_m[row],
-        log_size=seen.log_size[row],
-        log_probability=seen.log_probability[row],
-        error_m=seen.error_m[row],
+        **{name: getattr(seen, name)[row] for name in _OF_HYPOTHESES},
         keypoints=Keypoints(seen.keypoints_m[row], seen.sigma_m[row]),
         present=float(seen.present[row].sigmoid()),
         right_side=float(seen.right[row].sigmoid()),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -82,18 +82,14 @@ _HAND_M2 = 0.0105
 
 
 @dataclass(frozen=True, eq=False)
-class Crops:
-    """Crops and what is in them, in the crop's frame about its centre.
+class CropHands:
+    """The hands of N crops, in the crop's frame about its centre.
 
-    image: (N, CROP_CHANNELS, CROP, CROP).
-    parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
     present: (N,) there is a hand near the centre.  right: (N,) and it is a right one.
     pivot_m: (N, 3).  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
     joints_m: (N, 21, 3).
     """
 
-    image: Tensor
-    parts: Tensor
     present: Tensor
     right: Tensor
     pivot_m: Tensor
@@ -104,13 +100,24 @@ class Crops:
 
 
 @dataclass(frozen=True, eq=False)
-class CropScenes:
-    """What crops show, before they are taken; N of each.
+class Crops(CropHands):
+    """Crops and what is in them; `present`: and it is seen.
+
+    image: (N, CROP_CHANNELS, CROP, CROP).
+    parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
+    """
+
+    image: Tensor
+    parts: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class CropScenes(CropHands):
+    """What crops show, before they are taken; `present`: seen or not.
 
     shots: the pictures that crops are read of.  side: (N, 2) int32 pixels of such a picture and, in
     its middle, of the crop.  distance_m: of the crops' centres.  turned: by how much crops are
     turned, radians.  borders: (N, 2, 3) what lies in the image, see images_numba.
-    present: there is a hand near the centre, seen or not.  The rest: as in Crops.
     """
 
     shots: Shots
@@ -118,13 +125,6 @@ class CropScenes:
     distance_m: Tensor
     turned: Tensor
     borders: Tensor
-    present: Tensor
-    right: Tensor
-    pivot_m: Tensor
-    rotation: Tensor
-    angles: Tensor
-    log_size: Tensor
-    joints_m: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,17 +175,8 @@ def _crops(scenes: CropScenes, image: Tensor, parts: Tensor) -> Crops:
     parts = torch.where(parts == OTHER_HAND, OTHER_FOREARM, parts)
     parts = torch.where(parts == THING, SEGMENTS - 1, parts)
     visible = (parts == HAND).sum((1, 2)) >= 12
-    return Crops(
-        image=image,
-        parts=parts,
-        present=scenes.present & visible,
-        right=scenes.right,
-        pivot_m=scenes.pivot_m,
-        rotation=scenes.rotation,
-        angles=scenes.angles,
-        log_size=scenes.log_size,
-        joints_m=scenes.joints_m,
-    )
+    hands = {field.name: getattr(scenes, field.name) for field in fields(CropHands)}
+    return Crops(**hands | {"present": scenes.present & visible}, image=image, parts=parts)
 
 
 def crop_scenes(n: int, bank: ShapeBank, generator: torch.Generator) -> CropScenes:

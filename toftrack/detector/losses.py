@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import roma
 import torch
@@ -43,23 +42,9 @@ def _mean_hand(device: torch.device) -> HandShape:
     return default_hand_shape().to(device)
 
 
-@dataclass(frozen=True, eq=False)
-class PoseLosses:
-    """Sums to the loss, and what is reported; all () tensors on the network's device.
-
-    hypothesis_mm, keypoints_mm: mean errors of the likeliest hypothesis and of the keypoints.
-    """
-
-    total: Tensor
-    hypothesis_mm: Tensor
-    keypoints_mm: Tensor
-    within_20: Tensor
-    side: Tensor
-    present: Tensor
-
-
-def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> PoseLosses:
-    """See PoseLosses. Poses and joints of right hands count; side, parts and presence of all.
+def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss and what is reported, all () tensors on the network's device. Poses and joints of
+    right hands count; side, parts and presence of all.
 
     What does not count has a weight of 0, so that all sizes are the same in each step: a CUDA
     device is told once what to do, see training.
@@ -103,14 +88,13 @@ def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> PoseLosses:
         )
         off = (likeliest - crops.joints_m).norm(dim=-1).mean(1)
         right_side = ((p.right > 0) == crops.right).float()
-        return PoseLosses(
-            loss,
-            1e3 * (counting * off).sum(),
-            1e3 * (counting * miss.mean(1)).sum(),
-            (counting * (off < 0.02)).sum(),
-            (_shares(there) * right_side).sum(),
-            ((p.present > 0) == crops.present).float().mean(),
-        )
+        return loss, {
+            "joints_mm": 1e3 * (counting * off).sum(),
+            "keypoints_mm": 1e3 * (counting * miss.mean(1)).sum(),
+            "within_20_mm": (counting * (off < 0.02)).sum(),
+            "side": (_shares(there) * right_side).sum(),
+            "present": ((p.present > 0) == crops.present).float().mean(),
+        }
 
 
 def _shares(weights: Tensor) -> Tensor:

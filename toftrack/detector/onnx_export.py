@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import logging
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +21,7 @@ from toftrack.detector.onnx_networks import (
     digest,
     onnx_file,
     open_session,
+    quiet,
 )
 from toftrack.detector.quantisation import COMPARED, compare, example_crops, quantised
 from toftrack.detector.weights import load_weights
@@ -114,7 +111,7 @@ def _exported(
     network: nn.Module, example: Tensor, name: str, outputs: list[str], sizes: dict[int, Any]
 ) -> Any:
     """A network as an onnx.ModelProto; sizes: of the example, which may be others."""
-    with _quiet():
+    with quiet():
         program = torch.onnx.export(
             network.eval(),
             (example,),
@@ -136,20 +133,6 @@ def _exported(
     ):
         del part.metadata_props[:]  # where in the source it stands
     return model
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Within, nothing is said of packages that an export may use besides, and of torch's own."""
-    logger = logging.getLogger("torch.onnx")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(before)
 
 
 @torch.inference_mode()

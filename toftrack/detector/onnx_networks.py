@@ -7,12 +7,16 @@ for torch, which is the reference, and slower on the CPU.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
+import io
 import logging
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -33,24 +37,24 @@ FLOAT, WHOLE = "float32", "int8"
 COMMAND = "python -m toftrack.programs.export_detector"
 _LARGEST_BYTES = 1 << 28
 _log = logging.getLogger(__name__)
+Network = TypeVar("Network", PoseNet, Finder)
 
 
 @dataclass(frozen=True, eq=False)
-class OnnxPoseNet:
-    """A PoseNet for the CPU; reference: the one that it was made of."""
+class OnnxNetwork(Generic[Network]):
+    """A network for the CPU; reference: the one that it was made of."""
 
-    reference: PoseNet
+    reference: Network
     session: Any
+    device = torch.device("cpu")
 
-    @property
-    def device(self) -> torch.device:
-        """Where it is."""
-        return torch.device("cpu")
+    def to(self, device: torch.device) -> Network | Self:
+        """Itself on the CPU, elsewhere the reference."""
+        return self if device.type == "cpu" else self.reference.to(device)
 
-    @functools.cached_property
-    def precision(self) -> str:
-        """FLOAT or WHOLE."""
-        return str(_properties(self.session).get("precision", FLOAT))
+
+class OnnxPoseNet(OnnxNetwork[PoseNet]):
+    """A PoseNet for the CPU."""
 
     def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of crops (N, CROP_CHANNELS, 64, 64): what PoseNet.features returns; without the lock.
@@ -68,31 +72,14 @@ class OnnxPoseNet:
             raise ToftrackError("the detector's pose.onnx is of another network; " + _anew())
         return heads, keypoints, parts
 
-    def to(self, device: torch.device) -> PoseNet | OnnxPoseNet:
-        """Itself on the CPU, elsewhere the reference."""
-        return self if device.type == "cpu" else self.reference.to(device)
 
-
-@dataclass(frozen=True, eq=False)
-class OnnxFinder:
-    """A Finder for the CPU; reference: the one that it was made of."""
-
-    reference: Finder
-    session: Any
-
-    @property
-    def device(self) -> torch.device:
-        """Where it is."""
-        return torch.device("cpu")
+class OnnxFinder(OnnxNetwork[Finder]):
+    """A Finder for the CPU."""
 
     def __call__(self, images: Tensor) -> Found:
         """See network.Finder."""
         found = self.session.run(Found._fields, {"images": images.numpy()})
         return Found(*map(torch.from_numpy, found))
-
-    def to(self, device: torch.device) -> Finder | OnnxFinder:
-        """Itself on the CPU, elsewhere the reference."""
-        return self if device.type == "cpu" else self.reference.to(device)
 
 
 def load_networks(
@@ -169,17 +156,26 @@ def _runtime() -> Any:
     return onnxruntime
 
 
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Within, nothing is said of how an export or a quantisation goes, nor of other packages."""
+    loggers = logging.getLogger(), logging.getLogger("torch.onnx")
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+
+
 def _made_of(session: Any) -> tuple[str | None, ...]:
     """Format, version and name of a file's network, and the checksum of its weights."""
-    properties = _properties(session)
-    return tuple(
-        properties.get(name) for name in ("format", "version", "network", "weights_sha256")
-    )
-
-
-def _properties(session: Any) -> dict[str, str]:
-    properties: dict[str, str] = session.get_modelmeta().custom_metadata_map
-    return properties
+    properties = session.get_modelmeta().custom_metadata_map
+    return tuple(map(properties.get, ("format", "version", "network", "weights_sha256")))
 
 
 @functools.cache

@@ -23,8 +23,7 @@ from toftrack.detector.crops import crop, wide
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet, Proposed
 from toftrack.detector.onnx_networks import OnnxFinder
 from toftrack.detector.parts import Parts
-from toftrack.hand.overlap import overlap_of_each
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
+from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
 SAME_PLACE_M = 0.06
@@ -34,8 +33,6 @@ _ONE_PALM_M = 0.035
 finder takes hands that touch for nearer than they are: 4 cm apart where it was 9."""
 KEPT = 12
 """Hypotheses of a crop that are used further."""
-DOUBT_M = 0.06
-"""How far off a finger's outer joints may be that lies in another one, by the keypoints."""
 MIRROR = torch.tensor([-1.0, 1.0, 1.0])
 MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
 
@@ -187,7 +184,7 @@ def run_pose_network(
         error_m=ordered(p.error_m),
         joints_m=_joints(pivot, rotvec, angles, log_size, side),
         keypoints_m=keypoints,
-        sigma_m=_sigma_m(keypoints, p.sigma_m, log_size[:, 0]),
+        sigma_m=p.sigma_m,
         present=p.present,
         right=p.right,
         parts=tuple(
@@ -197,21 +194,6 @@ def run_pose_network(
             )
         ),
     )
-
-
-def _sigma_m(keypoints_m: Tensor, sigma_m: Tensor, log_size: Tensor) -> Tensor:
-    """(C, 21) deviations of the keypoints: larger where those of two fingers coincide.
-
-    Of a single finger that is seen the cells do not know which one it is, and say surely that it is
-    either.
-    """
-    length = DEFAULT_HAND_LENGTH_M * log_size.exp()
-    each = zip(keypoints_m, length.tolist(), strict=True)
-    overlap = torch.cat([overlap_of_each(keypoints[None], size) for keypoints, size in each])
-    doubt = DOUBT_M * overlap.clamp(max=1)  # (C, 5)
-    outer = torch.cat((doubt.new_zeros(len(doubt), 5, 1), doubt[..., None].expand(-1, -1, 3)), 2)
-    added = torch.cat((doubt.new_zeros(len(doubt), 1), outer.flatten(1)), 1)
-    return torch.hypot(sigma_m, added)
 
 
 def _joints(pivot_m: Tensor, rotvec: Tensor, angles: Tensor, log_size: Tensor, side: str) -> Tensor:

@@ -8,11 +8,7 @@ processors without VNNI add two products in 16 bits.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +17,7 @@ import torch
 
 from toftrack.detector.images import crop_images
 from toftrack.detector.network import PoseNet
-from toftrack.detector.onnx_networks import open_session
+from toftrack.detector.onnx_networks import open_session, quiet
 from toftrack.detector.shapes import shape_bank
 from toftrack.errors import ToftrackError
 
@@ -51,7 +47,7 @@ def quantised(model: Any, crops: np.ndarray) -> Any:
     import onnx
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-    with _quiet(), tempfile.TemporaryDirectory() as folder:
+    with quiet(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "quantised.onnx"
         quantize_static(
             model,
@@ -114,16 +110,3 @@ class _Crops:
     def get_next(self) -> dict[str, np.ndarray] | None:
         """The next ones, None at the end."""
         return next(self._batches, None)
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Within, the quantisation's prints and warnings are not seen."""
-    logger = logging.getLogger()
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        logger.setLevel(before)

@@ -16,6 +16,7 @@ checkpoints.py).
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import sys
 import time
@@ -143,19 +144,11 @@ def train_poses(
         image = _image(crops.image, device)
         with torch.autocast(device.type, torch.bfloat16, cache_enabled=False):
             outputs = network.features(image)
-        found = pose_losses(network.decode(image, *outputs), crops, network.anchors)
-        reported = {
-            "joints_mm": found.hypothesis_mm,
-            "keypoints_mm": found.keypoints_mm,
-            "within_20_mm": found.within_20,
-            "side": found.side,
-            "present": found.present,
-        }
-        return found.total, reported
+        return pose_losses(network.decode(image, *outputs), crops, network.anchors)
 
-    on_cpu = device.type == "cpu"
-    images: Images = Images(crop_images) if on_cpu else Images(crop_scenes, _Taken(device, seed))
-    task = Task("poses", "poses.images", images, losses, replayed=not on_cpu)
+    task = Task("poses", crop_images, losses)
+    if device.type != "cpu":
+        task = Task("poses", crop_scenes, losses, _taker(device, seed), replayed=True)
     return _train(network, task, schedule, shapes, seed, checkpoints, device)
 
 
@@ -179,7 +172,7 @@ def train_finder(
         loss = finder_loss(found, images)
         return loss, {"loss": loss.detach()}
 
-    task = Task("finder", "finder.images", Images(wide_images), losses)
+    task = Task("finder", wide_images, losses)
     return _train(network, task, schedule, shapes, seed + 1, checkpoints, device)
 
 
@@ -189,46 +182,44 @@ def _image(image: Tensor, device: torch.device) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Images:
-    """make: what processes make of (batch, shapes, generator).  taken: what becomes of it here."""
-
-    make: Callable[..., Any]
-    taken: Callable[[Any], Any] | None = None
-
-
-@dataclass(frozen=True)
 class Task:
     """What a network is trained on.
 
-    name: of its checkpoint.  counted: the setting that says how many images it sees.
-    losses: of a batch, and what is reported; () tensors.  replayed: on a CUDA device, a step is
-    recorded once and replayed, as all its sizes are the same each time.
+    name: of its checkpoint.  make: what processes make of (batch, shapes, generator).
+    losses: of a batch, and what is reported; () tensors.  taken: what becomes of a batch here.
+    replayed: on a CUDA device, a step is recorded once and replayed, as all its sizes are the same
+    each time.
     """
 
     name: str
-    counted: str
-    images: Images
+    make: Callable[..., Any]
     losses: Callable[[Any], tuple[Tensor, dict[str, Tensor]]]
+    taken: Callable[[Any], Any] | None = None
     replayed: bool = False
 
+    @property
+    def counted(self) -> str:
+        """The setting that says how many images it sees."""
+        network, _, restart = self.name.partition("_")
+        return f"{network}.{restart and 'restart_'}images"
 
-class _Taken:
-    """Crops of scenes on a CUDA device, beside the training there."""
 
-    def __init__(self, device: torch.device, seed: int) -> None:
-        self._device, self._seed = device, seed
-        self._stream: torch.cuda.Stream | None = None
+def _taker(device: torch.device, seed: int) -> Callable[[CropScenes], Crops]:
+    """Makes crops of scenes on a CUDA device, beside the training there."""
+    stream: torch.cuda.Stream | None = None
+    seeds = itertools.count(seed + 1)
 
-    def __call__(self, scenes: CropScenes) -> Crops:
-        if self._stream is None:
-            self._stream = torch.cuda.Stream(self._device)
-        self._seed += 1
-        with torch.cuda.stream(self._stream):
-            there = mapped(scenes, lambda one: on_device(one, self._device))
-            crops = crops_on_device(there, self._seed)
+    def take(scenes: CropScenes) -> Crops:
+        nonlocal stream
+        stream = stream or torch.cuda.Stream(device)
+        with torch.cuda.stream(stream):
+            there = mapped(scenes, lambda one: on_device(one, device))
+            crops = crops_on_device(there, next(seeds))
         # Whoever trains waits for nothing: these are ready before they are asked for.
-        self._stream.synchronize()
+        stream.synchronize()
         return crops
+
+    return take
 
 
 class _Step:
@@ -310,8 +301,7 @@ def _train(
         restart = replace(
             schedule, images=schedule.restart_images, rate=schedule.restart_rate, restart_images=0
         )
-        name = task.name
-        task = replace(task, name=f"{name}_restart", counted=f"{name}.restart_images")
+        task = replace(task, name=f"{task.name}_restart")
         begun = checksum({k: v.cpu().numpy() for k, v in network.state_dict().items()})
         seed += _RESTART_SEED
         for row in _descend(network, task, restart, seed, begun, _RESTART_SHARE, *where):
@@ -358,9 +348,9 @@ def _descend(
         total=steps * schedule.batch, initial=done, unit=" images", desc=task.name, file=sys.stderr
     )
     numbers = range(progress.step, steps)
-    made = made_batches(task.images.make, schedule.batch, numbers, shapes, seed, makers(device))
+    made = made_batches(task.make, schedule.batch, numbers, shapes, seed, makers(device))
     step = _Step(task, network, averaged, optimiser, device)
-    with bar, writing as stepped, prefetched(made, task.images.taken) as batches:
+    with bar, writing as stepped, prefetched(made, task.taken) as batches:
         for batch in batches:
             number = progress.step
             share = 1 - min(0.998, (number + 1) / (number + 10))
