@@ -17,8 +17,7 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.programs import calibrate, command_line
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
-from toftrack.recordings.srs import SrsWriter
-from toftrack.recordings.srs_facts import SrsFacts
+from toftrack.recordings.srs import SrsFacts, SrsWriter
 
 BOARD, SQUARE_M = (7, 5), 0.03
 # The nominal camera, off by 5 %, and a barrel distortion.

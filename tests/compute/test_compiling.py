@@ -97,16 +97,6 @@ def test_a_damaged_kernel_is_compiled_anew_and_reported_once(
     assert _is_loaded(), "it was mended"
 
 
-def test_what_stands_in_the_way_of_a_kernel_is_reported(folder: Path, caplog) -> None:
-    assert not _is_loaded()
-    (file,) = folder.rglob("*.nbi")
-    file.unlink()
-    file.mkdir()
-    assert not _is_loaded()
-    (message,) = caplog.messages
-    assert str(file) in message
-
-
 def test_where_it_cannot_be_written_every_run_compiles_and_says_why(folder: Path, caplog) -> None:
     folder.parent.mkdir()
     folder.write_bytes(b"mine")
@@ -116,16 +106,6 @@ def test_where_it_cannot_be_written_every_run_compiles_and_says_why(folder: Path
         (message,) = caplog.messages
         assert str(folder) in message and "NUMBA_CACHE_DIR" in message
     assert folder.read_bytes() == b"mine"
-
-
-def test_a_full_disk_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch, caplog) -> None:
-    def replace(source: str, target: str) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", replace)
-    assert not _is_loaded()
-    (message,) = caplog.messages
-    assert "No space left on device" in message and not _files(folder)
 
 
 class _Executed:

@@ -123,12 +123,6 @@ def test_each_level_leaves_out_more() -> None:
         before = less
 
 
-def test_settings_that_leave_out_more_stay() -> None:
-    model = make_tracker("detector.every=6", "detector.places=1", "refine=none").model
-    less = model.at_quality(LEVELS[-1])
-    assert less.detector.settings.every == 6 and less.detector.settings.places == 1
-
-
 def test_less_quality_may_be_one_thread() -> None:
     many = threads()
     with at_most(1):

@@ -55,14 +55,3 @@ def test_a_task_beside_is_waited_for_and_fails_where_it_is_waited_for(
     waits = beside(lambda: [][0])
     with pytest.raises(IndexError):
         waits()
-
-
-def test_without_another_thread_a_task_beside_is_done_when_it_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("toftrack.compute.threads.threads", lambda: 1)
-    done: list[int] = []
-    waits = beside(lambda: done.append(1))
-    assert not done
-    waits()
-    assert done == [1]

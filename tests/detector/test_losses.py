@@ -10,13 +10,7 @@ import torch
 from helpers.detection import dice, small_bank
 
 from toftrack.detector.hands import random_rotations
-from toftrack.detector.images import (
-    WIDE_SIZE,
-    Crops,
-    WideImages,
-    crop_images,
-    wide_images,
-)
+from toftrack.detector.images import WIDE_SIZE, Crops, WideImages, crop_images, wide_images
 from toftrack.detector.losses import finder_loss, hypothesis_joints, pose_losses
 from toftrack.detector.network import (
     PARTS,

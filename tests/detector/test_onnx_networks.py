@@ -106,14 +106,6 @@ def test_the_file_is_in_8_bits_and_says_so_and_bad_ones_are_refused(exported: Pa
         quantisation.compare(other, model, crops)
 
 
-def test_floating_point_is_an_option(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    monkeypatch.setattr(onnx_export, "export_networks", lambda *given: asked.append(given) or [])
-    for option in ([], ["--float"]):
-        export_detector.main(["a.npz", *option])
-    assert asked == [(Path("a.npz"), True), (Path("a.npz"), False)]
-
-
 @pytest.mark.parametrize("network", ["pose", "finder"])
 def test_weights_without_a_file_are_run_by_torch_which_is_said_once(
     network: str, weights: Path, caplog: pytest.LogCaptureFixture
@@ -127,14 +119,6 @@ def test_a_file_of_other_weights_is_not_used(
 ) -> None:
     torch.manual_seed(2)
     save_weights(weights, PoseNet(4), Finder(8), {})
-    assert "small.pose.onnx is of other weights" in torch_runs(weights, caplog)
-
-
-def test_the_finder_s_file_is_not_taken_for_the_pose_network_s(
-    weights: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    pose, finder = (onnx_networks.onnx_file(weights, name) for name in ("pose", "finder"))
-    pose.write_bytes(finder.read_bytes())
     assert "small.pose.onnx is of other weights" in torch_runs(weights, caplog)
 
 

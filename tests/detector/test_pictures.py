@@ -19,9 +19,9 @@ from helpers.detection import (
 )
 
 from toftrack.detector import pictures
-from toftrack.detector.hands import BACKGROUND, FOREARM, HAND, THING, posed_hands
+from toftrack.detector.hands import BACKGROUND, FOREARM, HAND, posed_hands
 from toftrack.detector.pictures import random_sensors, take_pictures
-from toftrack.detector.scenes import Scenes, surroundings, things
+from toftrack.detector.scenes import Scenes
 from toftrack.hand.surface import Ellipsoids
 from toftrack.render.closed_form import render_range_images
 
@@ -154,14 +154,6 @@ def test_a_dark_sleeve_is_not_read_and_the_hand_is() -> None:
     assert depth[labels == HAND].all()
 
 
-def test_a_seed_gives_the_same_pictures() -> None:
-    def taken(seed: int) -> np.ndarray:
-        return sensed(plate(0.5), seed, NOISE=0.003, HOLES=0.1)
-
-    assert np.array_equal(taken(1), taken(1))
-    assert not np.array_equal(taken(1), taken(2))
-
-
 def test_sensors_are_within_what_cameras_do() -> None:
     terms = random_sensors(4000, dice())
     assert terms.isfinite().all()
@@ -177,27 +169,6 @@ def test_sensors_are_within_what_cameras_do() -> None:
     assert 0.2 < light.float().mean() < 0.3
     assert not terms[light][:, pictures.FLYING].any()
     assert not terms[light][:, pictures.HOLLOW].any(), "they measure no time"
-
-
-def test_most_things_are_in_front_of_the_hand_and_none_is_in_it() -> None:
-    around = torch.tensor([[0.0, 0.0, 0.6]]).expand(1000, 3)
-    centres, axes, labels = things(around, 2, 1.0, dice())
-    assert (labels == THING).all() and axes.isfinite().all()
-    away = centres[..., 2] - 0.6
-    assert (away < 0).float().mean() == pytest.approx(0.75, abs=0.05)
-    assert not ((away > -0.04) & (away < 0.045)).any()
-    assert (things(around, 2, 0.0, dice())[2] == -1).all()
-
-
-def test_the_person_stands_behind_the_hand() -> None:
-    place = torch.tensor([[0.0, 0.0, 0.5]]).expand(300, 3)
-    hands = posed_hands(small_bank(), place, torch.zeros(300, dtype=torch.bool), dice(), HAND)
-    centres, axes, labels = surroundings(hands, place[:, 2], dice(1))
-    assert centres.isfinite().all() and axes.isfinite().all()
-    torso = centres[:, 0, 2] - axes[:, 0, 2].norm(dim=1)
-    # Stout ones reach a little farther than their torso's place was chosen for.
-    assert float((torso > 0.5).float().mean()) > 0.9
-    assert (labels <= BACKGROUND).all()
 
 
 def test_a_left_hand_is_the_mirror_image_of_a_right_one() -> None:

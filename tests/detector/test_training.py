@@ -73,18 +73,6 @@ def test_no_images_leave_the_weights_of_a_start_as_they_are(tmp_path: Path) -> N
         torch.testing.assert_close(same.state_dict()[key], value, atol=1e-3, rtol=1e-3)
 
 
-def test_a_training_that_began_from_other_weights_is_not_gone_on_with(tmp_path: Path) -> None:
-    for seed in (0, 1):
-        torch.manual_seed(seed)
-        save_weights(tmp_path / f"{seed}.npz", PoseNet(4), Finder(4), {})
-    begun, other = (Schedule(0, 8, 0.002, 4, str(tmp_path / f"{seed}.npz")) for seed in (0, 1))
-    train_finder(begun, 6, 0, Checkpoints(tmp_path, 1.0))
-    again = Checkpoints(tmp_path, 1.0, resume=tmp_path)
-    train_finder(begun, 6, 0, again)
-    with pytest.raises(ToftrackError, match="a training with start="):
-        train_finder(other, 6, 0, again)
-
-
 @pytest.mark.slow
 def test_a_share_of_the_start_makes_the_mean_of_both(tmp_path: Path) -> None:
     torch.manual_seed(0)
@@ -215,13 +203,6 @@ def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> Non
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert [summary[name][-1]["images"] for name in ("poses", "finder")] == [320, 288]
     assert "poses" in done.stderr and "finder" in done.stderr, "progress bars"
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_the_program_refuses_a_device_that_is_not_there(tmp_path: Path) -> None:
-    done = command(tmp_path, "compute=cuda")
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].startswith("error: compute=cuda, but torch finds no CUDA")
 
 
 def test_the_program_refuses_what_cannot_be(tmp_path: Path) -> None:

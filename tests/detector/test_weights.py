@@ -15,12 +15,7 @@ from toftrack.api import build_tracker
 from toftrack.detector import weights as module
 from toftrack.detector.crops import CROP_CHANNELS
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.weights import (
-    DEFAULT_FILE,
-    go_on_from,
-    load_weights,
-    save_weights,
-)
+from toftrack.detector.weights import DEFAULT_FILE, go_on_from, load_weights, save_weights
 from toftrack.errors import ToftrackError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -125,35 +120,23 @@ def test_a_file_that_is_cut_off(file: Path, part: float) -> None:
     refused(file, "is no file of the detector's weights")
 
 
-def test_weights_of_another_version(file: Path) -> None:
-    rewritten(file, version=2)
-    refused(file, "holds weights of version 2, and this toftrack reads version 1")
-
-
-def test_a_file_of_something_else(file: Path) -> None:
-    rewritten(file, format="toftrack-pose-space")
-    refused(file, "is no file of the detector's weights")
-    sample = DEFAULT_FILE.parent / "sample.npz"
-    refused(sample, "is no file of the detector's weights")
-
-
-def test_weights_of_networks_of_another_size(file: Path) -> None:
-    rewritten(file, pose_width=6)
-    refused(file, "holds weights of another network")
-
-
-@pytest.mark.parametrize("width", [0, 10**6, "24", None, [24], 1e3, True])
-def test_a_width_that_would_fill_the_memory_is_refused(file: Path, width: object) -> None:
-    rewritten(file, pose_width=width)
-    refused(file, "holds weights of another network")
-
-
-def test_a_missing_file(tmp_path: Path) -> None:
-    refused(tmp_path / "gone.npz", "there are no weights of the detector at")
-    refused(tmp_path, "is no file of the detector's weights")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": 2}, "holds weights of version 2, and this toftrack reads version 1"),
+        ({"format": "toftrack-pose-space"}, "is no file of the detector's weights"),
+        *(({"pose_width": width}, "of another network") for width in (6, 0, 10**6, "24", True)),
+    ],
+)
+def test_weights_that_say_that_they_are_others_are_refused(
+    file: Path, change: dict, words: str
+) -> None:
+    rewritten(file, **change)
+    refused(file, words)
 
 
 def test_what_is_no_archive(tmp_path: Path) -> None:
+    refused(tmp_path / "gone.npz", "there are no weights of the detector at")
     path = tmp_path / "weights.npz"
     path.write_text("weights")
     refused(path, "is no file of the detector's weights")
@@ -187,14 +170,6 @@ def test_a_file_that_is_too_large(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         stream.truncate(module._LARGEST_BYTES + 1)
     refused(path, "is too large for weights of the detector")
-
-
-def test_the_command_line_s_error_names_the_file(tmp_path: Path) -> None:
-    with pytest.raises(Exception) as caught:
-        build_tracker(configuration(f"detector.weights={tmp_path / 'gone.npz'}"))
-    chain = (caught.value, caught.value.__cause__)
-    reported = [str(error) for error in chain if isinstance(error, ToftrackError)]
-    assert reported and "gone.npz" in reported[0]
 
 
 def test_without_networks_their_weights_are_not_read(

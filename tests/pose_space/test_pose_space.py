@@ -44,16 +44,6 @@ def test_four_components_explain_what_they_explain_in_the_paper() -> None:
     assert float(ratios[-1]) == pytest.approx(100.0, abs=1e-3)
 
 
-def test_a_transformation_moves_every_finger_all_the_time_from_end_to_end() -> None:
-    poses = synthetic_training_poses()
-    rows = [label == "palm-fist" for label in poses.labels]
-    assert sum(rows) == 30
-    ends = [basic_pose(gesture)[None] for gesture in ("palm", "fist")]
-    path = torch.cat((ends[0], poses.angles_rad[rows], ends[1]))
-    flexions = [i for i, name in enumerate(ANGLE_NAMES) if i >= 5 and "flexion" in name]
-    assert (path[:, flexions].diff(dim=0) > 0).all()
-
-
 def test_all_components_reproduce_every_training_pose() -> None:
     poses = synthetic_training_poses()
     space = fit_pca(poses.angles_rad, poses.labels, 21)

@@ -26,8 +26,13 @@ from toftrack.pose_space.data.pose_data import (
 from toftrack.pose_space.data.pose_files import file_data
 from toftrack.pose_space.data.run_poses import run_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, make_pose_space
-from toftrack.pose_space.held_out import clip_folds, errors_table, evaluate_space, reconstruction
-from toftrack.pose_space.reach import nearest_latents
+from toftrack.pose_space.held_out import (
+    clip_folds,
+    errors_table,
+    evaluate_space,
+    nearest_latents,
+    reconstruction,
+)
 from toftrack.programs import train
 from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
 

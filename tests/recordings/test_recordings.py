@@ -96,13 +96,6 @@ def test_times_come_from_stamps_then_rate(
     np.testing.assert_allclose(np.diff(recording.timestamp_s), step)
 
 
-def test_radial_distance_stands_in_for_depth(tmp_path: Path) -> None:
-    radial = np.full((T, H, W), 0.7, np.float32)
-    recording = read_recording(save(tmp_path, depth_m=None, radial_m=radial))
-    assert recording.radial
-    np.testing.assert_array_equal(recording.depth, radial)
-
-
 def test_truth_without_flags_is_visible_and_in_space(tmp_path: Path) -> None:
     truth = read_recording(save(tmp_path, visible=None, in_space=None)).truth
     assert truth.visible.all()
@@ -174,11 +167,6 @@ def with_a_short_member(path: Path) -> None:
             archive.writestr(f"{name}.npy", content[:-50] if name == "depth_m" else content)
 
 
-def with_a_member_of_text(path: Path) -> None:
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("depth_m.npy", b"not an array at all")
-
-
 def a_single_array(path: Path) -> None:
     with path.open("wb") as stream:
         np.save(stream, np.ones(3))
@@ -195,7 +183,6 @@ def a_single_array(path: Path) -> None:
         (flipped, "damaged"),
         (packed_and_damaged, "damaged"),
         (with_a_short_member, "damaged"),
-        (with_a_member_of_text, "damaged"),
     ],
 )
 def test_damaged_files_are_reported(
@@ -263,8 +250,6 @@ IMAGES = np.ones((T, H, W), np.float32)
         ("depth_m", IMAGES[:0], "zero frames"),
         ("depth_m", IMAGES[:, :0], "empty"),
         ("depth_m", IMAGES.astype(complex), "float32"),
-        ("depth_m", IMAGES.astype("U3"), "float32"),
-        ("depth_m", IMAGES.astype("m8[s]"), "float32"),
         ("depth_m", (500 * IMAGES).astype(np.uint16), "millimetres.*/ 1000"),
         ("depth_m", 480 * IMAGES, "millimetres.*/ 1000"),
         ("depth_m", 40 * IMAGES, "centimetres.*/ 100"),
@@ -274,27 +259,19 @@ IMAGES = np.ones((T, H, W), np.float32)
         ("K", np.full((3, 3), np.nan), "NaN"),
         ("K", np.zeros((3, 3)), "positive focal"),
         ("K", np.array([[20.0, 0, 4], [0, 20, 3], [4, 3, 1]]), "0, 0, 1"),
-        ("K", np.array([["a"] * 3] * 3), "numbers"),
-        ("joints_m", np.zeros((T - 1, 21, 3)), ""),
         ("joints_m", np.zeros((T, 20, 3)), ""),
         ("joints_m", np.full((T, 21, 3), np.nan), ""),
         ("visible", np.ones(T + 1, bool), ""),
-        ("in_space", np.ones((T, 2), bool), ""),
-        ("visible_fraction", np.ones(T - 1), ""),
         ("joint_visible", np.ones((T, 20), bool), ""),
         ("amplitude", np.ones((T, H, W - 1), np.uint16), ""),
         ("amplitude", np.ones((T, H, W), np.float32), ""),
         ("timestamp_s", np.arange(T - 1.0), ""),
         ("timestamp_s", np.array([0.0, 0.1, 0.05, 0.2]), ""),
-        ("timestamp_s", np.array([0.0, np.nan, 0.2, 0.3]), ""),
         ("fps", 0.0, ""),
-        ("fps", np.nan, ""),
         ("fps", "fast", ""),
         ("distortion", np.zeros(3), ""),
-        ("distortion", np.full(5, np.inf), ""),
         ("metadata", "no json", ""),
         ("metadata", "[1]", ""),
-        ("metadata", np.ones(3), ""),
     ],
 )
 def test_what_breaks_the_format_is_reported_by_its_key(
@@ -302,13 +279,6 @@ def test_what_breaks_the_format_is_reported_by_its_key(
 ) -> None:
     text = complaint(save(tmp_path, **{key: value}))
     assert key in text and re.search(words, text)
-
-
-def test_millimetres_are_found_where_most_pixels_have_no_reading(tmp_path: Path) -> None:
-    depth = np.full((T, H, W), 480.0, np.float32)
-    depth[:, : H - 1] = 0
-    text = complaint(save(tmp_path, depth_m=None, radial_m=depth))
-    assert "'radial_m'" in text and "depth.astype('float32') / 1000" in text
 
 
 def test_a_recording_without_any_reading_is_valid(tmp_path: Path) -> None:

@@ -173,10 +173,6 @@ def test_depth_that_was_recorded_twice_is_one_topic(tmp_path: Path) -> None:
             [Message("/device_0/sensor_0/Depth_0/image/data", IMAGE, {}, recorded_ns(0))],
             "camera's own program.*device=realsense device.bag=",
         ),
-        (
-            [Message("/cam/sensor_3/frameType_3", IMAGE, {}, recorded_ns(0))],
-            "camera's own program.*device=orbbec device.bag=",
-        ),
     ],
 )
 def test_bags_without_depth_are_reported(
@@ -313,14 +309,8 @@ def test_quantised_inverse_depth_is_exact_to_its_steps() -> None:
     [
         (lambda f: f | {"format": "16UC1; compressedDepth rvl"}, "only PNG is read"),
         (lambda f: f | {"format": "16UC1; jpeg compressed mono8"}, "not depth"),
-        (lambda f: f | {"format": ""}, "without an encoding"),
         (lambda f: f | {"data": f["data"][:40]}, "PNG is damaged"),
         (lambda f: f | {"data": f["data"][5:]}, "holds no PNG"),
-        (lambda f: f | {"data": np.zeros(0, np.uint8)}, "holds no PNG"),
-        (
-            lambda f: f | {"data": np.r_[f["data"][:28], np.full(8, 255, "u1"), f["data"][36:]]},
-            "PNG is damaged",
-        ),
         (lambda f: f | {"format": "32FC1; compressedDepth png"}, "make no sense"),
         (
             lambda f: f | {"format": "32FC1; png compressed", "data": f["data"][12:]},

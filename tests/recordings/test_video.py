@@ -161,16 +161,9 @@ def broken(change: Callable[[dict], Any]) -> dict:
     [
         (None, "no attachment calibration.json"),
         (b"{", "calibration.json.*damaged"),
-        (b"\xff\xfe", "calibration.json.*damaged"),
-        ({"CalibrationInformation": {"Cameras": []}}, "damaged"),
-        (broken(lambda c: c.update(Purpose="colour")), "damaged"),
         (broken(lambda c: c["Intrinsics"].pop("ModelParameters")), "damaged"),
         (broken(lambda c: c["Intrinsics"]["ModelParameters"].pop()), "13 parameters"),
         (broken(lambda c: c.update(SensorWidth=640)), "another kind.*640"),
-        (
-            broken(lambda c: c["Intrinsics"].update(ModelType="CALIBRATION_LensTheta")),
-            "another kind.*Theta",
-        ),
         (
             broken(lambda c: c["Intrinsics"]["ModelParameters"].__setitem__(2, -1)),
             "positive focal lengths",
@@ -262,7 +255,6 @@ def test_colour_video_and_what_is_no_video_are_reported(tmp_path: Path) -> None:
         (words() // 8, 0.001),
         (words().astype(np.int32) // 8, 0.001),
         (words()[0] // 8, 0.001),
-        ((words() / 5000).astype(np.float32), 1),
         (words() / 5000, 1),
     ],
 )
@@ -279,8 +271,6 @@ def test_stacks_are_depth(tmp_path: Path, stack: np.ndarray, factor: float) -> N
     ("stack", "complaint"),
     [
         (np.ones((2, 3, 4, 3)), "must be depth images"),
-        (np.ones((0, 3, 4)), "must be depth images"),
-        (np.array([["a"] * 4] * 3), "must be depth images"),
         (np.full((2, 24, 32), 900.0), "plainly another unit.*--source-unit"),
         (np.array([[None] * 4] * 3), "no .npy of numbers"),
     ],

@@ -137,15 +137,6 @@ def test_the_neighbourhood_grows_with_the_focal_length_and_falls_with_the_distan
     assert head.evidence(farther).radius_px == pytest.approx(radius / 3)
 
 
-def test_without_a_neighbourhood_nothing_is_missed() -> None:
-    states = hand_states(3, 1)
-    counts = ReferenceScorer(SHAPE)(
-        states, f_measure(neighbourhood_m=0).evidence(scene_of(*states[:1], 0))
-    )
-    assert (counts.missed == 0).all()
-    assert (counts.correct > 0).all()
-
-
 def test_an_occluder_hides_the_model_and_is_no_evidence_against_it() -> None:
     state = hand_states(1, 0)
     scene = scene_of(state[0], 0)

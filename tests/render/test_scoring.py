@@ -115,18 +115,6 @@ def test_agrees_with_reference(kind, size, distance, radius_px):
         check(make_scorer(name, shape, CPU)(states, evidence), expected)
 
 
-def test_agrees_near_a_filter_s_particles():
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, 144, 176, 10.5, 0.4, 0)
-    states = torch.zeros(40, 27)
-    states[:, 1:3] = torch.tensor([0.08, 0.4])
-    spread = torch.tensor([0.01] * 3 + [0.1] * 24)
-    states += torch.randn(40, 27, generator=torch.Generator().manual_seed(0)) * spread
-    expected = ReferenceScorer(shape)(states, evidence)
-    for name in BACK_ENDS:
-        check(make_scorer(name, shape, CPU)(states, evidence), expected)
-
-
 def test_threads_share_the_particles():
     """The same counts from one thread, from several, and from calls at the same time."""
     shape = default_hand_shape()
@@ -198,15 +186,6 @@ def test_a_crop_counts_as_the_whole(back_end):
     states += 0.02 * torch.randn(20, 27, generator=torch.Generator().manual_seed(4))
     scorer = make_scorer(back_end, shape, CPU)
     check(scorer(states, evidence.cropped(31, 7, 301, 236)), scorer(states, evidence))
-
-
-def test_wide_images():
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, 480, 640, 37.4, 0.35, 5)
-    states = random_states(2, (0.3, 0.5), 5)
-    expected = ReferenceScorer(shape, chunk=1)(states, evidence)
-    for name in BACK_ENDS:
-        check(make_scorer(name, shape, CPU)(states, evidence), expected)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 130), (70, 1), (9, 65)])

@@ -128,14 +128,12 @@ def _enlarged(amplitude: np.ndarray, scale: float) -> np.ndarray | None:
 def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, guess: Camera) -> Lens:
     """Intrinsics and lens distortion (k1, k2) from corners; views that do not fit are left out.
 
-    Args:
-        views: at least five, from different sides.
-        board: columns, rows of inner corners.
-        square_m: side of a square.
-        guess: where to start, and the image's size.
+    views: at least five, from different sides.
+    board: columns, rows of inner corners.
+    square_m: side of a square.
+    guess: where to start, and the image's size.
 
-    Raises:
-        ToftrackError: there are too few views, or they do not determine the camera.
+    Raises ToftrackError: there are too few views, or they do not determine the camera.
     """
     views, points = list(views), board_points(board, square_m)
     if len(views) < _FEWEST_VIEWS:
@@ -225,14 +223,12 @@ def depth_pairs(
 ) -> DepthPairs:
     """Measured against true distances on the boards.
 
-    Args:
-        lens: with V views.
-        board: columns, rows of inner corners.
-        square_m: side of a square.
-        images: for each view the (H, W) radial distance in metres and the amplitude.
+    lens: with V views.
+    board: columns, rows of inner corners.
+    square_m: side of a square.
+    images: for each view the (H, W) radial distance in metres and the amplitude.
 
-    Raises:
-        ToftrackError: no pixel on any board has a reading.
+    Raises ToftrackError: no pixel on any board has a reading.
     """
     measured, true, weight, view = [], [], [], []
     for number, (radial, amplitude) in enumerate(images):
@@ -272,8 +268,7 @@ def pixel_errors(pairs: DepthPairs, polynomial: tuple[float, ...] = ()) -> np.nd
 def fit_depth(pairs: DepthPairs, orders: Sequence[int] = ORDERS) -> DepthFit:
     """The polynomial whose order predicts left-out frames best, by weighted least squares.
 
-    Raises:
-        ToftrackError: the boards are all at about one distance.
+    Raises ToftrackError: the boards are all at about one distance.
     """
     pairs = _averaged(pairs)
     used = np.unique(pairs.view)

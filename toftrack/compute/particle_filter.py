@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.motions import Motions
-from toftrack.compute.redraw import BOUNDS, Redraw, bound
+from toftrack.compute.redraw import BOUNDS, Redraw
 from toftrack.errors import ToftrackError
 
 
@@ -149,27 +148,6 @@ RESAMPLERS: dict[str, Callable[[int, torch.Generator], Tensor]] = {
     "systematic": systematic_positions,
     "stratified": stratified_positions,
 }
-
-
-def diffuse(
-    particles: Tensor,
-    sigmas: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    mode: str,
-    motions: Motions,
-    generator: torch.Generator,
-) -> Tensor:
-    """Move every particle by Gaussian noise inside the bounds of the pose space.
-
-    sigmas: (6 + d,) standard deviations in tangent coordinates.  mode: see bound.
-    """
-    noise = torch.randn(
-        particles.shape, generator=generator, device=particles.device, dtype=particles.dtype
-    )
-    moved = motions.compose(particles, noise * sigmas)
-    moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
-    return moved
 
 
 def annealed(

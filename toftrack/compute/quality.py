@@ -132,9 +132,8 @@ class Timekeeper:
 
     pace: as of the last frame.  reduced: frames from which something was left out.
 
-    Args:
-        pace: before the first frame.
-        clock: seconds that never go back.
+    pace: before the first frame.
+    clock: seconds that never go back.
     """
 
     def __init__(

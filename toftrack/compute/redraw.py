@@ -1,8 +1,9 @@
-"""Particles drawn anew from weighted ones and moved, the reference (paper, section 2.3)."""
+"""How particles are moved, and drawn anew by their weights, the reference (paper, section 2.3)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,6 +11,21 @@ from torch import Tensor
 Redraw = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, str], Tensor]
 """See `redraw_with`, without the motion."""
 BOUNDS = ("truncate", "reflect")
+
+
+class Motions(NamedTuple):
+    """The operations that every back end has, see compute/rigid.py.
+
+    compose: reference particles and tangent offsets, (N, 6 + d) or broadcast, to particles.
+    difference: particles (N, 6 + d) and one reference (1, 6 + d) to tangent offsets (N, 6 + d).
+    redraw: particles anew from weighted ones.
+    mean: particles (N, 6 + d) and weights (N,) to their mean (1, 6 + d), which is on the CPU.
+    """
+
+    compose: Callable[[Tensor, Tensor], Tensor]
+    difference: Callable[[Tensor, Tensor], Tensor]
+    redraw: Redraw
+    mean: Callable[[Tensor, Tensor], Tensor]
 
 
 def pick(weights: Tensor, positions: Tensor) -> Tensor:

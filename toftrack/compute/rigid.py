@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.motions import Motions
-from toftrack.compute.redraw import redraw_with
+from toftrack.compute.redraw import Motions, redraw_with
 from toftrack.compute.rotations import rotvec_composition, unitquat_to_rotvec
 from toftrack.compute.transfer import on_host, table
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import compiled, entry_point
-from toftrack.compute.motions import Motions
+from toftrack.compute.redraw import Motions
 from toftrack.compute.rigid import PIVOT_M
 
 _PIVOT = np.array(PIVOT_M)

@@ -11,8 +11,7 @@ import triton.language as tl
 from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.motions import Motions
-from toftrack.compute.redraw import redraw_with
+from toftrack.compute.redraw import Motions, redraw_with
 from toftrack.compute.rigid import PIVOT_M
 
 _BLOCK = 64

@@ -14,11 +14,7 @@ from torch import Tensor
 
 from toftrack.detector.dice import Dice
 from toftrack.detector.grasps_numba import CLOSE, YIELD, grasp
-from toftrack.detector.held_things import (
-    open_thumbs,
-    things_between_tips,
-    things_in_palms,
-)
+from toftrack.detector.held_things import open_thumbs, things_between_tips, things_in_palms
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import HandSurface
 from toftrack.pose_space.base import clamp_to_joint_limits

@@ -251,14 +251,9 @@ def extreme_kernel(
     FARTHEST_ONE: tl.constexpr, DOWN: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The nearest (or farthest) depth within `reach` pixels along rows, or down columns."""
-    n = tl.program_id(1).to(tl.int64)
+    n, place, v, u, width, height, inside = _block(lenses, width_all, BLOCK)
     reach = tl.load(reaches + n)
     if reach > 0:
-        place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-        v, u = place // width_all, place % width_all
-        width = tl.load(lenses + n * 5 + 3).to(tl.int32)
-        height = tl.load(lenses + n * 5 + 4).to(tl.int32)
-        inside = (v < height) & (u < width)
         first = n * height_all * width_all
         best = tl.load(image + first + place, mask=inside, other=0.0)
         for shift in range(-reach, reach + 1):

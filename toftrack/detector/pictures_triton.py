@@ -11,38 +11,12 @@ import torch
 import triton
 from torch import Tensor
 
+from toftrack.detector import pictures as cpu
+from toftrack.detector import pictures_kernels as kernels
 from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
 from toftrack.detector.hands import FOREARM, THING
 from toftrack.detector.network import PARTS
-from toftrack.detector.pictures import (
-    BIAS,
-    BLUR,
-    COARSE,
-    DARK,
-    FLYING,
-    HOLES,
-    HOLLOW,
-    HOLLOW_DEPTH_M,
-    HOLLOW_M,
-    NOISE,
-    ONE_SURFACE_M,
-    PATCHES,
-    RANGE,
-    SENSOR_TERMS,
-    SHADOW,
-    SMOOTH,
-    STEP,
-    Shots,
-)
-from toftrack.detector.pictures_kernels import (
-    draw_kernel,
-    extreme_kernel,
-    finish_kernel,
-    parts_kernel,
-    read_kernel,
-    sense_kernel,
-    smooth_kernel,
-)
+from toftrack.detector.pictures import Shots
 from toftrack.detector.things_numba import BALL, BOX, PART, RING
 
 _TILE = 16
@@ -66,21 +40,24 @@ def take(shots: Shots, size: tuple[int, int], seed: int) -> tuple[Tensor, Tensor
     device, lens, sensors = clean.device, shots.lens, shots.sensors
     grid = (triton.cdiv(height * width, _BLOCK), n)
     shape = (height, width)
-    clean = _with_hollows(clean, labels, lens, sensors[:, HOLLOW], grid)
+    clean = _with_hollows(clean, labels, lens, sensors[:, cpu.HOLLOW], grid)
     seeds = (shots.seeds + seed).remainder(2**31 - 1).int()
     noisy = torch.zeros_like(clean)
-    sense_kernel[grid](
+    kernels.sense_kernel[grid](
         clean, labels, sensors, seeds, lens, noisy, *shape,
-        SENSOR_TERMS, NOISE, FLYING, BIAS, HOLES, STEP, RANGE, BLUR, DARK, FOREARM, _BLOCK,
+        cpu.SENSOR_TERMS, cpu.NOISE, cpu.FLYING, cpu.BIAS, cpu.HOLES, cpu.STEP, cpu.RANGE,
+        cpu.BLUR, cpu.DARK, FOREARM, _BLOCK,
     )  # fmt: skip
     depth = torch.zeros_like(clean)
-    reaches = sensors[:, SMOOTH].int()
-    smooth_kernel[grid](noisy, depth, reaches, lens, *shape, float(ONE_SURFACE_M), _BLOCK)
+    reaches = sensors[:, cpu.SMOOTH].int()
+    kernels.smooth_kernel[grid](
+        noisy, depth, reaches, lens, *shape, float(cpu.ONE_SURFACE_M), _BLOCK
+    )
     generator = torch.Generator(device).manual_seed(seed)
     patches = torch.rand(n, 4, 3, device=device, generator=generator)
-    finish_kernel[grid](
+    kernels.finish_kernel[grid](
         depth, clean, sensors, patches, seeds, lens, *shape,
-        SENSOR_TERMS, COARSE, SHADOW, PATCHES, _MOST_SHADOW, _BLOCK,
+        cpu.SENSOR_TERMS, cpu.COARSE, cpu.SHADOW, cpu.PATCHES, _MOST_SHADOW, _BLOCK,
     )  # fmt: skip
     return depth, labels
 
@@ -95,7 +72,7 @@ def draw(shots: Shots, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     labels = torch.full((n, height, width), -1, dtype=torch.int8, device=device)
     columns, rows = triton.cdiv(width, _TILE), triton.cdiv(height, _TILE)
     parts = shots.parts
-    draw_kernel[(columns * rows, n)](
+    kernels.draw_kernel[(columns * rows, n)](
         _packed(shots),
         _ellipsoid_boxes(shots),
         shots.which,
@@ -134,11 +111,11 @@ def read_pictures(
     n, *shape = depth.shape
     image = depth.new_empty(n, CROP_CHANNELS, CROP, CROP)
     parts = torch.empty(n, PARTS, PARTS, dtype=torch.int64, device=depth.device)
-    read_kernel[(CROP * CROP // _BLOCK, n)](
+    kernels.read_kernel[(CROP * CROP // _BLOCK, n)](
         depth, side, distance_m, turn, border, image, *shape,
         2 / CROP_M, CROP, CROP_CHANNELS, _BLOCK,
     )  # fmt: skip
-    parts_kernel[(PARTS * PARTS // _BLOCK, n)](
+    kernels.parts_kernel[(PARTS * PARTS // _BLOCK, n)](
         labels, side, turn, border, image, parts, *shape, CROP, CROP_CHANNELS, PARTS, _BLOCK
     )
     return image, parts
@@ -207,12 +184,12 @@ def _with_hollows(
     """See pictures._deepen; deeper: (N,) by what part of their depth."""
     n, *shape = clean.shape
     nearest = torch.where(labels < 0, _FARTHEST_M, clean).flatten(1).amin(1)
-    reach = (0.5 * float(HOLLOW_M) * lens[:, 0] / (nearest + float(HOLLOW_DEPTH_M))).int()
+    reach = (0.5 * float(cpu.HOLLOW_M) * lens[:, 0] / (nearest + float(cpu.HOLLOW_DEPTH_M))).int()
     reach = torch.where(deeper > 0, reach, 0).int()
     around, other = clean, torch.empty_like(clean)
     for farthest, down in ((False, False), (False, True), (True, False), (True, True)):
-        extreme_kernel[grid](around, other, reach, lens, *shape, farthest, down, _BLOCK)
+        kernels.extreme_kernel[grid](around, other, reach, lens, *shape, farthest, down, _BLOCK)
         around, other = other, torch.empty_like(clean)
     hollow = clean - around
-    deep = (reach > 0)[:, None, None] & (labels >= 0) & (hollow < float(HOLLOW_DEPTH_M))
+    deep = (reach > 0)[:, None, None] & (labels >= 0) & (hollow < float(cpu.HOLLOW_DEPTH_M))
     return torch.where(deep, clean + deeper[:, None, None] * hollow, clean)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, fields, replace
-from typing import Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -51,11 +51,13 @@ class PoseSpace(Protocol):
 class TensorSpace:
     """What spaces that are frozen dataclasses of tensors share.
 
-    A subclass has the fields `lower`, `upper`, `training_latents` and `training_labels`, further
-    tensors as it needs them, and the methods `decode_freely` and `encode`.
+    A subclass has further tensors as it needs them, and the methods `decode_freely` and `encode`.
     """
 
+    lower: Tensor
+    upper: Tensor
     training_latents: Tensor
+    training_labels: tuple[str, ...]
 
     @property
     def dims(self) -> int:
@@ -76,9 +78,8 @@ class TensorSpace:
 
     def to(self, device: torch.device | str, dtype: torch.dtype = torch.float32) -> Self:
         """The same space on another device or of another dtype."""
-        return replace(
-            self, **{name: value.to(device, dtype) for name, value in self.arrays().items()}
-        )
+        moved: dict[str, Any] = {k: value.to(device, dtype) for k, value in self.arrays().items()}
+        return replace(self, **moved)
 
 
 def clamp_to_joint_limits(angles: Tensor) -> Tensor:

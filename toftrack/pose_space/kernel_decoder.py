@@ -43,14 +43,10 @@ class Regression(NamedTuple):
 class KernelDecodedSpace(TensorSpace):
     """A space whose map back to angles is a fitted kernel regression.
 
-    lower, upper: (d,).  training_latents: (M, d), the kernel's centres.
+    training_latents: (M, d), the kernel's centres.
     offset: (21,) rad.  trend: (d, 21).  coefficients: (M, 21).  inverse_width: ().
     """
 
-    lower: Tensor
-    upper: Tensor
-    training_latents: Tensor
-    training_labels: tuple[str, ...]
     offset: Tensor
     trend: Tensor
     coefficients: Tensor

@@ -19,7 +19,6 @@ class PCAPoseSpace(TensorSpace):
 
     mean: (21,) rad.  components: (d, 21) orthonormal rows.
     explained_variance_ratio: (21,) of all components, the kept ones first.
-    lower, upper: (d,).  training_latents: (M, d).
     """
 
     kind: ClassVar[str] = "pca"
@@ -27,10 +26,6 @@ class PCAPoseSpace(TensorSpace):
     mean: Tensor
     components: Tensor
     explained_variance_ratio: Tensor
-    lower: Tensor
-    upper: Tensor
-    training_latents: Tensor
-    training_labels: tuple[str, ...]
 
     def decode_freely(self, latent: Tensor) -> Tensor:
         """(N, d) to (N, 21) radians, without regard to the joint limits."""

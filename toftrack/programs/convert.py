@@ -33,8 +33,7 @@ from toftrack.recordings.sr_frame import (
     to_radial,
     unambiguous_range_m,
 )
-from toftrack.recordings.srs import SrsRecording, SrsWriter
-from toftrack.recordings.srs_facts import SrsFacts
+from toftrack.recordings.srs import SrsFacts, SrsRecording, SrsWriter
 from toftrack.recordings.store import open_recording
 from toftrack.recordings.video import DepthVideo
 

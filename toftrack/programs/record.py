@@ -33,8 +33,7 @@ from toftrack.programs.recording_argument import quoted
 from toftrack.programs.shutdown import SHUTDOWN_SIGNALS, EndedError
 from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.sr_frame import REGISTERS
-from toftrack.recordings.srs import SrsWriter
-from toftrack.recordings.srs_facts import SrsFacts, SrsInit
+from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
 
 _GIGABYTE = 1e9
 

@@ -50,13 +50,11 @@ class NpyStack:
 def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> NpyStack:
     """Open a stack.
 
-    Args:
-        path: the `.npy`.
-        camera_file: of the camera; None = the given intrinsics, or camera.json beside the file.
-        bare: intrinsics, unit of whole numbers (a millimetre) and frame rate (25) where given.
+    path: the `.npy`.
+    camera_file: of the camera; None = the given intrinsics, or camera.json beside the file.
+    bare: intrinsics, unit of whole numbers (a millimetre) and frame rate (25) where given.
 
-    Raises:
-        ToftrackError: it is no such stack, holds pickled objects, or nothing tells its camera.
+    Raises ToftrackError: it is no such stack, holds pickled objects, or nothing tells its camera.
     """
     path = Path(path).expanduser()
     images = _mapped(path)

@@ -33,17 +33,10 @@ import numpy as np
 from toftrack.archives import MOST_BYTES, Archive, PickledError, Pieces, write_archive
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import (
-    LARGEST_MEDIAN_M,
-    SMALLEST_MEDIAN_M,
-    Truth,
-    median_reading,
-    wrong_unit,
-)
+from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Truth, median_reading, wrong_unit
 from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.npz_camera import CAMERA_KEYS, camera_arrays, camera_of
 from toftrack.recordings.streamed_images import Images, StreamedImages
 from toftrack.recordings.truth import TRUTH_KEYS, of_shape, read_truth, truth_arrays
 from toftrack.safe_files import open_to_read
@@ -52,6 +45,8 @@ DEFAULT_FPS = 25.0
 LOADED_BYTES = MOST_BYTES
 """Longer recordings are not loaded: their images are read in turn."""
 _IMAGES = ("depth_m", "radial_m", "amplitude")
+CAMERA_KEYS = ("K", "distortion", "lens", "depth_polynomial", "depth_polynomial_range_m")
+_POLYNOMIAL = CAMERA_KEYS[3:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +101,12 @@ def write_recording(
     """Write any recording frame by frame, compressed; an existing file is replaced only by a
     complete one.
 
-    Args:
-        path: the file.
-        store: read twice where it has amplitudes. Depth keeps the type of a `Recording` (float16 or
-            float32), and becomes float32 of others.
-        progress: called after each frame's depth.
+    path: the file.
+    store: read twice where it has amplitudes. Depth keeps the type of a `Recording` (float16 or
+        float32), and becomes float32 of others.
+    progress: called after each frame's depth.
 
-    Raises:
-        ToftrackError: the file cannot be written, or the store not be read.
+    Raises ToftrackError: the file cannot be written, or the store not be read.
     """
 
     def depth_images() -> Iterator[np.ndarray]:
@@ -209,7 +202,7 @@ def _parse(arrays: dict[str, Any]) -> Recording:
     depth = _check_depth(arrays[depth_key], depth_key)
     check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
-    camera = camera_of(arrays, width, height)
+    camera = _camera_of(arrays, width, height)
     timestamp_s, fps = _times(arrays, count)
     metadata = _metadata(arrays)
     return Recording(
@@ -296,3 +289,29 @@ def _metadata(arrays: dict[str, Any]) -> dict[str, Any]:
         if isinstance(metadata, dict):
             return metadata
     raise ToftrackError(f"'metadata' must be the text of one JSON object{why}")
+
+
+def camera_arrays(camera: Camera) -> dict[str, np.ndarray]:
+    """Its arrays by key; those of what most cameras do not have only where this one does."""
+    arrays = {"K": np.asarray(camera.K), "distortion": np.asarray(camera.distortion)}
+    if camera.lens != "opencv":
+        arrays["lens"] = np.array(camera.lens)
+    for key in _POLYNOMIAL:
+        if values := getattr(camera, key):
+            arrays[key] = np.array(values)
+    return arrays
+
+
+def _camera_of(arrays: dict[str, Any], width: int, height: int) -> Camera:
+    """The camera of images of that size, px; `K` must be there. Raises ToftrackError."""
+    lens = arrays.get("lens", np.array("opencv"))
+    if lens.size != 1 or lens.dtype.kind != "U":
+        raise ToftrackError("'lens' must be one text, opencv or fisheye")
+    return Camera(
+        arrays["K"],
+        width,
+        height,
+        arrays.get("distortion", np.zeros(5)),
+        lens=lens.reshape(()).item(),
+        **{key: arrays[key] for key in _POLYNOMIAL if key in arrays},
+    )

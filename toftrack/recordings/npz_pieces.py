@@ -38,11 +38,10 @@ def add_pieces(
 
     zipfile by itself would compress it again.
 
-    Args:
-        shape, kind: of the array; kind as `<f4`.
-        pieces: of `compressed`, in order, or parts of such.
-        size: bytes of all pieces.
-        checksum: CRC-32 of the array's bytes.
+    shape, kind: of the array; kind as `<f4`.
+    pieces: of `compressed`, in order, or parts of such.
+    size: bytes of all pieces.
+    checksum: CRC-32 of the array's bytes.
     """
     content = io.BytesIO()
     header = {"descr": kind, "fortran_order": False, "shape": shape}

@@ -83,16 +83,14 @@ def read_png_folder(
 ) -> PngFolder:
     """Open a folder of depth images: the first one is checked, the others stay on the disk.
 
-    Args:
-        folder: its path.
-        camera_file: a camera file instead of the folder's `camera.json`.
-        unit_m: metres of one step of the images; None = as `camera.json` says, else 0.001.
-        fps: frames a second; None = as `camera.json` says, else 25.
-        intrinsics: fx, fy, cx, cy in pixels instead of the camera of `camera.json`.
+    folder: its path.
+    camera_file: a camera file instead of the folder's `camera.json`.
+    unit_m: metres of one step of the images; None = as `camera.json` says, else 0.001.
+    fps: frames a second; None = as `camera.json` says, else 25.
+    intrinsics: fx, fy, cx, cy in pixels instead of the camera of `camera.json`.
 
-    Raises:
-        ToftrackError: there is no folder, image or camera, or the first image is not a 16-bit grey
-            PNG, or of another size than the camera's; later, another one.
+    Raises ToftrackError: there is no folder, image or camera, or the first image is not a 16-bit
+    grey PNG, or of another size than the camera's; later, another one.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -137,16 +135,14 @@ def read_png_folder(
 class PngFolderWriter:
     """Writes a folder that `read_png_folder` reads; use it with `with`.
 
-    Args:
-        folder: made when it does not exist; must not contain PNG images.
-        camera: goes to `camera.json`, with the facts below.
-        unit_m: metres of one step of the depth images.
-        radial: the depth is the distance along the pixel's ray.
-        fps: frames a second.
-        metadata: JSON-able.
+    folder: made when it does not exist; must not contain PNG images.
+    camera: goes to `camera.json`, with the facts below.
+    unit_m: metres of one step of the depth images.
+    radial: the depth is the distance along the pixel's ray.
+    fps: frames a second.
+    metadata: JSON-able.
 
-    Raises:
-        ToftrackError: the folder cannot be written or is in use.
+    Raises ToftrackError: the folder cannot be written or is in use.
     """
 
     def __init__(

@@ -19,13 +19,7 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Frame, median_reading, wrong_unit
 from toftrack.recordings.npz_pieces import compressed
-from toftrack.recordings.unfinished import (
-    IMAGE_TYPES,
-    SUFFIX,
-    Facts,
-    UnfinishedRecording,
-    finish,
-)
+from toftrack.recordings.unfinished import IMAGE_TYPES, SUFFIX, Facts, UnfinishedRecording, finish
 
 _WAITING = 32
 """Frames at most that are not written yet, 1.8 MB each at 640 x 480."""
@@ -59,15 +53,13 @@ class Recorder:
     no more; after a kill `toftrack recover FILE.npz` makes it. A recorder that cannot go on says
     so, keeps what there is, and raises nothing.
 
-    Args:
-        path: the recording, `.npz`.
-        source: of the frames.
-        limit_gb: 1e9 bytes of the file, after which no more frames are taken.
-        overwrite: replace an existing file.
-        tell: called with `ended`, in the recorder's thread, as soon as that is so.
+    path: the recording, `.npz`.
+    source: of the frames.
+    limit_gb: 1e9 bytes of the file, after which no more frames are taken.
+    overwrite: replace an existing file.
+    tell: called with `ended`, in the recorder's thread, as soon as that is so.
 
-    Raises:
-        ToftrackError: the file exists, or cannot be made.
+    Raises ToftrackError: the file exists, or cannot be made.
     """
 
     def __init__(

@@ -20,12 +20,10 @@ def camera_of(info: Any, rectified: bool) -> Camera:
     Distortion models: `plumb_bob` and `rational_polynomial` (OpenCV's 4, 5, 8, 12 or 14
     coefficients), `equidistant` (OpenCV's fisheye), and none at all.
 
-    Args:
-        info: a CameraInfo of ROS 1 (fields D, K, P) or ROS 2 (d, k, p).
-        rectified: the images are free of distortion already: what they are seen through is P.
+    info: a CameraInfo of ROS 1 (fields D, K, P) or ROS 2 (d, k, p).
+    rectified: the images are free of distortion already: what they are seen through is P.
 
-    Raises:
-        ToftrackError: it is not calibrated or of another model; the sentence begins with "it".
+    Raises ToftrackError: it is not calibrated or of another model; the sentence begins with "it".
     """
     K = _matrix(info, "K", (3, 3))
     P = _matrix(info, "P", (3, 4))

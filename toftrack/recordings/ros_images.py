@@ -40,16 +40,13 @@ def is_depth(words: str) -> bool:
 def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:
     """The depth image of a message.
 
-    Args:
-        message: an Image or CompressedImage.
-        kind: `IMAGE` or `COMPRESSED`.
-        unit_m: metres of one step of whole numbers.
+    message: an Image or CompressedImage.
+    kind: `IMAGE` or `COMPRESSED`.
+    unit_m: metres of one step of whole numbers.
 
-    Returns:
-        (H, W) float32 metres, 0 = no reading, a new array.
+    Returns (H, W) float32 metres, 0 = no reading, a new array.
 
-    Raises:
-        ToftrackError: its pixels are of another kind, or damaged; the sentence begins with "it".
+    Raises ToftrackError: its pixels are of another kind, or damaged; the sentence begins with "it".
     """
     words = _pixels(message) if kind == IMAGE else _decompressed(message)
     if words.dtype.kind == "u":

@@ -51,17 +51,14 @@ def decode_frame(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The images of a raw frame.
 
-    Args:
-        data: FRAME_BYTES bytes.
-        range_m: what the largest distance word stands for, metres.
-        amplitude_threshold: pixels of a smaller amplitude become "no reading".
+    data: FRAME_BYTES bytes.
+    range_m: what the largest distance word stands for, metres.
+    amplitude_threshold: pixels of a smaller amplitude become "no reading".
 
-    Returns:
-        (144, 176) float32 metres along each pixel's ray, 0 = no reading, and the (144, 176) uint16
-        amplitude; both are new arrays.
+    Returns (144, 176) float32 metres along each pixel's ray, 0 = no reading, and the (144, 176)
+    uint16 amplitude; both are new arrays.
 
-    Raises:
-        ToftrackError: the frame does not have FRAME_BYTES bytes.
+    Raises ToftrackError: the frame does not have FRAME_BYTES bytes.
     """
     if len(data) != FRAME_BYTES:
         raise ToftrackError(
@@ -78,14 +75,12 @@ def decode_frame(
 def encode_frame(radial_m: np.ndarray, amplitude: np.ndarray | None, range_m: float) -> bytes:
     """The raw frame of two images; `decode_frame` gives them back, distances to range_m / 131070.
 
-    Args:
-        radial_m: (144, 176) metres along each pixel's ray. What is no number, not above 0 or
-            beyond the range becomes 0, "no reading".
-        amplitude: (144, 176) uint16; None gives zeros.
-        range_m: what the largest distance word stands for, metres.
+    radial_m: (144, 176) metres along each pixel's ray. What is no number, not above 0 or beyond the
+        range becomes 0, "no reading".
+    amplitude: (144, 176) uint16; None gives zeros.
+    range_m: what the largest distance word stands for, metres.
 
-    Raises:
-        ToftrackError: an image is not of the camera's size.
+    Raises ToftrackError: an image is not of the camera's size.
     """
     for image in (radial_m, amplitude):
         if image is not None and image.shape != (HEIGHT, WIDTH):

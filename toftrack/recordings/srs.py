@@ -17,24 +17,29 @@ object "TOFT" (JSON: camera, range, frames a second, metadata) and before each f
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 
+from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
+from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     FRAME_BYTES,
+    HEIGHT,
     REGISTERS,
+    WIDTH,
     decode_frame,
     nominal_camera,
     unambiguous_range_m,
 )
-from toftrack.recordings.srs_facts import SrsFacts, SrsInit, facts_text, parse_facts
 from toftrack.safe_files import open_new, open_to_read
 
 _SIGNATURE, _VERSION = 0x4F497273, 1
@@ -47,21 +52,75 @@ _SECONDS = struct.Struct("<d")
 _LARGEST_FACTS = 1 << 20  # bytes; a damaged size must not make us read a gigabyte as text
 
 
+@dataclass(frozen=True)
+class SrsInit:
+    """Which camera made the recording."""
+
+    product_id: int = 0x0074
+    interface_type: int = 0
+    serial_number: int = 0
+
+
+@dataclass(frozen=True)
+class SrsFacts:
+    """What toftrack adds to the format."""
+
+    range_m: float | None = None
+    """What the largest distance word stands for; None = not stated."""
+    camera: Camera | None = None
+    """None = not stated."""
+    fps: float = DEFAULT_FPS
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+def facts_text(facts: SrsFacts) -> bytes:
+    """The content of a TOFT object."""
+    content = {
+        "range_m": facts.range_m,
+        "fps": facts.fps,
+        "camera": facts.camera and facts.camera.to_dict(),
+        "metadata": facts.metadata,
+    }
+    return json.dumps(content).encode()
+
+
+def parse_facts(path: Path, text: bytes) -> SrsFacts:
+    """What the content of a TOFT object says; `path` is for the message.
+
+    Raises ToftrackError: what the recorder stated must not be replaced by a guess in silence.
+    """
+    damaged = ToftrackError(f"the TOFT object of the recording '{path}' is damaged")
+    try:
+        content = parse_json(text)
+        range_m, fps = content["range_m"], float(content["fps"])
+        range_m = None if range_m is None else float(range_m)
+        camera, metadata = content["camera"], content["metadata"]
+    except (ValueError, TypeError, KeyError):
+        raise damaged from None
+    for number in (fps, 1.0 if range_m is None else range_m):
+        if not (np.isfinite(number) and number > 0):
+            raise damaged
+    if not isinstance(metadata, dict):
+        raise damaged
+    camera = None if camera is None else Camera.from_dict(camera, path)
+    if camera is not None and (camera.width, camera.height) != (WIDTH, HEIGHT):
+        raise damaged
+    return SrsFacts(range_m, camera, fps, metadata)
+
+
 class SrsWriter:
     """Appends frames to a new `.srs` file; use it with `with`.
 
     Each frame reaches the operating system before `append` returns, so that a killed program leaves
     a file that is readable to its last whole frame.
 
-    Args:
-        path: the new file.
-        init: which camera.
-        registers: the camera's 64 register bytes as far as they are known.
-        facts: what else there is to say.
-        overwrite: replace an existing file.
+    path: the new file.
+    init: which camera.
+    registers: the camera's 64 register bytes as far as they are known.
+    facts: what else there is to say.
+    overwrite: replace an existing file.
 
-    Raises:
-        ToftrackError: the file exists already or cannot be written.
+    Raises ToftrackError: the file exists already or cannot be written.
     """
 
     def __init__(
@@ -214,14 +273,12 @@ def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> 
 
     A file that is cut off or damaged somewhere is usable up to there (`damage` says so).
 
-    Args:
-        path: the file.
-        modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it
-            in registers whose meaning is not public).
+    path: the file.
+    modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it in
+        registers whose meaning is not public).
 
-    Raises:
-        ToftrackError: the file is missing, not a stream file, of another version, in a wrong order
-            or without any whole frame.
+    Raises ToftrackError: the file is missing, not a stream file, of another version, in a wrong
+    order or without any whole frame.
     """
     path = Path(path).expanduser()
     if path.is_dir():

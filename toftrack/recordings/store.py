@@ -54,16 +54,14 @@ def open_recording(
 
     Only `.npz` is loaded as a whole; the others stay on the disk.
 
-    Args:
-        path: `.npz`, `.srs`, a folder of PNG images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder
-            with metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`.
-        camera_file: serves what has no camera of its own.
-        modulation_mhz: tells the range of a `.srs` that does not state it.
-        topic: of a ROS bag that has several of depth images.
-        bare: what is known of images that say nothing of themselves.
+    path: `.npz`, `.srs`, a folder of PNG images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder with
+        metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`.
+    camera_file: serves what has no camera of its own.
+    modulation_mhz: tells the range of a `.srs` that does not state it.
+    topic: of a ROS bag that has several of depth images.
+    bare: what is known of images that say nothing of themselves.
 
-    Raises:
-        ToftrackError: it cannot be used; one sentence that names it.
+    Raises ToftrackError: it cannot be used; one sentence that names it.
     """
     path = Path(path).expanduser()
     suffix = path.suffix.lower()

@@ -28,7 +28,7 @@ from toftrack.archives import add_array
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.json_text import parse_json
-from toftrack.recordings.npz_camera import camera_arrays
+from toftrack.recordings.npz import camera_arrays
 from toftrack.recordings.npz_pieces import add_pieces
 from toftrack.safe_files import lock, open_in_place, open_new, whole_file
 
@@ -81,14 +81,12 @@ class _Kept:
 class UnfinishedRecording:
     """A file that grows by frames; each is the operating system's before `append` returns.
 
-    Args:
-        path: of the new file.
-        replace: let a file that stands there go.
+    path: of the new file.
+    replace: let a file that stands there go.
 
-    Raises:
-        ToftrackError: another process writes the file (with `replace`).
-        OSError: the file exists, or cannot be made, or (by `begin` and `append`) not be written;
-            then it ends with the frame before.
+    Raises ToftrackError: another process writes the file (with `replace`).
+    Raises OSError: the file exists, or cannot be made, or (by `begin` and `append`) not be written;
+    then it ends with the frame before.
     """
 
     def __init__(self, path: Path, replace: bool = False) -> None:
@@ -155,14 +153,12 @@ class UnfinishedRecording:
 def finish(part: Path, path: Path, overwrite: bool = False) -> int:
     """Make the `.npz` of what is whole in a file that grew, which goes; returns the frames.
 
-    Args:
-        part: the file, which nobody writes any more.
-        path: of the recording.
-        overwrite: replace an existing one.
+    part: the file, which nobody writes any more.
+    path: of the recording.
+    overwrite: replace an existing one.
 
-    Raises:
-        ToftrackError: it is no such file, is being written, has no whole frame, or the recording
-            exists or cannot be written; the file then stays.
+    Raises ToftrackError: it is no such file, is being written, has no whole frame, or the recording
+    exists or cannot be written; the file then stays.
     """
     try:
         with _locked(part) as stream:

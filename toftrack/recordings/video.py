@@ -130,13 +130,11 @@ class Track:
 def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> DepthVideo:
     """Open a video of depth images.
 
-    Args:
-        path: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of 16 bits (FFV1).
-        camera_file: a camera file; None = the recording's own calibration, or what is given.
-        bare: intrinsics, unit (a millimetre) and frame rate of a video that does not tell them.
+    path: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of 16 bits (FFV1).
+    camera_file: a camera file; None = the recording's own calibration, or what is given.
+    bare: intrinsics, unit (a millimetre) and frame rate of a video that does not tell them.
 
-    Raises:
-        ToftrackError: it is damaged, has colour images or no depth, or nothing tells its camera.
+    Raises ToftrackError: it is damaged, has colour images or no depth, or nothing tells its camera.
     """
     path = Path(path).expanduser()
     if not path.is_file():

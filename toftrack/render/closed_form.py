@@ -54,24 +54,6 @@ def project(ellipsoids: Ellipsoids) -> Conics:
     return Conics(linear, quadratic, dual, visible)
 
 
-def screen_boxes(conics: Conics, k: Tensor, height: int, width: int) -> Tensor:
-    """Pixel boxes that hold each ellipsoid's outline, from the dual conic.
-
-    k: (3, 3) intrinsics. Returns (N, E, 4) int64: first and one-past-last column and row, clipped
-    to the image; empty boxes have last <= first.
-    """
-    c = conics.dual
-    boxes = []
-    for axis, size in ((0, width), (1, height)):
-        mean = c[..., axis, 2] / c[..., 2, 2]
-        spread = (mean.square() - c[..., axis, axis] / c[..., 2, 2]).clamp(min=0).sqrt()
-        focal, centre = k[axis, axis], k[axis, 2]
-        low = (focal * (mean - spread) + centre).ceil().clamp(0, size)
-        high = (focal * (mean + spread) + centre).floor().add(1).clamp(0, size)
-        boxes += [low, torch.where(conics.visible, high, low)]
-    return torch.stack(boxes, -1).nan_to_num(0).long()
-
-
 def inverse_depth(conics: Conics, rays: Tensor) -> Tensor:
     """Largest inverse depth along each ray over the ellipsoids, 0 where every one is missed.
 

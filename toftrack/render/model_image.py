@@ -53,8 +53,8 @@ def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) 
 def _projected(
     ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linear (E, 3) and quadratic (E, 3, 3) parts of inverse depths, and boxes (E, 4); the same as
-    closed_form.project and screen_boxes, which take as long for one hand as all the drawing.
+    """Linear (E, 3) and quadratic (E, 3, 3) parts of inverse depths, and boxes (E, 4), as
+    closed_form.project, which takes as long for one hand as all the drawing, and its dual conics.
     """
     centres, axes = ellipsoids.centres_m[0].numpy(), ellipsoids.axes_m[0].numpy()
     turned = axes.swapaxes(1, 2)

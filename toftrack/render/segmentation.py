@@ -31,7 +31,6 @@ class Observation:
         hides what is behind it.
     thing: (H, W) bool, pixels of a thing in the hand; None where there is none. Fingers may be
         behind it, so that these pixels say nothing.
-    own: (H, W) bool, pixels of the hand itself and of its arm, as far as that was asked.
     """
 
     depth_m: Tensor
@@ -41,22 +40,11 @@ class Observation:
     nearest_m: float
     other: Tensor | None = None
     thing: Tensor | None = None
-    own: Tensor | None = None
 
     @property
     def empty(self) -> bool:
         """True when nothing in the frame can be a hand."""
         return not np.isfinite(self.nearest_m)
-
-    @property
-    def hiding_m(self) -> Tensor:
-        """(H, W) Z of what may hide the hand, 0 where nothing may: a thing that it holds and the
-        hand itself do not hide it as what passes in front does, for they are seen with it.
-        """
-        depth_m = self.depth_m
-        for mask in (self.thing, self.own):
-            depth_m = depth_m if mask is None else depth_m.masked_fill(mask, 0.0)
-        return depth_m
 
     def to(self, device: torch.device) -> Observation:
         """The same observation on another device."""
@@ -68,7 +56,6 @@ class Observation:
             k=self.k.to(device),
             other=None if self.other is None else self.other.to(device),
             thing=None if self.thing is None else self.thing.to(device),
-            own=None if self.own is None else self.own.to(device),
         )
 
 

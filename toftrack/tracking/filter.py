@@ -15,6 +15,7 @@ from torch import Tensor
 from toftrack.compute import particle_filter
 from toftrack.compute.pace import FRAME_S
 from toftrack.compute.particle_filter import FilterSettings
+from toftrack.compute.redraw import bound
 from toftrack.compute.rigid import pivot_offset
 from toftrack.compute.spans import Spans
 from toftrack.compute.transfer import on_device
@@ -147,7 +148,7 @@ def drawn_to(found: Found, model: FilterModel) -> Filtered:
     space = model.space_of(filtered.particles)
     change = motions.difference(found.particle, filtered.mean)
     particles = motions.compose(filtered.particles, on_device(change, model.device))
-    latent = particle_filter.bound(particles[:, 6:], space.lower, space.upper, "truncate")
+    latent = bound(particles[:, 6:], space.lower, space.upper, "truncate")
     particles[:, 6:] = latent
     return Filtered(particles, filtered.weights, found.particle)
 

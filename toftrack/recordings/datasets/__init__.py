@@ -18,8 +18,7 @@ DATA_SETS: dict[str, DataSet] = {
 def open_data_set(name: str, folder: str | Path) -> tuple[DataSet, list[LabelledSequence]]:
     """A data set by its name, and the sequences that lie in a folder.
 
-    Raises:
-        ToftrackError: the name is unknown, or the folder does not hold that data set.
+    Raises ToftrackError: the name is unknown, or the folder does not hold that data set.
     """
     if name not in DATA_SETS:
         raise ToftrackError(f"the data set '{name}' is unknown; known: {', '.join(DATA_SETS)}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,36 @@ class LabelledSequence:
         return len(self.joints_m)
 
 
+def labelled_sequence(
+    name: str,
+    side: str,
+    camera: Camera,
+    images: Sequence[Path],
+    joints_m: np.ndarray,
+    read: Callable[[Path], np.ndarray],
+) -> LabelledSequence:
+    """A sequence at 30 frames a second, without the labels whose images are missing.
+
+    joints_m: (T, J, 3) of all T images.  read: the depth of one.
+    Raises ToftrackError where there is no image at all.
+    """
+    there = [row for row, path in enumerate(images) if path.is_file()]
+    if not there:
+        raise ToftrackError(
+            f"there is no image '{images[0]}', nor another of the sequence {name}; copy the data "
+            "set again"
+        )
+    return LabelledSequence(
+        name=name,
+        side=side,
+        camera=camera,
+        fps=30.0,
+        joints_m=joints_m[there],
+        frame=lambda index: read(images[there[index]]),
+        left_out=len(images) - len(there),
+    )
+
+
 @dataclass(frozen=True)
 class DataSet:
     """A public data set.
@@ -63,13 +93,11 @@ def compared_joints(
 ) -> np.ndarray:
     """Estimates as a data set defines its joints.
 
-    Args:
-        joints_m: (T, 21, 3) metres, in toftrack's order.
-        joints: the rows wanted, J of them.
-        tip_inset_m: how far finger ends move along the last bone towards the joint before.
+    joints_m: (T, 21, 3) metres, in toftrack's order.
+    joints: the rows wanted, J of them.
+    tip_inset_m: how far finger ends move along the last bone towards the joint before.
 
-    Returns:
-        (T, J, 3) metres.
+    Returns (T, J, 3) metres.
     """
     moved = np.array(joints_m, np.float64)
     for tip in _TIPS:

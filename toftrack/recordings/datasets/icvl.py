@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
 from toftrack.recordings.datasets.base import (
     MILLIMETRE,
     DataSet,
     LabelledSequence,
+    labelled_sequence,
     numbers,
     read_lines,
 )
@@ -25,7 +25,6 @@ from toftrack.recordings.png import read_png
 
 _WIDTH, _HEIGHT = 320, 240
 _CAMERA = Camera(np.array([[241.42, 0, 160], [0, 241.42, 120], [0, 0, 1]]), _WIDTH, _HEIGHT)
-_FPS = 30.0
 _IMAGES = "Depth"
 _NUMBERS = 48
 _JOINTS = (2, 3, 4, 5, 6, 8, 9, 10, 12, 13, 14, 16, 17, 18, 20)
@@ -59,25 +58,11 @@ def _sequences(part: Path, labels: Path) -> list[LabelledSequence]:
 
 
 def _sequence(name: str, labelled: list[tuple[Path, np.ndarray]]) -> LabelledSequence:
-    there = [(path, row) for path, row in labelled if path.is_file()]
-    if not there:
-        raise ToftrackError(
-            f"there is no image '{labelled[0][0]}', nor another of the sequence {name}; copy the "
-            "data set again"
-        )
-    images = [path for path, _ in there]
-    u, v, millimetres = np.moveaxis(np.array([row for _, row in there])[:, 1:], -1, 0)
-    z = MILLIMETRE * millimetres
-    K = _CAMERA.K
-    return LabelledSequence(
-        name=name,
-        side="left",
-        camera=_CAMERA,
-        fps=_FPS,
-        joints_m=np.stack([(u - K[0, 2]) * z / K[0, 0], (v - K[1, 2]) * z / K[1, 1], z], axis=-1),
-        frame=lambda index: _read_depth(images[index]),
-        left_out=len(labelled) - len(there),
-    )
+    images = [path for path, _ in labelled]
+    u, v, millimetres = np.moveaxis(np.array([row for _, row in labelled])[:, 1:], -1, 0)
+    z, K = MILLIMETRE * millimetres, _CAMERA.K
+    joints_m = np.stack([(u - K[0, 2]) * z / K[0, 0], (v - K[1, 2]) * z / K[1, 1], z], axis=-1)
+    return labelled_sequence(name, "left", _CAMERA, images, joints_m, _read_depth)
 
 
 def _read_depth(path: Path) -> np.ndarray:

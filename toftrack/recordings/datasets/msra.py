@@ -13,6 +13,7 @@ from the index to the little one, the thumb last.
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from toftrack.recordings.datasets.base import (
     MILLIMETRE,
     DataSet,
     LabelledSequence,
+    labelled_sequence,
     numbers,
     read_bytes,
     read_lines,
@@ -30,7 +32,6 @@ from toftrack.recordings.datasets.base import (
 
 _WIDTH, _HEIGHT = 320, 240
 _CAMERA = Camera(np.array([[241.42, 0, 160], [0, 241.42, 120], [0, 0, 1]]), _WIDTH, _HEIGHT)
-_FPS = 30.0
 _LABELS = "joint.txt"
 _JOINTS = (0, *range(5, 21), *range(1, 5))
 """toftrack's row of each label: the labels' thumb begins at its lowest joint, as ours does."""
@@ -41,14 +42,6 @@ _TIP_NOTE = (
     "a label of a finger's end is the last point of the authors' sphere model, about the middle of "
     "the last sphere"
 )
-
-
-def _open_tracking(folder: Path) -> list[LabelledSequence]:
-    return _sequences(folder, "Subject*")
-
-
-def _open_gestures(folder: Path) -> list[LabelledSequence]:
-    return _sequences(folder, "P[0-9]/*")
 
 
 def _sequences(folder: Path, pattern: str) -> list[LabelledSequence]:
@@ -70,21 +63,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _sequence(folder: Path, name: str) -> LabelledSequence:
     joints = _labels(folder / _LABELS)
     images = [folder / f"{index:06d}_depth.bin" for index in range(len(joints))]
-    there = [index for index, path in enumerate(images) if path.is_file()]
-    if not there:
-        raise ToftrackError(
-            f"the folder '{folder}' has labels, but no 000000_depth.bin; copy the data set again"
-        )
-    kept = [images[index] for index in there]
-    return LabelledSequence(
-        name=name,
-        side="right",
-        camera=_CAMERA,
-        fps=_FPS,
-        joints_m=joints[there],
-        frame=lambda index: _read_depth(kept[index]),
-        left_out=len(joints) - len(there),
-    )
+    return labelled_sequence(name, "right", _CAMERA, images, joints, _read_depth)
 
 
 def _labels(path: Path) -> np.ndarray:
@@ -138,7 +117,7 @@ MSRA14 = DataSet(
     tip_inset_m=0.007,
     tips=_TIP_NOTE,
     layout="there must be folders Subject1, Subject2, ... with joint.txt and 000000_depth.bin",
-    open=_open_tracking,
+    open=partial(_sequences, pattern="Subject*"),
 )
 MSRA15 = DataSet(
     name="MSRA15",
@@ -146,5 +125,5 @@ MSRA15 = DataSet(
     tip_inset_m=0.007,
     tips=_TIP_NOTE,
     layout="there must be folders P0/1, P0/2, ... with joint.txt and 000000_depth.bin",
-    open=_open_gestures,
+    open=partial(_sequences, pattern="P[0-9]/*"),
 )

@@ -9,6 +9,9 @@ are compared, and the two ends of the wrist as their middle; the palm's middle h
 
 from __future__ import annotations
 
+import io
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +22,13 @@ from toftrack.recordings.datasets.base import (
     MILLIMETRE,
     DataSet,
     LabelledSequence,
+    labelled_sequence,
+    read_bytes,
 )
-from toftrack.recordings.datasets.mat_file import read_numbers
 from toftrack.recordings.png import read_png
 
 _WIDTH, _HEIGHT = 640, 480
 _CAMERA = Camera(np.array([[588.036865, 0, 320], [0, 587.075073, 240], [0, 0, 1]]), _WIDTH, _HEIGHT)
-_FPS = 30.0
 _LABELS, _KEY = "joint_data.mat", "joint_xyz"
 _POINTS = {20: 0, 18: 3, 16: 6, 14: 9, 12: 12, 10: 15, 8: 18, 6: 21, 4: 24, 3: 25, 2: 27}
 """The labels' points of toftrack's rows: TIP and PIP of four fingers; TIP, IP, MCP of the thumb."""
@@ -33,6 +36,20 @@ _WRIST = (30, 31)
 _TEST_FRAMES, _FIRST_PERSON = 8252, 2440
 """The test part shows one person up to that frame, and another from there on."""
 _MAX_M = 10.0
+_PROGRAM = """
+import io, sys
+import numpy
+from scipy.io import loadmat
+name, file = sys.argv[1], io.BytesIO(sys.stdin.buffer.read())
+arrays = loadmat(file, variable_names=[name])
+if name not in arrays:
+    raise ValueError(f"it has no array named {name}")
+if getattr(arrays[name], "dtype", numpy.dtype(object)).kind not in "fiu":
+    raise ValueError(f"{name} does not consist of real numbers")
+numpy.save(sys.stdout.buffer, arrays[name], allow_pickle=False)
+"""
+"""Reads the file from standard input and writes the array to standard output as `.npy`. SciPy's
+reader can crash on a damaged file, and so runs in a process of its own."""
 
 
 def _open(folder: Path) -> list[LabelledSequence]:
@@ -55,22 +72,9 @@ def _sequences(folder: Path) -> list[LabelledSequence]:
 
 
 def _sequence(folder: Path, name: str, joints: np.ndarray, frames: range) -> LabelledSequence:
-    images = {index: folder / f"depth_1_{index + 1:07d}.png" for index in frames}
-    there = [index for index, path in images.items() if path.is_file()]
-    if not there:
-        raise ToftrackError(
-            f"there is no image '{images[frames[0]]}', nor another of its sequence; copy the data "
-            "set again"
-        )
-    return LabelledSequence(
-        name=name,
-        side="right",
-        camera=_CAMERA,
-        fps=_FPS,
-        joints_m=joints[there],
-        frame=lambda index: _read_depth(images[there[index]]),
-        left_out=len(frames) - len(there),
-    )
+    images = [folder / f"depth_1_{index + 1:07d}.png" for index in frames]
+    labels = joints[frames.start : frames.stop]
+    return labelled_sequence(name, "right", _CAMERA, images, labels, _read_depth)
 
 
 def _labels(path: Path) -> np.ndarray:
@@ -84,6 +88,21 @@ def _labels(path: Path) -> np.ndarray:
     wrist = frontal[:, _WRIST, :].mean(axis=1, keepdims=True)
     fingers = frontal[:, [_POINTS[row] for row in sorted(_POINTS)]]
     return MILLIMETRE * np.concatenate([wrist, fingers], axis=1) * (1, -1, 1)
+
+
+def read_numbers(path: Path, name: str) -> np.ndarray:
+    """A real numeric array by its name, in its own type.
+
+    Raises ToftrackError: the file cannot be read, is damaged or of another version, or has no such
+    array.
+    """
+    command = [sys.executable, "-c", _PROGRAM, name]
+    done = subprocess.run(command, input=read_bytes(path), capture_output=True, check=False)
+    if done.returncode != 0:
+        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        reason = last if done.returncode == 1 and last else "SciPy's reader crashes on it"
+        raise ToftrackError(f"the file '{path}' cannot be used ({reason}); copy the data set again")
+    return np.load(io.BytesIO(done.stdout), allow_pickle=False)
 
 
 def _damaged(path: Path, what: str) -> ToftrackError:

@@ -6,17 +6,7 @@ import numpy as np
 
 from toftrack.compute.compiling import compiled
 from toftrack.render.numba.hand import DX, HY, IY, LANES, XY, X, Y
-from toftrack.render.numba.vector import (
-    BLOCK,
-    down,
-    larger,
-    ramp,
-    root,
-    smaller,
-    splat,
-    store,
-    up,
-)
+from toftrack.render.numba.vector import BLOCK, down, larger, ramp, root, smaller, splat, store, up
 from toftrack.render.numba.words import (
     WORDS,
     any_bit,
