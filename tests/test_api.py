@@ -163,20 +163,6 @@ def test_a_bad_image_does_not_disturb_the_track() -> None:
     assert (before.index, after.index, after.state_name) == (2, 3, "tracking")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["nope=1"], "nope"),
-        (["hand.shape=gone.json"], "gone.json"),
-        (["filter.particles=0"], "filter.particles"),
-    ],
-)
-def test_a_bad_override_is_one_clear_sentence(overrides: list, words: str) -> None:
-    with pytest.raises(toftrack.ToftrackError) as caught:
-        toftrack.make_tracker(*overrides)
-    assert words in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_a_device_is_what_the_command_line_would_open() -> None:
     with toftrack.make_device("device=sample", "device.stop=2") as device:
         frames = list(device)

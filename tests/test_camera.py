@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,6 @@ def test_pixel_centres_lie_at_integers() -> None:
 def test_points_behind_the_camera_have_no_image() -> None:
     camera = Camera(K, W, H)
     assert np.isnan(camera.project(np.array([[0.1, 0.1, 0.0], [0.1, 0.1, -1.0]]))).all()
-
-
-def test_distorted_rays_project_back_to_their_pixels() -> None:
-    camera = Camera(K, W, H, DISTORTION)
-    rays = camera.normalised_rays().reshape(-1, 2)
-    points = np.column_stack([rays, np.ones(len(rays))])
-    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, DISTORTION)
-    v, u = np.mgrid[:H, :W]
-    np.testing.assert_allclose(
-        pixels.reshape(-1, 2), np.column_stack([u.ravel(), v.ravel()]), atol=0.02
-    )
 
 
 RATIONAL = (0.5, -0.1, 2e-3, -1e-3, 0.01, 0.85, 0.02, -0.005)
@@ -195,21 +185,9 @@ def test_image_of_another_size_is_reported() -> None:
 
 @pytest.mark.parametrize("count", [0, *LENSES])
 def test_save_and_load_keep_the_lens(tmp_path: Path, count: int) -> None:
-    camera = some_lens(count)
+    camera = replace(some_lens(count), depth_polynomial=(0.01, -0.002))
     camera.save(tmp_path / "camera.json")
-    loaded = Camera.load(tmp_path / "camera.json")
-    np.testing.assert_array_equal(loaded.distortion, camera.distortion)
-    assert loaded.lens == camera.lens
-
-
-def test_save_and_load_are_the_same_camera(tmp_path: Path) -> None:
-    camera = Camera(K, W, H, DISTORTION, (0.01, -0.002))
-    camera.save(tmp_path / "camera.json")
-    loaded = Camera.load(tmp_path / "camera.json")
-    np.testing.assert_array_equal(loaded.K, K)
-    np.testing.assert_array_equal(loaded.distortion, DISTORTION)
-    assert (loaded.width, loaded.height) == (W, H)
-    assert loaded.depth_polynomial == (0.01, -0.002)
+    assert Camera.load(tmp_path / "camera.json").to_dict() == camera.to_dict()
 
 
 @pytest.mark.parametrize(
@@ -237,7 +215,7 @@ def test_bad_camera_file_is_reported(tmp_path: Path, change: dict[str, Any], wor
 def test_file_that_is_no_camera_is_reported(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "camera.json"
     path.write_bytes(content)
-    with pytest.raises(ToftrackError, match="not a camera file"):
+    with pytest.raises(ToftrackError, match="camera.json"):
         Camera.load(path)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.help_text import fields_in_help
 from toftrack.json_text import read_json
 from toftrack.safe_files import write_whole
@@ -235,13 +235,8 @@ class Camera:
 
     def save(self, path: str | Path) -> None:
         """Write the camera as JSON. Raises ToftrackError when the file cannot be written."""
-        try:
+        with reported_errors(f"the camera file '{path}' cannot be written", "choose another place"):
             write_whole(path, json.dumps(self.to_dict(), indent=1) + "\n")
-        except OSError as error:
-            raise ToftrackError(
-                f"the camera file '{path}' cannot be written ({error.strerror}); choose another "
-                "place"
-            ) from error
 
     def to_dict(self) -> dict[str, Any]:
         """The content of a camera file, JSON-able."""
@@ -267,17 +262,12 @@ class Camera:
             raise ToftrackError(
                 "the name of the camera file is empty; give the path of one (.json)"
             )
-        try:
+        with reported_errors(
+            f"the camera file '{path}' cannot be read",
+            "give a camera file (.json) that toftrack wrote",
+            *(OSError, ValueError),
+        ):
             content = read_json(Path(path).expanduser())
-        except OSError as error:
-            raise ToftrackError(
-                f"the camera file '{path}' cannot be read ({error.strerror}); give the path of a "
-                "camera file (.json)"
-            ) from error
-        except ValueError:  # of the JSON or of the text's encoding
-            raise ToftrackError(
-                f"'{path}' is not a camera file: it is not JSON; give a file that toftrack wrote"
-            ) from None
         return cls.from_dict(content, path)
 
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -119,21 +119,9 @@ class Truth:
         return self._taken(rows, int(numbers[0]) if len(rows) else self.first)
 
     def _taken(self, rows: slice | np.ndarray, first: int) -> Truth:
-        def cut(values: np.ndarray | None) -> np.ndarray | None:
-            return None if values is None else values[rows]
-
-        return Truth(
-            joints_m=self.joints_m[rows],
-            visible=self.visible[rows],
-            in_space=self.in_space[rows],
-            visible_fraction=cut(self.visible_fraction),
-            joint_visible=cut(self.joint_visible),
-            first=first,
-            other=None if self.other is None else self.other._taken(rows, first),
-            pose_name=cut(self.pose_name),
-            still=cut(self.still),
-            side=self.side,
-        )
+        arrays = {n: values[rows] for n, values in vars(self).items() if np.ndim(values)}
+        other = None if self.other is None else self.other._taken(rows, first)
+        return replace(self, **arrays, first=first, other=other)
 
 
 @dataclass(frozen=True, eq=False)

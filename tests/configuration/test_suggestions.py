@@ -52,7 +52,7 @@ def test_a_misspelt_setting_of_the_papers_tracker_gets_the_nearest_one() -> None
         ),
         (
             "refine/gauss_newton.yaml",
-            ("damping:", "nope: 3\ndamping:"),
+            ("angle_rad:", "nope: 3\nangle_rad:"),
             "argument 'nope'.*at refine",
         ),
         (

@@ -191,19 +191,6 @@ def test_other_lenses_are_a_fisheye_none_or_reported(plug: Callable[..., Sdk]) -
         orbbec()
 
 
-@pytest.mark.parametrize(
-    ("changes", "reported"),
-    [
-        ({"keep": "some"}, "keep=newest or every"),
-        ({"start": 3, "stop": 3}, "0 <= start < stop"),
-        ({"bag": "none.bag"}, "no file 'none.bag'"),
-    ],
-)
-def test_settings_that_make_no_sense_are_reported(changes: dict[str, Any], reported: str) -> None:
-    with pytest.raises(ToftrackError, match=reported):
-        orbbec(**changes)
-
-
 def test_a_missing_or_strange_sdk_is_reported_with_the_extra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -187,15 +187,6 @@ def test_no_camera_is_reported_with_the_ids() -> None:
         camera("missing")
 
 
-def test_usb_that_cannot_be_listed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(**_: Any) -> None:
-        raise usb.core.USBError("no access", None, 13)
-
-    monkeypatch.setattr(sr3000_usb.usb.core, "find", fails)
-    with pytest.raises(ToftrackError, match="cannot be listed"):
-        sr3000()
-
-
 @pytest.mark.parametrize(("kind", "words"), [("permission", "udev"), ("busy", "another program")])
 def test_a_camera_that_cannot_be_opened_is_reported(kind: str, words: str) -> None:
     device = camera(kind)

@@ -104,27 +104,21 @@ def test_a_gesture_is_reported_by_its_fingers_and_thumb(
         assert probability > 0.6, thumb
 
 
-def test_a_thumb_is_up_over_loosely_curled_fingers_which_make_no_fist() -> None:
+@pytest.mark.parametrize(
+    ("flexions", "of_thumbs"),
+    [
+        ((40, 85, 45), {"up": "thumb_up", "out": "thumb_up"}),  # loosely curled
+        ((38, 115, 72), {"across": "fist", "beside": "fist", "up": "thumb_up"}),
+        ((35, 95, 55), {"up": "thumb_up", "out": "thumb_up"}),  # rolled up
+    ],
+)
+def test_fists_and_thumbs_up_may_have_knuckles_that_are_hardly_bent(
+    flexions: tuple[int, int, int], of_thumbs: dict[str, str]
+) -> None:
     angles = fingers(0, 1, 2, 3)
     for finger in range(4):
-        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians([40, 85, 45])
-    assert label_of(of_thumb(angles, "up")) == label_of(of_thumb(angles, "out")) == "thumb_up"
-    assert label_of(of_thumb(angles, "across")) != "fist"
-
-
-def test_a_fist_is_one_also_over_knuckles_that_are_hardly_bent() -> None:
-    angles = fingers(0, 1, 2, 3)
-    for finger in range(4):
-        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians([38, 115, 72])
-    assert label_of(of_thumb(angles, "across")) == label_of(of_thumb(angles, "beside")) == "fist"
-    assert label_of(of_thumb(angles, "up")) == "thumb_up"
-
-
-def test_a_thumb_is_up_over_fingers_that_roll_up_with_their_knuckles_hardly_bent() -> None:
-    angles = fingers(0, 1, 2, 3)
-    for finger in range(4):
-        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians([35, 95, 55])
-    assert label_of(of_thumb(angles, "up")) == label_of(of_thumb(angles, "out")) == "thumb_up"
+        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians(flexions)
+    assert {thumb: label_of(of_thumb(angles, thumb)) for thumb in of_thumbs} == of_thumbs
 
 
 def test_a_half_closed_hand_is_relaxed_and_a_pinch_with_straight_fingers_ok() -> None:

@@ -12,7 +12,7 @@ from helpers.settings import (
 )
 
 from toftrack.devices.sr3000.device import Sr3000
-from toftrack.devices.sr3000.emulator_settings import EmulatorSettings
+from toftrack.devices.sr3000.faults import EmulatorSettings
 from toftrack.recordings.sr_frame import unambiguous_range_m
 
 FAST = {"fps": 1000.0, "replug_s": 0.02, "late_s": 0.06}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toftrack.estimate import Estimate, confidence_words, no_estimate, state_words
+from toftrack.estimate import no_estimate
 from toftrack.output.advice import LostFrame, RunFacts, Watch, advice, lost_frame
 
 REACH_M = 1.05
@@ -26,15 +26,6 @@ def facts(frame: LostFrame, lost: int = 60, tracked: int = 40) -> RunFacts:
 def test_nothing_is_said_of_runs_that_went_well() -> None:
     assert advice(RunFacts(), "right", REACH_M) == ()
     assert advice(facts(ORDINARY, 50, 50), "right", REACH_M) == ()
-
-
-def test_first_it_is_said_what_was_seen() -> None:
-    whole = facts(ORDINARY)
-    whole.add_lost(replace(ORDINARY, state_name="hidden", farthest_m=3.0))
-    assert advice(whole, "right", REACH_M)[0] == (
-        "61 of 101 frames were lost (searching for the hand: 60, the hand is hidden: 1), in which "
-        "90 % of the pixels had readings, from 0.50 to 3.00 m."
-    )
 
 
 @pytest.mark.parametrize(
@@ -107,19 +98,3 @@ def test_advice_to_who_watches_is_of_what_is_recent() -> None:
         watch.see((replace(lost, lost=False),), nothing, (None,))
     assert watch.advice(None, recent=True) == ()
     assert watch.facts[0].counts["lost"] == 60, "the run's are all"
-
-
-def test_words_for_people() -> None:
-    lost = no_estimate(0, 0.0, "out of view", 4, 0.01)
-
-    def words(**changes: object) -> str:
-        return state_words(Estimate(**{**vars(lost), **changes}))
-
-    assert words() == "the hand is out of view"
-    assert words(state_name="tracking") == "not sure of the pose"
-    assert words(state_name="tracking", lost=False) == "tracking"
-    assert words(state_name="of another version") == "of another version"
-    assert [confidence_words(p) for p in (0.0, 0.001, 0.974, 0.9999, np.nan)] == [
-        *("0 % sure", "1 % sure", "97 % sure", "99 % sure"),
-        "",
-    ]

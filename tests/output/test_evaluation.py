@@ -10,7 +10,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
-from toftrack.output.evaluation import evaluate, metrics_table
+from toftrack.output.evaluation import evaluate
 
 
 def random_case(seed: int) -> tuple[np.ndarray, np.ndarray, Truth]:
@@ -181,20 +181,3 @@ def test_flagging_cannot_improve_the_error() -> None:
 def test_other_shapes_than_the_truth_are_reported(shape: tuple[int, ...]) -> None:
     with pytest.raises(ToftrackError, match="shape"):
         evaluate(np.zeros(shape), None, still_hand(10))
-
-
-def test_table_shows_the_figures() -> None:
-    truth = still_hand(10)
-    summary = {
-        "frames": 10,
-        "lost_frames": 2,
-        "mean_ms": 12.34,
-        "fps": 81.0,
-        "mean_score": None,
-        "metrics": evaluate(truth.joints_m + (0.003, 0, 0.004), np.zeros(10, bool), truth),
-    }
-    table = metrics_table(summary)
-    for words in ("2 of them lost", "12.3 ms", "81.0 frames/s", "5.0 mm", "40 mm", "100.0 %"):
-        assert words in table
-    del summary["metrics"]
-    assert "joint error" not in metrics_table(summary)

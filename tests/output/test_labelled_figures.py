@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from toftrack.output.labelled_figures import labelled_figures, table, totals
+from toftrack.output.labelled_figures import labelled_figures, totals
 
 JOINTS = (0, 5, 8, 20)
 """Two of them are fingertips."""
@@ -52,11 +52,3 @@ def test_the_total_is_the_mean_over_sequences() -> None:
     assert total["usable_pct"] == 50
     assert total["usable_90"] == [0, 100]
     assert total["mean_mm"] == pytest.approx(some["mean_mm"] / 2)
-
-
-def test_the_table_has_a_row_for_each_and_their_mean() -> None:
-    some = labelled_figures(*estimates(), TRUE, JOINTS)
-    lines = table({"P0/1": some, "P0/TIP": some}).splitlines()
-    assert [line.split()[0] for line in lines] == ["sequence", "P0/1", "P0/TIP", "mean"]
-    assert len({len(line) for line in lines}) == 1
-    assert len(table({"P0/1": some}).splitlines()) == 2

@@ -14,8 +14,6 @@ from toftrack.frames import Truth
 from toftrack.output.measures import FLAG_COUNTS, POSE_GESTURES, Estimates, measured
 from toftrack.recordings.npz import read_recording
 
-TIPS = [4, 8, 12, 16, 20]
-
 
 def truth(frames: int = 6, **fields: Any) -> Truth:
     """A hand whose joints are 20 mm apart, at rest."""

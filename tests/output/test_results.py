@@ -262,19 +262,6 @@ def test_frames_beyond_the_truth_are_not_judged(tmp_path: Path) -> None:
     assert "metrics" not in summary
 
 
-def test_the_table_has_a_dash_where_nothing_was_judged(tmp_path: Path) -> None:
-    done = [estimate(i) for i in (0, 1, 5)]
-    hidden = Truth(np.zeros((6, 21, 3)), np.zeros(6, bool), np.ones(6, bool))
-    rows = dict(
-        line.split("  ", 1)
-        for line in metrics_table(write(tmp_path, done, hidden).summary).split("\n")
-    )
-    reported = {name: text.strip() for name, text in rows.items()}
-    assert reported["usable"] == "- % of the 0 visible frames" and reported["first right"] == "-"
-    assert reported["false alarms"] == reported["frames below 40 mm"] == "- %"
-    assert reported["frames"] == "6, 0 of them lost, 3 dropped"
-
-
 def test_run_json_is_there_from_the_start(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, {"seed": 1}, NAMES, truth_of([], 5)):
         facts = read_run_facts(tmp_path)

@@ -255,12 +255,6 @@ def test_the_programs_count_jobs_that_failed_elsewhere() -> None:
         assert isinstance(instantiate(config.hydra.callbacks.failed_jobs), FailedJobs)
 
 
-def test_a_sweep_of_good_jobs_exits_with_zero(app: Path) -> None:
-    status, out, err = call(app, "-m", "seed=1,2")
-    assert (status, err) == (0, "")
-    assert out.count("replayed 100") == 2
-
-
 def test_environment_is_as_before_after_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     assert run(lambda: None) == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from toftrack.devices.folder import Folder
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
-from toftrack.programs import command_line, convert, record
+from toftrack.programs import convert, record
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import PngFolderWriter, read_png_folder
@@ -87,13 +86,6 @@ def test_depth_in_a_folder_is_millimetres(tmp_path: Path) -> None:
     np.testing.assert_array_equal(image, np.rint(1000 * expected.astype(np.float64)))
 
 
-def test_the_polynomial_is_not_lost_in_npz(srs: Path, tmp_path: Path) -> None:
-    camera = Camera(np.diag((200.0, 200, 1)), 176, 144, depth_polynomial=(0.01,))
-    camera.save(tmp_path / "camera.json")
-    convert.convert(srs, tmp_path / "a.npz", camera_file=tmp_path / "camera.json")
-    assert read_recording(tmp_path / "a.npz").camera.depth_polynomial == (0.01,)
-
-
 def test_convert_errors(srs: Path, tmp_path: Path) -> None:
     (tmp_path / "there.npz").write_bytes(b"")
     Camera(np.eye(3), 8, 6).save(tmp_path / "camera.json")
@@ -147,8 +139,8 @@ def test_a_topic_of_a_bag_is_converted_with_its_lens(tmp_path: Path) -> None:
     np.testing.assert_array_equal(made.camera.distortion, camera.distortion)
 
 
-def test_a_fisheye_lens_is_not_lost_in_npz(tmp_path: Path) -> None:
-    camera = Camera(np.diag((30.0, 31, 1)), 32, 24, np.full(4, 0.1), lens="fisheye")
+def test_lens_and_polynomial_are_not_lost_in_npz(tmp_path: Path) -> None:
+    camera = Camera(np.diag((30.0, 31, 1)), 32, 24, np.full(4, 0.1), (0.01,), lens="fisheye")
     camera.save(tmp_path / "camera.json")
     np.save(tmp_path / "a.npy", np.ones((2, 24, 32)))
     convert.convert(tmp_path / "a.npy", tmp_path / "out.npz", tmp_path / "camera.json")
@@ -160,33 +152,6 @@ def test_recordings_of_another_size_do_not_fit_the_camera(tmp_path: Path) -> Non
     with pytest.raises(ToftrackError, match="176x144"):
         convert.convert(tmp_path / "a.npz", tmp_path / "a.srs")
     assert convert.convert(tmp_path / "a.npz", tmp_path / "folder") == 2
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["a.avi"], "is recorded to .npz"),
-        (["a.srs", "--frames", "0"], "--frames"),
-        (["a.srs", "device=sample"], "only an SR3000"),
-        (["a.srs", "--conf", "nowhere"], "no config.yaml"),
-        (["a.srs", "device.transport=emulated", "device.emulated.faults=[missing]"], "1ad2:0074"),
-        (["a.srs", "device.unknown=3"], "unknown"),
-    ],
-)
-def test_record_errors_are_one_sentence(
-    arguments: list[str],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["record", *arguments])
-    assert command_line.run(record.main) == 1
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
 
 
 def test_record_survives_faults_with_every_whole_frame(tmp_path: Path) -> None:
@@ -260,12 +225,9 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     ("changes", "words"),
     [
         ({"image_1": np.ones((6, 9), np.uint16)}, "1.png.*9x6"),
-        ({"image_2": np.ones((6, 9), np.uint16)}, "2.png.*9x6.*but must be 8x6"),
         ({"image_1": np.ones((6, 8), np.uint8)}, "1.png.*16-bit"),
-        ({"image_2": np.ones((6, 8, 3), np.uint16)}, "2.png.*16-bit"),
         ({"camera": {"depth_unit_m": 0}}, "depth_unit_m"),
         ({"camera": {"fps": "fast"}}, "fps"),
-        ({"camera": {"radial": 1}}, "radial"),
         ({"camera": {"K": [[1]]}}, "3x3"),
     ],
 )
@@ -293,8 +255,4 @@ def test_more_broken_folders_are_reported(tmp_path: Path) -> None:
         read_png_folder(folder).image(2)
     (folder / "1.png").write_bytes(b"")
     with pytest.raises(ToftrackError, match="1.png.*no PNG"):
-        read_png_folder(folder)
-    (folder / "1.png").write_bytes((folder / "2.png").read_bytes())
-    (folder / "camera.json").write_text("{")
-    with pytest.raises(ToftrackError, match="not JSON"):
         read_png_folder(folder)

@@ -122,9 +122,3 @@ def test_what_is_no_run_or_has_no_hand_is_reported(run: Path, tmp_path: Path) ->
         results.append((lost_hand(0),))
     with pytest.raises(ToftrackError, match="nothing to export"):
         export.main([str(run), "--to", "bvh"])
-
-
-def test_an_unknown_format_is_refused(run: Path, capsys) -> None:
-    with pytest.raises(SystemExit):
-        export.main([str(run), "--to", "fbx"])
-    assert "glb" in capsys.readouterr().err

@@ -16,8 +16,6 @@ from helpers import programs
 from helpers.configured import f_measure, nearest_surface
 from helpers.programs import QUICK
 from helpers.tracking import ROOT, make_tracker, sample
-from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
@@ -165,29 +163,6 @@ def test_the_recording_is_found_from_another_folder(
     assert footage is not None and len(footage.truth) == FRAMES
 
 
-def test_figures_say_the_runs_numbers_in_the_words_used_elsewhere(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    texts: list[str] = []
-    true_picture = chart.picture_of
-
-    def noted(figure: Figure) -> np.ndarray:
-        picture = true_picture(figure)
-        texts.extend(text.get_text().replace("\n", " ") for text in figure.findobj(Text))
-        return picture
-
-    monkeypatch.setattr(chart, "picture_of", noted)
-    draw_figures(run, frame=3, out=tmp_path / "out")
-    score = read_run(run).results["score"][3]
-    mean = json.loads((run / "summary.json").read_text())["metrics"]["mean_mm"]
-    for words in (
-        *(f"Frame 3: score {score:.2f}, ", " missed", f"mean joint error {mean:.1f} mm"),
-        *("No frame was lost: the ", "may lie beyond it", "pointing", "time, s", "score", "lost"),
-    ):
-        assert any(words in text for text in texts), words
-    assert "gun" not in texts
-
-
 def test_lost_frames_are_shown_and_shaded(run: Path, tmp_path: Path) -> None:
     before = draw_figures(run, out=tmp_path / "before")
     change(run, lost=lambda lost: np.arange(len(lost)) >= 8)
@@ -302,13 +277,6 @@ def test_a_missing_file_is_named(run: Path, gone: str) -> None:
     (run / gone).unlink()
     with pytest.raises(ToftrackError, match=f"lacks {gone}"):
         draw_figures(run)
-
-
-def test_a_folder_that_is_no_runs_is_said_to_be_none(tmp_path: Path) -> None:
-    with pytest.raises(ToftrackError, match="not the output folder of a run"):
-        draw_figures(tmp_path)
-    with pytest.raises(ToftrackError, match="no folder"):
-        draw_figures(tmp_path / "nowhere")
 
 
 def test_a_recording_that_moved_is_asked_for(run: Path, tracked: Path) -> None:

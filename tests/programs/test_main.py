@@ -14,7 +14,6 @@ import toftrack
 from toftrack.configuration.compose import devices_of_files, setting_names
 from toftrack.errors import ToftrackError
 from toftrack.programs import main as front
-from toftrack.programs import record
 from toftrack.programs.recording_argument import options_first, quoted, with_recording
 
 KNOWN = setting_names(), devices_of_files()
@@ -166,9 +165,3 @@ def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missin
 def test_what_cannot_be_one_recording_is_reported(words: list[str], reported: str) -> None:
     with pytest.raises(ToftrackError, match=reported):
         with_recording(words, *KNOWN)
-
-
-def test_only_what_must_be_given_is_called_required(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        record.main([])
-    assert capsys.readouterr().err.endswith("the following arguments are required: OUT\n")

@@ -202,6 +202,8 @@ def test_at_the_limit_the_command_ends_well(
     ("arguments", "words"),
     [
         (["a.npz"], "which camera is it? Give device="),
+        (["a.avi"], "is recorded to .npz"),
+        (["a.srs", "device=sample"], "only an SR3000"),
         (["a.npz", "device=synthetic", "--limit", "0"], "--limit=0.0 is not possible"),
         (["a.npz", "device=synthetic", "--config-dir", "nowhere"], "no folder 'nowhere'"),
         (["a.npz", "device=replay"], "device.path"),

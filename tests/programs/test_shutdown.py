@@ -75,7 +75,3 @@ def test_what_is_ignored_stays_ignored_and_handlers_come_back() -> None:
         assert signal.getsignal(signal.SIGTERM) == term
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_ctrl_c_without_a_listener_is_130() -> None:
-    assert exit_status(KeyboardInterrupt()) == 130

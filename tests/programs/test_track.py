@@ -232,29 +232,6 @@ def test_a_missing_recording_is_reported_in_one_line_by_the_program_itself(tmp_p
     assert err == "error: there is no file 'gone.npz'; give the path of a recording (.npz)\n"
 
 
-MILLIMETRES = np.full((3, 30, 40), 600.0, np.float32)
-
-
-@pytest.mark.parametrize(
-    ("name", "drop", "changes", "words"),
-    [
-        ("no depth", ("depth_m",), {}, "'depth_m'"),
-        ("no camera", ("K",), {}, "'K'"),
-        ("no frames", (), {"depth_m": np.zeros((0, 30, 40), np.float32)}, "zero frames"),
-        ("millimetres", (), {"depth_m": MILLIMETRES}, "/ 1000"),
-        ("pickled", (), {"K": np.array([{"fx": 1}], object)}, "pickled"),
-    ],
-)
-def test_a_bad_recording_is_one_clear_sentence(
-    tmp_path, name: str, drop, changes: dict, words: str
-) -> None:
-    path = save(tmp_path / "bad.npz", drop, **changes)
-    with pytest.raises(ToftrackError) as reported:
-        Replay(path)
-    assert words in str(reported.value) and "bad.npz" in str(reported.value)
-    assert "\n" not in str(reported.value)
-
-
 def test_a_bad_recording_ends_the_program_before_it_writes(here, tmp_path) -> None:
     save(tmp_path / "bad.npz", ("depth_m",))
     status, out, err = here("device=replay", "device.path=bad.npz")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -167,21 +166,6 @@ def test_nothing_but_the_printed_address_says_the_token(view, visitor, capsys) -
         assert other.token != view.token
 
 
-def test_nothing_is_drawn_while_nobody_watches(view, monkeypatch) -> None:
-    drawn: list[int] = []
-    monkeypatch.setattr(
-        browser, "_encode", lambda m, _: drawn.append(m.estimates[0].index) or b"jpeg"
-    )
-    with Visitor(view.url) as visitor:
-        for _ in range(20):
-            view.show(moments()[0])
-        time.sleep(0.1)
-        assert drawn == []
-        view.show(moments()[1])
-        assert visitor.picture()[1] == b"jpeg"
-    assert drawn == [moments()[1].estimates[0].index]  # the others were never drawn
-
-
 def test_showing_a_frame_never_waits_for_the_drawing(view, visitor, monkeypatch) -> None:
     began, go = threading.Event(), threading.Event()
 
@@ -242,10 +226,7 @@ def test_ten_visitors_and_one_who_never_reads_all_get_on(view, capfd) -> None:
     "settings",
     [
         {"port": 65536},
-        {"port": "http"},
         {"quality": 0},
-        {"most_fps": 0},
-        {"wait_s": -1},
         {"linger_s": float("nan")},
         {"host": "192.0.2.1"},
     ],

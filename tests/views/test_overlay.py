@@ -16,7 +16,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
-from toftrack.views.base import NoView, TrackedFrame
+from toftrack.views.base import TrackedFrame
 from toftrack.views.overlay import (
     CAPTION_PX,
     VideoView,
@@ -205,16 +205,6 @@ def test_lost_is_red_and_tracking_is_not() -> None:
         assert (colour_share(right[:, -3:], red) > 0.9) == lost
 
 
-def test_the_caption_changes_with_the_frame() -> None:
-    one, other = (dataclasses.replace(hand(), index=index) for index in (123456, 654321))
-    first, second = (
-        sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (reported,), (None,), 3))[0]
-        for reported in (one, other)
-    )
-    assert (first[:, : 3 * W] != second[:, : 3 * W]).any()
-    assert (first[:, 3 * W :] == second[:, 3 * W :]).all()
-
-
 LONG = {"gesture": "pointing_thumb", "pinching": True, "confidence": 0.99, "index": 12345}
 REPORTED: dict[str, tuple[Estimate, ...]] = {
     "tracking": (dataclasses.replace(hand(), **LONG),),
@@ -321,14 +311,6 @@ def test_filmstrip_shows_the_left_side_above_the_right(tmp_path: Path) -> None:
     assert column.index(100) < column.index(50) < column.index(200)
 
 
-def test_memory_is_bounded_when_the_length_is_unknown(tmp_path: Path) -> None:
-    view = VideoView(tmp_path, 25, None)
-    for _ in range(700):
-        view.add(panel_of(9, (CAPTION_PX + 4, 8)))
-        assert len(view._tiles) <= 64
-    view.close()
-
-
 def test_nothing_is_written_without_a_panel(tmp_path: Path) -> None:
     VideoView(tmp_path, 25, 10).close()
     assert list(tmp_path.iterdir()) == []
@@ -337,13 +319,6 @@ def test_nothing_is_written_without_a_panel(tmp_path: Path) -> None:
 def test_a_video_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="overlay.mp4.*view=none"):
         VideoView(tmp_path / "nowhere", 25, 10).add(panel_of(1))
-
-
-def test_no_view_takes_the_same_calls_and_writes_nothing(tmp_path: Path) -> None:
-    with NoView(folder=tmp_path, fps=25, frames=3) as view:
-        view.show(moment())
-        assert not view.commands()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_tracked_frame_is_appended_as_its_panel(tmp_path: Path) -> None:

@@ -136,20 +136,6 @@ def test_every_frames_estimate_can_be_read_back(written: Path) -> None:
     assert len(colours[7]) == 1  # one colour says that it is lost
 
 
-def test_ellipsoids_have_the_sizes_of_the_hand_on_either_side(rerun_view) -> None:
-    from toftrack.hand.surface import hand_surface
-    from toftrack.views.rerun.entities import ellipsoids
-
-    one = moments()[0].hands[0]
-    right, left = (ellipsoids(one.estimate, one.shape.of_side(side)) for side in ("right", "left"))
-    sizes = [np.array(hand.half_sizes.as_arrow_array().to_pylist()) for hand in (right, left)]
-    assert sizes[0].shape == (len(hand_surface(one.shape)), 3) and (sizes[0] > 0).all()
-    np.testing.assert_allclose(sizes[0], sizes[1], rtol=1e-5)
-    for hand in (right, left):
-        rotations = np.array(hand.quaternions.as_arrow_array().to_pylist())
-        np.testing.assert_allclose(np.linalg.norm(rotations, axis=1), 1, atol=1e-5)
-
-
 def test_depth_comes_back_in_metres_and_with_its_pinhole(written: Path) -> None:
     steps = rows(written, "world/camera/depth", "DepthImage:buffer")
     metre = rows(written, "world/camera/depth", "DepthImage:meter")

@@ -34,7 +34,7 @@ from toftrack.benchmark.results import (
 )
 from toftrack.benchmark.runs import SIDES, Job, jobs, run_jobs, sources
 from toftrack.configuration.compose import configuration
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.output.accuracy import Row
 from toftrack.output.accuracy_tables import accuracy_tables, markdown, plain
 from toftrack.safe_files import write_whole
@@ -177,12 +177,8 @@ def write_picture(path: Path, result: dict[str, Any]) -> None:
     kind = path.suffix if path.suffix.lower() in (".png", ".jpg") else ".png"
     done, data = cv2.imencode(kind, accuracy_figure(result["each"], result["total"]))
     assert done
-    try:
+    with reported_errors(f"the picture '{path}' cannot be written", "choose another place"):
         write_whole(path, data.tobytes())
-    except OSError as error:
-        raise ToftrackError(
-            f"the picture '{path}' cannot be written ({error.strerror}); choose another place"
-        ) from error
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 import toftrack
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import read_json
 from toftrack.output.accuracy import Row, by_recording, groups, image_totals, totals
 from toftrack.output.paired import compared, rows_of
@@ -89,17 +89,10 @@ def _number(text: str) -> tuple[int, str]:
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of an earlier measurement; ToftrackError where the file is none."""
-    try:
-        return rows_of(read_json(path))
-    except OSError as error:
-        raise ToftrackError(
-            f"'{path}', to compare with, cannot be read ({error.strerror}); check the path"
-        ) from error
-    except ValueError as error:
-        raise ToftrackError(
-            f"'{path}', to compare with, is nothing that toftrack benchmark accuracy --json wrote "
-            f"({error}); give such a file"
-        ) from None
+    what = f"'{path}', to compare with, is nothing that toftrack benchmark accuracy --json wrote"
+    with reported_errors(what, "give such a file", OSError, ValueError):
+        rows = rows_of(read_json(path))
+    return rows
 
 
 def comparison_with(rows: Sequence[Row], others: Sequence[Row], name: str) -> dict[str, Any]:
@@ -125,12 +118,8 @@ def checked_targets(*paths: Path | None) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """A whole text file, or the old one and a ToftrackError."""
-    try:
+    with reported_errors(f"the file '{path}' cannot be written", "choose another place"):
         write_whole(path, text)
-    except OSError as error:
-        raise ToftrackError(
-            f"the file '{path}' cannot be written ({error.strerror}); choose another place"
-        ) from error
 
 
 def json_text(result: dict[str, Any]) -> str:

@@ -26,42 +26,41 @@ from toftrack.output.accuracy import Row, group_counts, row_figures
 from toftrack.output.evaluation import TIPS
 from toftrack.output.image_labels import Points, Stills, point_rows, read_labels, still_row
 from toftrack.output.measures import Estimates, measured
-from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import read_recording
 
 SIDES = ("told", "auto")
 
 
 @dataclass(frozen=True)
-class Job:
-    """A recording to be tracked with a seed.
+class Source:
+    """A recording that can be measured.
 
     name: what it is called, its folder's name and its own.  frames: how many it has.
     labels: the file with labels of its images; None: it has truth.
-    side: of SIDES.  overrides: of the tracker.
-    peer: name and Python of another method that says what it sees in the same frames, in turn with
-        the tracker; None: there is none.
+    amplitude: whether it has amplitude images.
     """
-
-    path: Path
-    name: str
-    frames: int
-    seed: int
-    side: str = "told"
-    labels: Path | None = None
-    overrides: tuple[str, ...] = ()
-    peer: tuple[str, str] | None = None
-
-
-@dataclass(frozen=True)
-class Source:
-    """A recording that can be measured: see Job."""
 
     path: Path
     name: str
     frames: int
     labels: Path | None = None
     amplitude: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """A recording to be tracked with a seed.
+
+    side: of SIDES.  overrides: of the tracker.
+    peer: name and Python of another method that says what it sees in the same frames, in turn with
+        the tracker; None: there is none.
+    """
+
+    source: Source
+    seed: int
+    side: str = "told"
+    overrides: tuple[str, ...] = ()
+    peer: tuple[str, str] | None = None
 
 
 def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> list[Source]:
@@ -104,7 +103,8 @@ def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
         name = f"{file.absolute().parent.name}/{file.stem}"
         count, size = len(recording), (recording.camera.width, recording.camera.height)
         if recording.truth is not None:
-            return Source(file, name, count, amplitude=_has_amplitude(recording))
+            amplitude = count > 0 and recording.image(0)[1] is not None
+            return Source(file, name, count, amplitude=amplitude)
         fitting = [
             one
             for one in known
@@ -118,10 +118,6 @@ def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
         return Source(file, name, count, fitting[0].path) if fitting else None
     finally:
         recording.close()
-
-
-def _has_amplitude(recording: FrameStore) -> bool:
-    return len(recording) > 0 and recording.image(0)[1] is not None
 
 
 def jobs(
@@ -142,17 +138,9 @@ def jobs(
                     f"'{one.path}' has no amplitude image, which --peer {peer[0]} needs; leave "
                     "the recording out, or --peer"
                 )
+    given = tuple(overrides)
     return [
-        Job(
-            one.path,
-            one.name,
-            one.frames,
-            seed,
-            side,
-            one.labels,
-            tuple(overrides),
-            peer if seed == seeds[0] else None,
-        )
+        Job(one, seed, side, given, peer if seed == seeds[0] else None)
         for one in found
         for seed in seeds
     ]
@@ -165,18 +153,14 @@ def run_jobs(
 
     Raises ToftrackError, also of a worker.
     """
-    total = sum(job.frames for job in todo)
+    total = sum(job.source.frames for job in todo)
+    here = workers == 1 or len(todo) < 2
+    finished = ((job, rows_of_job(job)) for job in todo) if here else _in_processes(todo, workers)
     with tqdm(total=total, unit=" frames", file=sys.stderr, desc=words or None) as bar:
-        if workers == 1 or len(todo) < 2:
-            for job in todo:
-                bar.set_postfix_str(f"{job.name}, seed {job.seed}", refresh=False)
-                done(job, rows_of_job(job))
-                bar.update(job.frames)
-            return
-        for job, rows in _in_processes(todo, workers):
-            bar.set_postfix_str(f"{job.name}, seed {job.seed}", refresh=False)
+        for job, rows in finished:
+            bar.set_postfix_str(f"{job.source.name}, seed {job.seed}", refresh=False)
             done(job, rows)
-            bar.update(job.frames)
+            bar.update(job.source.frames)
 
 
 def _in_processes(todo: Sequence[Job], workers: int) -> Iterator[tuple[Job, list[Row]]]:
@@ -206,22 +190,22 @@ def _begin_worker() -> None:
 
 def rows_of_job(job: Job) -> list[Row]:
     """Track a recording: one row, or one for each labelled image."""
-    if job.labels is None:
+    if job.source.labels is None:
         return _true_rows(job)
-    labels = read_labels(job.labels)
+    labels = read_labels(job.source.labels)
     rows = _stills(job, labels) if isinstance(labels, Stills) else _points(job, labels)
     return [{"recording": name, "seed": job.seed, **figures} for name, figures in rows]
 
 
 def _true_rows(job: Job) -> list[Row]:
     """A row of the tracker, and one of the peer, if there is one."""
-    with Replay(job.path) as device:
+    with Replay(job.source.path) as device:
         truth = device.truth
         assert truth is not None
         if job.side == "told" and not truth.side:
             raise ToftrackError(
-                f"'{job.path}' does not say whose hand it shows ('side' in its metadata), and so "
-                "no side can be given; give --side auto"
+                f"'{job.source.path}' does not say whose hand it shows ('side' in its metadata), "
+                "and so no side can be given; give --side auto"
             )
         peer = None if job.peer is None else peer_process(*job.peer)
         if peer is not None:
@@ -247,7 +231,7 @@ def _row(job: Job, device: Replay, truth: Truth, track: Estimates, compute_s: np
     length_mm = float(length) if isinstance(length, int | float) else None
     sensor = kind if isinstance(kind, str) else size
     return {
-        "recording": job.name,
+        "recording": job.source.name,
         "seed": job.seed,
         **row_figures(found, compute_s),
         "groups": group_counts(found.first, truth, gesture, sensor, length_mm),
@@ -287,18 +271,18 @@ def estimates_of(reported: Sequence[Sequence[Estimate]], found_side: bool) -> Es
 
 
 def _points(job: Job, labels: Points) -> Iterator[tuple[str, dict[str, Any]]]:
-    with Replay(job.path) as device:
+    with Replay(job.source.path) as device:
         track, _, _ = _tracked(device, job, labels.side)
         if track.joints_m.ndim == 4:
             raise ToftrackError("labelled images are of one hand; leave out --hands 2")
         assert track.joint_ok is not None
         rows = point_rows(labels, track.joints_m, track.lost, track.joint_ok, device.camera.K, TIPS)
     for number, figures in rows.items():
-        yield f"{job.name}#{number:04d}", {"kind": "points", **figures}
+        yield f"{job.source.name}#{number:04d}", {"kind": "points", **figures}
 
 
 def _stills(job: Job, labels: Stills) -> Iterator[tuple[str, dict[str, Any]]]:
-    with Replay(job.path) as device:
+    with Replay(job.source.path) as device:
         for number, (frame, shown) in enumerate(zip(device, labels.images, strict=True)):
             depth = device.camera.rectify(frame.depth, frame.radial)
             tracker = _tracker(job, labels.side)
@@ -308,7 +292,7 @@ def _stills(job: Job, labels: Stills) -> Iterator[tuple[str, dict[str, Any]]]:
                 raise ToftrackError("labelled images are of one hand; leave out --hands 2")
             figures = still_row(reported[0].gesture, reported[0].lost, labels.called[shown])
             about = {"kind": "stills", "shown": shown, "gesture": reported[0].gesture}
-            yield f"{job.name}#{number:04d}", about | figures
+            yield f"{job.source.name}#{number:04d}", about | figures
 
 
 def _tracker(job: Job, side: str) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
@@ -18,7 +19,7 @@ class Folder(Replay):
         unit_m: metres of one step of the images; None = as the folder says, else 0.001.
         fps: frames a second; None = as the folder says, else 25.
         intrinsics: fx, fy, cx, cy in pixels, without distortion, instead of the folder's camera.
-        start, stop, realtime, repeat, camera_file: as for `Replay`.
+        camera_file, start, stop, realtime, repeat: as for `Replay`.
 
     Raises:
         ToftrackError: as `Replay`, and when the images are not 16-bit grey PNGs of one size.
@@ -29,17 +30,13 @@ class Folder(Replay):
         path: str | Path,
         unit_m: float | None = None,
         fps: float | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        realtime: bool = False,
-        repeat: bool = False,
         camera_file: str | Path | None = None,
         intrinsics: Sequence[float] | None = None,
+        **playback: Any,
     ) -> None:
         if not path:
             raise ToftrackError("no folder was given; set device.path=FOLDER")
         store = read_png_folder(path, camera_file, unit_m, fps, intrinsics)
-        super().__init__(
-            path, start, stop, realtime, repeat, camera_file, intrinsics=intrinsics, store=store
-        )
+        playback |= {"camera_file": camera_file, "intrinsics": intrinsics}
+        super().__init__(path, store=store, **playback)
         self.description |= {"device": "folder", "unit_m": store.unit_m}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import time
 from abc import abstractmethod
@@ -49,18 +48,6 @@ class FrameNumbers:
         self.dropped += number - self._offset - self.index - 1
         self.index = number - self._offset
         return self.index
-
-
-@contextlib.contextmanager
-def reported_errors(
-    what: str, remedy: str, errors: tuple[type[Exception], ...] = (RuntimeError,)
-) -> Iterator[None]:
-    """Errors of the SDK become one sentence: what, the SDK's words, and what to do."""
-    try:
-        yield
-    except errors as error:
-        reason = " ".join(str(error).split())
-        raise ToftrackError(f"{what} ({reason}); {remedy}") from error
 
 
 def chosen_serial(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 from toftrack.devices.replay import Replay
 from toftrack.recordings.store import FIRST_SAMPLE, packaged_sample, sample_file
@@ -15,17 +15,9 @@ class Sample(Replay):
     Raises ToftrackError for a name that no sample has; it lists them.
     """
 
-    def __init__(
-        self,
-        start: int = 0,
-        stop: int | None = None,
-        realtime: bool = False,
-        repeat: bool = False,
-        camera_file: str | Path | None = None,
-        name: str = FIRST_SAMPLE,
-    ) -> None:
+    def __init__(self, name: str = FIRST_SAMPLE, **playback: Any) -> None:
         with packaged_sample(name) as path:
-            super().__init__(path, start, stop, realtime, repeat, camera_file)
+            super().__init__(path, **playback)
         # Where the package happens to be installed says nothing about the result.
         recording = f"toftrack/data/{sample_file(name)}"
         self.description |= {"device": "sample", "name": name, "recording": recording}

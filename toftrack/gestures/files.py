@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.json_text import read_json
 from toftrack.safe_files import open_to_read, write_whole
@@ -102,13 +102,9 @@ def save_poses(path: str | Path, poses: Sequence[NamedPose]) -> None:
             for pose in poses
         ],
     }
-    try:
+    what = f"the file of gestures '{path}' cannot be written"
+    with reported_errors(what, "choose another place with --file FILE"):
         write_whole(path, json.dumps(content, indent=1) + "\n")
-    except OSError as error:
-        raise ToftrackError(
-            f"the file of gestures '{path}' cannot be written ({error.strerror}); choose another"
-            " place with --file FILE"
-        ) from error
 
 
 def _in_degrees(angles_rad: np.ndarray) -> dict[str, float]:

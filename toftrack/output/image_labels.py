@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.json_text import read_json
 from toftrack.output.measures import FLAG_COUNTS, flag_counts
@@ -84,14 +84,10 @@ class Stills:
 def read_labels(path: str | Path) -> Points | Stills:
     """Labels of either kind; ToftrackError, one sentence that names the file."""
     path = Path(path).expanduser()
-    try:
+    with reported_errors(
+        f"the labels '{path}' cannot be read", "give a file of JSON", OSError, ValueError
+    ):
         content = read_json(path)
-    except OSError as error:
-        raise ToftrackError(
-            f"the labels '{path}' cannot be read ({error.strerror}); check the path"
-        ) from error
-    except ValueError as error:
-        raise ToftrackError(f"the labels '{path}' are no JSON ({error})") from None
     try:
         return _parsed(path, content)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:

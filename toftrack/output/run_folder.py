@@ -12,7 +12,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.devices.synthetic import Synthetic
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
@@ -235,14 +235,11 @@ def read_run(folder: str | Path) -> Run:
         raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to read")
     slots = 1 if results["lost"].ndim == 1 else results["lost"].shape[1]
     of_first = results["state_name"] if slots == 1 else results["state_name"][:, 0]
-    try:
+    what = f"'{folder / 'summary.json'}' cannot be read"
+    with reported_errors(what, "run track.py again", OSError, ValueError):
         summary = read_json(folder / "summary.json")
         if not isinstance(summary, dict):
             raise ValueError("it is no JSON object")
-    except (OSError, ValueError) as error:
-        raise ToftrackError(
-            f"'{folder / 'summary.json'}' cannot be read ({error}); run track.py again"
-        ) from None
     shapes = tuple(HandShape.load(folder / shape_file(slot)) for slot in range(slots))
     return Run(folder, results, results["index"], tuple(of_first.tolist()), summary, shapes)
 

@@ -19,7 +19,7 @@ from contextlib import suppress
 from typing import Any, Protocol, Self
 
 from toftrack.checks import check_number
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.estimate import Estimate
 from toftrack.output.lines import LINE_FIELDS, json_line
 
@@ -148,13 +148,10 @@ class UdpStream:
     def __init__(self, host: str, port: int, fields: Sequence[str] | None) -> None:
         self._fields = known_fields(fields)
         check_number("stream.port", port, 1, 65535, whole=True)
-        try:
+        what = f"stream.host={host} cannot be found"
+        advice = "give the name or address of the machine that listens"
+        with reported_errors(what, advice, OSError, UnicodeError):
             found = socket.getaddrinfo(str(host), port, type=socket.SOCK_DGRAM)
-        except (OSError, UnicodeError) as error:
-            raise ToftrackError(
-                f"stream.host={host} cannot be found ({error}); give the name or address of the "
-                "machine that listens"
-            ) from None
         family, kind, protocol, _, address = found[0]
         self._address: Any = address
         self._kind = family, kind, protocol
@@ -206,15 +203,11 @@ def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
 
 def _claim_stdout() -> int:
     """A descriptor of standard output; what is printed from now on goes to standard error."""
-    try:
+    what = "standard output cannot be used"
+    with reported_errors(what, "with stream=stdout, give it a pipe or a file"):
         if sys.stdout is not None:
             sys.stdout.flush()
         own = os.dup(_STDOUT)
-    except OSError as error:
-        raise ToftrackError(
-            f"standard output cannot be used ({error.strerror}); with stream=stdout, give it a "
-            "pipe or a file"
-        ) from None
     os.dup2(_STDERR, _STDOUT)
     return own
 

@@ -81,7 +81,8 @@ def _hand(folder: Path, slot: int, metadata: dict[str, Any]) -> dict[str, Any]:
     shape = _shape(folder, slot)
     if shape is None:
         return {}
-    fitted = _fits(metadata) and shape.fitted is not None
+    fits = (metadata.get("hand_shape") or {}).get("fitted")
+    fitted = bool(fits) and shape.fitted is not None
     return {"hand": {"side": shape.side, "length_mm": 1e3 * shape.hand_length_m, "fitted": fitted}}
 
 
@@ -90,11 +91,6 @@ def _shape(folder: Path, slot: int) -> HandShape | None:
         return HandShape.load(folder / shape_file(slot))
     except ToftrackError:
         return None
-
-
-def _fits(metadata: dict[str, Any]) -> bool:
-    """Whether a run fits its hands, or takes them as they were given."""
-    return bool((metadata.get("hand_shape") or {}).get("fitted"))
 
 
 def run_doubts(
@@ -112,7 +108,7 @@ def run_doubts(
     configured = (metadata.get("device") or {}).get("doubts")
     found = [times_doubt(records.column("timestamp_s"))] if configured is None else list(configured)
     k = (metadata.get("camera") or {}).get("K")
-    if _fits(metadata) and k is not None:
+    if (metadata.get("hand_shape") or {}).get("fitted") and k is not None:
         for slot, apparent in zip_longest(range(records.slots), apparent_m):
             shape = _shape(folder, slot)
             fitted = "" if shape is None else length_doubt(shape, np.array(k))

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from toftrack.calibration import fitting as calibration
 from toftrack.calibration.fitting import DepthFit, DepthPairs, Lens, View
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import open_recording
@@ -242,17 +242,13 @@ def _write_report(
         np.array(before["board_error_mm"]) / 1000,
         np.array(after["board_error_mm"]) / 1000,
     )
-    try:
+    what = f"the report folder '{folder}' cannot be written"
+    with reported_errors(what, "choose another with --report"):
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / "report.txt", text + "\n")
         write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
         write_picture(folder / "corners.png", sheet)
         write_figures(folder, {"depth_error.png": lambda: error_plot(*errors)})
-    except OSError as error:
-        raise ToftrackError(
-            f"the report folder '{folder}' cannot be written ({error.strerror}); choose another "
-            "with --report"
-        ) from error
 
 
 def _board(text: str) -> tuple[int, int]:

@@ -11,14 +11,13 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.labelled_figures import labelled_figures, table, totals
 from toftrack.programs import command_line
@@ -48,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "total": totals(figures),
             "sequences": figures,
         }
-        _write(Path(options.json), facts)
+        with reported_errors(f"'{options.json}' cannot be written", "choose another place"):
+            write_whole(options.json, json.dumps(facts, indent=1, allow_nan=False) + "\n")
 
 
 def evaluate(
@@ -146,15 +146,6 @@ def _chosen(sequences: list[LabelledSequence], names: str | None) -> list[Labell
         if name not in known:
             raise ToftrackError(f"there is no sequence '{name}'; there are {', '.join(known)}")
     return [known[name] for name in names.split(",")]
-
-
-def _write(path: Path, facts: dict[str, Any]) -> None:
-    try:
-        write_whole(path, json.dumps(facts, indent=1, allow_nan=False) + "\n")
-    except OSError as error:
-        raise ToftrackError(
-            f"the file '{path}' cannot be written ({error.strerror}); choose another place"
-        ) from error
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import reported_errors
 from toftrack.output.exports.bvh import bvh_of
 from toftrack.output.exports.glb import glb_of
 from toftrack.output.exports.motion import motions_of
@@ -42,13 +42,9 @@ def export(folder: Path, kind: str) -> list[Path]:
     Raises ToftrackError: the folder is no run's, or has no hand; or the file cannot be written.
     """
     contents = _contents(read_run(folder), kind)
-    try:
+    with reported_errors(f"'{folder}' cannot be written", "copy it to where it can be"):
         for name, content in contents.items():
             write_whole(folder / name, content)
-    except OSError as error:
-        raise ToftrackError(
-            f"'{folder}' cannot be written ({error.strerror or error}); copy it to where it can be"
-        ) from error
     return [folder / name for name in contents]
 
 

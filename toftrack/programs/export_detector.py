@@ -19,16 +19,6 @@ from toftrack.programs import command_line
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, write NAME.pose.onnx and NAME.finder.onnx. Raises ToftrackError."""
-    options = _parser().parse_args(arguments)
-
-    from toftrack.detector.onnx_export import export_networks
-    from toftrack.detector.weights import DEFAULT_FILE
-
-    for file in export_networks(options.weights or DEFAULT_FILE, not options.float):
-        print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m toftrack.programs.export_detector",
         description="Make of the detector's weights the files that ONNX Runtime runs, beside them.",
@@ -39,7 +29,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--float", action="store_true", help="the pose network in floating point, not in 8 bits"
     )
-    return parser
+    options = parser.parse_args(arguments)
+
+    from toftrack.detector.onnx_export import export_networks
+    from toftrack.detector.weights import DEFAULT_FILE
+
+    for file in export_networks(options.weights or DEFAULT_FILE, not options.float):
+        print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
 
 
 if __name__ == "__main__":

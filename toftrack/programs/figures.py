@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.estimate import confidence_words, state_words
 from toftrack.frames import Truth
 from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
@@ -106,7 +107,10 @@ def draw_figures(
     for position, slot in enumerate(_slots(run)):
         figures |= _of_slot(run, footage, slot, frame, with_film=position == 0)
     target = Path(out).expanduser() if out is not None else run.folder / "figures"
-    try:
+    with (
+        nullcontext() if footage is None else closing(footage.store),
+        reported_errors(f"'{target}' cannot be written", "give another folder with --out"),
+    ):
         # The folder within the run's must be no link; which one --out is, the user says.
         make_folder(target) if out is None else target.mkdir(parents=True, exist_ok=True)
         written = []
@@ -114,13 +118,6 @@ def draw_figures(
             path = target / f"{name}.png"
             write_picture(path, figures[name]())
             written.append(path)
-    except OSError as error:
-        raise ToftrackError(
-            f"'{target}' cannot be written ({error.strerror}); give another folder with --out"
-        ) from error
-    finally:
-        if footage is not None:
-            footage.store.close()
     return written
 
 

@@ -60,8 +60,7 @@ class Observed:
         return Observed(self.features[rows], self.right[rows], joints, self.sequence[rows])
 
 
-def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
-    """What the command line says."""
+def _asked(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m toftrack.programs.fit_confidence",
         description="Fit lost=calibrated: writes the file of lost.fitted.",
@@ -84,10 +83,9 @@ def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 def main(arguments: list[str] | None = None) -> None:
     """Render, track, fit, report."""
-
     from toftrack.views.figures.reliability import reliability_figure
 
-    asked = read_arguments(arguments)
+    asked = _asked(arguments)
     asked.output.mkdir(parents=True, exist_ok=True)
     count, sequences = _sequences(asked)
     parts = [
@@ -114,7 +112,12 @@ def main(arguments: list[str] | None = None) -> None:
     arrays = {name: getattr(seen, name) for name in ("features", "right", "sequence")}
     arrays |= {f"joint_{name}": values for name, values in seen.joints._asdict().items()}
     write_archive(asked.output / "features.npz", arrays)
-    print(f"{_words(summary)}\nlost.fitted={asked.output / 'confidence.json'}")
+    print(
+        f"{summary['frames']} frames, {100 * summary['right']:.0f} % right; held out: log loss"
+        f" {summary['held_out_log_loss']:.3f}; 90 % regions hold"
+        f" {summary['held_out_joints_in_90_pct_region']} % of the joints\n"
+        f"lost.fitted={asked.output / 'confidence.json'}"
+    )
 
 
 def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
@@ -157,7 +160,6 @@ def _fitted_frames(seen: Observed, kept: np.ndarray) -> tuple[np.ndarray, dict[s
 
 
 def _settings(overrides: list[str]) -> ConfidenceModel:
-    """The tracker's confidence as it is."""
     model = make_tracker(*overrides).model
     if not isinstance(model, TrackerModel):
         raise ToftrackError("fit_confidence fits lost=calibrated; leave experiment=paper out")
@@ -194,14 +196,6 @@ def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[JointConfidence, d
         "held_out_joints_log_loss": round(-float(np.log(right.clip(1e-9)).mean()), 4),
     }
     return belief, summary
-
-
-def _words(summary: dict[str, Any]) -> str:
-    return (
-        f"{summary['frames']} frames, {100 * summary['right']:.0f} % right; held out: log loss"
-        f" {summary['held_out_log_loss']:.3f}; 90 % regions hold"
-        f" {summary['held_out_joints_in_90_pct_region']} % of the joints"
-    )
 
 
 def fitted_weights(features: np.ndarray, right: np.ndarray) -> tuple[float, np.ndarray]:
@@ -242,28 +236,21 @@ def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -
         near = there & (far < RIGHT_M)
         error_cm = 100 * np.einsum("jab,jb->ja", joint_axes(joints), off)
         counted = there and not estimate.lost
-        rows.append(
-            (
-                info.features.values(),
-                near.all(),
-                *(info.joint_features, error_cm, near, counted),
-            )
-        )
+        of_joints = (info.joint_features, error_cm, near, counted)
+        rows.append((info.features.values(), near.all(), *of_joints))
     if not rows:
         return None
     features, right, *joint_rows = map(np.array, zip(*rows, strict=True))
-    of_joints = JointRows(*joint_rows)
-    return Observed(features, right, of_joints, np.full(len(rows), number))
+    return Observed(features, right, JointRows(*joint_rows), np.full(len(rows), number))
 
 
 def _together(parts: list[Observed]) -> Observed:
     joints = zip(*(part.joints for part in parts), strict=True)
-    return Observed(
-        np.concatenate([part.features for part in parts]),
-        np.concatenate([part.right for part in parts]),
-        JointRows(*map(np.concatenate, joints)),
-        np.concatenate([part.sequence for part in parts]),
+    features, right, sequence = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("features", "right", "sequence")
     )
+    return Observed(features, right, JointRows(*map(np.concatenate, joints)), sequence)
 
 
 if __name__ == "__main__":

@@ -47,8 +47,8 @@ class Tips:
         return Tips(self.confidence[rows], self.wrong[rows], self.shown[rows])
 
 
-def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
-    """What the command line says."""
+def main(arguments: list[str] | None = None) -> None:
+    """Parse the command line, track, choose, report. Raises ToftrackError."""
     parser = argparse.ArgumentParser(
         prog="python -m toftrack.programs.fit_joint_flags",
         description="Choose lost.joint_ok on every second recording of each folder, show it on the"
@@ -64,12 +64,7 @@ def read_arguments(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings")
     parser.add_argument("--output", type=Path, help="a .json file for the figures")
-    return parser.parse_args(arguments)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Track, choose, report."""
-    asked = read_arguments(arguments)
+    asked = parser.parse_args(arguments)
     if not 0 < asked.right < 100:
         raise ToftrackError(f"--right {asked.right:g} is no share; give per cent, as 4")
     labels = [read_points(path) for path in asked.labels]
@@ -79,7 +74,8 @@ def main(arguments: list[str] | None = None) -> None:
         observed(path, labels, seed, is_shown(path, found), asked.settings)
         for path, seed in tqdm(todo, unit=" recordings", file=sys.stderr)
     ]
-    tips = joined(parts)
+    columns = zip(*((part.confidence, part.wrong, part.shown) for part in parts), strict=True)
+    tips = Tips(*map(np.concatenate, columns))
     # Both ways round: what halves of few recordings differ by is to be seen.
     report = [halves(tips, shown, asked.right) for shown in (True, False)]
     if asked.output is not None:
@@ -163,12 +159,6 @@ def _tips_off_mm(joints_m: np.ndarray, known: Truth | Points, k: np.ndarray) -> 
         for row, value in off.items():
             errors[number, TIPS.index(row)] = value
     return errors
-
-
-def joined(parts: list[Tips]) -> Tips:
-    """All of them."""
-    sure, wrong, shown = zip(*((p.confidence, p.wrong, p.shown) for p in parts), strict=True)
-    return Tips(np.concatenate(sure), np.concatenate(wrong), np.concatenate(shown))
 
 
 def chosen(tips: Tips, right_pct: float) -> float:

@@ -12,7 +12,6 @@ import csv
 import io
 import math
 import statistics
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 
 import yaml
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import read_json
 from toftrack.safe_files import open_to_read, write_whole
 from toftrack.views.figures.chart import write_figures
@@ -236,10 +235,8 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     if known and figure not in known:
         raise ToftrackError(f"no job has the figure {figure}; known: {', '.join(known)}")
     groups = group_runs(runs, figure)
-    try:
+    with reported_errors(f"{folder} cannot be written", "copy it to where it can be"):
         write_csv(runs, folder / "sweep.csv")
-    except OSError as error:
-        raise ToftrackError(f"{folder} cannot be written ({error.strerror})") from error
     print(table(groups, figure))
     failed = [run for run in runs if run.error is not None]
     if failed:
@@ -263,7 +260,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0 also when jobs of the sweep failed, 1 when there is nothing to report."""
+    """The command line; 0 also when jobs of the sweep failed. Raises ToftrackError."""
     parser = argparse.ArgumentParser(
         prog="toftrack report", description="Gather the jobs of a sweep into one table."
     )
@@ -272,9 +269,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--figure", help="of summary.json, as metrics.fingertip_mm; default the mean joint error"
     )
     given = parser.parse_args(arguments)
-    try:
-        report(given.folder, given.figure)
-    except ToftrackError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    report(given.folder, given.figure)
     return 0

@@ -26,14 +26,11 @@ class FailedJobs(Callback):
         self._before: dict[Path, int] = {}
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        folder = Path(config.hydra.run.dir)
-        _let_links_go(folder)
-        empty_folders.expect(folder)
+        _prepare(Path(config.hydra.run.dir))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
-        _let_links_go(folder)
-        empty_folders.expect(folder)
+        _prepare(folder)
         for job in folder.iterdir() if folder.is_dir() else ():
             let_links_go(job)
             _let_links_go(job)
@@ -43,6 +40,11 @@ class FailedJobs(Callback):
         for path in _summaries(config):
             if path.stat().st_mtime_ns != self._before.get(path) and _tells_an_error(path):
                 note_failed_job(path.parent)
+
+
+def _prepare(folder: Path) -> None:
+    _let_links_go(folder)
+    empty_folders.expect(folder)
 
 
 def _let_links_go(folder: Path) -> None:

@@ -113,28 +113,6 @@ def test_a_lost_hand_is_hidden_and_its_pose_held() -> None:
             assert np.allclose(place, gltf.world(held)[name]), (frame, name)
 
 
-def test_each_of_several_hands_has_a_skeleton_of_its_own() -> None:
-    hands = [results_of(moving(side)) for side in ("right", "left")]
-    both = {name: np.stack([hand[name] for hand in hands], 1) for name in NAMES if name != "index"}
-    both |= {"timestamp_s": hands[0]["timestamp_s"], "index": hands[0]["index"]}
-    both["joint_names"] = JOINT_NAMES
-    motions = motions_of(both, (shape_of("right"), shape_of("right")))
-    assert [motion.shape.side for motion in motions] == ["right", "left"]
-    pytest.importorskip("pygltflib", reason="pip install '.[export]'")
-    gltf = Gltf(glb_of(motions))
-    assert len(gltf.document["skins"]) == 2
-    world = gltf.world(5)
-    for hand, letter in zip(hands, "RL", strict=True):
-        tip = hand["openxr_position_m"][5][OPENXR_JOINT_NAMES.index("index_tip")]
-        assert np.allclose(world[f"Index_Tip_{letter}"][:3, 3], tip, atol=2e-6)
-    rows = list(csv.DictReader(io.StringIO(csv_of(both))))
-    assert [(row["index"], row["slot"], row["side"]) for row in rows[:3]] == [
-        ("0", "0", "right"),
-        ("0", "1", "left"),
-        ("1", "0", "right"),
-    ]
-
-
 def test_until_its_side_is_found_out_a_hand_is_turned_as_it_was_then() -> None:
     estimates = [*moving("left")[:2], *moving("right")[2:]]
     gltf = exported(estimates, "right")
@@ -143,11 +121,6 @@ def test_until_its_side_is_found_out_a_hand_is_turned_as_it_was_then() -> None:
         for joint, name in enumerate(OPENXR_JOINT_NAMES):
             turned = Rotation.from_quat(estimates[frame].openxr_orientation[joint]).as_matrix()
             assert np.allclose(world[f"{name.title()}_R"][:3, :3], turned, atol=1e-5), (frame, name)
-
-
-def test_a_run_without_a_hand_is_reported() -> None:
-    with pytest.raises(ToftrackError, match="nothing to export"):
-        motions_of(results_of([lost_hand(0), lost_hand(1)]), (shape_of("right"),))
 
 
 def test_frames_whose_times_stand_still_are_laid_out_evenly() -> None:

@@ -74,12 +74,6 @@ def test_every_client_gets_every_line_as_in_track_jsonl(stream: WebSocketStream)
                 assert one.recv(PATIENCE_S) == json_line((estimate,))
 
 
-def test_only_the_wanted_fields_are_sent() -> None:
-    with websocket_stream(fields=["index", "pinching"]) as stream, listening(stream) as one:
-        stream.send((hand_estimate(3),))
-        assert json.loads(one.recv(PATIENCE_S)) == {"index": 3, "pinching": False}
-
-
 def test_a_client_that_leaves_disturbs_nobody(stream: WebSocketStream) -> None:
     with listening(stream) as stays:
         with listening(stream) as leaves:
@@ -150,23 +144,6 @@ def test_connections_that_ask_nothing_do_not_hold_up_the_end() -> None:
         eventually(lambda: all(map(ended, opened)))
 
 
-def test_trouble_of_the_server_is_reported_once_in_a_while(
-    stream: WebSocketStream, caplog: pytest.LogCaptureFixture
-) -> None:
-    for _ in range(500):
-        stream._server.call(
-            stream._server._loop.call_exception_handler,
-            {"message": "no more descriptors", "exception": OSError(24, "Too many open files")},
-        )
-    stream._server.begin(_nothing()).result(PATIENCE_S)
-    reported = [record for record in caplog.records if "no more descriptors" in record.getMessage()]
-    assert len(reported) == 1 and reported[0].exc_info is None
-    assert "Too many open files" in reported[0].getMessage()
-
-
-async def _nothing() -> None: ...
-
-
 def test_a_client_that_never_reads_stops_nothing_and_its_oldest_lines_go(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -187,13 +164,6 @@ def test_a_client_that_never_reads_stops_nothing_and_its_oldest_lines_go(
     words = caplog.text.split()
     sent, dropped = (int(words[words.index(word) - 1]) for word in ("estimates", "dropped"))
     assert sent + dropped >= 1499 and dropped > 100  # one may have been on its way
-
-
-def test_nothing_is_made_while_nobody_listens(
-    stream: WebSocketStream, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("toftrack.output.web.stream.json_line", lambda *_: pytest.fail("made"))
-    stream.send((hand_estimate(0),))
 
 
 @pytest.mark.parametrize(
@@ -254,16 +224,3 @@ def test_a_port_that_is_taken_is_reported(stream: WebSocketStream) -> None:
     port = urlsplit(stream.url).port
     with pytest.raises(ToftrackError, match=f"port {port} of 127.0.0.1 is taken.*stream.port=PORT"):
         websocket_stream(port=port).__enter__()
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"port": -1}, "stream.port=-1"),
-        ({"waiting": 0}, "stream.waiting=0"),
-        ({"fields": ["bones"]}, "'bones'"),
-    ],
-)
-def test_a_bad_setting_is_one_clear_error(changes: dict, words: str) -> None:
-    with pytest.raises(ToftrackError, match=words):
-        websocket_stream(**changes)

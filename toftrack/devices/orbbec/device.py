@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.devices.live import OTHER_FILE, SdkCamera, reported_errors
+from toftrack.devices.live import OTHER_FILE, SdkCamera
 from toftrack.devices.orbbec import sdk
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import Frame
 
 _log = logging.getLogger(__name__)
@@ -63,11 +63,11 @@ class Orbbec(SdkCamera):
         self._serial = ""
         if self._path is not None:
             what = f"{self._owner} is not a recording of an Orbbec camera"
-            with reported_errors(what, OTHER_FILE, self._errors):
+            with reported_errors(what, OTHER_FILE, *self._errors):
                 self._device = ob.PlaybackDevice(str(self._path))
         else:
             self._device, self._serial = sdk.find_camera(ob, serial)
-        with reported_errors(f"{self._owner} cannot be used", self._remedy, self._errors):
+        with reported_errors(f"{self._owner} cannot be used", self._remedy, *self._errors):
             self._pipeline, self._running = ob.Pipeline(self._device), False
             size = width, height, fps
             self._streams = sdk.choose_streams(ob, self._pipeline, size, infrared, self._owner)
@@ -98,7 +98,7 @@ class Orbbec(SdkCamera):
         what = "the Orbbec camera was found, but cannot be started"
         if self._path is not None:
             what = f"'{self._path}' cannot be replayed"
-        with reported_errors(what, self._remedy, self._errors):
+        with reported_errors(what, self._remedy, *self._errors):
             self._pipeline.start(config, self._put)
         self._running = True
 

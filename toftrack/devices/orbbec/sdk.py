@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import BUSY, chosen_serial, reported_errors
-from toftrack.errors import ToftrackError
+from toftrack.devices.live import BUSY, chosen_serial
+from toftrack.errors import ToftrackError, reported_errors
 
 _PIXELS = ("Y16", "Z16")
 """Formats of depth: 16-bit words."""
@@ -68,11 +68,11 @@ def find_camera(ob: ModuleType, serial: str | int | None) -> tuple[Any, str]:
 
     Raises ToftrackError when there is none, or several and none is chosen.
     """
-    with reported_errors("the Orbbec cameras cannot be listed", "plug them in again", errors(ob)):
+    with reported_errors("the Orbbec cameras cannot be listed", "plug them in again", *errors(ob)):
         devices = ob.Context().query_devices()
         numbers = serials(devices)
     number = chosen_serial(numbers, serial, "Orbbec")
-    with reported_errors("the Orbbec camera was found, but cannot be opened", BUSY, errors(ob)):
+    with reported_errors("the Orbbec camera was found, but cannot be opened", BUSY, *errors(ob)):
         return devices.get_device_by_index(numbers.index(number)), number
 
 

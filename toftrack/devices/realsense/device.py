@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.devices.live import BUSY, OTHER_FILE, SdkCamera, reported_errors
+from toftrack.devices.live import BUSY, OTHER_FILE, SdkCamera
 from toftrack.devices.realsense import sdk
 from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import Frame
 
 _log = logging.getLogger(__name__)
@@ -85,14 +85,16 @@ class RealSense(SdkCamera):
         self._emulator: EmulatedCamera | None = None
         size = None
         if self._path is not None:
-            with reported_errors(f"{self._owner} is not a recording of a RealSense", OTHER_FILE):
+            with reported_errors(
+                f"{self._owner} is not a recording of a RealSense", OTHER_FILE, RuntimeError
+            ):
                 self._device = rs.context().load_device(str(self._path))
         elif transport == "emulated":
             self._emulator, self.first_number = EmulatedCamera(rs, emulated), FIRST_NUMBER
             self._device, self._owner = self._emulator.device, "the emulated camera"
         else:
             self._device, size = sdk.find_camera(rs, serial), (width, height, fps)
-        with reported_errors(f"{self._owner} cannot be used", self._remedy):
+        with reported_errors(f"{self._owner} cannot be used", self._remedy, RuntimeError):
             self._streams = sdk.choose_streams(rs, self._device, size, infrared, self._owner)
             if preset is not None:
                 sdk.set_preset(rs, self._streams.sensor, preset)
@@ -156,7 +158,9 @@ class RealSense(SdkCamera):
     def _open_camera(self, pipeline: Any, config: Any) -> None:
         # The frames are kept, so that waiting ones do not use up the few that the SDK has.
         queue = self._rs.frame_queue(self._capacity, True)
-        with reported_errors("the RealSense camera was found, but cannot be started", BUSY):
+        with reported_errors(
+            "the RealSense camera was found, but cannot be started", BUSY, RuntimeError
+        ):
             pipeline.start(config, queue)
         if self._emulator is not None:
             waits = self._capacity > 1
@@ -166,7 +170,7 @@ class RealSense(SdkCamera):
 
     def _open_recording(self, pipeline: Any, config: Any) -> None:
         rs = self._rs
-        with reported_errors(f"'{self._path}' cannot be replayed", OTHER_FILE):
+        with reported_errors(f"'{self._path}' cannot be replayed", OTHER_FILE, RuntimeError):
             self._playback = (
                 config.resolve(rs.pipeline_wrapper(pipeline)).get_device().as_playback()
             )

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import chosen_serial, reported_errors
-from toftrack.errors import ToftrackError
+from toftrack.devices.live import chosen_serial
+from toftrack.errors import ToftrackError, reported_errors
 
 _WORST_FIT_PX = 0.5
 
@@ -55,7 +55,7 @@ def _preload_libusb() -> None:
 def find_camera(rs: ModuleType, serial: str | int | None) -> Any:
     """The plugged-in camera of that serial number, the only one for None; else ToftrackError."""
     with reported_errors(
-        "the RealSense cameras cannot be listed", "unplug them and plug them in again"
+        "the RealSense cameras cannot be listed", "unplug them and plug them in again", RuntimeError
     ):
         found = {_info(rs, device, "serial_number"): device for device in rs.context().devices}
     otherwise = ", or try it without a camera with device.transport=emulated"
@@ -198,5 +198,7 @@ def set_preset(rs: ModuleType, sensor: Any, name: str) -> None:
             f"the camera has no preset {name}; set device.preset to one of "
             f"{', '.join(['null', *names])}"
         )
-    with reported_errors(f"the camera does not take the preset {name}", "set device.preset=null"):
+    with reported_errors(
+        f"the camera does not take the preset {name}", "set device.preset=null", RuntimeError
+    ):
         sensor.set_option(option, names[name.lower()])

@@ -22,12 +22,12 @@ import usb.core
 from usb.backend import IBackend
 
 from toftrack.devices.sr3000 import descriptors
-from toftrack.devices.sr3000.emulator_settings import EmulatorSettings
 from toftrack.devices.sr3000.faults import (
     HARMLESS,
     OPEN_FAULTS,
     REQUEST_FAULTS,
     Chunk,
+    EmulatorSettings,
     parse_faults,
     transfer,
 )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Self
 from urllib.parse import urlsplit
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.render.likelihood import FMeasure
 from toftrack.safe_files import open_new
 from toftrack.views.base import TrackedFrame
@@ -171,12 +171,8 @@ def _require_answer(address: str) -> None:
         raise ToftrackError(
             f"view.connect={address} is no address of a viewer, as {_ADDRESS}; {advice}"
         )
-    try:
+    with reported_errors(f"no viewer answers at {address}", advice):
         socket.create_connection((host, port), _ANSWER_S).close()
-    except OSError as error:
-        raise ToftrackError(
-            f"no viewer answers at {address} ({error.strerror or error}); {advice}"
-        ) from error
 
 
 def _viewer_gone(reason: str) -> ToftrackError:
