@@ -87,7 +87,7 @@ class Estimate:
     """(3,) float32 unit vector from there to the finger's tip, else NaN."""
     landmarks: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan))
     """(21, 3) the joints as MediaPipe's landmarks: x, y in parts of the image's width and height, z
-    the depth beyond the wrist's in parts of the width; see hand/landmarks.py."""
+    the depth beyond the wrist's in parts of the width; see hand/conventions.py."""
     openxr_position_m: np.ndarray = field(default_factory=lambda: np.full((26, 3), np.nan))
     """(26, 3) metres, the joints of XR_EXT_hand_tracking; x right, y up, -z forward."""
     openxr_orientation: np.ndarray = field(default_factory=lambda: np.full((26, 4), np.nan))

@@ -119,7 +119,9 @@ class Truth:
         return self._taken(rows, int(numbers[0]) if len(rows) else self.first)
 
     def _taken(self, rows: slice | np.ndarray, first: int) -> Truth:
-        arrays = {n: values[rows] for n, values in vars(self).items() if np.ndim(values)}
+        arrays: dict[str, Any] = {
+            name: array[rows] for name, array in vars(self).items() if isinstance(array, np.ndarray)
+        }
         other = None if self.other is None else self.other._taken(rows, first)
         return replace(self, **arrays, first=first, other=other)
 

@@ -33,6 +33,15 @@ def read_json(path: str | Path) -> Any:
     return parse_json(text.decode("utf-8"))
 
 
+def read_object(path: str | Path) -> dict[str, Any]:
+    """The object in a file; an empty one where the file cannot be read, or holds none."""
+    try:
+        content = read_json(path)
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
 def _whole(digits: str) -> int:
     if len(digits) > _MOST_DIGITS:
         raise ValueError(f"a number has {len(digits)} digits")

@@ -7,7 +7,6 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,13 +24,6 @@ from toftrack.devices.sr3000.device import Sr3000
 from toftrack.devices.sr3000.faults import REQUEST_FAULTS
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES, unambiguous_range_m
-
-
-@pytest.fixture(autouse=True)
-def nothing_is_left() -> Iterator[None]:
-    """After each test: no thread, and (see `read`) no handle."""
-    yield
-    assert not [t for t in threading.enumerate() if t.name == "sr3000-reader"]
 
 
 @pytest.fixture(scope="module")

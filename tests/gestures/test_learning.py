@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.gestures.learning import learned_pose
+from toftrack.gestures.files import learned_pose
 
 STEADY = math.radians(25)
 POSE = np.linspace(0.0, 1.5, 21)

@@ -9,8 +9,7 @@ import pytest
 from helpers.hands import SIZE_PX, K, hand_estimate, lost_hand
 from helpers.tracking import follow, make_tracker, sample
 
-from toftrack.hand.conventions import in_all_conventions
-from toftrack.hand.landmarks import image_landmarks
+from toftrack.hand.conventions import image_landmarks, in_all_conventions
 from toftrack.hand.shape import default_hand_shape
 
 FIELDS = ("landmarks", "openxr_position_m", "openxr_orientation", "openxr_radius_m")

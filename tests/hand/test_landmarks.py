@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from toftrack.camera import Camera
-from toftrack.hand.landmarks import image_landmarks
+from toftrack.hand.conventions import image_landmarks
 from toftrack.hand.skeleton import JOINT_NAMES
 
 # As MediaPipe's HandLandmark lists them.

@@ -64,11 +64,6 @@ def test_a_hand_of_the_other_side_that_is_followed_is_reported() -> None:
     assert advice(followed, "left", REACH_M) == ()
 
 
-def test_there_are_at_most_three_sentences() -> None:
-    everything = replace(ORDINARY, within=0.0, nearest_m=0.1, other_side=True, hand_px=20)
-    assert len(advice(facts(everything), "left", REACH_M)) == 3
-
-
 def test_a_frames_facts_are_read_off_its_image() -> None:
     depth = np.zeros((240, 320), np.float32)
     depth[:, 80:] = np.linspace(0.5, 2.5, 240, dtype=np.float32)

@@ -13,7 +13,7 @@ import pytest
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.shape_space import COMPONENTS
 from toftrack.output.advice import LostFrame, RunFacts
-from toftrack.output.hand_doubts import apparent_doubt, length_doubt
+from toftrack.output.summary import apparent_doubt, length_doubt
 from toftrack.programs.main import main
 from toftrack.recordings.store import packaged_sample
 

@@ -20,7 +20,7 @@ from helpers.tracking import ROOT, make_tracker, sample
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.output.lines import HAND_FIELDS
-from toftrack.output.run_folder import open_footage, read_run
+from toftrack.output.run_folder import read_run
 from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
@@ -159,7 +159,7 @@ def test_the_recording_is_found_from_another_folder(
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     # The configuration says `hand.npz`, and .hydra where that was.
-    footage = open_footage(read_run(tracked))
+    footage = read_run(tracked).footage()
     assert footage is not None and len(footage.truth) == FRAMES
 
 
@@ -176,7 +176,7 @@ def test_lost_frames_are_shown_and_shaded(run: Path, tmp_path: Path) -> None:
 
 def test_runs_of_older_versions_are_read_as_well(run: Path) -> None:
     now = read_run(run)
-    later = {"confidence", "outside_rad", "side", "side_probability", "index", "state_name"}
+    later = {"confidence", "outside_rad", "side", "side_probability"}
     with np.load(run / "track.npz") as archive:
         kept = {key: archive[key] for key in archive.files if key not in later}
     np.savez(run / "track.npz", **kept)

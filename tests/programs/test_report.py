@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.programs.report import group_runs, main, read_runs, report
-from toftrack.views.figures.sweep import sweep_figure
+from toftrack.programs.report import group_runs, main, read_runs, report, sweep_figure
 
 
 def job(

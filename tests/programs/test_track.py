@@ -138,16 +138,6 @@ def test_a_run_of_a_wall_ends_with_what_to_try(here, tmp_path: Path) -> None:
     assert "segmentation.max_distance_m" in notes[1]
 
 
-def test_the_table_goes_to_standard_output_and_the_progress_to_standard_error(whole) -> None:
-    folder, _, out, err = whole
-    assert "joint error, mean" in out and "time a frame" in out
-    for name in ("track.npz", "track.jsonl", "summary.json", "overlay.mp4", "overlay.png"):
-        assert f"{folder.name}/{name}" in out
-    assert "frames/s" not in out.split("time a frame")[0]
-    assert "12/12" in err and "score" in err
-    assert "error" not in err and "Traceback" not in err
-
-
 def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:
     process = start("hydra.run.dir=out", *QUICK, cwd=tmp_path)
     lines, deadline = tmp_path / "out" / "track.jsonl", time.monotonic() + 200

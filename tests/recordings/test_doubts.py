@@ -16,7 +16,7 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames import checked_image
 from toftrack.output.advice import Watch
-from toftrack.output.hand_doubts import apparent_doubt, length_doubt
+from toftrack.output.summary import apparent_doubt, length_doubt
 from toftrack.recordings.doubts import lens_doubt, times_doubt
 from toftrack.recordings.npz import read_recording
 

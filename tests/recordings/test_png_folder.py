@@ -13,7 +13,7 @@ from helpers.tracking import ROOT
 from toftrack.api import make_device
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
-from toftrack.output.run_folder import open_footage, read_run
+from toftrack.output.run_folder import read_run
 from toftrack.programs.main import main
 from toftrack.recordings.png_folder import read_png_folder
 
@@ -52,7 +52,7 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     run = read_run(tmp_path / "run")
     np.testing.assert_array_equal(run.results["metadata"]["camera"]["K"], K)
     np.testing.assert_allclose(run.results["timestamp_s"], [0, 0.02])
-    footage = open_footage(run)
+    footage = run.footage()
     assert footage is not None, "figures are drawn with the same lens"
     np.testing.assert_array_equal(footage.camera.K, K)
 

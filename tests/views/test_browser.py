@@ -121,7 +121,7 @@ def test_visitors_are_told_the_beginning_and_the_end_at_once(phase: str, error: 
 def test_commands_arrive_in_order_and_once(view, visitor) -> None:
     for command in ("left", "restart", "right"):
         visitor.say(command=command, token=view.token)
-    eventually(lambda: len(view._commands) == 3)
+    eventually(lambda: len(view.asked) == 3)
     assert view.commands() == ["left", "restart", "right"]
     assert view.commands() == []
 

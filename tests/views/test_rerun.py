@@ -197,11 +197,6 @@ def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> 
     assert sorted(rows(path, "world/hand/joints", "Points3D:positions")) == [5, 7]
 
 
-def test_the_configured_likelihood_is_the_one_that_classifies() -> None:
-    config = configuration("view=rerun", "likelihood.tolerance_m=0.011")
-    assert config.view.likelihood.tolerance_m == 0.011
-
-
 def test_a_folder_that_cannot_be_written_is_reported(rerun_view, tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
         rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=f_measure())

@@ -6,12 +6,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-_MODULES = {
-    "speed": "toftrack.benchmark.speed",
-    "alternating": "toftrack.benchmark.alternating",
-    "accuracy": "toftrack.benchmark.accuracy",
-    "ablation": "toftrack.benchmark.ablation",
-}
+_MEASUREMENTS = ("speed", "alternating", "accuracy", "ablation")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,5 +21,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "toftrack benchmark speed --help and so on say more"
         )
         return 0
-    name, rest = (given[0], given[1:]) if given[:1] and given[0] in _MODULES else ("speed", given)
-    return importlib.import_module(_MODULES[name]).main(rest) or 0
+    name, *rest = given if given[:1] and given[0] in _MEASUREMENTS else ("speed", *given)
+    return importlib.import_module(f"toftrack.benchmark.{name}").main(rest) or 0

@@ -48,15 +48,19 @@ class _Finger(NamedTuple):
     split: _Range
 
 
-_STRAIGHT = _Finger((-30, 30), (-25, 25))
-_CURLED = _Finger((200, 270), (20, 160))
-_LOOSELY_CURLED = _Finger((150, 270), (-5, 100))
-_ROLLED_UP = _Finger((172, 225), (80, 128))
-_RESTING = _Finger((55, 130), (-5, 60))
-_HOOKED = _Finger((120, 176), (100, 180))
-_FLAT_BENT = _Finger((60, 110), (-110, -40))
-_PINCHING = _Finger((70, 160), (-10, 90))
-_NEARLY_STRAIGHT = _Finger((-30, 60), (-25, 40))
+_FINGERS = {
+    "S": _Finger((-30, 30), (-25, 25)),
+    "C": _Finger((200, 270), (20, 160)),
+    "L": _Finger((150, 270), (-5, 100)),
+    "U": _Finger((172, 225), (80, 128)),
+    "R": _Finger((55, 130), (-5, 60)),
+    "H": _Finger((120, 176), (100, 180)),
+    "F": _Finger((60, 110), (-110, -40)),
+    "P": _Finger((70, 160), (-10, 90)),
+    "N": _Finger((-30, 60), (-25, 40)),
+}
+"""Straight, Curled, Loosely curled, rolled Up over a knuckle that is hardly bent, Resting, Hooked,
+Flat and bent at the knuckle, Pinching, Nearly straight."""
 
 # Where the thumb's tip is: reach and gap in palm lengths, total flexion in degrees.
 _ANY: _Features = {}
@@ -72,23 +76,10 @@ _APART: _Features = {features.APART: (0.42, 0.80)}
 
 
 def _define(name: str, fingers: str, tips: _Features) -> Definition:
-    """fingers: a letter each, index to little: Straight, Curled, Loosely curled, rolled Up over a
-    knuckle that is hardly bent, Resting, Hooked, Flat and bent at the knuckle, Pinching, Nearly
-    straight."""
-    states = {
-        "S": _STRAIGHT,
-        "C": _CURLED,
-        "L": _LOOSELY_CURLED,
-        "U": _ROLLED_UP,
-        "R": _RESTING,
-        "H": _HOOKED,
-        "F": _FLAT_BENT,
-        "P": _PINCHING,
-        "N": _NEARLY_STRAIGHT,
-    }
+    """fingers: of each the letter in _FINGERS, index to little.  tips: ranges of other features."""
     low, high = np.full((2, features.COUNT), math.nan)
     for number, letter in enumerate(fingers):
-        state = states[letter]
+        state = _FINGERS[letter]
         for feature, values in (
             (features.FLEXION.start + number, state.flexion),
             (features.SPLIT.start + number, state.split),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from toftrack.errors import ToftrackError
-from toftrack.json_text import read_json
+from toftrack.json_text import read_json, read_object
 from toftrack.safe_files import check_replaceable, lock, open_in_place, open_to_read, remove_partial
 
 LINES = "track.jsonl"
@@ -130,7 +130,7 @@ def make_way(folder: Path) -> None:
     Raises OSError, too.
     """
     ends = ("track.npz", "summary.json")
-    if not _has_run(folder):
+    if read_object(folder / "run.json").get("format") != RUN_FORMAT:
         for name in (LINES, *ends):
             if not _may_go(folder / name):
                 raise ToftrackError(
@@ -141,14 +141,6 @@ def make_way(folder: Path) -> None:
         check_replaceable(folder / name)
         (folder / name).unlink(missing_ok=True)
     remove_partial(folder, WHOLE_FILES)
-
-
-def _has_run(folder: Path) -> bool:
-    try:
-        facts = read_json(folder / "run.json")
-    except (OSError, ValueError):
-        return False
-    return isinstance(facts, dict) and facts.get("format") == RUN_FORMAT
 
 
 def _may_go(path: Path) -> bool:

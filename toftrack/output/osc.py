@@ -20,10 +20,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from types import ModuleType
 from typing import Any
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, module_of_extra
 from toftrack.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.skeleton import JOINT_NAMES
@@ -67,7 +66,10 @@ class OscStream(UdpStream):
                 f"stream.parts names the unknown part {unknown[0]!r}; give some of "
                 f"{', '.join(PARTS)}"
             )
-        self._bundles, self._messages = _python_osc()
+        self._bundles, self._messages = (
+            module_of_extra(f"pythonosc.osc_{kind}_builder", "stream=osc needs python-osc", "osc")
+            for kind in ("bundle", "message")
+        )
         more = (name for part in self._parts for name in _FIELDS_OF[part])
         self._names = (*_FIELDS, *more)
 
@@ -132,15 +134,3 @@ def _floats(values: Sequence[float]) -> list[tuple[str, Any]]:
 
 def _finite(values: Sequence[float | None]) -> bool:
     return all(value is not None and math.isfinite(value) for value in values)
-
-
-def _python_osc() -> tuple[ModuleType, ModuleType]:
-    """Its builders of bundles and of messages."""
-    try:
-        from pythonosc import osc_bundle_builder, osc_message_builder
-    except ImportError:
-        raise ToftrackError(
-            "stream=osc needs python-osc, which is not installed: pip install 'toftrack[osc]', in "
-            "a checkout pip install -e '.[osc]'"
-        ) from None
-    return osc_bundle_builder, osc_message_builder

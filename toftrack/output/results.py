@@ -30,9 +30,8 @@ from toftrack.output.lines import (
     json_line,
     strict,
 )
-from toftrack.output.reader_facts import facts_for_readers
 from toftrack.output.realtime import RealTime
-from toftrack.output.records import Records, write_results
+from toftrack.output.records import Records, facts_for_readers, write_results
 from toftrack.output.summary import run_doubts, run_metrics, summarise
 from toftrack.safe_files import write_whole
 

@@ -85,7 +85,19 @@ class Run:
 
         recording: where it is, if it was moved.  Raises ToftrackError when it is gone or changed.
         """
-        return open_footage(self, recording)
+        device = self.config.get("device") or {}
+        about = self.results["metadata"].get("device") or {}
+        opened = open_tracked(about, device, self.found, recording)
+        if opened is None:
+            return None
+        store, name = opened
+        given = BareFacts(device.get("intrinsics"))
+        camera = given.camera(store.camera.width, store.camera.height) or store.camera
+        if about.get("camera_file"):
+            camera = Camera.load(self.found(about["camera_file"]))
+        rows = _rows(self, store, camera, about, device, name)
+        truth = store.truth
+        return Footage(store, camera, rows, None if truth is None else truth.of_frames(rows))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -250,28 +262,6 @@ def found_again(path: str | Path, ran_in: str | None) -> Path:
     if path.exists() or path.is_absolute() or ran_in is None:
         return path
     return Path(ran_in) / path
-
-
-def open_footage(run: Run, recording: str | Path | None = None) -> Footage | None:
-    """The recording that a run tracked; None when it tracked a live camera.
-
-    recording: where it is now, when it is not where it was.
-
-    Raises ToftrackError when it is gone, or is not the one that the run tracked.
-    """
-    device = run.config.get("device") or {}
-    about = run.results["metadata"].get("device") or {}
-    opened = open_tracked(about, device, run.found, recording)
-    if opened is None:
-        return None
-    store, name = opened
-    given = BareFacts(device.get("intrinsics"))
-    camera = given.camera(store.camera.width, store.camera.height) or store.camera
-    if about.get("camera_file"):
-        camera = Camera.load(run.found(about["camera_file"]))
-    rows = _rows(run, store, camera, about, device, name)
-    truth = store.truth
-    return Footage(store, camera, rows, None if truth is None else truth.of_frames(rows))
 
 
 def open_tracked(

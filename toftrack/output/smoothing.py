@@ -92,7 +92,9 @@ def smooth(
     position, angles = raw[:3], raw[6:]
     rotation = _exp(raw[3:6])
     if state is None or starts or not estimate.timestamp_s > state.timestamp_s:
-        return _first(estimate.timestamp_s, position, rotation, angles), estimate
+        pairs = ((position,) * 2, (rotation,) * 2, (angles,) * 2)
+        still = (np.zeros(3), np.zeros(3), np.zeros(len(angles)))
+        return SmoothState(estimate.timestamp_s, *pairs, *still), estimate
 
     seconds = estimate.timestamp_s - state.timestamp_s
     slow = _share(settings.speed_cutoff_hz, seconds)
@@ -121,20 +123,6 @@ def smooth(
     )
     vector = np.concatenate((smooth_position, _log(smooth_rotation), smooth_angles))
     return state, _with_state(estimate, vector.astype(np.float32), shape)
-
-
-def _first(
-    timestamp_s: float, position: np.ndarray, rotation: np.ndarray, angles: np.ndarray
-) -> SmoothState:
-    return SmoothState(
-        timestamp_s,
-        (position, position),
-        (rotation, rotation),
-        (angles, angles),
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros(len(angles)),
-    )
 
 
 def _with_state(estimate: Estimate, state: np.ndarray, shape: HandShape) -> Estimate:

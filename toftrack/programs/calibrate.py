@@ -7,7 +7,6 @@ that matter, turned to all sides, slowly. The camera file serves every device: `
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from toftrack.calibration import fitting as calibration
 from toftrack.calibration.fitting import DepthFit, DepthPairs, Lens, View
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import open_recording
@@ -54,11 +54,7 @@ class Calibration:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, calibrate, and write the files. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(
-        prog="toftrack calibrate",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("toftrack calibrate", __doc__)
     parser.add_argument("recording", help=".srs, .npz with amplitude, or a folder")
     parser.add_argument("--board", required=True, help="inner corners, columns x rows, as 7x5")
     parser.add_argument("--square", required=True, type=float, help="side of a square, m")
@@ -148,26 +144,21 @@ def calibrate(
 def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> list[View]:
     """The frames of these numbers that show the board. Raises ToftrackError soon where none does,
     for searching a frame in vain takes seconds."""
-    _require_board(store, board, numbers)
+    spread = np.unique(np.linspace(0, len(numbers) - 1, _SEARCHED).round().astype(int))
+    # From the middle outwards: at both ends somebody still carries the board.
+    places = sorted(spread, key=lambda at: abs(at - len(numbers) / 2))
+    if not any(calibration.shows_board(_amplitude(store, numbers[at]), board) for at in places):
+        raise ToftrackError(
+            f"no {board[0]}x{board[1]} chequerboard was seen in {len(places)} frames all over the "
+            "recording; it must be wholly in view, and --board its inner corners, columns x rows "
+            "(a board of 8x6 squares is 7x5)"
+        )
     views: list[View] = []
     for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):
         corners = calibration.find_corners(_amplitude(store, number), board)
         if corners is not None:
             views.append(View(int(number), corners))
     return views
-
-
-def _require_board(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> None:
-    places = np.unique(np.linspace(0, len(numbers) - 1, _SEARCHED).round().astype(int))
-    # From the middle outwards: at both ends somebody still carries the board.
-    for place in sorted(places, key=lambda at: abs(at - len(numbers) / 2)):
-        if calibration.shows_board(_amplitude(store, numbers[place]), board):
-            return
-    raise ToftrackError(
-        f"no {board[0]}x{board[1]} chequerboard was seen in {len(places)} frames all over the "
-        "recording; it must be wholly in view, and --board its inner corners, columns x rows (a "
-        "board of 8x6 squares is 7x5)"
-    )
 
 
 def _amplitude(store: FrameStore, number: int) -> np.ndarray:

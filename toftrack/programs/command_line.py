@@ -14,6 +14,7 @@ Exit status: 0 done, 1 an error (one sentence on standard error), 130 interrupte
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import functools
 import json
@@ -31,7 +32,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
-from toftrack.json_text import read_json
+from toftrack.json_text import read_object
 from toftrack.programs import empty_folders, shutdown
 from toftrack.safe_files import write_whole
 
@@ -103,6 +104,12 @@ def run(main: Callable[[], object]) -> int:
         print(f"error: {count} of the jobs failed, see above", file=sys.stderr)
         return 1
     return status if isinstance(status, int) else 0
+
+
+def plain_parser(program: str, about: str | None) -> argparse.ArgumentParser:
+    """A parser whose help shows a text, of several lines, as it stands."""
+    kind = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(prog=program, description=about, formatter_class=kind)
 
 
 def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
@@ -178,8 +185,4 @@ def _note_error(folder: Path, text: str) -> None:
     path = folder / "summary.json"
     # The sentence is on the terminal; a folder that cannot be written must not stop the sweep.
     with contextlib.suppress(OSError):
-        try:
-            summary = read_json(path)
-        except (FileNotFoundError, ValueError):
-            summary = {}
-        write_whole(path, json.dumps(summary | {"error": text}, indent=1) + "\n")
+        write_whole(path, json.dumps(read_object(path) | {"error": text}, indent=1) + "\n")

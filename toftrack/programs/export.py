@@ -7,7 +7,6 @@ goes into RUN.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from toftrack.output.exports.glb import glb_of
 from toftrack.output.exports.motion import motions_of
 from toftrack.output.exports.table import csv_of
 from toftrack.output.run_folder import Run, read_run
+from toftrack.programs.command_line import plain_parser
 from toftrack.safe_files import write_whole
 
 FORMATS = ("glb", "bvh", "csv")
@@ -24,11 +24,7 @@ FORMATS = ("glb", "bvh", "csv")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, write the file, print its name. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(
-        prog="toftrack export",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("toftrack export", __doc__)
     parser.add_argument("run", metavar="RUN", help="the output folder of toftrack track")
     parser.add_argument("--to", required=True, choices=FORMATS, help="the format")
     options = parser.parse_args(arguments)

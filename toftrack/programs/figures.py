@@ -17,7 +17,6 @@ and so on; the filmstrip shows both.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
@@ -31,7 +30,8 @@ from tqdm import tqdm
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.estimate import confidence_words, state_words
 from toftrack.frames import Truth
-from toftrack.output.run_folder import Footage, Run, observe, open_footage, read_run
+from toftrack.output.run_folder import Footage, Run, observe, read_run
+from toftrack.programs.command_line import plain_parser
 from toftrack.render.model_image import model_range_image
 from toftrack.safe_files import make_folder
 from toftrack.views.classified import classify
@@ -56,11 +56,7 @@ _SAME_SPACE = 0.01
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and draw. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(
-        prog="toftrack figures",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("toftrack figures", __doc__)
     parser.add_argument("run", metavar="RUN_DIR", help="the output folder of track.py")
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
     parser.add_argument("--out", metavar="DIR", help="instead of RUN_DIR/figures")
@@ -92,7 +88,7 @@ def draw_figures(
     """
     new_figure(1, 1)  # better missed now than when the recording is open
     run = read_run(folder)
-    footage = open_footage(run, recording)
+    footage = run.footage(recording)
     if frame is not None:
         _row_of(run, frame)
     figures: dict[str, Callable[[], np.ndarray]] = {}

@@ -31,6 +31,7 @@ from toftrack.programs.joint_fit import JointRows, fitted_joint_belief
 from toftrack.safe_files import write_whole
 from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES, ConfidenceModel, JointConfidence
 from toftrack.tracking.model import TrackerModel
+from toftrack.views.figures import chart
 from toftrack.views.pictures import write_picture
 
 RIGHT_M = 0.04
@@ -83,8 +84,6 @@ def _asked(arguments: list[str] | None) -> argparse.Namespace:
 
 def main(arguments: list[str] | None = None) -> None:
     """Render, track, fit, report."""
-    from toftrack.views.figures.reliability import reliability_figure
-
     asked = _asked(arguments)
     asked.output.mkdir(parents=True, exist_ok=True)
     count, sequences = _sequences(asked)
@@ -107,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
     joints = replace(belief, scale=settings.joints.scale, odds=settings.joints.odds)
     content = json.dumps(fitted | {"joints": asdict(joints)}, indent=1)
     write_whole(asked.output / "confidence.json", content + "\n")
-    picture = reliability_figure({"held out": (expit(log_odds[kept]), seen.right[kept])})
+    picture = reliability_figure(expit(log_odds[kept]), seen.right[kept])
     write_picture(asked.output / "reliability.png", picture)
     arrays = {name: getattr(seen, name) for name in ("features", "right", "sequence")}
     arrays |= {f"joint_{name}": values for name, values in seen.joints._asdict().items()}
@@ -251,6 +250,34 @@ def _together(parts: list[Observed]) -> Observed:
         for name in ("features", "right", "sequence")
     )
     return Observed(features, right, JointRows(*map(np.concatenate, joints)), sequence)
+
+
+_BINS = 10
+_FEWEST = 10
+
+
+def reliability_figure(said: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Observed against said probability of frames that were held out, BGR.
+
+    said: (N,) probabilities.  right: (N,) whether the estimates were right.
+    """
+    figure = chart.new_figure(700, 460)
+    axes = figure.subplots()
+    chart.label(axes, "said (points: tenths of the range, mean of each)", "right")
+    axes.plot((0, 1), (0, 1), color=chart.GREY, linewidth=1)
+    axes.plot(*_binned(said, right), "o-", color=chart.BLUE, label=f"held out ({len(said)})")
+    axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    figure.legend(loc="outside right upper", frameon=False)
+    picture = chart.picture_of(figure)
+    return chart.titled(picture, "Reliability of the confidence", "On the line is calibrated.")
+
+
+def _binned(said: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean said and observed probability of the bins that hold enough frames."""
+    index = np.minimum((said * _BINS).astype(int), _BINS - 1)
+    rows = [index == number for number in range(_BINS)]
+    rows = [row for row in rows if row.sum() >= _FEWEST]
+    return np.array([said[r].mean() for r in rows]), np.array([right[r].mean() for r in rows])
 
 
 if __name__ == "__main__":

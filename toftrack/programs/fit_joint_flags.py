@@ -7,7 +7,6 @@ python -m toftrack.programs.fit_joint_flags FOLDER... [--labels FILE]
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +23,6 @@ from toftrack.output.evaluation import TIPS
 from toftrack.output.image_labels import Points, lateral_errors_mm, read_labels
 from toftrack.output.trust import OK_MM
 from toftrack.programs import command_line
-
-_RATES = (1, 2, 3, 4, 5, 7, 10, 15, 20)
-"""Per cent of the right fingertips that are flagged, in the table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +59,6 @@ def main(arguments: list[str] | None = None) -> None:
         "--right", type=float, default=4.0, help="per cent of the right tips to be flagged (4)"
     )
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings")
-    parser.add_argument("--output", type=Path, help="a .json file for the figures")
     asked = parser.parse_args(arguments)
     if not 0 < asked.right < 100:
         raise ToftrackError(f"--right {asked.right:g} is no share; give per cent, as 4")
@@ -78,8 +73,6 @@ def main(arguments: list[str] | None = None) -> None:
     tips = Tips(*map(np.concatenate, columns))
     # Both ways round: what halves of few recordings differ by is to be seen.
     report = [halves(tips, shown, asked.right) for shown in (True, False)]
-    if asked.output is not None:
-        asked.output.write_text(json.dumps(report, indent=1) + "\n")
     print("\n\nthe other way round\n".join("\n".join(lines(one)) for one in report))
 
 
@@ -90,7 +83,6 @@ def halves(tips: Tips, shown: bool, right_pct: float) -> dict[str, Any]:
         "joint_ok": least,
         "chosen_on": rates(tips.half(not shown), least),
         "shown_on": rates(tips.half(shown), least),
-        "curve": curve(tips.half(shown)),
     }
 
 
@@ -182,19 +174,6 @@ def rates(tips: Tips, least: float) -> dict[str, Any]:
     return found
 
 
-def curve(tips: Tips) -> list[tuple[float, float]]:
-    """Per cent of the right tips that other thresholds flag, and of the wrong ones."""
-    if not tips.wrong.any() or tips.wrong.all():
-        return []
-    points = []
-    for right in _RATES:
-        least = np.percentile(tips.confidence[~tips.wrong], right)
-        points.append(
-            (float(right), round(100 * float((tips.confidence[tips.wrong] < least).mean()), 1))
-        )
-    return points
-
-
 def lines(report: dict[str, Any]) -> list[str]:
     """For people; the first goes into conf/lost/calibrated.yaml."""
     said = [f"joint_ok: {report['joint_ok']:g}"]
@@ -204,8 +183,7 @@ def lines(report: dict[str, Any]) -> list[str]:
             f"{words}: {of['wrong_flagged_pct']} % of {of['wrong']} wrong tips flagged,"
             f" {of['right_flagged_pct']} % of {of['right']} right ones"
         )
-    pairs = ", ".join(f"{wrong:g} at {right:g}" for right, wrong in report["curve"])
-    return [*said, f"other thresholds there, wrong at right flagged, %: {pairs}"]
+    return said
 
 
 if __name__ == "__main__":

@@ -21,8 +21,7 @@ from toftrack.api import build_tracker
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
 from toftrack.gestures.definitions import OTHER, SETS
-from toftrack.gestures.files import NamedPose, read_poses, save_poses
-from toftrack.gestures.learning import learned_pose
+from toftrack.gestures.files import NamedPose, learned_pose, read_poses, save_poses
 from toftrack.gestures.recognition import Gestures, gestures_with
 from toftrack.programs import command_line
 from toftrack.recordings.frame_store import FrameStore

@@ -10,14 +10,11 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import hydra
 from omegaconf import DictConfig
@@ -29,8 +26,9 @@ from toftrack.devices.base import Device
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
 from toftrack.programs import shutdown
+from toftrack.programs.command_line import plain_parser
 from toftrack.programs.recording_argument import quoted
-from toftrack.programs.shutdown import SHUTDOWN_SIGNALS, EndedError
+from toftrack.programs.shutdown import EndedError
 from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
@@ -41,11 +39,7 @@ _GIGABYTE = 1e9
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and record. Raises ToftrackError, and EndedError at the end of an
     interrupted recording, whose frames are all in the file."""
-    parser = argparse.ArgumentParser(
-        prog="toftrack record",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("toftrack record", __doc__)
     parser.add_argument("out", metavar="OUT", help="the new recording, .npz or .srs")
     parser.add_argument("--frames", type=int, help="stop after so many (default: at Ctrl-C)")
     parser.add_argument("--seconds", type=float, help="stop after so long")
@@ -162,10 +156,18 @@ def record(
     registers = bytearray(REGISTERS)
     for address, value in device.register_writes():
         registers[address] = value
+    came: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if came:  # impatience: the second one interrupts at once
+            raise EndedError(number)
+        came.append(number)
+        device.request_stop()
+
     about = SrsFacts(device.exposure.range_m, device.camera, device.fps, device.metadata)
     with (
         SrsWriter(path, init, bytes(registers), about, overwrite) as writer,
-        _Signals(device) as signals,
+        shutdown.handled(stop),
         tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5) as bar,
     ):
         began = time.monotonic()
@@ -184,33 +186,7 @@ def record(
             if seconds is not None and time.monotonic() - began >= seconds:
                 device.request_stop()
     print(f"{path}: {writer.frames} frames ({device.counts})")
-    return signals.came
-
-
-class _Signals:
-    """While entered, signals ask the camera to stop; `came` tells which one did."""
-
-    def __init__(self, device: Sr3000) -> None:
-        self.came: int | None = None
-        self._device = device
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> _Signals:
-        if threading.current_thread() is threading.main_thread():
-            for number in SHUTDOWN_SIGNALS:
-                if signal.getsignal(number) != signal.SIG_IGN:  # as by nohup
-                    self._before[number] = signal.signal(number, self._stop)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self.came is not None:  # impatience: the second one interrupts at once
-            raise EndedError(number)
-        self.came = number
-        self._device.request_stop()
+    return came[0] if came else None
 
 
 def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:

@@ -8,7 +8,6 @@ FILE.npz.part.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,7 +16,7 @@ from typing import Any
 
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
-from toftrack.json_text import read_json
+from toftrack.json_text import read_object
 from toftrack.output.evaluation import metrics_table
 from toftrack.output.files import LINES, WHOLE_FILES, cut_unfinished_line, locked_lines
 from toftrack.output.results import (
@@ -28,6 +27,7 @@ from toftrack.output.results import (
     records_of,
 )
 from toftrack.output.run_folder import found_again, open_tracked
+from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.store import open_source
 from toftrack.recordings.unfinished import is_recording, recover_recording
 from toftrack.safe_files import check_replaceable, remove_partial
@@ -39,11 +39,7 @@ _MADE = ("track.npz", "summary.json")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, write the files, print the table. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(
-        prog="toftrack recover",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("toftrack recover", __doc__)
     parser.add_argument(
         "run", metavar="RUN|FILE", help="the output folder of toftrack track, or a recording"
     )
@@ -80,7 +76,7 @@ def recover(
         with locked_lines(folder), records_of(folder, facts) as records:
             for name in _MADE:
                 check_replaceable(folder / name)
-            earlier = _earlier_summary(folder)
+            earlier = read_object(folder / "summary.json")  # of the run itself
             if not replace:
                 _check_not_less(folder, count_frames(records))
             if records.count:
@@ -119,15 +115,6 @@ def _check_not_less(folder: Path, frames: int) -> None:
         ) from None
     if there > frames:
         raise ToftrackError(f"'{path}' has {there} frames, but {LINES} only {frames}; {hint}")
-
-
-def _earlier_summary(folder: Path) -> dict[str, Any]:
-    """Of the run itself, if it came to that."""
-    try:
-        summary = read_json(folder / "summary.json")
-    except (OSError, ValueError):
-        return {}
-    return summary if isinstance(summary, dict) else {}
 
 
 def _truth(facts: dict[str, Any], recording: str | Path | None) -> Truth | None:

@@ -17,20 +17,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import read_json
 from toftrack.safe_files import open_to_read, write_whole
-from toftrack.views.figures.chart import write_figures
-from toftrack.views.figures.sweep import sweep_figure
+from toftrack.views.figures import chart
 
 FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
 """What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
 
 SEED = "seed"
-RECORDINGS = ("device.path",)
-"""Overrides that choose the recording: averaged over, and shown apart where there are several."""
+RECORDING = "device.path"
+"""Which recording a job tracked: averaged over, and shown apart where there are several."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
 def _telling(runs: Sequence[Run]) -> list[str]:
     """Overrides, other than seed and recording, in which runs differ."""
     apart = [key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1]
-    return [key for key in apart if key != SEED and key not in RECORDINGS]
+    return [key for key in apart if key not in (SEED, RECORDING)]
 
 
 def _keys(runs: Sequence[Run]) -> list[str]:
@@ -157,7 +157,7 @@ def _keys(runs: Sequence[Run]) -> list[str]:
 
 def recording(run: Run) -> str:
     """The name of the run's recording; empty when the sweep does not choose one."""
-    return next((Path(run.overrides[key]).stem for key in RECORDINGS if key in run.overrides), "")
+    return Path(run.overrides.get(RECORDING, "")).stem
 
 
 def _summarise(group: Group, figure: str) -> None:
@@ -253,7 +253,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     ]
     if points:
         label = f"{figure.removeprefix('metrics.')}, mean over recordings"
-        drawn = write_figures(folder, {"sweep.png": lambda: sweep_figure(points, label)})
+        drawn = chart.write_figures(folder, {"sweep.png": lambda: sweep_figure(points, label)})
         written += [folder / name for name in drawn]
     print("\n" + "\n".join(_printable(f"  {path}") for path in written))
     return runs, groups
@@ -271,3 +271,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     report(given.folder, given.figure)
     return 0
+
+
+Point = tuple[str, float, float, float | None]
+"""(settings, cost in ms, error, spread of the error over seeds or None)"""
+
+
+def sweep_figure(points: Sequence[Point], label: str) -> np.ndarray:
+    """Numbered dots with bars of one deviation over seeds, a legend below; BGR.
+
+    points: at least one.  label: of the error's axis, which starts at zero. The axis of the cost is
+        logarithmic.
+    """
+    figure = chart.new_figure(900, 500 + 22 * len(points))
+    axes = figure.subplots()
+    chart.label(axes, "ms a frame", label)
+    for number, (settings, cost_ms, error, spread) in enumerate(points, 1):
+        colour, at = chart.COLOURS[(number - 1) % len(chart.COLOURS)], (max(cost_ms, 1e-3), error)
+        axes.errorbar(*at, spread, fmt="o", color=colour, capsize=5, label=f"{number}  {settings}")
+        axes.annotate(str(number), at, (7, 5), textcoords="offset points", color=colour)
+    chart.round_log_ticks(axes, "x")
+    axes.margins(0.15, 0.1)
+    axes.set_ylim(bottom=0)
+    figure.legend(loc="outside lower left", frameon=False)
+    return chart.picture_of(figure)

@@ -93,39 +93,29 @@ class ShapeFiles:
     """
 
     def __init__(self, folder: Path, tracker: HandsTracker) -> None:
-        self._tracker = tracker
-        self._files = [_ShapeFile(folder / shape_file(i)) for i in range(len(tracker.states))]
+        self._tracker, count = tracker, len(tracker.states)
+        self._paths = [folder / shape_file(slot) for slot in range(count)]
+        self._saved: list[HandShape | None] = [None] * count
+        self._saved_s = [-math.inf] * count
 
     def save(self, last: bool = False) -> None:
         """Write the present hands, where they are others than were written.
 
         Raises ToftrackError when that is not possible; before the last time, it may be later.
         """
-        for file, shape in zip(self._files, self._tracker.fitted, strict=True):
-            file.save(shape, last)
-
-
-class _ShapeFile:
-    """One of them."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._saved: HandShape | None = None
-        self._saved_s = -math.inf
-
-    def save(self, shape: HandShape, last: bool) -> None:
-        """See ShapeFiles."""
         now_s = time.monotonic()
-        if shape is self._saved or not (last or now_s > self._saved_s + _APART_S):
-            return
-        self._saved_s = now_s
-        try:
-            shape.to("cpu").save(self._path)
-        except OSError as error:
-            if last:
-                raise ToftrackError(
-                    f"'{self._path}' cannot be written ({error.strerror or error}); make room, or "
-                    "choose another folder with hydra.run.dir=DIR"
-                ) from error
-            return
-        self._saved = shape
+        for slot, (path, shape) in enumerate(zip(self._paths, self._tracker.fitted, strict=True)):
+            due = last or now_s > self._saved_s[slot] + _APART_S
+            if shape is self._saved[slot] or not due:
+                continue
+            self._saved_s[slot] = now_s
+            try:
+                shape.to("cpu").save(path)
+            except OSError as error:
+                if last:
+                    raise ToftrackError(
+                        f"'{path}' cannot be written ({error.strerror or error}); make room, or "
+                        "choose another folder with hydra.run.dir=DIR"
+                    ) from error
+            else:
+                self._saved[slot] = shape

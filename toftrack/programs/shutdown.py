@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType
@@ -50,19 +50,26 @@ _requests = _Requests()
 
 
 @contextmanager
-def obeyed() -> Iterator[None]:
-    """Within it the signals raise EndedError. A signal that is ignored, as by nohup, stays so."""
-    _requests.count, _requests.waiting = 0, None
+def handled(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Within it the signals go to a handler. A signal that is ignored, as by nohup, stays so."""
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
         for number in SHUTDOWN_SIGNALS:
             if signal.getsignal(number) != signal.SIG_IGN:
-                before[number] = signal.signal(number, _request)
+                before[number] = signal.signal(number, handler)
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, own in before.items():
+            signal.signal(number, own)
+
+
+@contextmanager
+def obeyed() -> Iterator[None]:
+    """Within it the signals raise EndedError."""
+    _requests.count, _requests.waiting = 0, None
+    with handled(_request):
+        yield
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from toftrack.json_text import read_json
+from toftrack.json_text import read_object
 from toftrack.programs import empty_folders
 from toftrack.programs.command_line import note_failed_job
 from toftrack.safe_files import let_links_go
@@ -38,7 +38,7 @@ class FailedJobs(Callback):
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         for path in _summaries(config):
-            if path.stat().st_mtime_ns != self._before.get(path) and _tells_an_error(path):
+            if path.stat().st_mtime_ns != self._before.get(path) and "error" in read_object(path):
                 note_failed_job(path.parent)
 
 
@@ -58,11 +58,3 @@ def _let_links_go(folder: Path) -> None:
 def _summaries(config: DictConfig) -> list[Path]:
     folder = Path(config.hydra.sweep.dir).absolute()
     return sorted(folder.glob("**/summary.json"))
-
-
-def _tells_an_error(path: Path) -> bool:
-    try:
-        content = read_json(path)
-    except (OSError, ValueError):
-        return False
-    return isinstance(content, dict) and "error" in content

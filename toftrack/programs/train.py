@@ -98,17 +98,13 @@ def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any])
 
 
 def _summary(kind: str, dims: int, data: PoseData, rows: list[Row]) -> dict:
+    kinds = ("training", "held_out", "reached")
     table = [
-        row._asdict()
-        | {
-            "training": row.training._asdict(),
-            "held_out": row.held_out and row.held_out._asdict(),
-            "reached": row.reached and row.reached._asdict(),
-        }
-        for row in rows
+        {key: value._asdict() if value and key in kinds else value for key, value in pairs}
+        for pairs in (row._asdict().items() for row in rows)
     ]
     asked = next(row for row in rows if row.dims == dims)
-    figures = {"training": asked.training, "held_out": asked.held_out, "reached": asked.reached}
+    figures = {kind: getattr(asked, kind) for kind in kinds}
     return {
         "kind": kind,
         "dims": dims,

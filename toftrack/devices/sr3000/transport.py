@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import (
     MODULATION_CODES,
@@ -83,8 +84,8 @@ class Exposure:
     def __post_init__(self) -> None:
         unambiguous_range_m(self.modulation_mhz)
         if self.integration_time is not None:
-            _check_whole("integration_time", self.integration_time, 0, 255)
-        _check_whole("amplitude_threshold", self.amplitude_threshold, 0, 0xFFFF)
+            check_number("device.integration_time", self.integration_time, 0, 255, whole=True)
+        check_number("device.amplitude_threshold", self.amplitude_threshold, 0, 0xFFFF, whole=True)
 
     @property
     def range_m(self) -> float:
@@ -125,22 +126,22 @@ class UsbSettings:
         if not self.ids:
             raise ToftrackError("device.usb.ids is empty; give at least one VENDOR:PRODUCT")
         for name in ("timeout_ms", "drain_ms", "read_multiple"):
-            _check_whole(f"usb.{name}", getattr(self, name), 1, 600_000)
-        _check_whole("usb.tail_check_ms", self.tail_check_ms, 0, 1000)
+            check_number(f"device.usb.{name}", getattr(self, name), 1, 600_000, whole=True)
+        check_number("device.usb.tail_check_ms", self.tail_check_ms, 0, 1000, whole=True)
         for name in ("interface", "endpoint_in", "endpoint_out", "request_type", "request"):
-            _check_whole(f"usb.{name}", getattr(self, name), 0, 255)
+            check_number(f"device.usb.{name}", getattr(self, name), 0, 255, whole=True)
         for name in ("request_value", "request_index"):
-            _check_whole(f"usb.{name}", getattr(self, name), 0, 0xFFFF)
+            check_number(f"device.usb.{name}", getattr(self, name), 0, 0xFFFF, whole=True)
         registers = {}
         for address, value in dict(self.registers).items():
             address = int(address) if str(address).isdecimal() else address
-            _check_whole("usb.registers: an address", address, 0, REGISTERS - 1)
-            _check_whole(f"usb.registers: the value of {address}", value, 0, 255)
+            check_number("device.usb.registers: an address", address, 0, REGISTERS - 1, whole=True)
+            check_number(f"device.usb.registers: the value of {address}", value, 0, 255, whole=True)
             registers[address] = value
         object.__setattr__(self, "registers", registers)
         for name in ("integration_time_register", "modulation_register"):
-            if getattr(self, name) is not None:
-                _check_whole(f"usb.{name}", getattr(self, name), 0, REGISTERS - 1)
+            if (value := getattr(self, name)) is not None:
+                check_number(f"device.usb.{name}", value, 0, REGISTERS - 1, whole=True)
 
     def register_writes(self, exposure: Exposure) -> list[tuple[int, int]]:
         """Address and value of what is written when the camera is opened, in this order."""
@@ -162,8 +163,8 @@ class MesaSettings:
     timeout_ms: int
 
     def __post_init__(self) -> None:
-        _check_whole("libmesasr.mode", self.mode, 0, 0x7FFFFFFF)
-        _check_whole("libmesasr.timeout_ms", self.timeout_ms, 1, 600_000)
+        check_number("device.libmesasr.mode", self.mode, 0, 0x7FFFFFFF, whole=True)
+        check_number("device.libmesasr.timeout_ms", self.timeout_ms, 1, 600_000, whole=True)
 
 
 @dataclass(frozen=True)
@@ -185,9 +186,8 @@ class Persistence:
             value = getattr(self, name)
             if value is None and name == "give_up_s":
                 continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-                raise ToftrackError(f"device.persistence.{name} must be above 0 s, not {value!r}")
-        _check_whole("persistence.reopen_after", self.reopen_after, 1, 1_000_000)
+            check_number(f"device.persistence.{name}", value, 0, above=True)
+        check_number("device.persistence.reopen_after", self.reopen_after, 1, 1_000_000, whole=True)
 
 
 def parse_id(text: str) -> tuple[int, int]:
@@ -199,10 +199,3 @@ def parse_id(text: str) -> tuple[int, int]:
             f"device.usb.ids: '{text}' is not VENDOR:PRODUCT in hexadecimal, as 1ad2:0074"
         ) from None
     return vendor, product
-
-
-def _check_whole(name: str, value: object, least: int, most: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise ToftrackError(
-            f"device.{name} must be a whole number from {least} to {most}, not {value!r}"
-        )

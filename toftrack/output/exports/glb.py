@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import module_of_extra
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.output.exports.mesh import hand_mesh
 from toftrack.output.exports.motion import HandMotion, rest_joints
@@ -25,7 +25,7 @@ _ROOT = OPENXR_JOINT_NAMES.index("wrist")
 
 def glb_of(motions: list[HandMotion]) -> bytes:
     """The content of a .glb file. Raises ToftrackError when pygltflib is not installed."""
-    file = _File(_pygltflib())
+    file = _File(module_of_extra("pygltflib", "glb needs pygltflib", "export"))
     for motion in motions:
         _add_hand(file, motion)
     return file.content()
@@ -174,14 +174,3 @@ class _File:
         self.document.buffers = [self.gltf.Buffer(byteLength=len(self._data))]
         self.document.set_binary_blob(bytes(self._data))
         return b"".join(self.document.save_to_bytes())
-
-
-def _pygltflib() -> ModuleType:
-    try:
-        import pygltflib
-    except ImportError:
-        raise ToftrackError(
-            "glb needs pygltflib, which is not installed: pip install 'toftrack[export]', in a "
-            "checkout pip install -e '.[export]'"
-        ) from None
-    return pygltflib

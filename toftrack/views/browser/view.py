@@ -98,7 +98,8 @@ class BrowserView:
         self._newest: tuple[TrackedFrame, float] | None = None
         """The newest moment, and when the device gave it."""
         self._times_s: deque[float] = deque(maxlen=200)
-        self._commands: deque[str] = deque(maxlen=_MOST_COMMANDS)
+        self.asked: deque[str] = deque(maxlen=_MOST_COMMANDS)
+        """The visitors' commands; the oldest are forgotten when nobody fetches them."""
         self._visited = threading.Event()
         # What follows belongs to the server's thread.
         self._work = asyncio.Event()
@@ -140,7 +141,7 @@ class BrowserView:
 
     def commands(self) -> Sequence[str]:
         """What the visitors asked for since the last call."""
-        return [self._commands.popleft() for _ in range(len(self._commands))]
+        return [self.asked.popleft() for _ in range(len(self.asked))]
 
     def close(self) -> None:
         """End the page and its thread; a second call does nothing."""
@@ -186,10 +187,6 @@ class BrowserView:
         """What the page is told; a `picture` follows."""
         age = {"age_ms": round(1e3 * (time.monotonic() - self._arrived_s), 1)} if self.jpeg else {}
         return {"phase": self._phase, "picture": picture} | self._facts | age
-
-    def asked(self, command: str) -> None:
-        """Keep a visitor's command; the oldest are forgotten when nobody fetches them."""
-        self._commands.append(command)
 
     def wanted(self) -> None:
         """A visitor waits for a picture."""
@@ -267,7 +264,7 @@ class _Visitor:
         ):
             self.tell({"refused": "commands need the whole address that the tracker printed"})
         else:
-            self._view.asked(command)
+            self._view.asked.append(command)
 
     def __len__(self) -> int:
         return len(self._messages)

@@ -16,6 +16,7 @@ from toftrack.render.likelihood import FMeasure
 from toftrack.safe_files import open_new
 from toftrack.views.base import TrackedFrame
 from toftrack.views.rerun.entities import Entities, blueprint, rr
+from toftrack.views.video import unwritable
 
 FILE_NAME = "track.rrd"
 
@@ -71,7 +72,7 @@ class RerunView:
                 open_new(self._path, replace=True).close()  # the library follows links
                 self._stream.save(self._path, default_blueprint=blueprint())
             except (OSError, *_RERUN_ERRORS) as error:
-                raise _unwritable(self._path) from error
+                raise unwritable(self._path, error) from error
         self._entities = Entities(self._stream, likelihood)
         self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_QUEUED_FRAMES)
         self._left_out = 0
@@ -143,7 +144,7 @@ class RerunView:
         if not isinstance(self._failure, _RERUN_ERRORS):
             raise self._failure
         if self._path is not None:
-            raise _unwritable(self._path) from self._failure
+            raise unwritable(self._path, self._failure) from self._failure
         raise _viewer_gone(str(self._failure)) from self._failure
 
 
@@ -179,10 +180,4 @@ def _viewer_gone(reason: str) -> ToftrackError:
     return ToftrackError(
         f"the viewer is gone ({reason}): what it had not received is missing there, the result "
         "files are whole; start it again, or leave out view.connect and view.spawn"
-    )
-
-
-def _unwritable(path: Path) -> ToftrackError:
-    return ToftrackError(
-        f"'{path}' cannot be written; check the folder and the free space, or choose view=none"
     )

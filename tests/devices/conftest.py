@@ -1,0 +1,15 @@
+"""What holds after every test of a device."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left() -> Iterator[None]:
+    """After each test: no thread."""
+    yield
+    assert not [t for t in threading.enumerate() if t.name == "sr3000-reader"]
