@@ -115,6 +115,6 @@ def test_a_bad_setting_is_one_clear_error() -> None:
 
 
 def test_a_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pythonosc", None)
+    monkeypatch.setitem(__import__("sys").modules, "pythonosc.osc_bundle_builder", None)
     with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[osc\]'"):
         osc_stream()
