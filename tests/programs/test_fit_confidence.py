@@ -21,7 +21,7 @@ def test_doubt_of_joints_follows_the_new_log_odds_within_each_track() -> None:
         np.ones(count, bool),
     )
     right = np.ones(count, bool)
-    seen = Observed(features, right, joints, np.array([0, 0, 1, 1, 1, 1]))
+    seen = Observed(features, right, right, joints, np.array([0, 0, 1, 1, 1, 1]))
     log_odds = np.array([2.0, -2.0, 4.0, 0.0, -4.0, 4.0])
     found = with_doubt(seen, log_odds, memory=0.75).joints.features
     doubt = JOINT_FEATURES.index("doubt")

@@ -17,6 +17,8 @@ from toftrack.detector.crops import crop_rotation
 from toftrack.detector.hand_detector import Detection
 from toftrack.detector.network import PARTS
 from toftrack.detector.parts import (
+    BACKGROUND_PART,
+    FOREARM_PART,
     HAND_PART,
     THING_PART,
     Parts,
@@ -32,7 +34,7 @@ from toftrack.tracking.candidates import (
     propose,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.pixels import without_things
+from toftrack.tracking.pixels import with_own_arm, without_things
 from toftrack.tracking.select import Source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -192,3 +194,39 @@ def test_without_a_thing_all_stays_as_it_is() -> None:
     assert rest is whole
     parts[0, :3] = THING_PART
     assert seen_with(parts)[1].thing is None, "too little for a thing"
+
+
+def behind(gap_m: float, kind: int = BACKGROUND_PART) -> tuple[Observation, Detection]:
+    """A hand whose lower half is behind a surface, which the network says is `kind`; and what it
+    says of the hand.
+    """
+    truth = hand_at()
+    detection = detection_of(truth)
+    centre = detection.keypoints.points_m[9].double().numpy()
+    seen = frame_of(image_of(truth), track_of(truth), detection).observation
+    before = torch.zeros_like(seen.hand)
+    before[int(seen.hand.nonzero()[:, 0].float().mean()) :] = True
+    parts = Parts(np.full((PARTS, PARTS), kind, np.uint8), crop_rotation(centre), centre, False)
+    depth = torch.where(before, float(centre[2]) - gap_m, seen.depth_m)
+    hidden = replace(seen, depth_m=depth, occluder=before, hand=seen.hand & ~before)
+    return hidden, replace(detection, parts=parts)
+
+
+@pytest.mark.parametrize("kind", [FOREARM_PART, BACKGROUND_PART, HAND_PART, THING_PART])
+def test_the_own_arm_alone_hides_nothing_of_the_hand_that_it_is_before(kind: int) -> None:
+    observation, detection = behind(0.06, kind)
+    known = with_own_arm(observation, detection)
+    own = kind == FOREARM_PART
+    assert bool(known.occluder.any()) is not own
+    assert torch.equal(known.hand, observation.hand | (observation.occluder & own))
+
+
+def test_a_hand_that_is_mostly_covered_is_held_where_it_was() -> None:
+    hand = filtered(0.0)
+    everything = torch.ones_like(hand.frame.observation.occluder)
+    near = torch.full_like(hand.frame.observation.depth_m, 0.3)
+    covered = replace(hand.frame.observation, depth_m=near, occluder=everything)
+    table = propose(replace(hand, frame=replace(hand.frame, observation=covered)))
+    assert torch.equal(table.pose, hand.frame.track.pose)
+    assert table.source.tolist() == [Source.PREVIOUS]
+    assert len(propose(hand)) == 4

@@ -47,6 +47,7 @@ def model_of(**changes: object) -> ConfidenceModel:
     """Of the score alone: log odds 4 at a good score, 0 at 2 below, and so on; no memory."""
     odds = LogOdds(4.0, {"log_score": 2.0})
     usual = {"memory": 0.0, "confidence": 0.5, "give_up": 0.1, "patience": 5, "log_odds": odds}
+    usual |= {"whole": 0.0}
     return confidence_model(**(usual | changes))
 
 
@@ -156,3 +157,10 @@ def test_joints_out_of_sight_are_counted() -> None:
     u = (200.0 * joints[:, 0] / joints[:, 2] + 87.5).round()
     half[:, : int(u.median())] = 0.3
     assert 0.2 < features_of(joints, half).hidden < 0.8
+
+
+def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:
+    model = model_of(whole=0.5, whole_odds=LogOdds(3.0, {"other_side": -2.0}))
+    for other_side, lost in ((0.0, False), (1.4, False), (1.6, True)):
+        found = judge(followed(), with_odds(4.0, other_side=other_side), FRAME_S, 1.0, 0.0, model)
+        assert found.lost == lost and found.whole_odds == pytest.approx(3.0 - 2.0 * other_side)

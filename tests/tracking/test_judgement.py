@@ -47,7 +47,13 @@ def image() -> DepthImage:
 
 
 LOST = confidence_model(memory=0.0, confidence=0.3, believe=0.6, second=0.8, give_up=0.1)
-PLAIN = replace(LOST, log_odds=LogOdds(0.0, {"log_score": 1.0}), patience=5)
+PLAIN = replace(
+    LOST,
+    log_odds=LogOdds(0.0, {"log_score": 1.0}),
+    whole=0.0,
+    whole_odds=LogOdds(0.0, {}),
+    patience=5,
+)
 """Log odds are just the feature log_score."""
 HIDDEN = {"hidden": 0.5}
 
@@ -206,6 +212,12 @@ def test_a_track_is_believed_once_and_doubted_while_it_is_lost(
     assert after.believed == (believed or not lost)
     assert after.age.seconds == pytest.approx(track.age.seconds + FRAME_S)
     assert hand.seen.ever == (not lost), "remembered as last believed"
+
+
+def test_a_new_hand_is_believed_that_is_right_as_a_whole_whatever_its_fingers() -> None:
+    for odds, lost in ((3.0, False), (1.0, True)):
+        model = replace(PLAIN, whole_odds=LogOdds(odds, {}))
+        assert closed(track_of(HERE, believed=False), 0.4, model=model)[0].lost == lost
 
 
 def beside(watched: bool) -> OtherHand:

@@ -46,19 +46,21 @@ _HELD_OUT = 5
 class Observed:
     """What the tracker's estimates of T frames were formed from, and how right they were.
 
-    features: (T, S).  right: (T,) every joint is within 40 mm.
+    features: (T, S).  right: (T,) every joint is within 40 mm.  whole: (T,) they are on average.
     joints: of each joint.  sequence: (T,) numbers of the sequences.
     """
 
     features: np.ndarray
     right: np.ndarray
+    whole: np.ndarray
     joints: JointRows
     sequence: np.ndarray
 
     def of(self, rows: np.ndarray) -> Observed:
         """Some of the frames."""
         joints = self.joints.of(rows)
-        return Observed(self.features[rows], self.right[rows], joints, self.sequence[rows])
+        here = self.features[rows], self.right[rows], self.whole[rows]
+        return Observed(*here, joints, self.sequence[rows])
 
 
 def _asked(arguments: list[str] | None) -> argparse.Namespace:
@@ -95,20 +97,24 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     seen = _together([part for part in parts if part is not None])
     kept = seen.sequence % _HELD_OUT == 0
-    log_odds, summary = _fitted_frames(seen, kept)
+    log_odds, summary = _fitted_frames(seen, seen.right, kept)
+    summary["whole"] = _fitted_frames(seen, seen.whole, kept)[1]
     settings = _settings(asked.overrides)
     seen = with_doubt(seen, log_odds, settings.memory)
     belief, more = _fitted_joints(seen, kept)
     summary |= more
     write_whole(asked.output / "summary.json", json.dumps(summary, indent=1) + "\n")
-    fitted = {name: summary[name] for name in ("intercept", "weights")}
+    fitted = {
+        part: {name: of[name] for name in ("intercept", "weights")}
+        for part, of in (("every_joint", summary), ("whole", summary["whole"]))
+    }
     # Scale and odds of the joints are not fitted on rendered sequences: they stay.
     joints = replace(belief, scale=settings.joints.scale, odds=settings.joints.odds)
     content = json.dumps(fitted | {"joints": asdict(joints)}, indent=1)
     write_whole(asked.output / "confidence.json", content + "\n")
     picture = reliability_figure(expit(log_odds[kept]), seen.right[kept])
     write_picture(asked.output / "reliability.png", picture)
-    arrays = {name: getattr(seen, name) for name in ("features", "right", "sequence")}
+    arrays = {name: getattr(seen, name) for name in ("features", "right", "whole", "sequence")}
     arrays |= {f"joint_{name}": values for name, values in seen.joints._asdict().items()}
     write_archive(asked.output / "features.npz", arrays)
     print(
@@ -139,9 +145,11 @@ def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
     return asked.sequences, rendered()
 
 
-def _fitted_frames(seen: Observed, kept: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-    """Log odds (T,) that frames are right, the model, and figures about the kept frames."""
-    x, y = seen.features, seen.right
+def _fitted_frames(
+    seen: Observed, y: np.ndarray, kept: np.ndarray
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Log odds (T,) of y (T,), the model, and figures about the kept frames."""
+    x = seen.features
     intercept, weights = fitted_weights(x[~kept], y[~kept])
     log_odds = intercept + x @ weights
     p = expit(log_odds[kept])
@@ -233,23 +241,24 @@ def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -
         off = sequence.joints_m[index] - joints
         far = np.linalg.norm(off, axis=1)
         near = there & (far < RIGHT_M)
+        whole = there & (far.mean() < RIGHT_M)
         error_cm = 100 * np.einsum("jab,jb->ja", joint_axes(joints), off)
         counted = there and not estimate.lost
         of_joints = (info.joint_features, error_cm, near, counted)
-        rows.append((info.features.values(), near.all(), *of_joints))
+        rows.append((info.features.values(), near.all(), whole, *of_joints))
     if not rows:
         return None
-    features, right, *joint_rows = map(np.array, zip(*rows, strict=True))
-    return Observed(features, right, JointRows(*joint_rows), np.full(len(rows), number))
+    features, right, whole, *joint_rows = map(np.array, zip(*rows, strict=True))
+    return Observed(features, right, whole, JointRows(*joint_rows), np.full(len(rows), number))
 
 
 def _together(parts: list[Observed]) -> Observed:
     joints = zip(*(part.joints for part in parts), strict=True)
-    features, right, sequence = (
+    features, right, whole, sequence = (
         np.concatenate([getattr(part, name) for part in parts])
-        for name in ("features", "right", "sequence")
+        for name in ("features", "right", "whole", "sequence")
     )
-    return Observed(features, right, JointRows(*map(np.concatenate, joints)), sequence)
+    return Observed(features, right, whole, JointRows(*map(np.concatenate, joints)), sequence)
 
 
 _BINS = 10

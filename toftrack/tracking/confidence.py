@@ -348,9 +348,13 @@ class ConfidenceModel:
         two hands that are asked for while the first one is believed; any hand beside another one
         needs at least this.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
+    whole: estimates whose mean joint error is below 40 mm with a lower probability are flagged lost
+        as well: a hand taken for another one, or turned round, is not to be used at all, while one
+        of whose joints a hidden thumb is wrong is, but for that joint.
     memory: part of the log odds that comes from the frames before.
     joint_ok: joints of an estimate that are near with a lower probability are not ok.
-    log_odds: that every joint is within 40 mm, from one frame.  joints: of each joint.
+    log_odds: that every joint is within 40 mm, from one frame.  whole_odds: that their mean error
+        is below that.  joints: of each joint.
     """
 
     confidence: float
@@ -360,11 +364,13 @@ class ConfidenceModel:
     patience: int
     memory: float
     joint_ok: float
+    whole: float
     log_odds: LogOdds
+    whole_odds: LogOdds
     joints: JointConfidence
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "second", "give_up", "joint_ok"):
+        for name in ("confidence", "believe", "second", "whole", "give_up", "joint_ok"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
         check_number("lost.patience", self.patience, 0, whole=True)
@@ -380,11 +386,14 @@ def make_confidence(fitted: str | None = None, **thresholds: Any) -> ConfidenceM
     path = _FITTED if fitted is None else Path(fitted)
     try:
         content = read_json(path)
-        log_odds = LogOdds(float(content["intercept"]), dict(content["weights"]))
+        log_odds, whole_odds = (
+            LogOdds(float(content[name]["intercept"]), dict(content[name]["weights"]))
+            for name in ("every_joint", "whole")
+        )
         joints = JointConfidence(**content["joints"])
     except (OSError, ValueError, TypeError, KeyError, AttributeError, ToftrackError) as error:
         raise ToftrackError(
             f"lost.fitted='{path}' is no confidence that was fitted ({error}); give a file of"
             " python -m toftrack.programs.fit_confidence, or leave it out"
         ) from None
-    return ConfidenceModel(**thresholds, log_odds=log_odds, joints=joints)
+    return ConfidenceModel(**thresholds, log_odds=log_odds, whole_odds=whole_odds, joints=joints)

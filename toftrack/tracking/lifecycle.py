@@ -59,6 +59,9 @@ _HIDDEN = 0.3
 """Share of the joints behind something from which on a hand is hidden."""
 _OUT_OF_VIEW = 0.4
 """Share of the joints outside of the image from which on a hand is out of view."""
+_WHOLE_HAND = 0.9
+"""A new hand that is right as a whole with this probability is believed, whatever its confidence:
+of one that holds a thing, or lies beside another one, a joint is often far off."""
 _PATIENT = 10
 """Times as long is waited for a hand that is hidden: each of its frames counts so much less."""
 _TRIED_S, _AGAIN_S = 0.5, 0.5
@@ -83,7 +86,7 @@ class Status:
 
     state_name, lost: as Estimate has them.  ends: the track does not go on.
     confidence: probability that every joint is within 40 mm; NaN where nothing says.
-    log_odds: the same, smoothed over time.
+    log_odds: the same, smoothed over time.  whole_odds: likewise of the mean joint error.
     doubtful: as Track has it, with this frame.
     """
 
@@ -92,6 +95,7 @@ class Status:
     ends: bool = False
     confidence: float = math.nan
     log_odds: float = 0.0
+    whole_odds: float = 0.0
     doubtful: Duration = Duration()
 
 
@@ -238,6 +242,7 @@ def close(
         age=track.age.extended(dt_s),
         doubtful=status.doubtful,
         log_odds=status.log_odds,
+        whole_odds=status.whole_odds,
         surest=max(track.surest, status.log_odds),
         doubted=status.lost,
         believed=track.believed or not status.lost,
@@ -265,6 +270,7 @@ def judge(
     """
     kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
     smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
+    whole = kept * track.whole_odds + (1 - kept) * model.whole_odds(features)
     confidence = _probability(smooth)
     # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
     passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
@@ -273,11 +279,12 @@ def judge(
     doubtful = Duration(track.doubtful.seconds + passed / (_PATIENT if waits else 1))
     doubtful = doubtful if confidence < model.give_up else Duration()
     ends = model.patience > 0 and doubtful.begun and doubtful.reached(model.patience)
-    # Whether it is a hand at all does not depend on whose it is.
-    believed = track.believed or confidence >= new
-    lost = not believed or side * confidence < model.confidence
+    # Whether it is a hand at all does not depend on whose it is, nor on where all its joints are.
+    probable = _probability(whole)
+    believed = track.believed or confidence >= new or probable >= _WHOLE_HAND
+    lost = not believed or side * confidence < model.confidence or probable < model.whole
     name = _state_name(features) if lost else "tracking"
-    return Status(name, lost, ends, side * confidence, smooth, doubtful)
+    return Status(name, lost, ends, side * confidence, smooth, whole, doubtful)
 
 
 def _probability(log_odds: float) -> float:

@@ -33,7 +33,8 @@ class Track:
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
     age: how long it has been followed.
     doubtful: how long its confidence has been below what a track is kept for.
-    log_odds: that the estimate is right, smoothed over time.
+    log_odds: that the estimate is right, smoothed over time.  whole_odds: that its mean error is
+        below 40 mm, likewise.
     surest: the highest log odds so far.
     doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
     unseen_s: how long ago the pose network was asked about it.
@@ -51,6 +52,7 @@ class Track:
     age: Duration = Duration()
     doubtful: Duration = Duration()
     log_odds: float = 0.0
+    whole_odds: float = 0.0
     surest: float = -math.inf
     doubted: bool = False
     believed: bool = False

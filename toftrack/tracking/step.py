@@ -20,7 +20,7 @@ from toftrack.tracking.candidates import (
     HandFrame,
     keypoints_of,
     propose,
-    without_held_things,
+    with_parts,
 )
 from toftrack.tracking.comparing import compared_beside, observed_shape
 from toftrack.tracking.confidence import confidence_features, joint_features
@@ -179,7 +179,7 @@ def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
         frame = replace(frame, hand=hand, detection=detection)
         if frame.mirrored is not None:
             frame = compared_beside(frame, frame.mirrored(), image)
-    return without_held_things(frame)
+    return with_parts(frame)
 
 
 def conclude(
