@@ -164,3 +164,19 @@ def test_settings_are_checked() -> None:
     }.items():
         with pytest.raises(ToftrackError, match=f"detector.{name}="):
             detector_settings(**{name: value})
+
+
+def test_keypoints_of_fingers_in_one_another_are_doubted() -> None:
+    points = default_hand_points()
+    apart = module.doubted_sigma_m(points, torch.full((21,), 0.003), 0.19)
+    together = points.clone()
+    together[9:13] = points[5:9]
+    found = module.doubted_sigma_m(together, torch.full((21,), 0.003), 0.19)
+    assert float(apart.max()) < 0.01
+    for first in (5, 9):
+        assert bool((found[first + 1 : first + 4] > 0.05).all()) and float(found[first]) < 0.01
+
+
+def default_hand_points() -> torch.Tensor:
+    """(21, 3) of an open hand."""
+    return forward_kinematics(torch.zeros(1, 27), default_hand_shape()).joints_m[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from helpers.detection import detection_of
 from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
 
 from toftrack.errors import ToftrackError
+from toftrack.hand.overlap import RADII_MM
 from toftrack.tracking.candidates import HandFrame, keypoints_of, posterior_of
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.posterior import Posterior, touching
@@ -20,7 +22,7 @@ from toftrack.tracking.posterior import Posterior, touching
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 TRUTH = hand_at()
-NONE = {"keypoints": 0.0, "other_hand": 0.0}
+NONE = {"keypoints": 0.0, "overlap": 0.0, "other_hand": 0.0}
 
 
 def poses(count: int = 24) -> torch.Tensor:
@@ -103,6 +105,30 @@ def test_keypoints_cost_their_robust_squared_deviation() -> None:
     assert found.min() > -0.4 * 9 and found.max() < 0
 
 
+def overlap_of(fingers: np.ndarray) -> float:
+    """How much the fingers (5, 4, 3) of a hand of the mean size are in one another."""
+    total, steps = 0.0, np.diff(fingers, axis=1)
+    straight = np.linalg.norm(steps.sum(1), axis=1) / np.linalg.norm(steps, axis=2).sum(1)
+    straight = np.clip((straight - 0.7) / 0.2, 0, 1)
+    points = [[*f[1:], (f[1] + f[2]) / 2, (f[2] + f[3]) / 2] for f in fingers]
+    for a, b in itertools.combinations(range(5), 2):
+        strict = max(straight[a], straight[b]) if a > 0 else 0.0  # the thumb crosses the others
+        touch_m = (0.6 + 0.4 * strict) / 1e3
+        for p, radius in zip(points[a], RADII_MM[a], strict=True):
+            its = zip(points[b], RADII_MM[b], strict=True)
+            depth = max(1 - np.linalg.norm(p - q) / (touch_m * (radius + r)) for q, r in its)
+            total += (1 + 3 * strict) * max(0.0, depth) ** 2
+    return total
+
+
+def test_fingers_in_one_another_cost_their_overlap() -> None:
+    seen = frame()
+    overlap = [overlap_of(hand[1:].reshape(5, 4, 3)) for hand in joints_of(seen)]
+    assert max(overlap) > 0.1
+    found = added(seen, overlap=0.5)
+    np.testing.assert_allclose(found, -0.5 * np.array(overlap), rtol=1e-3, atol=1e-4)
+
+
 def test_another_hand_costs_the_joints_that_lie_in_it() -> None:
     other = other_hand()
     seen, expected = frame(other), []
@@ -133,13 +159,13 @@ def test_each_other_hand_costs_its_own() -> None:
     np.testing.assert_allclose(both, alone, atol=1e-5)
 
 
-ALL = {"keypoints": 0.4, "other_hand": 3.0}
+ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0}
 
 
 def test_the_named_terms_add_up_to_the_posterior() -> None:
     whole = posterior(frame(other_hand()), **ALL)
     terms = whole.named(poses())
-    assert set(terms) == {"image", "keypoints", "other hand 0"}
+    assert set(terms) == {"image", "keypoints", "overlap", "other hand 0"}
     torch.testing.assert_close(sum(terms.values()), whole(poses()))
     assert all(value.shape == (len(poses()),) and bool(value.any()) for value in terms.values())
 
@@ -153,8 +179,8 @@ def test_terms_are_independent_of_one_another() -> None:
 @pytest.mark.parametrize(
     ("names", "left"),
     [
-        (("keypoints",), {"other hand 0"}),
-        (("other_hand",), {"keypoints"}),
+        (("keypoints",), {"overlap", "other hand 0"}),
+        (("other_hand",), {"keypoints", "overlap"}),
         (tuple(ALL), set()),
     ],
 )

@@ -18,11 +18,14 @@ from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networ
 from toftrack.detector.parts import ALL_HAND, Parts
 from toftrack.detector.proposals import NetworkOutput, Places, find_hands, start_finding
 from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
+from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 
 _AGAIN = 2.0
 """Places whose merit is so much lower than the best are not considered again."""
+_DOUBT_M = 0.06
+"""How far off a finger's outer joints may be that lies in another one, by the keypoints."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
@@ -235,13 +238,26 @@ def doubt_m(detection: Detection) -> float:
 
 
 def _detection(seen: NetworkOutput, row: int) -> Detection:
+    points_m = seen.keypoints_m[row]
+    length_m = DEFAULT_HAND_LENGTH_M * float(seen.log_size[row, 0].exp())
     return Detection(
         **{name: getattr(seen, name)[row] for name in _OF_HYPOTHESES},
-        keypoints=Keypoints(seen.keypoints_m[row], seen.sigma_m[row]),
+        keypoints=Keypoints(points_m, doubted_sigma_m(points_m, seen.sigma_m[row], length_m)),
         present=float(seen.present[row].sigmoid()),
         right_side=float(seen.right[row].sigmoid()),
         parts=seen.parts[row],
     )
+
+
+def doubted_sigma_m(points_m: Tensor, sigma_m: Tensor, hand_length_m: float) -> Tensor:
+    """(21,) deviations of keypoints (21, 3): larger where those of two fingers coincide.
+
+    Of a single finger that is seen the cells do not know which one it is, and say surely that it is
+    either; what is no hand, such as an elbow, has its fingers in one another.
+    """
+    doubt_m = _DOUBT_M * overlap_of_each(points_m[None], hand_length_m)[0].clamp(max=1)
+    outer = doubt_m[:, None] * torch.tensor([0.0, 1.0, 1.0, 1.0])
+    return torch.hypot(sigma_m, torch.cat((torch.zeros(1), outer.flatten())))
 
 
 def make_detector(weights: str | None = None, **settings: Any) -> HandDetector:

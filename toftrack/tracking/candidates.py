@@ -27,6 +27,7 @@ from toftrack.tracking.posterior import (
     ImageTerm,
     KeypointsTerm,
     OtherHandTerm,
+    OverlapTerm,
     Posterior,
     Term,
 )
@@ -160,6 +161,8 @@ def posterior_of(
     keypoints = 0.0 if detection.empty else keypoints
     if keypoints:
         terms["keypoints"] = KeypointsTerm(keypoints_of(detection, model), keypoints)
+    if weights.overlap:
+        terms["overlap"] = OverlapTerm(fitted.shape.hand_length_m, weights.overlap)
     if weights.other_hand:
         touched = [other.joints_m for other in others if other.certain]
         terms |= {

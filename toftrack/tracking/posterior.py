@@ -1,6 +1,6 @@
 """The posterior of a hand's pose: one definition for all who compare poses.
 
-    log p(pose | frame) = image + keypoints + other hand  (up to a constant)
+    log p(pose | frame) = image + keypoints + overlap + other hand  (up to a constant)
 
 A start, the candidates of a frame and the two sides of a hand are compared by it; the particle
 filter weighs its particles by the image alone, sharpened. Each term is a small object, and a term
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.transfer import on_device, on_host
+from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer
@@ -34,6 +35,7 @@ class PosteriorWeights:
     """The weights of the posterior's terms; see conf/posterior for what each does."""
 
     keypoints: float
+    overlap: float
     other_hand: float
 
     def __post_init__(self) -> None:
@@ -83,6 +85,20 @@ class KeypointsTerm:
         off = (joints_m - self.keypoints.points_m).norm(dim=-1) / self.keypoints.sigma_m
         off = off.square()
         return -self.weight * (off / (1 + off / _FAR_SIGMAS**2)).mean(1)
+
+
+@dataclass(frozen=True, eq=False)
+class OverlapTerm:
+    """Fingers in one another. Else what is no hand, such as an elbow, is one whose fingers lie in
+    each other: without this term a fresh draw is usable in 28 instead of 91 %.
+    """
+
+    hand_length_m: float
+    weight: float
+
+    def __call__(self, poses: Tensor, joints_m: Tensor) -> Tensor:
+        """See Term."""
+        return -self.weight * finger_overlap(joints_m, self.hand_length_m)
 
 
 @dataclass(frozen=True, eq=False)
