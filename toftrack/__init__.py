@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from toftrack.output.results import read_results
     from toftrack.output.run_folder import Run, read_run
     from toftrack.tracking.tracker import HandsTracker, Tracker
-    from toftrack.views.drawing import draw
+    from toftrack.views.overlay import draw
 
     __version__: str
 
@@ -55,7 +55,7 @@ _PLACES = {
     "ToftrackError": "toftrack.errors",
     "HandsTracker": "toftrack.tracking.tracker",
     "Tracker": "toftrack.tracking.tracker",
-    "draw": "toftrack.views.drawing",
+    "draw": "toftrack.views.overlay",
     "make_device": "toftrack.api",
     "make_hands_tracker": "toftrack.api",
     "make_tracker": "toftrack.api",

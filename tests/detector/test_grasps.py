@@ -12,8 +12,7 @@ from helpers.detection import clean_picture, dice, intrinsics, plain_scenes, sma
 
 from toftrack.detector import grasps as grasping
 from toftrack.detector import hands as module
-from toftrack.detector.grasps import Grasps, random_grasps
-from toftrack.detector.hands import HAND, THING, posed_hands
+from toftrack.detector.hands import HAND, THING, Grasps, posed_hands, random_grasps
 from toftrack.detector.held_things import _PHONE_M
 from toftrack.detector.things_numba import BALL, BOX, CONE, RING, part_distance
 from toftrack.hand.shape import HandShape

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from toftrack.benchmark.results import compared, rows_of
 from toftrack.frames import Truth
 from toftrack.output.accuracy import (
     by_recording,
@@ -16,7 +17,6 @@ from toftrack.output.accuracy import (
 )
 from toftrack.output.accuracy_tables import accuracy_tables, markdown, plain
 from toftrack.output.measures import FLAG_COUNTS, Estimates, measured
-from toftrack.output.paired import compared, rows_of
 
 
 def tracked(seed: int, name: str = "set/a", frames: int = 60) -> dict:

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from toftrack.output.labelled_figures import labelled_figures, totals
+from toftrack.programs.evaluate import labelled_figures, totals
 
 JOINTS = (0, 5, 8, 20)
 """Two of them are fingertips."""

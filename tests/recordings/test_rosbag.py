@@ -33,9 +33,9 @@ from toftrack.camera import Camera
 from toftrack.devices.replay import Replay
 from toftrack.devices.rosbag import Bag
 from toftrack.errors import ToftrackError
-from toftrack.recordings import ros_images
+from toftrack.recordings import ros_messages
 from toftrack.recordings.bag_names import is_bag
-from toftrack.recordings.ros_camera import camera_of
+from toftrack.recordings.ros_messages import camera_of
 from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.store import open_recording
 
@@ -284,21 +284,21 @@ def test_a_damaged_message_ends_the_recording_before_it(tmp_path: Path) -> None:
 def test_rows_may_be_padded_and_bytes_swapped() -> None:
     depth = some_depth(1)[0]
     for fields in (image(depth, pad=6), image(depth, big=True), image(depth, "32FC1", big=True)):
-        found = ros_images.depth_image(as_message(fields), IMAGE, 0.001)
+        found = ros_messages.depth_image(as_message(fields), IMAGE, 0.001)
         np.testing.assert_allclose(found, depth, atol=1e-6)
 
 
 def test_no_reading_is_zero_in_every_encoding() -> None:
     depth = some_depth(1)[0]
     depth[0, :4] = (np.nan, np.inf, -1, 0)
-    found = ros_images.depth_image(as_message(image(depth, "32FC1")), IMAGE, 0.001)
+    found = ros_messages.depth_image(as_message(image(depth, "32FC1")), IMAGE, 0.001)
     assert (found[0, :4] == 0).all() and np.isfinite(found).all()
 
 
 def test_quantised_inverse_depth_is_exact_to_its_steps() -> None:
     depth = some_depth(1)[0]
     message = as_message(compressed(depth, "32FC1; compressedDepth png"))
-    found = ros_images.depth_image(message, COMPRESSED, 0.001)
+    found = ros_messages.depth_image(message, COMPRESSED, 0.001)
     # A step of 1 / z is 1 / 10100 m.
     np.testing.assert_array_less(np.abs(found - depth), depth**2 / 10100 / 2 + 1e-5)
     assert (found[:3] == 0).all()
@@ -323,14 +323,14 @@ def test_compressed_images_of_another_kind_are_reported(
 ) -> None:
     message = as_message(change(compressed(some_depth(1)[0])))
     with pytest.raises(ToftrackError, match=words):
-        ros_images.depth_image(message, COMPRESSED, 0.001)
+        ros_messages.depth_image(message, COMPRESSED, 0.001)
 
 
 def test_an_image_with_too_few_bytes_is_reported() -> None:
     fields = image(some_depth(1)[0])
     for change in ({"data": fields["data"][:-70]}, {"step": 3}, {"height": 0}, {"width": 2**31}):
         with pytest.raises(ToftrackError, match="too few"):
-            ros_images.depth_image(as_message(fields | change), IMAGE, 0.001)
+            ros_messages.depth_image(as_message(fields | change), IMAGE, 0.001)
 
 
 LENSES = {

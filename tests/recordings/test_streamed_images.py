@@ -12,7 +12,7 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.recordings import npz
 from toftrack.recordings.npz import Recording, read_recording
-from toftrack.recordings.streamed_images import StreamedImages
+from toftrack.recordings.npz_pieces import StreamedImages
 
 K = np.array([[90.0, 0, 40], [0, 91.0, 30], [0, 0, 1]])
 RNG = np.random.default_rng(0)

@@ -17,6 +17,7 @@ from toftrack.benchmark.accuracy import add_arguments, divided
 from toftrack.benchmark.results import (
     checked_targets,
     circumstances,
+    compared,
     json_text,
     result_of,
     write_text,
@@ -25,7 +26,6 @@ from toftrack.benchmark.runs import Job, jobs, run_jobs, sources
 from toftrack.errors import ToftrackError
 from toftrack.output.accuracy import Row
 from toftrack.output.accuracy_tables import Table, clear_mark, markdown, plain
-from toftrack.output.paired import compared
 
 
 class Variant(NamedTuple):

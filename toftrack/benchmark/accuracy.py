@@ -168,7 +168,7 @@ def write_picture(path: Path, result: dict[str, Any]) -> None:
     """The picture of a result; ToftrackError where it cannot be written or drawn."""
     import cv2
 
-    from toftrack.views.figures.accuracy import accuracy_figure
+    from toftrack.views.figures.runs import accuracy_figure
 
     if not result["each"]:
         raise ToftrackError(

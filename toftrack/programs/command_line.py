@@ -18,6 +18,7 @@ import argparse
 import contextlib
 import functools
 import json
+import logging
 import math
 import os
 import sys
@@ -33,7 +34,7 @@ from omegaconf import DictConfig
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
 from toftrack.json_text import read_object
-from toftrack.programs import empty_folders, shutdown
+from toftrack.programs import shutdown
 from toftrack.safe_files import write_whole
 
 
@@ -73,11 +74,11 @@ def run(main: Callable[[], object]) -> int:
     _program.running = True
     _program.tracebacks = os.environ.get(FULL_ERROR) == "1"
     _program.failed_jobs.clear()
-    empty_folders.forget()
+    _forget_folders()
     try:
         with shutdown.obeyed(), _hydra_raises():
             status = main()
-            empty_folders.forget()
+            _forget_folders()
     except KeyboardInterrupt as end:
         shutdown.say("interrupted: what was done until then is kept", sys.stderr)
         shutdown.forget_streams()
@@ -97,7 +98,7 @@ def run(main: Callable[[], object]) -> int:
         _report(error)
         return 1
     finally:
-        empty_folders.clear()
+        _clear_folders()
         _program.running = False
     if _program.failed_jobs:
         count = len(_program.failed_jobs)
@@ -186,3 +187,68 @@ def _note_error(folder: Path, text: str) -> None:
     # The sentence is on the terminal; a folder that cannot be written must not stop the sweep.
     with contextlib.suppress(OSError):
         write_whole(path, json.dumps(read_object(path) | {"error": text}, indent=1) + "\n")
+
+
+# Hydra makes the folder of a run, with its own files in it, before the program has looked at its
+# settings: that of one that failed before it wrote anything of its own goes away again.
+_HYDRAS = frozenset({"config.yaml", "hydra.yaml", "overrides.yaml"})
+_SWEEPS = "multirun.yaml"
+
+
+@dataclass(frozen=True)
+class _Folder:
+    path: Path
+    new: tuple[Path, ...]
+    """Those of it and its parents that were not there, the innermost first."""
+
+
+_expected: list[_Folder] = []
+
+
+def expect_folder(folder: Path) -> None:
+    """A run or a sweep is about to make this folder. One with files in it is nobody's to clear."""
+    path = folder.absolute()
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        return
+    new = [place for place in (path, *path.parents) if not place.exists()]
+    _expected.append(_Folder(path, tuple(new)))
+
+
+def _forget_folders() -> None:
+    """What was expected so far stays as it is."""
+    _expected.clear()
+
+
+def _clear_folders() -> None:
+    """Remove the expected folders that hold nothing but what Hydra put there."""
+    for folder in _expected:
+        with contextlib.suppress(OSError):  # the error that is being reported counts for more
+            _clear(folder)
+    _forget_folders()
+
+
+def _clear(folder: _Folder) -> None:
+    files = [path for path in folder.path.glob("*") if path.name != ".hydra"]
+    inner = list(folder.path.glob(".hydra/*"))
+    if any(path.suffix != ".log" and path.name != _SWEEPS for path in files):
+        return
+    if any(path.name not in _HYDRAS for path in inner):
+        return
+    _close_logs(folder.path)
+    for path in (*files, *inner):
+        path.unlink()
+    for place in (folder.path / ".hydra", *folder.new):
+        if place.is_dir():
+            place.rmdir()
+
+
+def _close_logs(folder: Path) -> None:
+    """Windows removes no file that is open."""
+    root = logging.getLogger()
+    for handler in list(root.handlers):
+        if (
+            isinstance(handler, logging.FileHandler)
+            and folder in Path(handler.baseFilename).parents
+        ):
+            root.removeHandler(handler)
+            handler.close()

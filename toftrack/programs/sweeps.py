@@ -11,8 +11,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from toftrack.json_text import read_object
-from toftrack.programs import empty_folders
-from toftrack.programs.command_line import note_failed_job
+from toftrack.programs.command_line import expect_folder, note_failed_job
 from toftrack.safe_files import let_links_go
 
 
@@ -44,7 +43,7 @@ class FailedJobs(Callback):
 
 def _prepare(folder: Path) -> None:
     _let_links_go(folder)
-    empty_folders.expect(folder)
+    expect_folder(folder)
 
 
 def _let_links_go(folder: Path) -> None:

@@ -16,7 +16,7 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import median_reading, nearest_reading
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.streamed_images import Images, StreamedImages
+from toftrack.recordings.npz_pieces import Images, StreamedImages
 
 _PER_FRAME = (
     *("timestamp_s", "joints_m", "visible", "in_space"),

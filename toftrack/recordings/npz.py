@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +32,12 @@ import numpy as np
 
 from toftrack.archives import MOST_BYTES, Archive, PickledError, Pieces, write_archive
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Truth, median_reading, wrong_unit
 from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.streamed_images import Images, StreamedImages
-from toftrack.recordings.truth import TRUTH_KEYS, of_shape, read_truth, truth_arrays
+from toftrack.recordings.npz_pieces import Images, StreamedImages
 from toftrack.safe_files import open_to_read
 
 DEFAULT_FPS = 25.0
@@ -133,24 +132,8 @@ def write_recording(
         arrays["amplitude"] = Pieces(shape, np.dtype("<u2"), amplitude_images())
     if store.truth is not None:
         arrays |= truth_arrays(store.truth)
-    try:
+    with reported_errors(f"the recording '{path}' cannot be written", "choose another place"):
         write_archive(path, arrays)
-    except OSError as error:
-        raise ToftrackError(
-            f"the recording '{path}' cannot be written ({error.strerror}); choose another place"
-        ) from error
-
-
-_KEYS = (
-    "depth_m",
-    "radial_m",
-    *CAMERA_KEYS,
-    "amplitude",
-    "fps",
-    "timestamp_s",
-    *TRUTH_KEYS,
-    "metadata",
-)
 
 
 def _read_members(path: Path) -> dict[str, Images]:
@@ -315,3 +298,119 @@ def _camera_of(arrays: dict[str, Any], width: int, height: int) -> Camera:
         lens=lens.reshape(()).item(),
         **{key: arrays[key] for key in _POLYNOMIAL if key in arrays},
     )
+
+
+_JOINTS = 21
+_FIELDS = ("joints_m", "visible", "in_space", "visible_fraction", "joint_visible", "pose_name")
+_FIRST = {name: name for name in _FIELDS}
+"""What fields of Truth are called in a file."""
+_OTHER = {name: f"{name}2" for name in _FIELDS} | {"joints_m": "joints2_m"}
+"""Those of the other hand."""
+_KEYS = (
+    "depth_m",
+    "radial_m",
+    *CAMERA_KEYS,
+    "amplitude",
+    "fps",
+    "timestamp_s",
+    *_FIRST.values(),
+    *_OTHER.values(),
+    "metadata",
+)
+
+
+def truth_arrays(truth: Truth) -> dict[str, np.ndarray]:
+    """The arrays of a file; sides and rests belong into its metadata."""
+    arrays: dict[str, np.ndarray] = {}
+    for keys, hand in ((_FIRST, truth), (_OTHER, truth.other)):
+        values = {key: getattr(hand, name, None) for name, key in keys.items()}
+        arrays |= {key: value for key, value in values.items() if value is not None}
+    return arrays
+
+
+def read_truth(arrays: dict[str, Any], count: int, metadata: dict[str, Any]) -> Truth | None:
+    """The truth of `count` frames; None where a file has none.
+
+    Sides and rests are read from the metadata where it has them: `side` (or `handedness`) and
+    `side2`, and `still`, the first and the last frame of each rest of the first hand.
+
+    Raises ToftrackError, a sentence about a key, when an array cannot be meant.
+    """
+    first = _truth_of_one(arrays, count, _FIRST)
+    if first is None:
+        return None
+    other = _truth_of_one(arrays, count, _OTHER)
+    if other is not None:
+        other = replace(other, side=_side(metadata, "side2"))
+    side = _side(metadata, "side") or _side(metadata, "handedness")
+    return replace(first, other=other, side=side, still=_still(metadata.get("still"), count))
+
+
+def of_shape(arrays: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
+    """A numeric or boolean array of the given shape."""
+    array = arrays[key]
+    if array.dtype.kind not in "biuf":
+        raise ToftrackError(f"'{key}' must consist of numbers, but is {array.dtype}")
+    return _shaped(array, key, shape)
+
+
+def _shaped(array: np.ndarray, key: str, shape: tuple[int, ...]) -> np.ndarray:
+    if array.shape != shape:
+        raise ToftrackError(
+            f"'{key}' must have the shape {shape} (the first is the number of frames), but has "
+            f"{array.shape}"
+        )
+    return array
+
+
+def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> Truth | None:
+    """Of one hand.  keys: what the fields are called."""
+    if keys["joints_m"] not in arrays:
+        return None
+    joints = of_shape(arrays, keys["joints_m"], (count, _JOINTS, 3)).astype(np.float32)
+    if not np.isfinite(joints).all():
+        name = keys["joints_m"]
+        raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
+
+    def flags(name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+        key = keys[name]
+        return of_shape(arrays, key, shape).astype(bool) if key in arrays else None
+
+    visible, in_space = flags("visible", (count,)), flags("in_space", (count,))
+    fraction = None
+    if keys["visible_fraction"] in arrays:
+        fraction = of_shape(arrays, keys["visible_fraction"], (count,)).astype(np.float32)
+    return Truth(
+        joints_m=joints,
+        visible=np.ones(count, bool) if visible is None else visible,
+        in_space=np.ones(count, bool) if in_space is None else in_space,
+        visible_fraction=fraction,
+        joint_visible=flags("joint_visible", (count, _JOINTS)),
+        pose_name=_names(arrays, keys["pose_name"], count),
+    )
+
+
+def _names(arrays: dict[str, Any], key: str, count: int) -> np.ndarray | None:
+    """(T,) text."""
+    if key not in arrays:
+        return None
+    array = arrays[key]
+    if array.dtype.kind not in "US":
+        raise ToftrackError(f"'{key}' must be text, but is {array.dtype}")
+    if array.dtype.kind == "S":
+        array = np.char.decode(array, "utf-8", "replace")
+    return _shaped(array, key, (count,))
+
+
+def _side(metadata: dict[str, Any], key: str) -> str:
+    side = metadata.get(key)
+    return side if side in ("right", "left") else ""
+
+
+def _still(rests: Any, count: int) -> np.ndarray | None:
+    """(T,) bool of [[first, last], ...]; None where there is none, or nothing of that kind."""
+    still = np.zeros(count, bool)
+    for rest in rests if isinstance(rests, list) else ():
+        if isinstance(rest, list) and len(rest) == 2 and all(type(end) is int for end in rest):
+            still[max(rest[0], 0) : max(rest[1] + 1, 0)] = True
+    return still if still.any() else None

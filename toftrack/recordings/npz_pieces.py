@@ -1,4 +1,4 @@
-"""Arrays of an `.npz` of which pieces are compressed already, one behind the other."""
+"""Long arrays of an `.npz` in pieces: compressed one behind the other, and read one by one."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import io
 import math
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+
+from toftrack.archives import Archive, Header
+from toftrack.errors import ToftrackError, reported_errors
+from toftrack.safe_files import open_to_read
 
 _LEVEL = 1
 """Of zlib; 6 takes three times as long for a tenth less."""
@@ -82,3 +87,67 @@ def _product(a: int, b: int) -> int:
             product ^= b
         b = b >> 1 ^ (_POLYNOMIAL if b & 1 else 0)
     return product
+
+
+class StreamedImages:
+    """(T, H, W) images of one array of an archive, each to be had by its number.
+
+    Made for going forward. An image before the latest one is found by beginning anew.
+
+    Raises ToftrackError where the array cannot be read in turn, and later where it is damaged.
+    """
+
+    def __init__(self, path: Path, name: str, header: Header) -> None:
+        self._path, self._name = path, name
+        if header.fortran_order or header.kind.kind not in "fiu":
+            raise ToftrackError(
+                f"'{name}' of the recording '{path}' has {header.size / 1e9:.1f} GB, and can be "
+                "read in turn only as numbers in C order; save it so (numpy.ascontiguousarray)"
+            )
+        self.shape, self.dtype, self.ndim = header.shape, header.kind, len(header.shape)
+        self.size = int(np.prod(header.shape, dtype=object))
+        self._images: Generator[np.ndarray] | None = None
+        self._latest: tuple[int, np.ndarray] | None = None
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        """(H, W), of the file's type."""
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        if self._latest is None or index < self._latest[0]:
+            self.close()
+            self._images = self._in_turn()
+        number, image = self._latest or (-1, np.empty(0))
+        while number < index:
+            assert self._images is not None
+            number, image = number + 1, next(self._images)
+            self._latest = number, image
+        return image
+
+    def close(self) -> None:
+        """Close the file; the next image opens it again."""
+        if self._images is not None:
+            self._images.close()
+        self._images = self._latest = None
+
+    def _in_turn(self) -> Generator[np.ndarray]:
+        shape = self.shape[1:]
+        size = int(np.prod(shape)) * self.dtype.itemsize
+        recording, remedy = f"the recording '{self._path}'", "copy or record it again"
+        with (
+            reported_errors(f"{recording} cannot be read", remedy),
+            reported_errors(f"{recording} is damaged", remedy, ValueError),
+            open_to_read(self._path) as file,
+            Archive(file).rows(self._name) as stream,
+        ):
+            for _ in range(len(self)):
+                content = stream.read(size)
+                if len(content) < size:
+                    raise ValueError(f"{self._name!r} is cut off")
+                yield np.frombuffer(content, self.dtype).reshape(shape)
+
+
+Images = np.ndarray | StreamedImages
+"""(T, H, W) images, in memory or on the disk."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.safe_files import open_to_read
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -24,13 +24,9 @@ def read_png(path: Path, kind: type, shape: tuple[int, ...] | None = None) -> np
 
     Raises ToftrackError when it cannot be read, is damaged, or of another kind.
     """
-    try:
+    with reported_errors(f"the image '{path}' cannot be read", "check its permissions"):
         with open_to_read(path) as stream:
             content = stream.read()
-    except OSError as error:
-        raise ToftrackError(
-            f"the image '{path}' cannot be read ({error.strerror}); check its permissions"
-        ) from error
     image = decoded_png(content)
     if image is None:
         raise ToftrackError(f"the image '{path}' is damaged, or no PNG; copy or record it again")

@@ -17,6 +17,7 @@ import io
 import json
 import re
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -25,7 +26,7 @@ import cv2
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import read_json
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
@@ -95,10 +96,8 @@ def read_png_folder(
     folder = Path(folder).expanduser()
     if not folder.is_dir():
         raise ToftrackError(f"there is no folder '{folder}'; give a folder of 16-bit PNG images")
-    try:
+    with reported_errors(f"the folder '{folder}' cannot be read", "check its permissions"):
         images = sorted((p for p in folder.iterdir() if p.suffix.lower() == ".png"), key=_order)
-    except OSError as error:
-        raise ToftrackError(f"the folder '{folder}' cannot be read ({error.strerror})") from error
     amplitude = [path for path in images if path.name.lower().startswith("amplitude")]
     depth = [path for path in images if path not in set(amplitude)]
     if not depth:
@@ -156,7 +155,7 @@ class PngFolderWriter:
     ) -> None:
         self.folder, self.unit_m, self.frames = Path(folder).expanduser(), unit_m, 0
         facts = {"depth_unit_m": unit_m, "radial": radial, "fps": fps, "metadata": metadata or {}}
-        try:
+        with self._writing():
             self.folder.mkdir(parents=True, exist_ok=True)
             if any(self.folder.glob("*.png")):
                 raise ToftrackError(
@@ -167,8 +166,6 @@ class PngFolderWriter:
             self._times = io.TextIOWrapper(
                 open_new(self.folder / _TIMES, replace=True), encoding="utf-8"
             )
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def append(self, depth_m: np.ndarray, amplitude: np.ndarray | None, timestamp_s: float) -> None:
         """Add a frame: (H, W) metres, rounded to the unit (no reading and too far become 0), and
@@ -176,21 +173,17 @@ class PngFolderWriter:
         valid = (depth_m > 0) & (depth_m < np.inf)
         steps = np.where(valid, depth_m, 0).astype(np.float64) / self.unit_m
         words = np.where(steps <= 0xFFFF, np.rint(steps), 0).astype(np.uint16)
-        try:
+        with self._writing():
             self._save(f"depth_{self.frames:06d}.png", words)
             if amplitude is not None:
                 self._save(f"amplitude_{self.frames:06d}.png", amplitude)
             self._times.write(f"{timestamp_s!r}\n")
-        except OSError as error:
-            raise self._unwritable(error) from error
         self.frames += 1
 
     def close(self) -> None:
         """Finish `timestamps.txt`. Raises ToftrackError when it cannot be written."""
-        try:
+        with self._writing():
             self._times.close()
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def __enter__(self) -> Self:
         return self
@@ -202,10 +195,9 @@ class PngFolderWriter:
         with open_new(self.folder / name) as stream:
             stream.write(cv2.imencode(".png", image)[1].tobytes())
 
-    def _unwritable(self, error: OSError) -> ToftrackError:
-        return ToftrackError(
-            f"the folder '{self.folder}' cannot be written ({error.strerror}); choose another place"
-        )
+    def _writing(self) -> AbstractContextManager[None]:
+        what = f"the folder '{self.folder}' cannot be written"
+        return reported_errors(what, "choose another place")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Frame, median_reading, wrong_unit
 from toftrack.recordings.npz_pieces import compressed
 from toftrack.recordings.unfinished import IMAGE_TYPES, SUFFIX, Facts, UnfinishedRecording, finish
@@ -139,13 +139,9 @@ class Recorder:
                         f"the file '{path}' exists already; {rest}choose another name, or "
                         "overwrite it with `toftrack record --overwrite`"
                     )
-        try:
+        what = f"the recording '{self.path}' cannot be written"
+        with reported_errors(what, "choose another place"):
             return UnfinishedRecording(self._part, self._overwrite)
-        except OSError as error:
-            raise ToftrackError(
-                f"the recording '{self.path}' cannot be written ({error.strerror or error}); "
-                "choose another place"
-            ) from error
 
     def _run(self) -> None:
         while (frame := self._queue.get()) is not None:

@@ -2,7 +2,7 @@
 
 One topic of depth images is played, with the lens that its camera_info tells. A bag is read through
 once for the times, and then again, message by message: long ones need no more memory than short
-ones. What is read of each message stands in `ros_images.py` and `ros_camera.py`.
+ones. What is read of each message stands in `ros_messages.py`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,20 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import LARGEST_MEDIAN_M
 from toftrack.recordings.bag_names import storage_of
 from toftrack.recordings.bare import MILLIMETRE, BareFacts
 from toftrack.recordings.npz import DEFAULT_FPS
-from toftrack.recordings.ros_camera import CAMERA_INFO, camera_of
-from toftrack.recordings.ros_images import COMPRESSED, IMAGE, depth_image, encoding, is_depth
+from toftrack.recordings.ros_messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    camera_of,
+    depth_image,
+    encoding,
+    is_depth,
+)
 from toftrack.safe_files import check_readable
 
 _REPAIR = {
@@ -117,12 +124,8 @@ def read_rosbag(
     if not path.exists():
         raise ToftrackError(f"there is no bag '{path}'; give the path of a recording")
     unit_m = BareFacts(unit_m=unit_m).unit_m or MILLIMETRE
-    try:
+    with reported_errors(f"the bag '{path}' cannot be read", "give the path of a recording"):
         check_readable(path)
-    except OSError as error:
-        raise ToftrackError(
-            f"the bag '{path}' cannot be read ({error.strerror}); give the path of a recording"
-        ) from error
     bag = _Bag(path)
     try:
         chosen = _choose(bag, topic)

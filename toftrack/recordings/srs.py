@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -27,7 +28,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import parse_json
 from toftrack.recordings.npz import DEFAULT_FPS
 from toftrack.recordings.sr_frame import (
@@ -246,13 +247,11 @@ class SrsRecording:
 
     def raw(self, index: int) -> bytes:
         """A frame as the camera sent it, FRAME_BYTES bytes. Raises ToftrackError if unreadable."""
-        try:
+        with _reading(self.path):
             if self._stream is None:
                 self._stream = open_to_read(self.path)
             self._stream.seek(int(self._offsets[index]))
             data = self._stream.read(FRAME_BYTES)
-        except OSError as error:
-            raise _unreadable(self.path, error) from error
         if len(data) != FRAME_BYTES:
             raise ToftrackError(f"the recording '{self.path}' became shorter while it was read")
         return data
@@ -284,15 +283,10 @@ def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> 
     if path.is_dir():
         raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.srs)")
     default_range_m = unambiguous_range_m(modulation_mhz)
-    try:
-        with open_to_read(path) as stream:
-            scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
-    except FileNotFoundError:
-        raise ToftrackError(
-            f"there is no file '{path}'; give the path of a recording (.srs)"
-        ) from None
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    if not path.exists():
+        raise ToftrackError(f"there is no file '{path}'; give the path of a recording (.srs)")
+    with _reading(path), open_to_read(path) as stream:
+        scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
     if not scan.offsets:
         reason = f" ({scan.damage})" if scan.damage else ""
         raise ToftrackError(f"the recording '{path}' has no whole frame{reason}; record it again")
@@ -393,8 +387,6 @@ def _object(kind: int, content: bytes) -> bytes:
     return _PAIR.pack(kind, _PAIR.size + len(content)) + content
 
 
-def _unreadable(path: Path, error: OSError) -> ToftrackError:
-    return ToftrackError(
-        f"the recording '{path}' cannot be read ({error.strerror or error}); check the file and "
-        "its permissions"
-    )
+def _reading(path: Path) -> AbstractContextManager[None]:
+    what = f"the recording '{path}' cannot be read"
+    return reported_errors(what, "check the file and its permissions")

@@ -26,7 +26,7 @@ import numpy as np
 
 from toftrack.archives import add_array
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import parse_json
 from toftrack.recordings.npz import camera_arrays
 from toftrack.recordings.npz_pieces import add_pieces
@@ -160,7 +160,10 @@ def finish(part: Path, path: Path, overwrite: bool = False) -> int:
     Raises ToftrackError: it is no such file, is being written, has no whole frame, or the recording
     exists or cannot be written; the file then stays.
     """
-    try:
+    with reported_errors(
+        f"the recording '{path}' cannot be made of '{part}', which is kept",
+        f"make room, then `toftrack recover {part}`",
+    ):
         with _locked(part) as stream:
             facts, frames = _read(stream, part)
             if not frames:
@@ -173,11 +176,6 @@ def finish(part: Path, path: Path, overwrite: bool = False) -> int:
             with whole_file(path) as target:
                 _make_npz(target, stream, facts, frames)
         part.unlink()
-    except OSError as error:
-        raise ToftrackError(
-            f"the recording '{path}' cannot be made of '{part}', which is kept "
-            f"({error.strerror or error}); make room, then `toftrack recover {part}`"
-        ) from error
     return len(frames)
 
 

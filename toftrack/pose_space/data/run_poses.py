@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from toftrack.archives import read_archive
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.pose_space.data.pose_data import CLIP, PoseData, spread_out
 from toftrack.pose_space.data.pose_files import within_limits
@@ -57,18 +57,15 @@ def run_data(path: str, poses: int | None, confidence: float) -> PoseData:
 
 def _read(place: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States (N, 27), confidences (N,) and which can be used (N,), the slots one after another."""
-    try:
+    remedy, no_track = (
+        "give data.path=RUN, the output folder of a run",
+        "is not the track.npz of a run",
+    )
+    with (
+        reported_errors(f"{place} cannot be read", remedy),
+        reported_errors(f"{place} {no_track}", remedy, ValueError),
+    ):
         content = read_archive(place, {"state", "lost", "confidence", "dropped"})
-    except OSError as error:
-        raise ToftrackError(
-            f"{place} cannot be read ({error.strerror or error}); give data.path=RUN, the output"
-            " folder of a run"
-        ) from None
-    except ValueError as error:
-        raise ToftrackError(
-            f"{place} is not the track.npz of a run ({error}); give data.path=RUN, the output"
-            " folder of a run"
-        ) from None
     state, lost = content.get("state"), content.get("lost")
     if (
         state is None

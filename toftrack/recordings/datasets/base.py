@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.safe_files import open_to_read
 
 MILLIMETRE = 1e-3
@@ -109,13 +109,9 @@ def compared_joints(
 
 def read_bytes(path: Path) -> bytes:
     """The content of a file; ToftrackError, one sentence, when it cannot be read."""
-    try:
+    with reported_errors(f"the file '{path}' cannot be read", "copy the data set again"):
         with open_to_read(path) as stream:
             return stream.read()
-    except OSError as error:
-        raise ToftrackError(
-            f"the file '{path}' cannot be read ({error.strerror}); copy the data set again"
-        ) from error
 
 
 def read_lines(path: Path) -> list[str]:
