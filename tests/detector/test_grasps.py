@@ -10,7 +10,6 @@ import pytest
 import torch
 from helpers.detection import clean_picture, dice, intrinsics, plain_scenes, small_bank
 
-from toftrack.detector import grasps as grasping
 from toftrack.detector import hands as module
 from toftrack.detector.hands import HAND, THING, Grasps, posed_hands, random_grasps
 from toftrack.detector.held_things import _PHONE_M
@@ -65,10 +64,10 @@ def in_palm(
     opposed: float, tries: int, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Grasps, np.ndarray]:
     """Power grasps, and their joints (N, 21, 3)."""
-    monkeypatch.setattr(grasping, "POWER_SHARE", 1.0)
-    monkeypatch.setattr(grasping, "_OPENED_SHARE", 0.0)
-    monkeypatch.setattr(grasping, "_OPPOSED_SHARE", opposed)
-    monkeypatch.setattr(grasping, "_THUMB_TRIES", tries)
+    monkeypatch.setattr(module, "POWER_SHARE", 1.0)
+    monkeypatch.setattr(module, "_OPENED_SHARE", 0.0)
+    monkeypatch.setattr(module, "_OPPOSED_SHARE", opposed)
+    monkeypatch.setattr(module, "_THUMB_TRIES", tries)
     held, shape = grasps()
     state = torch.cat((torch.zeros(N, 6), held.angles), 1)
     return held, forward_kinematics(state, shape).joints_m.numpy()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from toftrack.hand.conventions import openxr_hand_compiled
 from toftrack.hand.openxr import openxr_hand, openxr_rig
-from toftrack.hand.openxr_numba import openxr_hand_compiled
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 

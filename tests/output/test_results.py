@@ -353,9 +353,7 @@ def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
     "changes",
     [
         {"metadata": []},
-        {"metadata": {"camera": [1]}},
         {"metadata": {"pose_space": {"dims": 10**9}}},
-        {"metadata": {"config": {"hands": 3}}},
         {"metadata": {"camera": {"K": 1}}},
     ],
     ids=str,

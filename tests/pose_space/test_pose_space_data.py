@@ -15,11 +15,13 @@ from helpers.tracking import ROOT
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
-from toftrack.pose_space.data.natural_poses import natural_poses
 from toftrack.pose_space.data.pose_data import (
     PoseData,
+    drawn_poses,
     mixed_data,
     natural_data,
+    natural_poses,
+    recorded_poses,
     spread_out,
     synthetic_data,
 )
@@ -37,6 +39,7 @@ from toftrack.programs import train
 from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
 
 LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
+LOW, HIGH = torch.tensor(ANGLE_LIMITS).unbind(1)
 
 
 def random_angles(count: int, seed: int = 0, part: float = 0.6) -> torch.Tensor:
@@ -164,12 +167,6 @@ def broken(kind: str, path: Path) -> str:
     write_csv(path, values)
     if kind == "text":
         path.write_text(path.read_text() + ",".join(["1"] * 20 + ["much"]) + "\n")
-    if kind == "short row":
-        path.write_text(path.read_text() + "1,2,3\n")
-    if kind == "semicolons":
-        path.write_text(path.read_text().replace(",", ";"))
-    if kind == "column twice":
-        path.write_text(path.read_text().replace("index_mcp_abduction", "thumb_ip_flexion"))
     if kind == "binary":
         path.write_bytes(bytes(range(256)))
     return str(path)
@@ -184,9 +181,6 @@ def broken(kind: str, path: Path) -> str:
         ("radians as degrees", "data.units=radians"),
         ("no units", "does not say its units"),
         ("other signs", "beyond a hand's joint limits"),
-        ("short row", "pose 6 has 3 values for 21 columns"),
-        ("semicolons", "no header of comma-separated names"),
-        ("column twice", "2 columns 'thumb_ip_flexion'"),
         ("binary", "comma-separated text in UTF-8"),
     ],
 )
@@ -201,8 +195,6 @@ def test_a_bad_csv_is_one_clear_sentence(tmp_path: Path, kind: str, part: str) -
     ("content", "part"),
     [
         ({"poses": np.zeros((3, 21))}, "no array 'angles'"),
-        ({"angles": np.zeros((3, 20))}, "of the shape"),
-        ({"angles": np.array([["a"] * 21])}, "must be numbers"),
         ({"angles": np.array([{}] * 21, dtype=object)}, "'angles' holds pickled objects"),
         ({"angles": np.ones((3, 21)), "labels": np.array(["a"])}, "1 'labels' for 3 poses"),
         ({"angles": np.ones((3, 21)), "angle_names": np.array(["a"] * 21)}, "does not name"),
@@ -340,3 +332,21 @@ def test_the_command_trains_on_a_users_file_and_records_it(
         assert cv2.imread(str(out / name)).std() > 0
     errors = json.loads((out / "summary.json").read_text())["errors"]
     assert [row["dims"] for row in errors] == [1, 2]
+
+
+def test_the_recorded_poses_are_those_of_hands() -> None:
+    recorded = recorded_poses()
+    assert recorded.shape == (800, 21)
+    # Recorded hands bend a little beyond what clinics tabulate.
+    assert (recorded > LOW - 0.35).all() and (recorded < HIGH + 0.35).all()
+
+
+def test_the_drawn_poses_are_within_the_limits_and_of_all_kinds() -> None:
+    more = natural_poses()
+    assert torch.equal(more[:800], recorded_poses())
+    for angles in (drawn_poses(), more[800:]):
+        assert (angles >= LOW).all() and (angles <= HIGH).all()
+        # Fingers straight and curled, each of them.
+        bent = angles[:, 5:].unflatten(1, (4, 4))[:, :, 1:].sum(2)
+        for share in ((bent < 0.7).float().mean(0), (bent > 3.0).float().mean(0)):
+            assert (share > 0.1).all() and (share < 0.8).all()

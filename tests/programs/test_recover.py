@@ -17,8 +17,7 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.json_text import read_json
 from toftrack.output.files import LINES
-from toftrack.output.realtime import RealTime
-from toftrack.output.results import ResultWriter, read_results
+from toftrack.output.results import RealTime, ResultWriter, read_results
 from toftrack.programs import export
 from toftrack.programs.recover import main, recover
 from toftrack.programs.sweeps import FailedJobs

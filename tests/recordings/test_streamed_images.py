@@ -11,7 +11,7 @@ import pytest
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.recordings import npz
-from toftrack.recordings.npz import Recording, read_recording
+from toftrack.recordings.npz import read_recording
 from toftrack.recordings.npz_pieces import StreamedImages
 
 K = np.array([[90.0, 0, 40], [0, 91.0, 30], [0, 0, 1]])
@@ -76,7 +76,3 @@ def test_what_cannot_be_read_in_turn_is_reported(long: Path, changes: dict) -> N
     np.savez(long, **{"depth_m": DEPTH, "amplitude": AMPLITUDE, "K": K} | changes)
     with pytest.raises(ToftrackError, match="long.npz"):
         read_recording(long)
-
-
-def test_a_recording_of_it_is_a_recording(long: Path) -> None:
-    assert isinstance(read_recording(long), Recording)

@@ -14,7 +14,6 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.render.closed_form import project
-from toftrack.render.disc import disc_square, disc_steps
 from toftrack.render.numba import hand, missed
 from toftrack.render.numba.hand import LANES, TERMS
 from toftrack.render.numba.kernel import pack_evidence
@@ -22,6 +21,7 @@ from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.numba.vector import BLOCK
 from toftrack.render.numba.words import WORDS
 from toftrack.render.reference import dilate_disc
+from toftrack.render.scoring import disc_square, disc_steps
 from toftrack.render.torch_scorer import Outlines, outlines
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -10,8 +10,8 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.refinement.gauss_newton import TorchRefiner
 from toftrack.refinement.gauss_newton_numba import CompiledRefiner
-from toftrack.render.disc import disc_square
 from toftrack.render.numba.scorer import NumbaScorer
+from toftrack.render.scoring import disc_square
 from toftrack.render.torch_scorer import TorchScorer
 from toftrack.tracking.backend import choose_backend, make_scorer
 

@@ -113,12 +113,6 @@ def test_a_slot_without_a_hand_is_not_drawn_and_not_called_lost() -> None:
     assert colour_share(two(lost_hand(), lost_hand())[0], (40, 40, 220)) > 0.5
 
 
-def test_a_doubted_one_of_two_hands_is_hollow_and_neither_is_framed() -> None:
-    sure, doubted = (two(present(), other_hand(lost=lost)) for lost in (False, True))
-    assert colour_share(doubted[1], (0, 0, 0)) > colour_share(sure[1], (0, 0, 0))
-    assert colour_share(doubted[0], (40, 40, 220)) == 0
-
-
 def test_a_side_is_said_with_how_sure_it_is_unless_it_was_given() -> None:
     assert [side_words(one) for one in (present(), other_hand(), lost_hand())] == [
         *("right", "left 83 %", ""),
@@ -162,16 +156,6 @@ def test_joints_that_are_not_ok_are_hollow_and_their_bones_dashed() -> None:
     gaps = np.abs(left[pixels[:, 1], pixels[:, 0]].astype(int) - THUMB).max(1) > 60
     assert 0.2 < gaps.mean() <= 1
     assert (np.abs(whole[pixels[:, 1], pixels[:, 0]].astype(int) - THUMB).max(1) < 12).all()
-
-
-def test_a_nearer_hand_has_thicker_bones() -> None:
-    far, near = hand(), hand()
-    near = dataclasses.replace(near, joints_m=near.joints_m * np.float32(0.5))
-    shares = [
-        colour_share(sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))[1], THUMB)
-        for one in (far, near)
-    ]
-    assert shares[1] > 1.5 * shares[0]  # the same length in the image at half the distance
 
 
 def test_no_skeleton_without_an_estimate_behind_the_camera_or_far_outside_the_image() -> None:

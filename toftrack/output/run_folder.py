@@ -187,13 +187,12 @@ class Run:
         for field in fields(kind):
             if field.type == "float" and settings.get(field.name, 0.0) is None:
                 settings[field.name] = math.inf
-        try:
+        with reported_errors(
+            f"the {group} of the run in '{self.folder}' is of another version",
+            "run track.py again with this one",
+            TypeError,
+        ):
             return kind(**settings)
-        except TypeError as error:
-            raise ToftrackError(
-                f"the {group} of the run in '{self.folder}' is of another version ({error}); run "
-                "track.py again with this one"
-            ) from None
 
 
 @dataclass(frozen=True, eq=False)

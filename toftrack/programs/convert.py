@@ -22,7 +22,6 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.npy import NpyStack
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.png_folder import PngFolder, PngFolderWriter
 from toftrack.recordings.rosbag import RosBag
@@ -35,7 +34,7 @@ from toftrack.recordings.sr_frame import (
 )
 from toftrack.recordings.srs import SrsFacts, SrsRecording, SrsWriter
 from toftrack.recordings.store import open_recording
-from toftrack.recordings.video import DepthVideo
+from toftrack.recordings.video import DepthVideo, NpyStack
 
 _MILLIMETRE = 0.001
 

@@ -1,20 +1,27 @@
 """Write a run in a format that other programs open: `toftrack export RUN --to glb`.
 
 glb: an animated hand with a skin, for Blender, Unity, Godot and web pages (needs the extra export).
-bvh: its skeleton's motion, for animation programs. csv: a flat table, for spreadsheets. The file
-goes into RUN.
+bvh: its skeleton's motion in centimetres and degrees, x right, y up, z backward, for animation
+programs; the hand is as large as at the end of the run, and held where it is lost. csv: a flat
+table, for spreadsheets. The file goes into RUN.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from toftrack.errors import reported_errors
-from toftrack.output.exports.bvh import bvh_of
+from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
+from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.output.exports.glb import glb_of
-from toftrack.output.exports.motion import motions_of
-from toftrack.output.exports.table import csv_of
+from toftrack.output.exports.motion import HandMotion, motions_of
 from toftrack.output.run_folder import Run, read_run
 from toftrack.programs.command_line import plain_parser
 from toftrack.safe_files import write_whole
@@ -55,3 +62,105 @@ def _contents(run: Run, kind: str) -> dict[str, bytes]:
         return {"hand.bvh": bvh_of(motions[0]).encode()}
     # A file has one skeleton.
     return {f"hand{motion.slot + 1}.bvh": bvh_of(motion).encode() for motion in motions}
+
+
+_CM = 100.0
+_ROTATIONS = "Zrotation Xrotation Yrotation"
+_LEFT_OUT = ("palm",)
+"""It does not move by itself."""
+
+
+def bvh_of(motion: HandMotion) -> str:
+    """The content of a .bvh file."""
+    lines = ["HIERARCHY"]
+    order: list[int] = []
+    _describe(OPENXR_JOINT_NAMES.index("wrist"), 0, motion, lines, order)
+    seconds = float(np.median(np.diff(motion.time_s))) if len(motion.time_s) > 1 else 1 / 25
+    lines += ["MOTION", f"Frames: {len(motion.time_s)}", f"Frame Time: {seconds:.6f}"]
+    rotations = Rotation.from_quat(motion.turn[:, order].reshape(-1, 4)).as_euler(
+        "ZXY", degrees=True
+    )
+    angles = np.unwrap(rotations.reshape(len(motion.time_s), -1), axis=0, period=360)
+    rows = np.concatenate((_CM * motion.offset_m[:, order[0]], angles), 1)
+    lines += [" ".join(f"{value:.4f}" for value in row) for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _describe(
+    joint: int, depth: int, motion: HandMotion, lines: list[str], order: list[int]
+) -> None:
+    """Append a joint's part of the hierarchy and all below it, and its number to the order."""
+    indent = "  " * depth
+    children = [
+        child
+        for child, parent in enumerate(OPENXR_PARENTS)
+        if parent == joint and OPENXR_JOINT_NAMES[child] not in _LEFT_OUT
+    ]
+    # The place of the root is a channel.
+    offset = _CM * motion.rest_offset_m[joint] if depth else np.zeros(3)
+    place = f"{indent}  OFFSET " + " ".join(f"{value:.6f}" for value in offset)
+    if not children:
+        lines += [f"{indent}End Site", f"{indent}{{", place, f"{indent}}}"]
+        return
+    order.append(joint)
+    channels = f"6 Xposition Yposition Zposition {_ROTATIONS}" if not depth else f"3 {_ROTATIONS}"
+    kind = "JOINT" if depth else "ROOT"
+    lines += [f"{indent}{kind} {motion.name(OPENXR_JOINT_NAMES[joint])}", f"{indent}{{", place]
+    lines.append(f"{indent}  CHANNELS {channels}")
+    for child in children:
+        _describe(child, depth + 1, motion, lines, order)
+    lines.append(f"{indent}}}")
+
+
+_PLAIN = (
+    *("state_name", "lost", "dropped", "confidence", "side", "side_probability", "score"),
+    *("outside_rad", "gesture", "gesture_probability", "pinch", "pinching"),
+)
+_POINTS = ("pointing_origin_m", "pointing_direction")
+
+
+def csv_of(results: Mapping[str, Any]) -> str:
+    """The content of a .csv file: a row a frame, or a frame and hand where there are several.
+
+    What is unknown (NaN) is an empty cell. results: of a track.npz.
+    """
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerows(_rows(results))
+    return text.getvalue()
+
+
+def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
+    several = np.ndim(results["lost"]) > 1
+    slots = np.shape(results["lost"])[1] if several else 1
+    plain = [name for name in _PLAIN if name in results]
+    points = [name for name in _POINTS if name in results]
+    names = [name.removesuffix("_m") for name in points]
+    units = ["_m" if name.endswith("_m") else "" for name in points]
+    header = ["index", "timestamp_s", *(["slot"] if several else []), *plain]
+    header += [f"{n}_{axis}{u}" for n, u in zip(names, units, strict=True) for axis in "xyz"]
+    header += [f"{joint}_{axis}_m" for joint in results["joint_names"] for axis in "xyz"]
+    flags = [name for name in ("joint_ok",) if name in results]  # older runs have none
+    header += [f"{joint}_ok" for _ in flags for joint in results["joint_names"]]
+    header += [f"{angle}_rad" for angle in ANGLE_NAMES]
+    yield header
+    index = results.get("index", np.arange(len(results["lost"])))
+    for row, number in enumerate(index):
+        for slot in range(slots):
+            here = (row, slot) if several else (row,)
+            seconds = f"{results['timestamp_s'][row]:.6f}"
+            cells = [number, seconds, *([slot] if several else [])]
+            # A frame is dropped for all of its hands.
+            cells += [np.asarray(results[name])[here[: np.ndim(results[name])]] for name in plain]
+            for name in (*points, "joints_m", *flags):
+                cells += results[name][here].ravel().tolist()
+            cells += results["state"][here][-len(ANGLE_NAMES) :].tolist()
+            yield [_cell(value) for value in cells]
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, (bool, np.bool_)):
+        return str(int(value))
+    if isinstance(value, (float, np.floating)):
+        return "" if not np.isfinite(value) else f"{value:.6g}"
+    return str(value)

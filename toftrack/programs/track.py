@@ -32,8 +32,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.advice import Watch
 from toftrack.output.evaluation import metrics_line, metrics_table
-from toftrack.output.realtime import RealTime
-from toftrack.output.results import ResultWriter
+from toftrack.output.results import RealTime, ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.output.summary import shape_file

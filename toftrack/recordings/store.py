@@ -11,13 +11,12 @@ from toftrack.errors import ToftrackError
 from toftrack.recordings.bag_names import is_bag
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.npy import read_npy
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import read_png_folder
 from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.srs import read_srs
-from toftrack.recordings.video import VIDEOS, read_video
+from toftrack.recordings.video import VIDEOS, read_npy, read_video
 
 _BY_OPENNI = (
     "write its depth out as 16-bit PNG images by OpenNI, put a camera.json beside them "

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.safe_files import open_in_place, open_new
 
 _OPTIONS = {"preset": "ultrafast", "tune": "zerolatency", "crf": "23"}
@@ -128,10 +128,10 @@ def unwritable(path: Path, error: Exception | None = None) -> ToftrackError:
 
 def video_library() -> Any:
     """The package that encodes; ToftrackError where it is not installed."""
-    try:
+    with reported_errors(
+        "view=video needs the package av",
+        "pip install av, or choose view=none",
+        ImportError,
+    ):
         import av
-    except ImportError as error:
-        raise ToftrackError(
-            f"view=video needs the package av ({error}); pip install av, or choose view=none"
-        ) from None
     return av

@@ -18,10 +18,9 @@ from toftrack.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.exports.bvh import bvh_of
 from toftrack.output.exports.glb import glb_of, hand_mesh
 from toftrack.output.exports.motion import motions_of
-from toftrack.output.exports.table import csv_of
+from toftrack.programs.export import bvh_of, csv_of
 
 NAMES = ("index", "timestamp_s", "state_name", "lost", "side", "joints_m", "state", "gesture")
 MORE = (

@@ -2,15 +2,43 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.data.natural_poses import drawn_poses, recorded_poses
 from toftrack.pose_space.data.training_poses import synthetic_training_poses
+
+_DATA = Path(__file__).parents[2] / "data" / "natural_poses.npz"
+
+
+def _kept(name: str) -> Tensor:
+    with np.load(_DATA, allow_pickle=False) as content:
+        return torch.from_numpy(content[name].astype(np.float32))
+
+
+@functools.cache
+def recorded_poses() -> Tensor:
+    """(800, 21) joint angles of recorded bare hands, radians (see data/README.md)."""
+    return _kept("angles_centidegrees") * (math.pi / 18000)
+
+
+def drawn_poses() -> Tensor:
+    """(480, 21) radians, within the joint limits, from which pose spaces are learned."""
+    return _kept("space_rad")
+
+
+@functools.cache
+def natural_poses() -> Tensor:
+    """(1600, 21) radians: the recorded poses and as many that were drawn."""
+    return torch.cat((recorded_poses(), _kept("sampled_rad")))
+
 
 CLIP = 80
 """Natural poses in a row that are held out together."""

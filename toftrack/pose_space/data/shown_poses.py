@@ -16,7 +16,7 @@ from torch import Tensor
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.pose_space.base import clamp_to_joint_limits
-from toftrack.pose_space.data.natural_poses import recorded_poses
+from toftrack.pose_space.data.pose_data import recorded_poses
 
 KINDS = {
     "shown": 0.42,  # SHOWN

@@ -12,10 +12,9 @@ from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
-from toftrack.render.disc import disc_square, disc_steps
 from toftrack.render.numba.hand import LANES
 from toftrack.render.numba.kernel import pack_evidence, score_hands
-from toftrack.render.scoring import Counts, Evidence
+from toftrack.render.scoring import Counts, Evidence, disc_square, disc_steps
 
 
 class NumbaScorer:

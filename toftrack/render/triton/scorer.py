@@ -18,8 +18,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.render.closed_form import _NEAREST_M
-from toftrack.render.disc import disc_square, disc_steps
-from toftrack.render.scoring import Counts, Evidence
+from toftrack.render.scoring import Counts, Evidence, disc_square, disc_steps
 from toftrack.render.torch_scorer import TorchScorer
 from toftrack.render.triton.kernel import (
     TERMS,

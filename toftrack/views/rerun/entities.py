@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
-from toftrack.errors import ToftrackError
+from toftrack.errors import reported_errors
 from toftrack.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import FMeasure
@@ -38,14 +38,13 @@ from toftrack.views.base import TrackedFrame, TrackedHand
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB, side_words
 
-try:
+with reported_errors(
+    "view=rerun needs the package rerun-sdk",
+    "install it with pip install -e '.[rerun]', or choose another view",
+    ImportError,
+):
     import rerun as rr
     import rerun.blueprint as rrb
-except ImportError as error:
-    raise ToftrackError(
-        f"view=rerun needs the package rerun-sdk ({error}); install it with "
-        "pip install -e '.[rerun]', or choose another view"
-    ) from error
 
 _STEPS_A_METRE = 5000.0
 """Depth goes out in whole steps of 0.2 mm, up to 13 m: half the size of floating point."""
