@@ -31,7 +31,9 @@ def moments() -> tuple[TrackedFrame, ...]:
     for frame in device:
         depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
         estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        kept.append(one_hand(frame, depth, device.camera, estimate, shape, tracker.insight))
+        kept.append(
+            one_hand(frame, depth, device.camera, estimate, shape, tracker.hands.insights[0])
+        )
     return kept[0], kept[-1]
 
 

@@ -281,8 +281,6 @@ def test_unknown_landmarks_count_as_none_and_a_wrong_one_little() -> None:
     ("key", "value"),
     [
         ("iterations", -1),
-        ("points", 0),
-        ("points", 2.5),
         ("point_m", -0.01),
         ("angle_rad", "wide"),
     ],

@@ -32,9 +32,10 @@ from toftrack.tracking.candidates import (
     keypoints_of,
     posterior_of,
     propose,
+    with_own_arm,
+    without_things,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.pixels import with_own_arm, without_things
 from toftrack.tracking.select import Source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -118,11 +119,11 @@ def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
 
 
 def test_keypoints_are_trusted_no_more_than_is_set() -> None:
-    model = model_with(keypoint_m=0.02, keypoint_sigmas=2.0)
+    model = model_with(keypoint_m=0.02)
     detection = detection_of(hand_at())
     assert (keypoints_of(detection, model).sigma_m == 0.02).all()
     unsure = replace(detection.keypoints, sigma_m=torch.full((21,), 0.03))
-    assert keypoints_of(replace(detection, keypoints=unsure), model).sigma_m == pytest.approx(0.06)
+    assert keypoints_of(replace(detection, keypoints=unsure), model).sigma_m == pytest.approx(0.03)
 
 
 def test_a_keypoint_weight_divides_the_deviations_and_0_leaves_them_without_effect() -> None:

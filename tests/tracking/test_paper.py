@@ -96,7 +96,7 @@ def test_a_pose_can_be_given_on_the_command_line() -> None:
 @pytest.mark.parametrize("frame", range(0, 100, 20))
 def test_the_palm_is_expected_on_the_hand_or_the_wrist(frame: int) -> None:
     scene = sample().cut(frame)
-    centre = palm_centre(observed(scene), generator())
+    centre = palm_centre(observed(scene))
     assert centre.shape == (3,) and centre.dtype == np.float32
     assert np.linalg.norm(centre - scene.joints_m[0, PALM].mean(0)) < 0.2
 
@@ -104,7 +104,7 @@ def test_the_palm_is_expected_on_the_hand_or_the_wrist(frame: int) -> None:
 def test_a_surface_that_is_all_wall_still_has_a_place_on_it() -> None:
     k = np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]])
     seen = nearest_surface()(np.full((60, 80), 0.5, np.float32), k)
-    assert palm_centre(seen, generator())[2] == pytest.approx(0.5, abs=0.03)
+    assert palm_centre(seen)[2] == pytest.approx(0.5, abs=0.03)
 
 
 def test_the_estimate_is_the_filters_mean_and_nothing_else() -> None:

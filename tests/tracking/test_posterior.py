@@ -162,14 +162,6 @@ def test_each_other_hand_costs_its_own() -> None:
 ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0}
 
 
-def test_the_named_terms_add_up_to_the_posterior() -> None:
-    whole = posterior(frame(other_hand()), **ALL)
-    terms = whole.named(poses())
-    assert set(terms) == {"image", "keypoints", "overlap", "other hand 0"}
-    torch.testing.assert_close(sum(terms.values()), whole(poses()))
-    assert all(value.shape == (len(poses()),) and bool(value.any()) for value in terms.values())
-
-
 def test_terms_are_independent_of_one_another() -> None:
     seen = frame(other_hand())
     each = sum(added(seen, **{name: weight}) for name, weight in ALL.items())

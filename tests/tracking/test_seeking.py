@@ -50,16 +50,6 @@ def centres(model: TrackerModel) -> np.ndarray:
     return np.array(model.detector.centres_m).reshape(-1, 3)
 
 
-def test_a_search_takes_a_frame_for_its_places_and_one_for_detecting_at_two() -> None:
-    model = searching(HERE, THERE, hand_at(-0.2), hand_at(-0.4))
-    found, asked, over = frames(followed(track_of(HERE), None), model, 3)
-    assert found.second_s == 0
-    assert [len(state.hands[1].seeking.centres_m) for state in (found, asked, over)] == [3, 1, 0]
-    assert len(centres(model)) == 3
-    away = np.linalg.norm(centres(model) - detection_of(HERE).centre_m.numpy(), axis=1)
-    assert (away > SAME_PLACE_M).all(), "where the first hand is there is no other one"
-
-
 def test_a_slot_takes_part_when_its_hand_is_found_and_not_before() -> None:
     model = searching(HERE, THERE)
     before = followed(track_of(HERE), None)

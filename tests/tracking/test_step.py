@@ -116,7 +116,7 @@ def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() 
     after = tracker.state
     assert equal(replace(after, generator=fresh.generator, next_index=0), fresh)
     assert torch.equal(after.generator, before.generator) and after.next_index == 9
-    assert tracker.insight is None
+    assert tracker.hands.insights[0] is None
     empty = tracker.step(np.zeros_like(scene.depth_m[0]), scene.k)
     assert empty.index == 9 and np.isnan(empty.joints_m).all() and empty.gesture == ""
 
@@ -124,12 +124,12 @@ def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() 
 def test_what_a_step_saw_is_kept_with_the_time_of_its_stages() -> None:
     tracker, scene = quick(), sample()
     estimate = tracked(tracker, scene, range(1))[0]
-    seconds = tracker.insight.seconds
+    seconds = tracker.hands.insights[0].seconds
     stages = {"detector", "filter: scoring", "filter: rest", "refinement", "rest"}
     assert stages == set(seconds)
     assert all(value > 0 for value in seconds.values())
     assert sum(seconds.values()) <= estimate.compute_s
-    assert tracker.insight.particles.shape == (80, 10)
+    assert tracker.hands.insights[0].particles.shape == (80, 10)
 
 
 @pytest.mark.parametrize(

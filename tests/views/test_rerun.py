@@ -65,7 +65,9 @@ def moments() -> tuple[TrackedFrame, ...]:
     for frame in device:
         depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
         estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        tracked.append(one_hand(frame, depth, device.camera, estimate, shape, tracker.insight))
+        tracked.append(
+            one_hand(frame, depth, device.camera, estimate, shape, tracker.hands.insights[0])
+        )
     last = tracked[-1].estimates[0]
     nan = dataclasses.replace(
         last, index=6, timestamp_s=0.24, state=np.full(27, np.nan, np.float32), lost=True

@@ -38,8 +38,8 @@ _ABOVE_ZERO = frozenset(
     likelihood.beta likelihood.tolerance_m
     pose_space.dims
     record_limit_gb
-    refine.angle_rad refine.point_m refine.points
-    detector.hypotheses detector.keypoint_m detector.keypoint_sigmas detector.places
+    refine.angle_rad refine.point_m
+    detector.hypotheses detector.keypoint_m detector.places
     segmentation.depth_range_m segmentation.max_distance_m segmentation.max_pixels
     segmentation.reach_m
     smooth.min_cutoff_hz smooth.speed_cutoff_hz

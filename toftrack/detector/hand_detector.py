@@ -45,7 +45,6 @@ class DetectorSettings:
     search: int
     sure: float
     keypoint_m: float
-    keypoint_sigmas: float
     keypoint_weight: float
 
     def __post_init__(self) -> None:
@@ -55,8 +54,7 @@ class DetectorSettings:
         check_number("detector.least", self.least, 0, 1)
         check_number("detector.merit", self.merit)
         check_number("detector.keypoint_weight", self.keypoint_weight, 0)
-        for name in ("keypoint_m", "keypoint_sigmas"):
-            check_number(f"detector.{name}", getattr(self, name), 0, above=True)
+        check_number("detector.keypoint_m", self.keypoint_m, 0, above=True)
 
 
 @dataclass(frozen=True, eq=False)

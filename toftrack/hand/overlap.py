@@ -33,20 +33,11 @@ def finger_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
     fingers' radii. The sum over all pairs of fingers. Straight fingers do not share any room: two
     hypotheses of the one finger that is seen. Bent ones are squeezed into each other.
     """
-    return pairs_overlap(joints_m, hand_length_m).sum(1)
+    return overlap_of_each(joints_m, hand_length_m).sum(1) / 2
 
 
 def overlap_of_each(joints_m: Tensor, hand_length_m: float) -> Tensor:
     """The same for each finger with all others, (N, 21, 3) to (N, 5)."""
-    pairs = pairs_overlap(joints_m, hand_length_m)
-    of_finger = pairs.new_zeros(len(pairs), 5)
-    for fingers in _tables(pairs.device, pairs.dtype)[:2]:
-        of_finger.index_add_(1, fingers, pairs)
-    return of_finger
-
-
-def pairs_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
-    """The same for each of the ten pairs, (N, 21, 3) to (N, 10)."""
     first, second, apart, crossing = _tables(joints_m.device, joints_m.dtype)
     fingers = joints_m[:, 1:].unflatten(1, (5, 4))
     steps = fingers[:, :, 1:] - fingers[:, :, :-1]
@@ -60,7 +51,9 @@ def pairs_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
     gap = torch.cdist(points[:, first], points[:, second])  # (N, pairs, 5, 5)
     share = (SQUEEZED + (1 - SQUEEZED) * either) * (hand_length_m / DEFAULT_HAND_LENGTH_M)
     depth = (1 - gap / (apart * share[:, :, None, None])).clamp(min=0)
-    return (1 + (STRICT - 1) * either) * depth.amax(3).square().sum(2)
+    pairs = (1 + (STRICT - 1) * either) * depth.amax(3).square().sum(2)
+    of_finger = pairs.new_zeros(len(pairs), 5)
+    return of_finger.index_add_(1, first, pairs).index_add_(1, second, pairs)
 
 
 @functools.cache

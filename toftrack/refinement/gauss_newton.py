@@ -82,16 +82,15 @@ class Refinement:
     """
 
     iterations: int
-    points: int
     point_m: float
     angle_rad: float
+    points: int = 500
     reach_m: float = 0.025
     silhouette_px: float = 1.0
     damping: float = 0.001
 
     def __post_init__(self) -> None:
-        for name, least in (("iterations", 0), ("points", 1)):
-            check_number(f"refine.{name}", getattr(self, name), least, whole=True)
+        check_number("refine.iterations", self.iterations, 0, whole=True)
         for name in ("point_m", "angle_rad"):
             check_number(f"refine.{name}", getattr(self, name), 0, above=True)
 

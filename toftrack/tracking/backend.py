@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TypedDict
 
 import torch
 from torch import Tensor
@@ -75,49 +74,43 @@ def _torch(device: torch.device) -> Backend:
     return Backend(
         "torch",
         device,
-        **_beside(device),
-        make_scorer=lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
+        _on_cpu_too(device, rigid.MOTIONS),
+        lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
+        TorchRefiner if device.type == "cpu" else _compiled_refiner(),
     )
 
 
-class _Beside(TypedDict):
-    """What a back end has beside its scorer."""
-
-    motions: Motions
-    make_refiner: Callable[[HandShape], Refiner]
-
-
-def _beside(device: torch.device, there: Motions = rigid.MOTIONS) -> _Beside:
-    """In torch on the CPU; on a device `there`, with compiled code on the CPU next to it."""
+def _on_cpu_too(device: torch.device, there: Motions) -> Motions:
+    """Motions of particles on a device; on the CPU beside it the compiled ones."""
     if device.type == "cpu":
-        return _Beside(motions=there, make_refiner=TorchRefiner)
-    here = _compiled()
+        return there
+    from toftrack.compute.rigid_numba import MOTIONS as HERE
 
     def at(tensor: Tensor) -> Motions:
-        return here["motions"] if tensor.device.type == "cpu" else there
+        return HERE if tensor.device.type == "cpu" else there
 
-    motions = Motions(
+    return Motions(
         compose=lambda reference, tangent: at(reference).compose(reference, tangent),
         difference=lambda particles, reference: at(particles).difference(particles, reference),
         redraw=there.redraw,
         mean=there.mean,
     )
-    return _Beside(motions=motions, make_refiner=here["make_refiner"])
 
 
-def _compiled() -> _Beside:
-    from toftrack.compute import rigid_numba
+def _compiled_refiner() -> Callable[[HandShape], Refiner]:
     from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 
-    return _Beside(motions=rigid_numba.MOTIONS, make_refiner=CompiledRefiner)
+    return CompiledRefiner
 
 
 def _numba(device: torch.device) -> Backend:
     """Compiled code on the CPU; particles elsewhere are scored by it, and moved where they are."""
+    from toftrack.compute import rigid_numba
     from toftrack.render.numba.scorer import NumbaScorer
 
-    beside = _compiled() if device.type == "cpu" else _beside(device)
-    return Backend("numba", device, **beside, make_scorer=NumbaScorer)
+    there = rigid_numba.MOTIONS if device.type == "cpu" else rigid.MOTIONS
+    motions = _on_cpu_too(device, there)
+    return Backend("numba", device, motions, NumbaScorer, _compiled_refiner())
 
 
 def _triton(device: torch.device) -> Backend:
@@ -125,9 +118,9 @@ def _triton(device: torch.device) -> Backend:
     from toftrack.render.triton.scorer import TritonScorer, require_device
 
     require_device()
-    beside = _beside(device, rigid_triton.MOTIONS)
-    make_scorer = partial(TritonScorer, device=device)
-    return Backend("triton", device, **beside, make_scorer=make_scorer)
+    motions = _on_cpu_too(device, rigid_triton.MOTIONS)
+    scorer = partial(TritonScorer, device=device)
+    return Backend("triton", device, motions, scorer, _compiled_refiner())
 
 
 _MAKERS: dict[str, Callable[[torch.device], Backend]] = {

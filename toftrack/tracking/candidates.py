@@ -11,18 +11,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.detector.hand_detector import Detection
+from toftrack.detector.parts import FOREARM_PART, THING_PART
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import out_of_sight
 from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
-from toftrack.tracking.pixels import with_own_arm, without_things
 from toftrack.tracking.posterior import (
     ImageTerm,
     KeypointsTerm,
@@ -49,6 +50,11 @@ _BENT_STEPS, _BENT_M, _BENT_RAD = 6, 0.010, 0.8
 far an angle may go."""
 _NO_WEIGHT = 1e-6
 """Instead of 0, so that deviations stay numbers: kilometres."""
+_LEAST_PARTS = 4
+"""Parts of a crop, of 9 mm, that a thing in the hand has at least."""
+_MOSTLY, _UNKNOWN = 0.5, 255
+"""Of a surface in front of the hand, so much must be its arm where the network sees it; and the
+class of what it does not see."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +181,7 @@ def posterior_of(
 def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
     """The detector's keypoints as the refinement takes them."""
     cfg, found = model.detector.settings, detection.keypoints
-    sigma = (cfg.keypoint_sigmas * found.sigma_m).clamp(min=cfg.keypoint_m)
+    sigma = found.sigma_m.clamp(min=cfg.keypoint_m)
     return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, _NO_WEIGHT))
 
 
@@ -265,3 +271,50 @@ def _refined(table: Hypotheses, filtered: FilteredFrame) -> Hypotheses:
     values = filtered.posterior(pose)
     pose = torch.where(values.isneginf()[:, None], table.pose, pose)
     return replace(table, pose=pose, log_posterior=values)
+
+
+def without_things(observation: Observation, detection: Detection) -> Observation:
+    """The same without the pixels of a thing in the hand, as the pose network tells them.
+
+    Else the best pose is one whose fingers explain the thing.
+    """
+    kind = detection.parts.kind
+    if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
+        return observation
+    thing = _pixels_of(observation.hand, observation, detection, THING_PART)
+    return replace(observation, hand=observation.hand & ~thing, thing=thing)
+
+
+def with_own_arm(observation: Observation, detection: Detection) -> Observation:
+    """The same with what the pose network calls the hand's forearm told from what hides it.
+
+    Who wears the camera has the arm nearer to it than the hand, which it does not hide as what
+    passes in front does. A surface in front is the arm when the network says so of most of it.
+    """
+    occluder = observation.occluder.cpu().numpy()
+    count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
+    row, column = np.nonzero(occluder)
+    kind = detection.parts.at(_points_of(row, column, observation), outside=_UNKNOWN)
+    of = surface[row, column]
+    known = np.bincount(of[kind != _UNKNOWN], minlength=count)
+    mine = np.bincount(of[kind == FOREARM_PART], minlength=count)
+    arm = torch.from_numpy((mine > _MOSTLY * known)[surface] & occluder).to(observation.hand.device)
+    return replace(observation, hand=observation.hand | arm, occluder=observation.occluder & ~arm)
+
+
+def _pixels_of(
+    among: Tensor, observation: Observation, detection: Detection, *kinds: int
+) -> Tensor:
+    """(H, W) bool: those pixels of a mask that the pose network says are of some classes."""
+    row, column = np.nonzero(among.cpu().numpy())
+    chosen = np.isin(detection.parts.at(_points_of(row, column, observation)), kinds)
+    mask = np.zeros(among.shape, bool)
+    mask[row[chosen], column[chosen]] = True
+    return torch.from_numpy(mask).to(among.device)
+
+
+def _points_of(row: np.ndarray, column: np.ndarray, observation: Observation) -> np.ndarray:
+    """(P, 3) what is seen at pixels, camera frame."""
+    k, z = observation.k.cpu().numpy(), observation.depth_m.cpu().numpy()[row, column]
+    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
+    return np.stack((x, y, z), 1)

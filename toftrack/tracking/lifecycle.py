@@ -1,5 +1,6 @@
 """Where tracks begin and end: `open_hand` before a frame is compared, `close` after, and
-`reconcile` where there are two hands. Nobody else begins or ends a track.
+`reconcile` where there are two hands. Besides, a comparison of sides (comparing.py) and a pose at
+another place (step.py) begin one, and the hand that is watched may become the first one.
 
 | in a frame | the track |
 | --- | --- |

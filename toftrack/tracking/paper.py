@@ -75,7 +75,7 @@ class RoughStart:
         rows = [label == "palm" for label in space.training_labels]
         reference[0, 6:] = space.training_latents[rows.index(True) if True in rows else 0]
         if self.pose is None:
-            centre = torch.from_numpy(palm_centre(observation, generator))
+            centre = torch.from_numpy(palm_centre(observation))
             reference[0, :3] = centre - reference.new_tensor(PIVOT_M)
         else:
             reference[0, :6] = torch.tensor(self.pose)
@@ -89,7 +89,7 @@ class RoughStart:
         return Track(there, weights, mean, still, still.new_zeros(21), model.decode(mean))
 
 
-def palm_centre(observation: Observation, generator: torch.Generator) -> np.ndarray:
+def palm_centre(observation: Observation) -> np.ndarray:
     """Where the middle of the palm is, roughly, (3,) float32 metres.
 
     It is the centre of the widest and nearest disc that is inscribed in the silhouette cut along
@@ -115,9 +115,6 @@ def palm_centre(observation: Observation, generator: torch.Generator) -> np.ndar
     weights = np.where(usable, radius_m**3 * nearness, 0.0)
     if not weights.any():
         weights = silhouette.astype(np.float64)
-    # Drawn and not used: the figures in docs/paper.md rest on the random numbers that follow.
-    drawn = torch.from_numpy(weights.ravel() / weights.max()).double()
-    torch.multinomial(drawn, 1, generator=generator)
     row, column = np.divmod(int(weights.argmax()), weights.shape[1])
     v, u = row - margin, column - margin
     # Noise and flying pixels: the median of a neighbourhood, wherever it is mostly hand.

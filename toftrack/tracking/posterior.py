@@ -131,13 +131,6 @@ class Posterior:
             total = total + term(poses, joints)
         return total
 
-    def named(self, poses: Tensor) -> dict[str, Tensor]:
-        """Every term by itself, (N,) each."""
-        joints = self.joints(poses)
-        return {"image": self.image(poses)} | {
-            name: term(poses, joints) for name, term in self.terms.items()
-        }
-
 
 def touching(joints_m: Tensor, other_m: Tensor) -> Tensor:
     """(N,) how much of hands (N, 21, 3) lies in another one (J, 3), 0 .. 1."""

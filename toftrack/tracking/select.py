@@ -54,8 +54,6 @@ class Hypotheses:
     @classmethod
     def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
         """One below the other."""
-        if len(tables) == 1:
-            return tables[0]
         return cls(
             torch.cat([table.pose for table in tables]),
             torch.cat([table.source for table in tables]),

@@ -80,11 +80,6 @@ class LastSeen:
         return self.age_s < math.inf
 
     @property
-    def believed(self) -> bool:
-        """Whether there was one, and not just a place where one may be."""
-        return self.ever and self.surest > -math.inf
-
-    @property
     def centre_m(self) -> np.ndarray:
         """(3,) middle of its palm."""
         particle = self.particle.numpy()

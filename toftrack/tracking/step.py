@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -92,8 +91,9 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
     found = followed(before, image, model, dt_s, generator, spans)
     with spans("detector"):
         before = sought(before, seeking, model)
-    if seeking is not None:
-        found = [_still_sought(one, before) for one in found]
+    if seeking is not None:  # what it has found meanwhile
+        seekings = [hand.seeking for hand in before.hands]
+        found = [(s, replace(hand, seeking=seekings[s]), i, e) for s, hand, i, e in found]
     before = replace(before, generator=generator.get_state())
     return reconciled(before, found, image, model, dt_s, spans)
 
@@ -122,7 +122,9 @@ def followed(
     opened = list[HandFrame | Absence]()
     for number, slot in enumerate(slots):
         with spans("detector"):
-            opened.append(opened_by(todo[number], model))
+            task = todo[number]
+            others = seen_in(task.others, image, model)
+            opened.append(open_hand(slot, task.hand, others, image, model, dt_s))
             track = opened[-1].track
             if track is not hands[slot].track and not both_go_on:  # the next one must know
                 hands[slot] = replace(opened[-1].hand, track=track)
@@ -133,12 +135,6 @@ def followed(
 def _seeded_by(generator: torch.Generator) -> torch.Generator:
     """Another one: a hand's random numbers do not depend on how many the other one uses."""
     return torch.Generator().manual_seed(int(torch.randint(2**62, (1,), generator=generator)))
-
-
-def opened_by(task: HandTask, model: TrackerModel) -> HandFrame | Absence:
-    """See open_hand."""
-    others = seen_in(task.others, task.image, model)
-    return open_hand(task.slot, task.hand, others, task.image, model, task.dt_s)
 
 
 def concluded(
@@ -262,7 +258,11 @@ def reconciled(
         infos[slot] = replace(info, seconds=spans.seconds())
     second_s = since_search(before, [slot for slot, _, _, _ in found])
     after = replace(before, hands=tuple(hands), second_s=second_s)
-    after, exchanged = reconcile(before, after, partial(_found_hand, model), dt_s)
+
+    def place(hand: HandState, track: Track) -> PlacedHand:  # of its image nothing is asked
+        return PlacedHand(track.pose, model.hand(hand.side, hand.shape), np.eye(3), (1, 1))
+
+    after, exchanged = reconcile(before, after, place, dt_s)
     if before.watched:
         after = watched_over(after, model.configured.handedness)
         first = seen[0] if 0 in seen else unseen(before.hands[0], image, model)
@@ -275,14 +275,3 @@ def reconciled(
         for slot, hand in zip(slots, after.hands, strict=True)
     ]
     return after, tuple(infos), tuple(estimates)
-
-
-def _still_sought(found: Concluded, state: TrackerState) -> Concluded:
-    """A hand after a frame with what a search for it has found meanwhile."""
-    slot, hand, info, estimate = found
-    return slot, replace(hand, seeking=state.hands[slot].seeking), info, estimate
-
-
-def _found_hand(model: TrackerModel, hand: HandState, track: Track) -> PlacedHand:
-    """A hand where it was found; of its image nothing is asked."""
-    return PlacedHand(track.pose, model.hand(hand.side, hand.shape), np.eye(3), (1, 1))

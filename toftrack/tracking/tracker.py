@@ -146,10 +146,7 @@ class HandsTracker:
 
 
 class Tracker:
-    """Follows one hand: the only slot of a HandsTracker.
-
-    hands: that tracker.
-    """
+    """Follows one hand: the only slot of a HandsTracker, `hands`."""
 
     def __init__(
         self,
@@ -201,11 +198,6 @@ class Tracker:
         return self.hands.infos[0]
 
     @property
-    def insight(self) -> StepInfo | None:
-        """The same; None also where nothing could be a hand."""
-        return self.hands.insights[0]
-
-    @property
     def track(self) -> Track | None:
         """The hand that is followed; None while there is none."""
         return self.state.hands[0].track
@@ -214,26 +206,6 @@ class Tracker:
     def shape(self) -> HandShape:
         """The hand that the next frame is compared with."""
         return self.hands.shapes[0]
-
-    @property
-    def fitted(self) -> HandShape:
-        """The same hand, with how sure the fit is of it."""
-        return self.hands.fitted[0]
-
-    @property
-    def scorer(self) -> Scorer:
-        """The back end's, for that hand."""
-        return self.hands.scorer
-
-    @property
-    def space(self) -> PoseSpace:
-        """The pose space."""
-        return self.hands.space
-
-    @property
-    def device(self) -> torch.device:
-        """Where everything is computed."""
-        return self.hands.device
 
 
 def _stepped(state: TrackerState, image: DepthImage, model: FilterModel) -> Stepped:
