@@ -58,7 +58,8 @@ def test_an_interrupt_while_tracking_is_loaded(
 def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
     moment = "toftrack.benchmark.speed" if name == "benchmark" else "hydra"
     reported = interrupted(tmp_path, moment, "-m", "toftrack", name, "x")
-    assert (reported.returncode, reported.stderr) == (130, "interrupted\n")
+    assert reported.returncode == 130 and reported.stderr.startswith("interrupted")
+    assert reported.stderr.count("\n") == 1
 
 
 def test_the_command_begins_where_interrupts_are_caught_first() -> None:

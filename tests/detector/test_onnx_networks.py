@@ -15,7 +15,7 @@ from helpers.configured import detector_settings
 from helpers.detection import small_networks
 from helpers.tracking import sample
 
-from toftrack.detector import onnx_export, onnx_networks, proposals, quantisation
+from toftrack.detector import onnx_export, onnx_networks, proposals
 from toftrack.detector.crops import CROP, CROP_CHANNELS, wide
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import Finder, PoseNet
@@ -35,7 +35,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(1)
     save_weights(path, PoseNet(4), Finder(8), {})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quantisation, "CALIBRATION", 32)
+        patch.setattr(onnx_export, "CALIBRATION", 32)
         export_detector.main([str(path)])
     return path
 
@@ -99,11 +99,11 @@ def test_the_file_is_in_8_bits_and_says_so_and_bad_ones_are_refused(exported: Pa
     assert "int8" in [one.value for one in model.metadata_props if one.key == "precision"]
     kinds = [part.data_type for part in model.graph.initializer if len(part.dims) == 4]
     assert kinds.count(onnx.TensorProto.INT8) == len(kinds) - 3, "all but the first and the last"
-    crops = quantisation.example_crops()[:4]
-    quantisation.compare(pose.reference, model, crops)
+    crops = onnx_export.example_crops()[:4]
+    onnx_export.compare(pose.reference, model, crops)
     other, _ = small_networks()
     with pytest.raises(ToftrackError, match=r"mm away .* give --float"):
-        quantisation.compare(other, model, crops)
+        onnx_export.compare(other, model, crops)
 
 
 @pytest.mark.parametrize("network", ["pose", "finder"])
