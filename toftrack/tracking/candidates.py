@@ -92,8 +92,8 @@ class HandFrame:
     def covered(self) -> bool:
         """Whether so much of the hand is behind something that it is held where it was."""
         seen, joints = self.observation, self.fitted.refiner.joints(self.track.pose)[0]
-        hiding = seen.occluder if seen.other is None else seen.occluder | seen.other
-        return out_of_sight(joints, seen.depth_m * hiding, seen.k)[1] > _COVERED
+        hiding_m = seen.depth_m * seen.occluder  # not another hand: the networks know both apart
+        return out_of_sight(joints, hiding_m, seen.k)[1] > _COVERED
 
 
 @dataclass(frozen=True, eq=False)
