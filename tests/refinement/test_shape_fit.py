@@ -172,7 +172,7 @@ def test_a_fixed_hand_stays_whatever_is_seen_of_another() -> None:
 
 def test_only_auto_is_fitted() -> None:
     fixed = make_tracker("hand.shape=default")
-    assert not fixed.model.fits and fixed.fitted.fitted is None
+    assert not fixed.model.fits and fixed.hands.fitted[0].fitted is None
     assert make_tracker().model.fits
-    fitted_hand = make_tracker("hand.side=left").fitted
+    fitted_hand = make_tracker("hand.side=left").hands.fitted[0]
     assert fitted_hand.side == "left" and fitted_hand.fitted is None, "nothing was fitted yet"
