@@ -93,7 +93,10 @@ def test_the_whole_image_is_searched_while_no_hand_is_believed(
 ) -> None:
     track = None if doubted is None else track_of(hand_at(), doubted=doubted)
     hand = slot_of(track, searched_s=searched_s)
-    assert search_due(hand, model_with(FixedDetector(search=every))) == due
+    model = model_with(FixedDetector(search=every))
+    assert search_due(hand, model) == due
+    if doubted is False:
+        assert search_due(hand, model, dt_s=0.2), "where frames are rare, any hand is searched for"
 
 
 @pytest.mark.parametrize(

@@ -29,16 +29,20 @@ _STEP_M, _SPEED_M_S = 0.04, 0.25
 """How far a hand has moved since it was last believed: at once, and a second."""
 _ANYWHERE = -1.5
 """Log probability of a place if the hand was not where it was last believed."""
+RARE_S = 0.1
+"""After so long a prediction says little: the hand is found anew in the whole image as well."""
 FORGOTTEN_S = 1.0
 """After so long nothing is known of where a hand is that was believed."""
 _AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
 """What was taken for a hand and was none is left alone for so long, if it stays where it is."""
 
 
-def search_due(hand: HandState, model: TrackerModel) -> bool:
-    """Whether the whole image is searched: while no hand is believed, and not each time if set."""
+def search_due(hand: HandState, model: TrackerModel, dt_s: float = 0.0) -> bool:
+    """Whether the whole image is searched, dt_s after the last: while no hand is believed, and not
+    each time if set; and where frames are rare.
+    """
     if hand.track is not None and not hand.track.doubted:
-        return False
+        return dt_s > RARE_S
     frames = model.detector.settings.search
     return frames == 1 or Duration(hand.searched_s).reached(frames)
 

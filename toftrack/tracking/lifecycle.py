@@ -22,13 +22,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.detector.hand_detector import NO_DETECTION, Detection, doubt_m
+from toftrack.detector.hand_detector import NO_DETECTION, Detection, doubt_m, merit
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import HandFrame, image_term
 from toftrack.tracking.comparing import begun, compared, comparison_due, observed_shape
 from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
 from toftrack.tracking.detect import (
+    RARE_S,
     detect,
     detection_due,
     expected_of,
@@ -114,7 +115,7 @@ def open_hand(
     sides where they are to be compared (compared_beside); else everything depends on it, and waits.
     """
     alone, track, mirrored = without(image, others), hand.track, None
-    if track is not None and goes_on(hand, others):
+    if track is not None and goes_on(hand, others, dt_s):
         due = comparison_due(hand, model, dt_s)
         asked = due or detection_due(track, model.detector.settings, dt_s)
         pending = start_detection(hand, track, alone, model, dt_s) if asked else _nothing
@@ -154,11 +155,12 @@ def open_hand(
     )
 
 
-def goes_on(hand: HandState, others: Sequence[OtherHand | Neighbour]) -> bool:
+def goes_on(hand: HandState, others: Sequence[OtherHand | Neighbour], dt_s: float) -> bool:
     """Whether a hand's track goes on in a frame. One that is doubted waits for the detector where
-    nothing is surely followed, or a search beside the other hand has found something elsewhere.
+    nothing is surely followed, or a search beside the other hand has found something elsewhere; and
+    so does any where frames are rare.
     """
-    if hand.track is None:
+    if hand.track is None or dt_s > RARE_S:
         return False
     elsewhere = hand.seeking is not None and search_is_over(hand)
     return not hand.track.doubted or (not elsewhere and any(o.certain for o in others))
@@ -180,10 +182,10 @@ def _detected(
     A track that is doubted gives way to a hand that is detected elsewhere.
     """
     track, best = hand.track, NO_DETECTION
-    if hand.seeking is not None:
+    if hand.seeking is not None and search_is_over(hand):
         best = detect_again(hand, hand.seeking, image, others, model)
         hand = replace(hand, seeking=None)
-    elif search_due(hand, model):
+    elif search_due(hand, model, dt_s):
         best = search(hand, image, others, model)
         hand = replace(hand, searched_s=0.0)
     if track is None:
@@ -191,9 +193,11 @@ def _detected(
     if not detection_due(track, model.detector.settings, dt_s):
         return hand, NO_DETECTION
     elsewhere = is_elsewhere(best, hand, track, model, dt_s)
-    if elsewhere and not _stays_watched(hand, others):
+    if elsewhere and track.doubted and not _stays_watched(hand, others):
         return _left_behind(hand, model), best
     there = detect(hand, track, image, model, dt_s)
+    if elsewhere and not track.doubted and merit(best, best.heat) > merit(there, best.heat):
+        return _left_behind(hand, model), best
     # The prediction of a track that is wrong may show the network what keeps it wrong.
     surer = not (best.empty or elsewhere) and doubt_m(best) < doubt_m(there)
     return hand, best if surer else there

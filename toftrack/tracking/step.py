@@ -118,7 +118,7 @@ def followed(
 
     with spans("detector"):
         todo = tasks()
-    both_go_on = len(todo) == 2 and all(goes_on(task.hand, task.others) for task in todo)
+    both_go_on = len(todo) == 2 and all(goes_on(task.hand, task.others, dt_s) for task in todo)
     opened = list[HandFrame | Absence]()
     for number, slot in enumerate(slots):
         with spans("detector"):
