@@ -38,9 +38,7 @@ _AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
 
 
 def search_due(hand: HandState, model: TrackerModel, dt_s: float = 0.0) -> bool:
-    """Whether the whole image is searched, dt_s after the last: while no hand is believed, and not
-    each time if set; and where frames are rare.
-    """
+    """Whether the whole image is searched: while no hand is believed, or where frames are rare."""
     if hand.track is not None and not hand.track.doubted:
         return dt_s > RARE_S
     frames = model.detector.settings.search
@@ -69,7 +67,11 @@ def search(
         # A hand of the other side may be too unlike one of this to be found as such.
         mirrored = detector.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
         mirrored = [one for one in mirrored if one.merit > least]
-        of_other = [one for one in mirrored if not any(_same_place(one, seen) for seen in found)]
+        of_other = [
+            one
+            for one in mirrored
+            if all((one.centre_m - it.centre_m).norm() > SAME_PLACE_M for it in found)
+        ]
         found = [*found, *of_other]
     if undecided and not hand.seen.ever:
         found = held_out(found)
@@ -79,11 +81,6 @@ def search(
         return found[0]
     centre, up = found[0].centre_m.numpy()[None], np.asarray(found[0].up)[None]
     return detector.detect(image.depth_m, image.k, centre, side, up)[0]
-
-
-def _same_place(one: Detection, other: Detection) -> bool:
-    """Whether two detections are of one hand."""
-    return float((one.centre_m - other.centre_m).norm()) < SAME_PLACE_M
 
 
 def detect(

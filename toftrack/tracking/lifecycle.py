@@ -156,14 +156,13 @@ def open_hand(
 
 
 def goes_on(hand: HandState, others: Sequence[OtherHand | Neighbour], dt_s: float) -> bool:
-    """Whether a hand's track goes on in a frame. One that is doubted waits for the detector where
-    nothing is surely followed, or a search beside the other hand has found something elsewhere; and
-    so does any where frames are rare.
+    """Whether a hand's track goes on in a frame. It waits for the detector where frames are rare, or
+    it is doubted and nothing else is sure or a search has found something elsewhere.
     """
     if hand.track is None or dt_s > RARE_S:
         return False
-    elsewhere = hand.seeking is not None and search_is_over(hand)
-    return not hand.track.doubted or (not elsewhere and any(o.certain for o in others))
+    sure = any(other.certain for other in others)
+    return not hand.track.doubted or (sure and not search_is_over(hand))
 
 
 def _nothing() -> Detection:
@@ -182,7 +181,7 @@ def _detected(
     A track that is doubted gives way to a hand that is detected elsewhere.
     """
     track, best = hand.track, NO_DETECTION
-    if hand.seeking is not None and search_is_over(hand):
+    if hand.seeking is not None and hand.seeking.over:
         best = detect_again(hand, hand.seeking, image, others, model)
         hand = replace(hand, seeking=None)
     elif search_due(hand, model, dt_s):
@@ -193,10 +192,9 @@ def _detected(
     if not detection_due(track, model.detector.settings, dt_s):
         return hand, NO_DETECTION
     elsewhere = is_elsewhere(best, hand, track, model, dt_s)
-    if elsewhere and track.doubted and not _stays_watched(hand, others):
-        return _left_behind(hand, model), best
     there = detect(hand, track, image, model, dt_s)
-    if elsewhere and not track.doubted and merit(best, best.heat) > merit(there, best.heat):
+    gone = elsewhere and (track.doubted or merit(best, best.heat) > merit(there, best.heat))
+    if gone and not _stays_watched(hand, others):
         return _left_behind(hand, model), best
     # The prediction of a track that is wrong may show the network what keeps it wrong.
     surer = not (best.empty or elsewhere) and doubt_m(best) < doubt_m(there)
