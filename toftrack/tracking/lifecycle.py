@@ -156,8 +156,8 @@ def open_hand(
 
 
 def goes_on(hand: HandState, others: Sequence[OtherHand | Neighbour], dt_s: float) -> bool:
-    """Whether a hand's track goes on in a frame. It waits for the detector where frames are rare, or
-    it is doubted and nothing else is sure or a search has found something elsewhere.
+    """Whether a hand's track goes on in a frame, or waits for the detector: where frames are rare,
+    or it is doubted and nothing else is sure, or something was found elsewhere.
     """
     if hand.track is None or dt_s > RARE_S:
         return False
