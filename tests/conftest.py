@@ -7,10 +7,14 @@ fails the run, so that no test falls asleep unnoticed.
 
 from __future__ import annotations
 
+import copy
+import functools
 import os
 import re
 import signal
+import sys
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -85,6 +89,40 @@ def _ctrl_c_interrupts():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _loaded_once():
+    """What hundreds of trackers begin with: conf/ with the same overrides, the same networks."""
+    with pytest.MonkeyPatch.context() as patch:
+        if loading := sys.modules.get("hydra._internal.config_loader_impl"):
+            _compose_once(loading.ConfigLoaderImpl, patch)
+        if detector := sys.modules.get("toftrack.detector.hand_detector"):
+            load, known = detector.load_networks, functools.cache(detector.load_networks)
+
+            def networks(path=None):
+                # On a GPU torch's are moved there.
+                pair = load(path) if path else known()
+                return [type(one)(copy.deepcopy(one.reference), one.session) for one in pair]
+
+            patch.setattr(detector, "load_networks", networks)
+        yield
+
+
+def _compose_once(loader: type, patch: pytest.MonkeyPatch) -> None:
+    whole, known = loader._load_configuration_impl, {}
+    conf = Path(__file__).parents[1] / "conf"
+
+    def load(self, **given):
+        paths = [one.path.removeprefix("file://") for one in self.config_search_path.get_path()]
+        if str(conf) not in paths:
+            return whole(self, **given)
+        key = str((paths, given, os.getcwd()))
+        if key not in known:
+            known[key] = whole(self, **given)
+        return copy.deepcopy(known[key])
+
+    patch.setattr(loader, "_load_configuration_impl", load)
 
 
 @pytest.fixture(scope="module")

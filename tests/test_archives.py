@@ -185,12 +185,12 @@ def test_other_compressions_are_refused(tmp_path: Path) -> None:
     assert "'a': its compression is not read; save it with numpy.savez" in reported(path)
 
 
-def test_what_bzip2_packed_a_million_times_smaller_than_the_directory_says_is_not_unpacked(
+def test_what_is_much_larger_than_the_directory_says_is_not_unpacked(
     tmp_path: Path,
 ) -> None:
-    path = save(tmp_path / "a.npz", {"a": [header((2**30,), "<u1"), *[ZEROS] * 1024]}, BZIP2)
+    path = save(tmp_path / "a.npz", {"a": [header((2**26,), "<u1"), *[ZEROS] * 64]}, BZIP2)
     whole = path.read_bytes()
-    size = struct.pack("<I", 2**30 + len(header((2**30,), "<u1")))
+    size = struct.pack("<I", 2**26 + len(header((2**26,), "<u1")))
     assert size in whole
     small = npy(np.zeros(1000, np.uint8))
     path.write_bytes(whole.replace(size, struct.pack("<I", len(small))))

