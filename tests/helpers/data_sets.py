@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from scipy.io import savemat
 
 from toftrack.camera import Camera
-from toftrack.recordings.npz import read_recording
+from toftrack.recordings.npz import Recording, read_recording
 
 THUMB_LAST = [0, *range(5, 21), *range(1, 5)]
 """toftrack's rows in MSRA's order."""
@@ -28,9 +29,14 @@ class Scene:
     K: np.ndarray
 
 
+@cache
+def _sample() -> Recording:
+    return read_recording(str(resources.files("toftrack") / "data" / "sample.npz"))
+
+
 def scene(camera: Camera, frames: int) -> Scene:
     """The first frames of the sample recording through a camera."""
-    sample = read_recording(str(resources.files("toftrack") / "data" / "sample.npz"))
+    sample = _sample()
     assert sample.truth is not None
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     ours, theirs = sample.camera.K, camera.K

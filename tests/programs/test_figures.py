@@ -62,6 +62,17 @@ def run(tracked: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(tracked, tmp_path / "run"))
 
 
+def blank(*_: object) -> np.ndarray:
+    return np.zeros((9, 9, 3), np.uint8)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes most of the time; everything before it is done."""
+    for name in NAMES:
+        monkeypatch.setattr(figures, f"{name}_figure", blank)
+
+
 def change(run: Path, **arrays: Callable[[np.ndarray], np.ndarray]) -> None:
     """Change arrays of the run's track.npz."""
     with np.load(run / "track.npz") as archive:
@@ -143,7 +154,7 @@ def test_five_figures_are_written_that_show_something(run: Path) -> None:
         assert min(picture.shape[:2]) > 250 and picture.std() > 10, path.name
 
 
-def test_the_papers_run_is_drawn_though_json_has_no_infinity(run: Path) -> None:
+def test_the_papers_run_is_drawn_though_json_has_no_infinity(run: Path, undrawn: None) -> None:
     with np.load(run / "track.npz") as archive:
         facts = json.loads(str(archive["metadata"]))
     assert isinstance(facts["config"]["segmentation"]["reach_m"], float)
@@ -163,7 +174,11 @@ def test_the_recording_is_found_from_another_folder(
     assert footage is not None and len(footage.truth) == FRAMES
 
 
-def test_lost_frames_are_shown_and_shaded(run: Path, tmp_path: Path) -> None:
+def test_lost_frames_are_shown_and_shaded(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("measurement", "filmstrip", "latent"):
+        monkeypatch.setattr(figures, f"{name}_figure", blank)
     before = draw_figures(run, out=tmp_path / "before")
     change(run, lost=lambda lost: np.arange(len(lost)) >= 8)
     after = draw_figures(run, out=tmp_path / "after")
@@ -209,7 +224,7 @@ def test_two_hands_have_figures_of_their_own_and_one_filmstrip(
 
     def title(*values: object) -> np.ndarray:
         titles.append(next(value for value in values if isinstance(value, str)))
-        return np.zeros((9, 9, 3), np.uint8)
+        return blank()
 
     for name in ("measurement_figure", "lost_figure", "course_figure", "latent_figure"):
         monkeypatch.setattr(figures, name, title)
@@ -239,14 +254,13 @@ def test_without_truth_the_score_stands_alone(run: Path, tmp_path: Path) -> None
 
 
 def test_a_space_that_has_changed_is_reported_and_used_anew(
-    run: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[np.ndarray, str]] = []
-    picture = np.zeros((9, 9, 3), np.uint8)
     monkeypatch.setattr(
         figures,
         "latent_figure",
-        lambda space, latent, *a: (seen.append((latent, a[-1])), picture)[1],
+        lambda space, latent, *a: (seen.append((latent, a[-1])), blank())[1],
     )
     draw_figures(run)
     true = read_run(run).results["latent"]
@@ -258,7 +272,7 @@ def test_a_space_that_has_changed_is_reported_and_used_anew(
 
 
 def test_a_live_run_gets_the_figures_that_need_no_images(
-    run: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, undrawn: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def live(metadata: np.ndarray) -> np.ndarray:
         content = json.loads(metadata.item())
@@ -279,7 +293,7 @@ def test_a_missing_file_is_named(run: Path, gone: str) -> None:
         draw_figures(run)
 
 
-def test_a_recording_that_moved_is_asked_for(run: Path, tracked: Path) -> None:
+def test_a_recording_that_moved_is_asked_for(run: Path, tracked: Path, undrawn: None) -> None:
     absent = run.parent / "else.npz"
     with pytest.raises(ToftrackError, match="is not there; say where .* --recording"):
         draw_figures(run, absent)
@@ -320,7 +334,7 @@ def test_a_run_says_no_code_to_execute(run: Path) -> None:
 
 
 def test_the_command_answers_errors_with_a_sentence(
-    run: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, undrawn: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command_line.run(lambda: figures.main([str(run), "--frame", "99"])) == 1
     assert "error: the run has no frame 99; give --frame from 0 to 11" in capsys.readouterr().err
@@ -339,7 +353,7 @@ def test_a_missing_matplotlib_is_one_sentence_and_leaves_out_plots_alone(
         draw_figures(run)
     drawn = {
         "plot.png": lambda: chart.picture_of(chart.new_figure(90, 90)),
-        "picture.png": lambda: np.zeros((9, 9, 3), np.uint8),
+        "picture.png": blank,
     }
     assert chart.write_figures(run, drawn) == ["picture.png"]
     assert "without plot.png: figures need matplotlib" in capsys.readouterr().err

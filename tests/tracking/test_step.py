@@ -59,7 +59,7 @@ def equal(one: object, two: object) -> bool:
     return one == two or (one != one and two != two)
 
 
-@pytest.mark.parametrize("kept", [0, 2, 7])
+@pytest.mark.parametrize("kept", [0, 5])
 @pytest.mark.parametrize("made", [quick, by_the_paper])
 def test_a_recording_replayed_from_a_saved_state_gives_the_same_estimates(
     kept: int, made: Callable[..., Tracker]
@@ -167,7 +167,7 @@ def test_a_movement_at_another_rate_has_the_same_speed() -> None:
     assert float((speeds[0] - speeds[1]).norm()) < 0.05, speeds
 
 
-@pytest.mark.parametrize("jump_s", [-100.0, 1e6, math.nan, 1e-9])
+@pytest.mark.parametrize("jump_s", [-100.0, 1e6, math.nan])
 def test_a_clock_that_jumps_does_not_lose_the_hand(jump_s: float) -> None:
     tracker, scene = quick(), sample()
     tracked(tracker, scene, range(8))

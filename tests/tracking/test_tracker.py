@@ -123,17 +123,12 @@ def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
     assert errors_mm(two, scene)[-1] < 20
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_one_does_not() -> None:
-    scene = first(6)
+def test_the_same_seed_gives_the_same_bits_and_another_one_others_that_are_as_good() -> None:
+    scene = first(12)
     one, two, other = (follow(scene, f"seed={seed}") for seed in (3, 3, 4))
     assert all(map(same, one, two))
     assert not any(map(same, one, other))
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_other_seeds_find_the_hand_as_well(seed: int) -> None:
-    scene = first(12)
-    assert errors_mm(follow(scene, f"seed={seed}"), scene)[5:].mean() < 12
+    assert all(errors_mm(found, scene)[5:].mean() < 12 for found in (one, other))
 
 
 def without_hand(scene: Scene, gone: range) -> Scene:
