@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import programs
 from helpers.detection import small_bank
 from helpers.tracking import ROOT
 
@@ -206,9 +207,11 @@ def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> Non
 
 
 def test_the_program_refuses_what_cannot_be(tmp_path: Path) -> None:
-    done = command(tmp_path, "shapes=0")
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].startswith("error: shapes")
+    program = str(ROOT / "toftrack" / "programs" / "train_detector.py")
+    given = ("shapes=0", "hydra.run.dir=out")
+    status, _, err = programs.call(*given, folder=tmp_path, program=program)
+    assert status == 1
+    assert err.splitlines()[-1].startswith("error: shapes")
 
 
 class SwitchedOffError(Exception):
