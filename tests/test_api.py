@@ -7,6 +7,7 @@ import inspect
 import subprocess
 import sys
 import threading
+from functools import cache
 from pathlib import Path
 
 import hydra
@@ -144,13 +145,9 @@ def test_a_bad_image_or_matrix_is_one_clear_sentence(depth: object, k: object, w
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
-_made: list = []
-
-
+@cache
 def _tracker() -> toftrack.Tracker:
-    if not _made:
-        _made.append(toftrack.make_tracker())
-    return _made[0]
+    return toftrack.make_tracker()
 
 
 def test_a_bad_image_does_not_disturb_the_track() -> None:

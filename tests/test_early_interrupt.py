@@ -39,29 +39,15 @@ def interrupted(tmp_path: Path, moment: str, *words: str) -> subprocess.Complete
     )
 
 
-COMMAND, PROGRAM = ("-m", "toftrack", "track"), (str(ROOT / "track.py"),)
-
-
-@pytest.mark.parametrize(
-    ("program", "moment"),
-    [
-        (COMMAND, "toftrack.programs.main"),
-        (COMMAND, "omegaconf"),
-        (COMMAND, "torch"),
-        (PROGRAM, "hydra"),
-        (PROGRAM, "toftrack.devices.sample"),
-    ],
-)
-def test_an_interrupt_while_tracking_is_loaded(
-    tmp_path: Path, program: tuple[str, ...], moment: str
-) -> None:
-    words = (*program, "view=none", f"hydra.run.dir={tmp_path / 'run'}")
+@pytest.mark.parametrize("moment", ["hydra", "omegaconf", "toftrack.devices.sample", "torch"])
+def test_an_interrupt_while_tracking_is_loaded(tmp_path: Path, moment: str) -> None:
+    words = (str(ROOT / "track.py"), "view=none", f"hydra.run.dir={tmp_path / 'run'}")
     reported = interrupted(tmp_path, moment, *words)
     assert reported.returncode == 130, reported.stderr
     assert "Traceback" not in reported.stderr and "interrupted" in reported.stderr
 
 
-@pytest.mark.parametrize("name", ["record", "report", "benchmark"])
+@pytest.mark.parametrize("name", ["track", "record", "report", "benchmark"])
 def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
     moment = "toftrack.benchmark.speed" if name == "benchmark" else "hydra"
     reported = interrupted(tmp_path, moment, "-m", "toftrack", name, "x")

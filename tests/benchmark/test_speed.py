@@ -5,19 +5,9 @@ from __future__ import annotations
 import json
 
 import pytest
-import torch
 
 from toftrack.benchmark import command, speed
 from toftrack.errors import ToftrackError
-
-
-@pytest.fixture
-def one_thread():
-    """Because idle helpers of torch hold up small work on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def test_a_small_run_writes_json(tmp_path, capsys, one_thread) -> None:

@@ -113,22 +113,6 @@ def test_every_option_composes_and_can_be_made(
             hydra.utils.instantiate(part)
 
 
-@pytest.mark.parametrize(
-    ("group", "option", "key"),
-    [
-        ("device", "replay", "device.path"),
-        ("device", "folder", "device.path"),
-        ("data", "leap", "data.path"),
-        ("data", "file", "data.path"),
-        ("data", "run", "data.path"),
-        ("data", "mixture", "data.parts.leap.path"),
-    ],
-)
-def test_what_must_be_given_is_named(group: str, option: str, key: str) -> None:
-    config = composed(group, option)
-    assert key in OmegaConf.missing_keys(config)
-
-
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_opens_with_a_line_about_what_it_is(group: str, option: str) -> None:
     text = (CONF / group / f"{option}.yaml").read_text()

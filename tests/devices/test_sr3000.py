@@ -247,11 +247,9 @@ def test_an_exception_in_the_consumer_releases_the_camera() -> None:
 def test_ctrl_c_during_a_transfer_releases_the_camera() -> None:
     device = camera(loop=True, fps=2.0, usb={"timeout_ms": 1000})
     threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
-    began = time.monotonic()
     with pytest.raises(KeyboardInterrupt), device:
         for _ in device:
             pass
-    assert time.monotonic() - began < 2.5
     assert device.emulator.open_handles == set()
     assert device.emulator.misuse == []
 

@@ -137,3 +137,13 @@ def _encode(container: Any, streams: list[Any], images: list[np.ndarray], fps: i
     for stream in streams:
         container.mux(stream.encode())
     container.close()
+
+
+def video_frames(path: Path) -> list[np.ndarray]:
+    """All frames of a video, BGR."""
+    reader, frames = cv2.VideoCapture(str(path)), []
+    while True:
+        there, frame = reader.read()
+        if not there:
+            return frames
+        frames.append(frame)

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -181,9 +180,7 @@ def test_a_signal_ends_with_its_status(app: Path, number: int, code: int) -> Non
     process = start(app, "fail=wait")
     assert process.stdout.readline() == "waiting\n"
     process.send_signal(number)
-    begin = time.monotonic()
-    _, err = process.communicate(timeout=30)
-    assert time.monotonic() - begin < 20
+    _, err = process.communicate(timeout=20)
     assert process.returncode == code
     assert err.startswith("interrupted: ")
     assert "Traceback" not in err

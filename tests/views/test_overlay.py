@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.moments import one_hand
+from helpers.videos import video_frames
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
@@ -231,13 +232,7 @@ def panel_of(value: int, size: tuple[int, int] = (CAPTION_PX + 50, 160)) -> np.n
 
 
 def read_video(path: Path) -> tuple[list[np.ndarray], float]:
-    reader = cv2.VideoCapture(str(path))
-    frames = []
-    while True:
-        there, frame = reader.read()
-        if not there:
-            return frames, reader.get(cv2.CAP_PROP_FPS)
-        frames.append(frame)
+    return video_frames(path), cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS)
 
 
 def test_video_has_every_panel_at_the_rate(tmp_path: Path) -> None:

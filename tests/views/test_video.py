@@ -8,10 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from helpers.tracking import ROOT
+from helpers.videos import video_frames
 
 from toftrack.errors import ToftrackError
 from toftrack.views.overlay import VideoView
@@ -53,12 +53,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def greys(path: Path) -> list[float]:
     """The mean grey of each frame."""
-    reader, found = cv2.VideoCapture(str(path)), []
-    while True:
-        there, frame = reader.read()
-        if not there:
-            return found
-        found.append(float(frame.mean()))
+    return [float(frame.mean()) for frame in video_frames(path)]
 
 
 def test_a_killed_run_leaves_every_second_that_was_whole(killed: Path) -> None:
