@@ -14,7 +14,6 @@ import re
 import signal
 import sys
 from collections import Counter
-from pathlib import Path
 
 import pytest
 
@@ -93,10 +92,8 @@ def _ctrl_c_interrupts():
 
 @pytest.fixture(autouse=True, scope="session")
 def _loaded_once():
-    """What hundreds of trackers begin with: conf/ with the same overrides, the same networks."""
+    """What hundreds of trackers begin with: the same networks."""
     with pytest.MonkeyPatch.context() as patch:
-        if loading := sys.modules.get("hydra._internal.config_loader_impl"):
-            _compose_once(loading.ConfigLoaderImpl, patch)
         if detector := sys.modules.get("toftrack.detector.hand_detector"):
             load = detector.load_networks
             known = functools.cache(lambda file: load())  # a test may say that it is another one
@@ -111,22 +108,6 @@ def _loaded_once():
 
             patch.setattr(detector, "load_networks", networks)
         yield
-
-
-def _compose_once(loader: type, patch: pytest.MonkeyPatch) -> None:
-    whole, known = loader._load_configuration_impl, {}
-    conf = Path(__file__).parents[1] / "conf"
-
-    def load(self, **given):
-        paths = [one.path.removeprefix("file://") for one in self.config_search_path.get_path()]
-        if str(conf) not in paths:
-            return whole(self, **given)
-        key = str((paths, given, os.getcwd()))
-        if key not in known:
-            known[key] = whole(self, **given)
-        return copy.deepcopy(known[key])
-
-    patch.setattr(loader, "_load_configuration_impl", load)
 
 
 @pytest.fixture(scope="module")
