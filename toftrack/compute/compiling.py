@@ -25,10 +25,15 @@ from numba.extending import intrinsic
 
 log = logging.getLogger(__name__)
 
-OPTIONS = {"fastmath": {"contract", "arcp", "nsz"}, "nogil": True, "error_model": "numpy"}
+OPTIONS = {
+    "fastmath": {"contract", "arcp", "nsz"},
+    "nogil": True,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+}
 """nnan and ninf stay off: NaN is how a kernel learns that a square root missed."""
 
-compiled: Any = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+compiled: Any = numba.njit(**OPTIONS, no_cpython_wrapper=True)
 """Decorator of the functions that kernels call, and that Python cannot."""
 
 _SILENT_S = 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -99,6 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in _LONG_HELP and any(word in _HELP for word in rest):
         print(long_help(name))
         return 0
+    gc.set_threshold(20_000)  # loading and compiling leave little to collect
     from toftrack.programs.command_line import run
 
     return run(lambda: _program(name)(rest))
