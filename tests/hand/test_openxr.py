@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from toftrack.hand.conventions import openxr_hand_compiled
 from toftrack.hand.openxr import (
     OPENXR_JOINT_NAMES,
     OPENXR_PARENTS,
@@ -261,3 +262,22 @@ def test_leading_axes_stay_and_hands_that_are_none_are_nan() -> None:
     assert all(np.isfinite(array[2, 1]).all() for array in hands)
     none = openxr_hand(np.full((0, 21, 3), np.nan), np.zeros((0, 27)), rig)
     assert none.position_m.shape == (0, 26, 3)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_compiled_twin_agrees(side: str) -> None:
+    shape = default_hand_shape(side=side)
+    rig = openxr_rig(shape)
+    generator = torch.Generator().manual_seed(0)
+    states = torch.rand((50, 27), generator=generator, dtype=torch.float64) * 3 - 1.5
+    states[0] = 0
+    states[1, 3:6] = torch.tensor([torch.pi, 0, 0])
+    joints = forward_kinematics(states, shape.to(torch.float64)).joints_m.numpy()
+    for state, placed in zip(states.numpy(), joints, strict=True):
+        wanted = openxr_hand(placed, state, rig)
+        found = openxr_hand_compiled(placed, state, rig)
+        np.testing.assert_allclose(found.position_m, wanted.position_m, atol=1e-9)
+        same = np.abs((found.orientation * wanted.orientation).sum(1))  # where w = 0, q is -q
+        np.testing.assert_allclose(same, 1, atol=1e-9)
+        assert (found.orientation[:, 3] >= 0).all()
+        np.testing.assert_array_equal(found.radius_m, wanted.radius_m)

@@ -48,7 +48,7 @@ def _pose_and_project(
 ):
     x = np.empty(27 * LANES, np.float32)
     hand.pose_hands(states, 0, slots, base, lengths, mirror, x, frames, valid)
-    hand.project_hands(frames, index, surface, k[0], k[1], k[2], k[3], size[0], size[1], out, boxes)
+    hand.project_hands(frames, index, surface, k, size[0], size[1], out, boxes)
 
 
 @entry_point

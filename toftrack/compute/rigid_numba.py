@@ -30,6 +30,29 @@ def quaternion(a, b, c):
 
 
 @compiled
+def quaternion_of(m):
+    """Of a rotation matrix (3, 3), from its largest component on (Shepperd, 1978)."""
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    largest = 0
+    for i in range(1, 3):
+        if m[i, i] > m[largest, largest]:
+            largest = i
+    if trace > m[largest, largest]:
+        w = math.sqrt(1 + trace) / 2
+        s = 1 / (4 * w)
+        return (m[2, 1] - m[1, 2]) * s, (m[0, 2] - m[2, 0]) * s, (m[1, 0] - m[0, 1]) * s, w
+    i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+    a = math.sqrt(max(1 + m[i, i] - m[j, j] - m[k, k], 1e-12)) / 2
+    s = 1 / (4 * a)
+    b, d, w = (m[i, j] + m[j, i]) * s, (m[i, k] + m[k, i]) * s, (m[k, j] - m[j, k]) * s
+    if i == 0:
+        return a, b, d, w
+    if i == 1:
+        return d, a, b, w
+    return b, d, a, w
+
+
+@compiled
 def product(p, q):
     """Of two quaternions: first q turns, then p."""
     return (
@@ -164,11 +187,9 @@ def pose_hand(state, base_frames, base, lengths, mirror, frames, joints):
                         for k in range(3):
                             frame[i, j] += frames[0, i, k] * base_frames[finger, k, j]
             # Only the thumb has an abduction at its second joint; no third joint has any.
-            if bone == 0 or (bone == 1 and finger == 0):
-                mix_columns(frame, 0, state[angle])
+            for column in range(0 if bone == 0 or (bone == 1 and finger == 0) else 1, 2):
+                mix_columns(frame, column, state[angle])
                 angle += 1
-            mix_columns(frame, 1, state[angle])
-            angle += 1
             for i in range(3):
                 along = lengths[finger, bone] * frame[i, 1]
                 joints[joint + bone + 1, i] = joints[joint + bone, i] - along

@@ -17,13 +17,12 @@ _LEAST_SLOPE = np.float32(0.05)
 def crop_at(depth, mirror, k, centre, turn, image):
     """See crops.crop: about a centre (3,), turned by (3, 3), into an image (C, CROP, CROP).
 
-    mirror: the depth is read as a mirror shows it; k and the centre are those of the mirrored.
+    depth: (H, W) float32, Z in metres.  mirror: it is read as a mirror shows it; k and the centre
+    are those of the mirrored.  image: float32, written, see crops.channels, from the pixels nearest
+    to its samples.
     """
-    mapping, single, slope = (
-        np.empty((3, 3), np.float64),
-        np.empty((3, 3), np.float32),
-        np.empty(3, np.float32),
-    )
+    mapping, single = np.empty((3, 3), np.float64), np.empty((3, 3), np.float32)
+    slope = np.empty(3, np.float32)
     distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
     focal, middle = 2 * CROP * distance / CROP_M, (2 * CROP - 1) / 2
     largest = 0.0
@@ -41,42 +40,29 @@ def crop_at(depth, mirror, k, centre, turn, image):
             single[i, j] = mapping[i, j] / largest
     slope[0], slope[1] = turn[2, 0] / focal, turn[2, 1] / focal
     slope[2] = turn[2, 2] - middle * (turn[2, 0] + turn[2, 1]) / focal
-    scale = np.float32(2 / CROP_M)
-    _read_crop(depth, mirror, single, slope, scale, np.float32(distance), image)
-
-
-@compiled
-def _read_crop(depth, flip, mapping, slope, scale, distance, image):
-    """The channels of a crop, see crops.channels, from the pixels nearest to its samples.
-
-    depth: (H, W) float32, Z in metres; read as a mirror shows it where flip is true.
-    mapping: (3, 3) float32 from the crop's samples to pixels.
-    slope: (3,) float32, of a sample: its Z over its z along the crop's axis.
-    scale: from metres to half cubes.  distance: of the crop's centre, metres.
-    image: (CROP_CHANNELS, CROP, CROP) float32, written.
-    """
-    size = image.shape[1]
-    samples = 2 * size
+    scale, away = np.float32(2 / CROP_M), np.float32(distance)
+    samples = 2 * CROP
     places, share = np.empty(samples, np.int64), np.empty(samples, np.float32)
-    for row in range(size):
-        image[:4, row] = _ZERO
-        image[4:, row] = _ONE
+    for row in range(CROP):
+        for channel in range(len(image)):  # slices take numba long to compile
+            for column in range(CROP):
+                image[channel, row, column] = _ZERO if channel < 4 else _ONE
         for line in range(2 * row, 2 * row + 2):
-            _place(depth.shape, flip, mapping, slope, np.float32(line), places, share)
+            _place(depth.shape, mirror, single, slope, np.float32(line), places, share)
             for sample in range(samples):
                 if places[sample] < 0:
                     image[3, row, sample // 2] += np.float32(0.25)
                     continue
                 z = depth.flat[places[sample]] * share[sample]
                 if z > _ZERO:
-                    relative = (z - distance) * scale
+                    relative = (z - away) * scale
                     column = sample // 2
                     clipped = min(max(relative, -_ONE), _ONE)
                     image[0, row, column] += clipped
                     image[4 + 2 * (line - 2 * row) + sample % 2, row, column] = clipped
                     image[1, row, column] += np.float32(0.25) * (abs(relative) < _ONE)
                     image[2, row, column] += np.float32(0.25)
-        for column in range(size):
+        for column in range(CROP):
             share_read = image[2, row, column]
             mean = np.float32(0.25) * image[0, row, column] / max(share_read, np.float32(0.25))
             image[0, row, column] = mean if share_read > _ZERO else _ONE
@@ -85,7 +71,11 @@ def _read_crop(depth, flip, mapping, slope, scale, distance, image):
 
 @compiled
 def _place(shape, flip, mapping, slope, line, places, share):
-    """Of a line's samples: the flat places of their pixels, -1 for none, and z over Z."""
+    """Of a line's samples: the flat places of their pixels, -1 for none, and z over Z.
+
+    mapping: (3, 3) float32 from the crop's samples to pixels.
+    slope: (3,) float32, of a sample: its Z over its z along the crop's axis.
+    """
     height, width = np.float32(shape[0]), np.float32(shape[1])
     for sample in range(len(places)):  # vectorised
         a = np.float32(sample)

@@ -8,7 +8,7 @@ import numpy as np
 
 from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid import PIVOT_M
-from toftrack.compute.rigid_numba import pose_hand, rotation_vector
+from toftrack.compute.rigid_numba import pose_hand, quaternion_of, rotation_vector
 from toftrack.detector.crops import CROP, CROP_M
 from toftrack.detector.network import (
     ANGLES,
@@ -46,8 +46,9 @@ def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
     _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
     _decode_keypoints(keypoints, depth, joints[c], sigma[c])
     for j in range(JOINTS):
-        p = (joints[c, j, 0], joints[c, j, 1], joints[c, j, 2])
-        _into_camera(p, turn, centre, mirror, joints[c, j])
+        p = joints[c, j]
+        p64 = np.float64(p[0]), np.float64(p[1]), np.float64(p[2])
+        _into_camera(p64, turn, centre, mirror, p)
 
 
 @compiled
@@ -70,18 +71,18 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
         chance[h] = -np.inf
         one = reported[h * EACH : (h + 1) * EACH]
         _rotation(one, _ANCHORS[h], turn, matrix)
-        turned = rotation_vector(_quaternion(matrix))
+        turned = rotation_vector(quaternion_of(matrix))
         sign = -1.0 if mirror else 1.0
         for i in range(3):
             state[3 + i] = turned[i] if i == 0 else sign * turned[i]
             rotvec[c, kept, i] = state[3 + i]
         for j in range(ANGLES):
             low, high = _LIMITS[j]
-            state[6 + j] = low + (high - low) * sigmoid(one[6 + j])
+            state[6 + j] = low + (high - low) / (1 + math.exp(-one[6 + j]))
             angles[c, kept, j] = state[6 + j]
         log_size[c, kept] = LOG_SIZE * one[6 + ANGLES]
-        p = one[7 + ANGLES : 10 + ANGLES]
-        at = (OFFSET_M * p[0], OFFSET_M * p[1], OFFSET_M * p[2])
+        x, y, z = one[7 + ANGLES], one[8 + ANGLES], one[9 + ANGLES]
+        at = (OFFSET_M * x, OFFSET_M * y, OFFSET_M * z)
         _into_camera(at, turn, centre, mirror, pivot[c, kept])
         error[c, kept] = ERROR_M * softplus(one[EACH - 1]) + LEAST_ERROR_M
         pose_hand(state, hand[0], hand[1], hand[2], sign, frames, posed)
@@ -125,29 +126,6 @@ def _rotation(reported, anchor, turn, matrix):
 
 
 @compiled
-def _quaternion(m):
-    """Of a rotation matrix (3, 3), from its largest component on (Shepperd, 1978)."""
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    largest = 0
-    for i in range(1, 3):
-        if m[i, i] > m[largest, largest]:
-            largest = i
-    if trace > m[largest, largest]:
-        w = math.sqrt(1 + trace) / 2
-        s = 1 / (4 * w)
-        return (m[2, 1] - m[1, 2]) * s, (m[0, 2] - m[2, 0]) * s, (m[1, 0] - m[0, 1]) * s, w
-    i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-    a = math.sqrt(max(1 + m[i, i] - m[j, j] - m[k, k], 1e-12)) / 2
-    s = 1 / (4 * a)
-    b, d, w = (m[i, j] + m[j, i]) * s, (m[i, k] + m[k, i]) * s, (m[k, j] - m[j, k]) * s
-    if i == 0:
-        return a, b, d, w
-    if i == 1:
-        return d, a, b, w
-    return b, d, a, w
-
-
-@compiled
 def _into_camera(p, turn, centre, mirror, out):
     """A point of a crop's frame, about its centre, in the camera's, mirrored back if need be."""
     for i in range(3):
@@ -188,12 +166,6 @@ def _decode_keypoints(keypoints, depth, joints, sigma):
 def _cell(number):
     """Where the middle of a cell is, metres from the crop's."""
     return ((number + 0.5) / CELLS - 0.5) * CROP_M
-
-
-@compiled
-def sigmoid(x):
-    """Of a number."""
-    return 1 / (1 + math.exp(-x))
 
 
 @compiled

@@ -82,11 +82,9 @@ def _capsules_of(finger, angles, base_frames, base, lengths, radii, shifts, caps
     x, y, z = base[finger, 0], base[finger, 1], base[finger, 2]
     angle = 1 + 4 * finger
     for bone in range(3):
-        if bone == 0:
-            mix_columns(frame, 0, angles[angle])
+        for column in range(0 if bone == 0 else 1, 2):
+            mix_columns(frame, column, angles[angle])
             angle += 1
-        mix_columns(frame, 1, angles[angle])
-        angle += 1
         length, shift = lengths[finger, bone], shifts[finger, bone]
         end = length - radii[finger, bone] if bone == 2 else length
         for k, along in enumerate((0.0, end)):
@@ -112,11 +110,9 @@ def _gap(finger, first, angles, base_frames, base, lengths, radii, shifts, parts
     angle = start
     gap = 1.0
     for bone in range(3):
-        if bone == 0 or (bone == 1 and finger == 0):
-            mix_columns(frame, 0, angles[angle])
+        for column in range(0 if bone == 0 or (bone == 1 and finger == 0) else 1, 2):
+            mix_columns(frame, column, angles[angle])
             angle += 1
-        mix_columns(frame, 1, angles[angle])
-        angle += 1
         length, radius = lengths[finger, bone], radii[finger, bone]
         shift = shifts[finger, bone]
         if bone >= first:
@@ -146,11 +142,9 @@ def _opposition(angles, base_frames, base, lengths, radii, shifts, parts, frame)
     x, y, z = base[0, 0], base[0, 1], base[0, 2]
     angle = 0
     for bone in range(3):
-        if bone < 2:
-            mix_columns(frame, 0, angles[angle])
+        for column in range(0 if bone < 2 else 1, 2):
+            mix_columns(frame, column, angles[angle])
             angle += 1
-        mix_columns(frame, 1, angles[angle])
-        angle += 1
         length, shift = lengths[0, bone], shifts[0, bone]
         if bone < 2:
             x, y, z = x - length * frame[0, 1], y - length * frame[1, 1], z - length * frame[2, 1]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from toftrack.compute.compiling import compiled, entry_point
-from toftrack.compute.rigid_numba import pose_hand
+from toftrack.compute.rigid_numba import pose_hand, quaternion_of
 from toftrack.estimate import Estimate
 from toftrack.hand.openxr import OpenXRHand, OpenXRRig, openxr_hand, openxr_rig
 from toftrack.hand.shape import HandShape
@@ -75,6 +75,7 @@ def place(joints, state, base_frames, metacarpals, radius, mirror, position, ori
     frames, none = np.empty((16, 3, 3), np.float64), np.zeros((21, 3), np.float64)
     pose_hand(state, base_frames, none[:5], none[:5], mirror, frames, none)
     way, nail, start = np.empty(3, np.float64), np.empty(3, np.float64), np.empty(3, np.float64)
+    axes = np.empty((3, 3), np.float64)
     for i in range(3):
         position[1, i] = joints[0, i]
     for finger in range(5):
@@ -89,14 +90,14 @@ def place(joints, state, base_frames, metacarpals, radius, mirror, position, ori
                 nail[i] = 0.0
                 for k in range(3):
                     nail[i] += frames[0, i, k] * base_frames[finger, k, 0]
-            turn(way, nail, mirror, orientation[first - 1])
+            turn(way, nail, mirror, axes, orientation[first - 1])
         for bone in range(3):
             frame = frames[1 + 3 * finger + bone]
             for i in range(3):
                 position[first + bone, i] = joints[1 + 4 * finger + bone, i]
                 way[i] = -frame[i, 1]
                 nail[i] = frame[i, 0]
-            turn(way, nail, mirror, orientation[first + bone])
+            turn(way, nail, mirror, axes, orientation[first + bone])
         for i in range(3):
             inset = radius[first + 3] * way[i]
             position[first + 3, i] = joints[4 + 4 * finger, i] - inset
@@ -106,7 +107,7 @@ def place(joints, state, base_frames, metacarpals, radius, mirror, position, ori
         position[0, i] = 0.5 * (position[11, i] + position[12, i])
         way[i] = position[11, i] - position[1, i]
         nail[i] = frames[0, i, 0]
-    turn(way, nail, mirror, orientation[1])
+    turn(way, nail, mirror, axes, orientation[1])
     for i in range(4):
         orientation[0, i] = orientation[11, i]
     for joint in range(26):
@@ -115,7 +116,7 @@ def place(joints, state, base_frames, metacarpals, radius, mirror, position, ori
 
 
 @compiled
-def turn(way, hinge, mirror, out):
+def turn(way, hinge, mirror, axes, out):
     """Quaternion (4,) x y z w of a bone's axes in the world: its direction, and the axis about
     which it bends, both (3,) in the camera's frame.
     """
@@ -126,23 +127,9 @@ def turn(way, hinge, mirror, out):
     y0, y1, y2 = d1 * h2 - d2 * h1, d2 * h0 - d0 * h2, d0 * h1 - d1 * h0
     length = math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)
     y0, y1, y2 = y0 / length, y1 / length, y2 / length
-    x0, x1, x2 = d1 * y2 - d2 * y1, d2 * y0 - d0 * y2, d0 * y1 - d1 * y0
-    z0, z1, z2 = -d0, -d1, -d2
-    # Of the four ways to read a quaternion off a rotation the one with the largest part first.
-    terms = (1 + x0 - y1 - z2, 1 - x0 + y1 - z2, 1 - x0 - y1 + z2, 1 + x0 + y1 + z2)
-    best = 0
-    for i in range(1, 4):
-        if terms[i] > terms[best]:
-            best = i
-    if best == 0:
-        q = (terms[0], y0 + x1, z0 + x2, y2 - z1)
-    elif best == 1:
-        q = (y0 + x1, terms[1], z1 + y2, z0 - x2)
-    elif best == 2:
-        q = (z0 + x2, z1 + y2, terms[2], x1 - y0)
-    else:
-        q = (y2 - z1, z0 - x2, x1 - y0, terms[3])
-    length = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    sign = -1.0 if q[3] < 0 else 1.0
+    axes[0, 0], axes[1, 0], axes[2, 0] = d1 * y2 - d2 * y1, d2 * y0 - d0 * y2, d0 * y1 - d1 * y0
+    axes[0, 1], axes[1, 1], axes[2, 1] = y0, y1, y2
+    axes[0, 2], axes[1, 2], axes[2, 2] = -d0, -d1, -d2
+    q = quaternion_of(axes)
     for i in range(4):
-        out[i] = sign * q[i] / length
+        out[i] = -q[i] if q[3] < 0 else q[i]

@@ -86,37 +86,7 @@ def _move(state, prior, settings, sums):
 
 
 @compiled
-def _refine(state, prior, keypoints, seen, shape, surface, settings, work):
-    """All iterations on one hand, see refine_hands; keypoints: (21, 3) and (21,)."""
-    base_frames, base, lengths, mirror = shape
-    index, centres, semi_axes = surface
-    iterations, points, _, _, deviation, _, _ = settings
-    hand, posed, matched, within, wrenches, twists, sums = work
-    frames, joints, axes = hand
-    xyz, distance, nearest = matched
-    known = keypoints[1]
-    pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
-    count = choose_points(seen[0], joints, points, within, xyz)
-    informed = count > 0
-    for j in range(len(known)):
-        informed |= known[j] > 0 and known[j] < np.inf
-    if not informed:
-        return
-    for _ in range(iterations):
-        pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
-        pose_ellipsoids(frames, joints, index, centres, semi_axes, posed)
-        joint_axes(frames, base_frames, mirror, axes)
-        clear(wrenches)
-        nearest_ellipsoids(xyz, count, posed, distance, nearest)
-        add_points(matched, count, index, posed, hand, settings, wrenches)
-        add_silhouette(seen, lengths, hand, deviation, wrenches)
-        add_keypoints(keypoints[0], keypoints[1], hand, wrenches)
-        assemble(wrenches, hand, twists, sums)
-        _move(state, prior, settings, sums)
-
-
-@compiled
-def scratch(ellipsoids, points, seen):
+def _scratch(ellipsoids, points, seen):
     """What one thread works in.
 
     Of the hand: frames (16, 3, 3), joints (21, 3), axes of the angles (21, 3).  Its ellipsoids
@@ -154,14 +124,36 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings, coun
     settings: iterations, points, reach_m, point_m, silhouette_px, angle_rad, damping.
     counter: (1,) int64 hands taken.
     """
-    mine = scratch(len(surface[0]), min(settings[1], len(seen[0])), len(seen[0]))
+    base_frames, base, lengths, mirror = shape
+    index, centres, semi_axes = surface
+    iterations, points, _, _, deviation, _, _ = settings
+    hand, posed, matched, within, wrenches, twists, sums = _scratch(
+        len(index), min(points, len(seen[0])), len(seen[0])
+    )
+    frames, joints, axes = hand
+    xyz, distance, nearest = matched
     while True:
         i = take(counter)
         if i >= len(states):
             break
-        row = i % max(1, len(keypoints[0]))
-        known = keypoints[0][row], keypoints[1][row]
-        _refine(states[i], priors[i], known, seen, shape, surface, settings, mine)
+        state, row = states[i], i % max(1, len(keypoints[0]))
+        known, sigma = keypoints[0][row], keypoints[1][row]
+        pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
+        count = choose_points(seen[0], joints, points, within, xyz)
+        informed = count > 0
+        for j in range(len(sigma)):
+            informed |= sigma[j] > 0 and sigma[j] < np.inf
+        for _ in range(iterations if informed else 0):
+            pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
+            pose_ellipsoids(frames, joints, index, centres, semi_axes, posed)
+            joint_axes(frames, base_frames, mirror, axes)
+            clear(wrenches)
+            nearest_ellipsoids(xyz, count, posed, distance, nearest)
+            add_points(matched, count, index, posed, hand, settings, wrenches)
+            add_silhouette(seen, lengths, hand, deviation, wrenches)
+            add_keypoints(known, sigma, hand, wrenches)
+            assemble(wrenches, hand, twists, sums)
+            _move(state, priors[i], settings, sums)
 
 
 class CompiledRefiner:

@@ -6,7 +6,7 @@ derivative n. So w w' and w times the residual are first summed up frame by fram
 of freedom come in once for all of them. Distances to the ellipsoids are float32 over all points
 side by side; everything else is float64.
 
-Throughout, `hand` is what gauss_newton_numba.scratch says of a posed hand: its frames (16, 3, 3),
+Throughout, `hand` is what gauss_newton_numba._scratch says of a posed hand: its frames (16, 3, 3),
 joints (21, 3) and the axes of its angles (21, 3); `wrenches` (16, 7, 6) are the sums of each frame,
 those with the residuals in the last row.
 """
@@ -48,11 +48,13 @@ def choose_points(points, joints, count, within, chosen):
         for j in range(21):
             total += joints[j, i]
         middle[i] = np.float32(total / 21)
+    x, y, z = middle[0], middle[1], middle[2]
     near = 0
     for p in range(len(points)):
         # One after the other, without a branch: what is not near is overwritten.
         within[near] = p
-        near += _within(points[p], middle)
+        a, b, c = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+        near += a * a + b * b + c * c < _REACH
     stride = max(1, (near + count - 1) // count)
     found = 0
     for rank in range(0, near, stride):
@@ -60,12 +62,6 @@ def choose_points(points, joints, count, within, chosen):
             chosen[i, found] = points[within[rank], i]
         found += 1
     return found
-
-
-@compiled
-def _within(point, middle):
-    a, b, c = point[0] - middle[0], point[1] - middle[1], point[2] - middle[2]
-    return a * a + b * b + c * c < _REACH
 
 
 @compiled
@@ -274,7 +270,7 @@ def assemble(wrenches, hand, twists, sums):
             for i in range(7):
                 for j in range(6):
                     to[i, j] += wrenches[of, i, j]
-    dof = 6
+    dof = np.int64(6)  # no literal, for which numba compiles _couple once more
     for finger in range(5):
         first = dof
         for bone in range(3):

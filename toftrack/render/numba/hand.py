@@ -188,14 +188,16 @@ def _flexed(frame, x, slot):
 
 
 @compiled
-def project_hands(frames, frame_index, surface, fx, fy, px, py, width, height, out, boxes):
+def project_hands(frames, frame_index, surface, k, width, height, out, boxes):
     """Coefficients of the ellipsoids of LANES hands, see the module's text.
 
+    k: fx, fy, cx, cy.
     surface: (E + 1, 9) centre and S (xx, xy, xz, yy, yz, zz) in the ellipsoid's frame.
     out: (E + 1, TERMS * LANES), in pixels and 1/m; half height -1 where there is nothing to draw.
     boxes: (4 * LANES,), first and one-past-last column and row in the image of all ellipsoids but
     the last, the wrist's.
     """
+    fx, fy, px, py, width, height = k[0], k[1], k[2], k[3], np.float32(width), np.float32(height)
     left, top = splat(width), splat(height)
     right, bottom = splat(_ZERO), splat(_ZERO)
     for e in range(frame_index.shape[0]):

@@ -98,7 +98,7 @@ def _render(conics, i, box, origin, stride, tile, spans, lines, places):
     left_most, right_most = np.float32(left - origin), np.float32(right - 1 - origin)
     # The last block that is drawn may reach so far.
     utmost = right_most + np.float32(BLOCK - 1)
-    listed = 0
+    listed = np.int64(0)  # no literal, for which numba compiles what it is passed to once more
     for e in range(conics.shape[0] - 1):
         conic = conics[e]
         high, dx = conic[HY * LANES + i], conic[DX * LANES + i]
@@ -139,7 +139,7 @@ def _render(conics, i, box, origin, stride, tile, spans, lines, places):
                 listed += min(BLOCK, rows - row)
                 if listed > _LISTED - BLOCK:
                     _draw(lines, places, listed, tile)
-                    listed = 0
+                    listed = np.int64(0)
     _draw(lines, places, listed, tile)
 
 
@@ -219,41 +219,26 @@ def pack_evidence(low, high, occluder, hand):
 
 
 @entry_point
-def score_hands(
-    states,
-    k,
-    images,
-    hand,
-    height,
-    width,
-    steps,
-    slots,
-    base,
-    lengths,
-    mirror,
-    index,
-    surface,
-    counter,
-    out,
-):
+def score_hands(states, frame, shape, counter, out):
     """Score particles as long as `counter` has any; called from several threads.
 
     A task is LANES of them, the last ones fewer, so that no thread waits long for another.
 
-    states: (N, 27).  k: fx, fy, cx, cy.  images, hand: of pack_evidence, for `width` columns.
-    steps: of disc_steps.  slots .. surface: see NumbaScorer.
+    states: (N, 27).  shape: see NumbaScorer.
+    frame: k (fx, fy, cx, cy), images and hand of pack_evidence, the image's height and width, steps
+        of disc_steps, and the farthest row of these.
     counter: (1,) int64 tasks taken.  out: (4, N) correct, false, missed, residual.
     """
-    reach, parts = 0, hand.shape[0] - 1
-    for i in range(steps.shape[0]):
-        reach = max(reach, steps[i, 1])
+    k, images, hand, height, width, steps, reach = frame
+    slots, base, lengths, mirror, index, surface = shape
+    parts = hand.shape[0] - 1
     whole = max(states.shape[0] // LANES - 2, 0)
     x = np.empty(27 * LANES, np.float32)
     frames = np.empty((16, 12 * LANES), np.float32)
     valid = np.empty(LANES, np.uint8)
     conics = np.empty((index.shape[0], TERMS * LANES), np.float32)
     boxes = np.empty(4 * LANES, np.float32)
-    tile = _zeros(0)
+    tile = np.empty(0, np.float32)
     spans = np.empty(2 * (height + BLOCK), np.float32)
     lines, places = np.empty(5 * _LISTED, np.float32), np.empty(_LISTED, np.int32)
     model = np.empty((parts + 3, height + 2 * (reach + WORDS)), np.uint64)
@@ -267,19 +252,7 @@ def score_hands(
         if first >= states.shape[0]:
             break
         pose_hands(states, first, slots, base, lengths, mirror, x, frames, valid)
-        project_hands(
-            frames,
-            index,
-            surface,
-            k[0],
-            k[1],
-            k[2],
-            k[3],
-            np.float32(width),
-            np.float32(height),
-            conics,
-            boxes,
-        )
+        project_hands(frames, index, surface, k, width, height, conics, boxes)
         for i in range(min(count, states.shape[0] - first)):
             for j in range(4):
                 out[j, first + i] = _ZERO

@@ -49,7 +49,7 @@ class NumbaScorer:
         x = _array(states, np.float32)
         counts = np.empty((4, len(x)), np.float32)
         tasks = np.zeros(1, np.int64)
-        given = x, *self._packed(evidence), *self._hand, tasks, counts
+        given = x, self._packed(evidence), self._hand, tasks, counts
         # A second thread is not worth waking for less than a task of its own.
         run_shared(functools.partial(score_hands, *given), len(x) // LANES)
         if states.device.type == "cpu":
@@ -68,13 +68,15 @@ class NumbaScorer:
                 _array(evidence.occluder, np.float32),
                 _array(evidence.hand, np.bool_),
             )
+            steps = disc_steps(disc_square(evidence.radius_px, height, width), height, width)
             packed = (
                 np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
                 images,
                 hand,
                 height,
                 width,
-                disc_steps(disc_square(evidence.radius_px, height, width), height, width),
+                steps,
+                int(steps[:, 1].max()),
             )
             self._frame = evidence, packed
         return packed
