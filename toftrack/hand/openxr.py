@@ -21,8 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
-from toftrack.compute.rotations import rotvec_to_rotmat, unitquat_to_rotmat
+from toftrack.compute.rotations import unitquat_to_rotmat
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
@@ -136,7 +137,7 @@ def openxr_hand(joints_m: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> Open
 
 def _placed(joints: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> tuple[np.ndarray, np.ndarray]:
     """(N, 21, 3) and (N, 27) to positions (N, 26, 3) and quaternions (N, 26, 4) in the world."""
-    palm = rotvec_to_rotmat(torch.from_numpy(state[:, 3:6])).numpy()
+    palm = Rotation.from_rotvec(state[:, 3:6]).as_matrix()
     if rig.mirrored:
         palm = palm * np.array([-1.0, 1.0, 1.0])
     metacarpals = joints[:, :1] + rig.metacarpals_m @ palm.swapaxes(1, 2)
@@ -153,7 +154,7 @@ def _placed(joints: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> tuple[np.n
     nails /= _length(nails)
     ways, nails = _WORLD * ways, _WORLD * nails
     axes = np.stack((_cross(ways, nails), nails, -ways), -1)  # X = Y x Z = -Z x Y
-    turned = _quaternions(axes.reshape(-1, 9))
+    turned = Rotation.from_matrix(axes.reshape(-1, 3, 3)).as_quat(canonical=True)
 
     position = np.empty((len(joints), 26, 3))
     position[:, _SAME_THERE] = _WORLD * joints[:, _SAME]
@@ -232,35 +233,6 @@ def _thickness(points: np.ndarray, ways: np.ndarray, flesh: Ellipsoids) -> np.nd
     up = np.where(inside, (root - b) / a, 0).max(1)
     down = np.where(inside, (root + b) / a, 0).max(1)
     return up + down
-
-
-def _bar_itzhack() -> np.ndarray:
-    """(10, 16): a rotation's 9 numbers and a 1 to the 16 of 4 q q', q = x y z w."""
-    terms = np.zeros((10, 4, 4))
-    signum = np.array([[1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1]])
-    terms[9] = np.eye(4)
-    for axis in range(3):
-        terms[4 * axis, range(4), range(4)] = signum[:, axis]
-        after, before = (axis + 1) % 3, (axis + 2) % 3
-        for row, column, sign in ((before, after, 1), (after, before, -1)):
-            terms[3 * row + column, [axis, 3], [3, axis]] = sign
-            terms[3 * row + column, [after, before], [before, after]] = 1
-    return terms.reshape(10, 16)
-
-
-_TERMS = _bar_itzhack()
-
-
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """(M, 9) proper rotations, row by row, to (M, 4) unit quaternions x y z w with w >= 0.
-
-    4 q q' is linear in the rotation, and its row with the largest diagonal is the most exact (Bar-
-    Itzhack, J. Guidance 23(6), 2000). Much faster than scipy's on few rotations.
-    """
-    products = (rotations @ _TERMS[:9] + _TERMS[9]).reshape(-1, 4, 4)
-    rows = np.arange(len(products))
-    best = products[rows, products.diagonal(axis1=1, axis2=2).argmax(1)]
-    return best * (np.where(best[:, 3:] < 0, -1.0, 1.0) / _length(best))
 
 
 def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
