@@ -223,8 +223,7 @@ def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
 
     def step(index: int, anew: bool = False) -> tuple[float, Mapping[str, float]]:
         if anew:
-            hands = tuple(replace(hand, track=None) for hand in tracker.state.hands)
-            tracker.state = replace(tracker.state, hands=hands)
+            tracker.state = replace(tracker.state, tracks=())
         depth, radial = frames[index % len(frames)]
         began = time.perf_counter()
         rectified = camera.rectify(depth, radial)

@@ -16,14 +16,14 @@ from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.parts import ALL_HAND, Parts
-from toftrack.detector.proposals import NetworkOutput, Places, find_hands, start_finding
+from toftrack.detector.proposals import NetworkOutput, Places, start_finding
 from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 
-_AGAIN = 2.0
-"""Places whose merit is so much lower than the best are not considered again."""
+_AGAIN = 3.0
+"""The first look may be so much worse than what a hand needs: the second one is more exact."""
 _DOUBT_M = 0.06
 """How far off a finger's outer joints may be that lies in another one, by the keypoints."""
 _CLEAR_M = 0.010
@@ -176,43 +176,27 @@ class HandDetector:
         wait = start_pose_network(self.pose, depth_m, k, centre_m, side, up)
         return lambda: _detection(wait(), 0)
 
-    def search(
-        self,
-        depth_m: np.ndarray,
-        k: np.ndarray,
-        side: str,
-        likely: Callable[[np.ndarray], float] = lambda centre_m: 0.0,
+    def look(
+        self, depth_m: np.ndarray, k: np.ndarray, places: Places, side: str
     ) -> list[Detection]:
-        """Detection at all places where a hand may be, the best first. There is one where `merit`
-        exceeds that of the settings.
+        """Hands of a side at places of the finder, the best first; those that may be none are left
+        out, by the `merit` of the settings.
 
-        likely: what is known of places (3,) besides the image, log scale.
-
-        At the best places poses are proposed twice, the second time about the palm that was found
+        At the better places poses are proposed twice, the second time about the palm that was found
         with its fingers upright: they are the more exact the nearer the crop's centre is to the
         middle of the palm.
         """
-        cfg = self.settings
-        found = find_hands(self.finder, depth_m, k, cfg.places, cfg.least)
-        centres, heat = found.centre_m, found.probability
-        detections = self.detect(depth_m, k, centres, side)
-
-        def merits() -> np.ndarray:
-            both = zip(detections, heat, strict=True)
-            return np.array([merit(g, p) + likely(g.centre_m.numpy()) for g, p in both])
-
-        first = merits()
-        good = [row for row in range(len(first)) if first[row] > first.max() - _AGAIN]
-        again = np.array([detections[row].centre_m.numpy() for row in good]).reshape(-1, 3)
-        up = np.array([detections[row].up for row in good]).reshape(-1, 3)
-        for row, detection in zip(good, self.detect(depth_m, k, again, side, up), strict=True):
-            detections[row] = detection
-        second = merits()
-        order = np.argsort(-second, kind="stable")
-        return [
-            replace(detections[row], heat=float(heat[row]), merit=float(second[row]))
-            for row in order
+        least = self.settings.merit
+        first = self.detect(depth_m, k, places.centre_m, side)
+        both = zip(first, places.probability, strict=True)
+        good = [(one, float(heat)) for one, heat in both if merit(one, heat) > least - _AGAIN]
+        again = np.array([one.centre_m.numpy() for one, _ in good]).reshape(-1, 3)
+        up = np.array([one.up for one, _ in good]).reshape(-1, 3)
+        found = [
+            replace(one, heat=heat, merit=merit(one, heat))
+            for one, (_, heat) in zip(self.detect(depth_m, k, again, side, up), good, strict=True)
         ]
+        return sorted((one for one in found if one.merit > least), key=lambda one: -one.merit)
 
     def start_search(self, depth_m: np.ndarray, k: np.ndarray) -> Callable[[], Places]:
         """Where hands may be, the first part of a search; begun beside whatever can do without."""

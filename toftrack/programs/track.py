@@ -99,8 +99,7 @@ def _notes(parts: _Parts) -> tuple[str, ...]:
 
 def _given_side(tracker: HandsTracker) -> str | None:
     """Of the only hand, by the configuration or in a view; None where it is detected."""
-    one = tracker.states[0]
-    return one.side if len(tracker.states) == 1 and one.handedness.given else None
+    return tracker.state.told if len(tracker.states) == 1 else None
 
 
 def _run(config: DictConfig, device: Device, parts: _Parts) -> float:

@@ -7,7 +7,6 @@ and filtering for human motion capture", IJCV 87, 2010): what the filter and the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +21,6 @@ from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import out_of_sight
-from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
 from toftrack.tracking.posterior import (
     ImageTerm,
@@ -33,7 +31,7 @@ from toftrack.tracking.posterior import (
     Term,
 )
 from toftrack.tracking.select import Hypotheses, Source
-from toftrack.tracking.state import HandState, Track
+from toftrack.tracking.state import Track
 
 _SURELY_PRESENT = 0.97
 """Probability of a hand from which on the network is believed which pixels are the hand's arm: a
@@ -58,29 +56,23 @@ class of what it does not see."""
 
 
 @dataclass(frozen=True, eq=False)
-class HandFrame:
-    """One hand in one frame: what is compared with what.
+class View:
+    """A track's hand in one frame: what its poses are compared with.
 
-    slot: of the hand.  hand: its state as of this frame.  track: the track that goes on or begins.
     fitted: the hand as it is applied.  observation: not empty.
     expected_m: the depth at which its nearest joint was expected; 0 where the track begins.
-    detection: what the detector says of it, and `pending` waits for it where it is still computed.
-    others: hands that are tracked as well.  image: the likelihood of the image.
-    mirrored: where the sides are to be compared, waits for what the detector says of the other one.
+    detection: what the pose network says of it; empty where it was not asked.
+    others: (21, 3) each, joints of other hands.  image: the likelihood of the image.
     """
 
-    slot: int
-    hand: HandState
     track: Track
     fitted: FittedHand
     observation: Observation
     expected_m: float
     detection: Detection
-    pending: Callable[[], Detection]
-    others: tuple[OtherHand, ...]
+    others: tuple[Tensor, ...]
     image: ImageTerm
     model: TrackerModel
-    mirrored: Callable[[], Detection] | None = None
 
     @cached_property
     def hidden(self) -> bool:
@@ -95,47 +87,45 @@ class HandFrame:
         hiding_m = seen.depth_m * seen.occluder  # not another hand: the networks know both apart
         return out_of_sight(joints, hiding_m, seen.k)[1] > _COVERED
 
+    @cached_property
+    def keypoints(self) -> Keypoints:
+        """The detection's, as the refinement takes them."""
+        return keypoints_of(self.detection, self.model)
 
-@dataclass(frozen=True, eq=False)
-class FilteredFrame:
-    """A hand's frame after the filter, with what its candidates are compared by.
-
-    pose: (1, 27) the filter's estimate.
-    keypoints: as the refinement takes them.
-    """
-
-    frame: HandFrame
-    pose: Tensor
-    keypoints: Keypoints
-    posterior: Posterior
-    seen: SeenPoints
-
-    @classmethod
-    def of(cls, frame: HandFrame, mean: Tensor) -> FilteredFrame:
-        """mean: (1, 6 + d) of the particles."""
-        detection, model = frame.detection, frame.model
-        posterior = posterior_of(
-            frame.observation, frame.fitted, detection, frame.others, model, frame.image
-        )
-        keypoints = keypoints_of(detection, model)
-        return cls(frame, model.decode(mean), keypoints, posterior, seen_points(frame.observation))
+    @cached_property
+    def seen(self) -> SeenPoints:
+        """The points that poses are brought onto."""
+        return seen_points(self.observation)
 
     def refined(self, poses: Tensor) -> Tensor:
         """Hands (N, 27) brought onto the seen points and the keypoints."""
-        cfg, refiner = self.frame.model.refinement, self.frame.fitted.refiner
-        return refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
+        cfg = self.model.refinement
+        return self.fitted.refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
+
+    def posterior(self, keypoints: float | None = None) -> Posterior:
+        """The posterior of the hand's pose.  keypoints: their weight, instead of its own."""
+        weights, terms = self.model.weights, dict[str, Term]()
+        keypoints = weights.keypoints if keypoints is None else keypoints
+        if keypoints and not self.detection.empty:
+            terms["keypoints"] = KeypointsTerm(self.keypoints, keypoints)
+        if weights.overlap:
+            terms["overlap"] = OverlapTerm(self.fitted.shape.hand_length_m, weights.overlap)
+        if weights.other_hand:
+            for number, joints in enumerate(self.others):
+                terms[f"other hand {number}"] = OtherHandTerm(joints, weights.other_hand)
+        return Posterior(self.image, self.fitted.refiner.joints, terms)
 
 
-def with_parts(frame: HandFrame) -> HandFrame:
-    """The frame with what the pose network says of its pixels: those of a thing in the hand are not
+def with_parts(view: View) -> View:
+    """The view with what the pose network says of its pixels: those of a thing in the hand are not
     the hand's, and where something hides the hand, those of its own arm do not.
     """
-    seen = without_things(frame.observation, frame.detection)
-    if frame.hidden and frame.detection.present >= _SURELY_PRESENT:
-        seen = with_own_arm(seen, frame.detection)
-    if seen is frame.observation:
-        return frame
-    return replace(frame, observation=seen, image=image_term(seen, frame.fitted, frame.model))
+    seen = without_things(view.observation, view.detection)
+    if view.hidden and view.detection.present >= _SURELY_PRESENT:
+        seen = with_own_arm(seen, view.detection)
+    if seen is view.observation:
+        return view
+    return replace(view, observation=seen, image=image_term(seen, view.fitted, view.model))
 
 
 def image_term(
@@ -147,35 +137,6 @@ def image_term(
     """The likelihood of a segmented image, which is not empty."""
     evidence = model.likelihood.evidence(observation).to(model.device)
     return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
-
-
-def posterior_of(
-    observation: Observation,
-    fitted: FittedHand,
-    detection: Detection,
-    others: Sequence[OtherHand],
-    model: TrackerModel,
-    image: ImageTerm,
-    keypoints: float | None = None,
-) -> Posterior:
-    """The posterior of one hand in one frame; terms of weight 0 are left out.
-
-    keypoints: the weight of these, instead of the posterior's own.
-    """
-    weights, terms = model.weights, dict[str, Term]()
-    keypoints = weights.keypoints if keypoints is None else keypoints
-    keypoints = 0.0 if detection.empty else keypoints
-    if keypoints:
-        terms["keypoints"] = KeypointsTerm(keypoints_of(detection, model), keypoints)
-    if weights.overlap:
-        terms["overlap"] = OverlapTerm(fitted.shape.hand_length_m, weights.overlap)
-    if weights.other_hand:
-        touched = [other.joints_m for other in others if other.certain]
-        terms |= {
-            f"other hand {n}": OtherHandTerm(joints, weights.other_hand)
-            for n, joints in enumerate(touched)
-        }
-    return Posterior(image, fitted.refiner.joints, terms)
 
 
 def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
@@ -217,58 +178,45 @@ def detected_poses(
     return torch.cat((fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
 
 
-def best_start(
-    detection: Detection,
-    observation: Observation,
-    fitted: FittedHand,
-    posterior: Posterior,
-    model: TrackerModel,
-) -> tuple[Tensor, float]:
-    """The best (1, 27) of the detector's poses, as they are and refined, and its log posterior."""
-    cfg, count = model.refinement, model.detector.settings.hypotheses
-    poses = detected_poses(detection, observation, fitted, model, count)
-    if cfg.iterations:
-        seen, keypoints = seen_points(observation), keypoints_of(detection, model)
-        better = fitted.refiner(poses, poses[:, 6:], seen, cfg, keypoints)
-        poses = torch.cat((poses, better))
-    values = posterior(poses)
+def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, float]:
+    """The best (1, 27) of the detector's poses, as they are and refined, and its log posterior.
+
+    keypoints: their weight in the posterior, instead of its own.
+    """
+    model = view.model
+    count = model.detector.settings.hypotheses
+    poses = detected_poses(view.detection, view.observation, view.fitted, model, count)
+    if model.refinement.iterations:
+        poses = torch.cat((poses, view.refined(poses)))
+    values = view.posterior(keypoints)(poses)
     best = int(values.argmax())
     return poses[best][None], float(values[best])
 
 
-def propose(filtered: FilteredFrame) -> Hypotheses:
+def propose(view: View, mean: Tensor) -> Hypotheses:
     """The scored hypotheses of a frame's hand: the last frame's fingers where the filter has the
-    hand, the filter's estimate, and the detector's likeliest pose; refined.
+    hand, the filter's estimate (1, 27), and the detector's likeliest pose; refined.
 
-    A hand that is mostly covered is held where it was.
+    A hand that is mostly covered is held where it was. Poses that explain nothing of the image once
+    they are refined stay as they were proposed: of a hand that leaves the image a few points are
+    left, which may draw it anywhere.
     """
-    frame, track, state = filtered.frame, filtered.frame.track, filtered.pose
-    model = frame.model
+    model, posterior = view.model, view.posterior()
     if not model.refinement.iterations:
-        return _refined(Hypotheses.of(state, Source.DYNAMICS), filtered)
-    if frame.covered:
-        held = Hypotheses.of(track.pose, Source.PREVIOUS)
-        return replace(held, log_posterior=filtered.posterior(track.pose))
-    detected = detected_poses(frame.detection, frame.observation, frame.fitted, model, 1)
-    previous = torch.cat((state[:, :6], track.pose[:, 6:]), 1)
+        return replace(Hypotheses.of(mean, Source.DYNAMICS), log_posterior=posterior(mean))
+    if view.covered:
+        held = Hypotheses.of(view.track.pose, Source.PREVIOUS)
+        return replace(held, log_posterior=posterior(view.track.pose))
+    detected = detected_poses(view.detection, view.observation, view.fitted, model, 1)
+    previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
     tables = [
         Hypotheses.of(previous, Source.PREVIOUS),
-        Hypotheses.of(state, Source.DYNAMICS),
+        Hypotheses.of(mean, Source.DYNAMICS),
         Hypotheses.of(detected, Source.DETECTOR),
     ]
-    return _refined(Hypotheses.joined(tables), filtered)
-
-
-def _refined(table: Hypotheses, filtered: FilteredFrame) -> Hypotheses:
-    """The same table, refined and scored.
-
-    Poses that then explain nothing of the image stay as they were proposed: of a hand that leaves
-    the image a few points are left, which may draw it anywhere.
-    """
-    pose = table.pose
-    if filtered.frame.model.refinement.iterations:
-        pose = filtered.refined(pose)
-    values = filtered.posterior(pose)
+    table = Hypotheses.joined(tables)
+    pose = view.refined(table.pose)
+    values = posterior(pose)
     pose = torch.where(values.isneginf()[:, None], table.pose, pose)
     return replace(table, pose=pose, log_posterior=values)
 

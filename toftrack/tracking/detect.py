@@ -1,161 +1,121 @@
-"""When and where a hand is detected."""
+"""What the networks say of an image: at the tracks' places, and where else hands may be."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 
 from toftrack.compute.pace import Duration
-from toftrack.detector.hand_detector import NO_DETECTION, Detection, DetectorSettings
-from toftrack.detector.proposals import SAME_PLACE_M
-from toftrack.frames import DepthImage
-from toftrack.render.segmentation import Expected
+from toftrack.compute.threads import threads
+from toftrack.detector.hand_detector import Detection
+from toftrack.detector.proposals import SAME_PLACE_M, Places
+from toftrack.tracking.association import Seen
 from toftrack.tracking.confidence import log_odds
-from toftrack.tracking.filter import predicted_palm
-from toftrack.tracking.handedness import OTHER_SIDE
-from toftrack.tracking.hands import OtherHand
-from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.state import HandState, Track
+from toftrack.tracking.scene import Scene
+from toftrack.tracking.sides import comparison_due
+from toftrack.tracking.state import NO_PLACES, OTHER_SIDE, TrackerState
 
-_AS_WELL = 1.3
-"""Hands are seen about as well when their expected errors differ by less than this factor ..."""
-_WELL_M = 0.02
-"""... or are both smaller than this."""
-_IN_FRONT_M = 0.03
-"""What is so much nearer than a hidden hand is what hides it."""
-_STEP_M, _SPEED_M_S = 0.04, 0.25
-"""How far a hand has moved since it was last believed: at once, and a second."""
-_ANYWHERE = -1.5
-"""Log probability of a place if the hand was not where it was last believed."""
-RARE_S = 0.1
-"""After so long a prediction says little: the hand is found anew in the whole image as well."""
-FORGOTTEN_S = 1.0
-"""After so long nothing is known of where a hand is that was believed."""
-_AGAIN_S, _WATCHED_AGAIN_S = 1.5, 6.0
-"""What was taken for a hand and was none is left alone for so long, if it stays where it is."""
+_RARE_S = 0.1
+"""After so long a prediction says little: hands are looked for in the whole image first."""
+_AS_WELL, _WELL_M = 1.3, 0.02
+"""Hands are seen about as well when their expected errors differ by less than this factor, or are
+both smaller than this."""
 
 
-def search_due(hand: HandState, model: TrackerModel, dt_s: float = 0.0) -> bool:
-    """Whether the whole image is searched: while no hand is believed, or where frames are rare."""
-    if hand.track is not None and not hand.track.doubted:
-        return dt_s > RARE_S
-    frames = model.detector.settings.search
-    return frames == 1 or Duration(hand.searched_s).reached(frames)
+def detected(
+    scene: Scene, state: TrackerState
+) -> tuple[list[Seen], TrackerState, Callable[[], Places] | None]:
+    """All detections of a frame; the state with the time of the finder's look, and what waits for
+    its places where they are only needed in the next frame.
 
-
-def detection_due(track: Track, settings: DetectorSettings, dt_s: float) -> bool:
-    """Whether the pose network is asked about a hand that is followed; not always if it is sure."""
-    sure = not track.doubted and track.log_odds > log_odds(settings.sure)
-    waited = Duration(track.unseen_s + dt_s).reached(settings.every)
-    return not sure or waited
-
-
-def search(
-    hand: HandState, image: DepthImage, others: Sequence[OtherHand], model: TrackerModel
-) -> Detection:
-    """The hand in the whole image that may be this one, or NO_DETECTION."""
-    detector, side, least = model.detector, hand.side, model.detector.settings.merit
-    likely = partial(reachable, hand, [other.centre_m for other in others])
-    found = detector.search(image.depth_m, image.k, side, likely)
-    found = [one for one in found if one.merit > least]
-    undecided = not hand.handedness.given
-    alone = hand.track is None and not any(other.believed for other in others)
-    of_other: list[Detection] = []
-    if undecided and alone and (not found or not hand.seen.ever):
-        # A hand of the other side may be too unlike one of this to be found as such.
-        mirrored = detector.search(image.depth_m, image.k, OTHER_SIDE[side], likely)
-        mirrored = [one for one in mirrored if one.merit > least]
-        of_other = [
-            one
-            for one in mirrored
-            if all((one.centre_m - it.centre_m).norm() > SAME_PLACE_M for it in found)
-        ]
-        found = [*found, *of_other]
-    if undecided and not hand.seen.ever:
-        found = held_out(found)
-    if not found:
-        return NO_DETECTION
-    if not any(found[0] is one for one in of_other):
-        return found[0]
-    centre, up = found[0].centre_m.numpy()[None], np.asarray(found[0].up)[None]
-    return detector.detect(image.depth_m, image.k, centre, side, up)[0]
-
-
-def detect(
-    hand: HandState, track: Track, image: DepthImage, model: TrackerModel, dt_s: float
-) -> Detection:
-    """What the pose network says where a hand is predicted."""
-    fitted = model.hand(hand.side, hand.shape)
-    centre, up = predicted_palm(track, dt_s, fitted, model)
-    return model.detector.detect(image.depth_m, image.k, centre, hand.side, up)[0]
-
-
-def start_detection(
-    hand: HandState, track: Track, image: DepthImage, model: TrackerModel, dt_s: float
-) -> Callable[[], Detection]:
-    """The same, begun beside whatever does not need it; what is returned waits for it."""
-    fitted = model.hand(hand.side, hand.shape)
-    centre, up = predicted_palm(track, dt_s, fitted, model)
-    return model.detector.start(image.depth_m, image.k, centre[0], hand.side, up[0])
-
-
-def is_elsewhere(
-    detection: Detection, hand: HandState, track: Track, model: TrackerModel, dt_s: float
-) -> bool:
-    """Whether a hand was detected at another place than where a track is predicted."""
-    if detection.empty:
-        return False
-    centre = predicted_palm(track, dt_s, model.hand(hand.side, hand.shape), model)[0][0]
-    return bool(np.linalg.norm(detection.centre_m.numpy() - centre) > SAME_PLACE_M)
-
-
-def expected_of(detection: Detection) -> Expected:
-    """Where a hand is to be segmented that is not tracked yet."""
-    joints = detection.joints_m[0]
-    nearest, farthest = map(float, joints[:, 2].aminmax())
-    return Expected(nearest, farthest, tuple(detection.centre_m.tolist()))
-
-
-def held_out(found: Sequence[Detection]) -> list[Detection]:
-    """The nearest of those hands that are seen about as well as the best one.
-
-    Where nobody said which hand is meant, it is the one that is held out to the camera.
+    While every hand is surely followed, the finder runs beside the filter, and what it sees is
+    looked at a frame later.
     """
-    if not found:
+    detector, image = scene.model.detector, scene.image
+    reliable = [hand.track.reliable for hand in scene.hands]
+    rare = scene.dt_s > _RARE_S
+    at_once = rare or not all(reliable) or not reliable
+    settings = detector.settings
+    frames = settings.search if at_once or threads() > 1 else max(settings.search, 2)
+    due = frames == 1 or Duration(state.found_s).reached(frames)
+    finding = detector.start_search(image.depth_m, image.k) if due and at_once else None
+    own = [_start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row)]
+    places = state.places
+    if finding is not None:
+        places, finding, state = finding(), None, replace(state, found_s=0.0)
+    seen = [wait() for wait in own]
+    if due and not at_once:
+        finding = detector.start_search(image.depth_m, image.k)
+        state = replace(state, found_s=0.0)
+    known = [] if rare else [h.palm_m[0] for h in scene.hands if h.track.reliable]
+    places = _apart_from([*known, *state.refused[:, :3]], places)
+    if len(places.centre_m):
+        seen += _elsewhere(scene, state, places, rare)
+    return seen, replace(state, places=NO_PLACES), finding
+
+
+def _is_asked(scene: Scene, row: int) -> bool:
+    """Whether the pose network is asked about a track; not always if it is sure."""
+    track, settings = scene.hands[row].track, scene.model.detector.settings
+    sure = track.reliable and track.log_odds > log_odds(settings.sure)
+    waited = Duration(track.asked_s + scene.dt_s).reached(settings.every)
+    return not sure or waited or comparison_due(track, scene.dt_s)
+
+
+def _start(scene: Scene, row: int) -> Callable[[], Seen]:
+    """The detection at a track's place, begun beside whatever does not need it; of both sides where
+    they are to be compared.
+    """
+    hand, image = scene.hands[row], scene.image_for(row)
+    at = image.depth_m, image.k, hand.palm_m[0]
+    side, start = hand.track.side, scene.model.detector.start
+    wait, mirrored = start(*at, side, hand.up_m[0]), None
+    if comparison_due(hand.track, scene.dt_s):
+        mirrored = start(*at, OTHER_SIDE[side], hand.up_m[0])
+    return lambda: Seen(wait(), side, row, None if mirrored is None else mirrored())
+
+
+def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) -> list[Seen]:
+    """What is seen at places of the finder, as a hand of any side that is missing."""
+    image = scene.image if rare else scene.unexplained()
+    tracks = [hand.track for hand in scene.hands]
+    missing = {track.side for track in tracks if rare or not track.reliable}
+    confirmed = [track.side for track in tracks if track.confirmed]
+    if not tracks:
+        missing = {state.told} if state.told else {"right", "left"}
+    elif len(confirmed) == 1:
+        missing.add(OTHER_SIDE[confirmed[0]])
+    seen: list[Seen] = []
+    for side in sorted(missing, reverse=True):  # right first
+        for one in scene.model.detector.look(image.depth_m, image.k, places, side):
+            seen.append(Seen(one, side))
+    seen.sort(key=lambda one: -one.detection.merit)
+    return seen if tracks or state.told else held_out_first(seen)
+
+
+def _apart_from(known: Sequence[np.ndarray], places: Places) -> Places:
+    """The places that are none of the known ones (3,)."""
+    rows = [
+        row
+        for row, at in enumerate(places.centre_m)
+        if all(np.linalg.norm(at - one) > SAME_PLACE_M for one in known)
+    ]
+    return Places(places.centre_m[rows], places.probability[rows])
+
+
+def held_out_first(seen: Sequence[Seen]) -> list[Seen]:
+    """First the nearest of those hands that are seen about as well as the best one: where nobody
+    said which hand is meant, it is the one that is held out to the camera.
+    """
+    if not seen:
         return []
-    most = max(_WELL_M, _AS_WELL * min(float(one.error_m[0]) for one in found))
-    alike = [one for one in found if float(one.error_m[0]) < most]
-    return [min(alike, key=lambda one: float(one.centre_m[2]))]
+    most = max(_WELL_M, _AS_WELL * min(_error_m(one.detection) for one in seen))
+    alike = [one for one in seen if _error_m(one.detection) < most]
+    first = min(alike, key=lambda one: float(one.detection.centre_m[2]))
+    return [first, *(one for one in seen if one is not first)]
 
 
-def reachable(
-    hand: HandState,
-    others_m: Sequence[np.ndarray],
-    centre_m: np.ndarray,
-    apart_m: float = SAME_PLACE_M,
-) -> float:
-    """How likely a hand has come to a place from where it was last believed, log scale.
-
-    Another hand, or the thing that hides the hand, is no place that it has jumped to; nor what was
-    just taken for it and was none.
-
-    others_m: (3,) each, the middles of other hands.  apart_m: nearer to one, it is that hand.
-    """
-    if any(np.linalg.norm(other - centre_m) < apart_m for other in others_m):
-        return -np.inf
-    patience = _WATCHED_AGAIN_S if hand.watched else _AGAIN_S
-    tried = hand.tried.age_s < patience
-    if tried and np.linalg.norm(hand.tried.centre_m - centre_m) < SAME_PLACE_M:
-        return -np.inf
-    # What was never believed may be a thing, and what is nearer the hand.
-    believed = hand.track if hand.believed else None
-    if believed is not None and centre_m[2] < believed.nearest_m - _IN_FRONT_M:
-        return -np.inf
-    if hand.seen.age_s >= FORGOTTEN_S:
-        return 0.0
-    away = float(np.linalg.norm(hand.seen.centre_m - centre_m))
-    near = -0.5 * (away / (_STEP_M + _SPEED_M_S * hand.seen.age_s)) ** 2
-    # Or it was never there.
-    return max(near, _ANYWHERE - float(np.logaddexp(0.0, hand.seen.surest)))
+def _error_m(detection: Detection) -> float:
+    return float(detection.error_m[0])

@@ -41,35 +41,44 @@ def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Ten
     return track.velocity * (settings.velocity * reach_s)
 
 
-def predicted_palm(
-    track: Track, dt_s: float, hand: FittedHand, model: FilterModel
-) -> tuple[np.ndarray, np.ndarray]:
-    """(1, 3) middle of a hand's palm, dt_s after the last frame, and (1, 3) where its fingers
-    point, as long as from the wrist to there.
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """A track's hand as it is expected in a frame.
 
-    Poses are the more exact the nearer the crop's centre is to the middle of the palm, so that a
-    small hand's is not where a large one's would be.
+    pose: (1, 27).  joints_m: (21, 3).
+    palm_m: (1, 3) middle of its palm.  up_m: (1, 3) from its wrist to there, where fingers point.
+        Poses are the more exact the nearer the crop's centre is to the middle of the palm, so that
+        a small hand's is not where a large one's would be.
+    depths: where it is to be segmented.
     """
-    moved = predicted_motion(track, dt_s, model.filter)[None]
-    particle = model.backend.motions.compose(track.mean, moved).numpy()
-    up = np.float32(hand.ratio) * pivot_offset(particle[:, 3:6])
-    centre: np.ndarray = particle[:, :3] + up
-    centre[:, 2] = np.maximum(centre[:, 2], _NEAREST_M)
-    return centre, up
+
+    track: Track
+    fitted: FittedHand
+    pose: Tensor
+    joints_m: Tensor
+    palm_m: np.ndarray
+    up_m: np.ndarray
+    depths: Expected
 
 
-def predicted_depths(track: Track, dt_s: float, hand: FittedHand, model: FilterModel) -> Expected:
-    """Where a hand is to be segmented, dt_s after the last frame."""
+def predict(track: Track, dt_s: float, model: FilterModel) -> Predicted:
+    """A track's hand dt_s after its last frame: moved on, its fingers as they were."""
+    fitted = model.hand(track.side, track.shape)
     moved = predicted_motion(track, dt_s, model.filter)
-    joints = hand.refiner.joints(
-        model.decode(model.backend.motions.compose(track.mean, moved[None]))
-    )[0]
+    tangent = torch.cat((moved[:6], moved.new_zeros(21)))[None]
+    pose = model.backend.motions.compose(track.pose, tangent)
+    joints = fitted.refiner.joints(pose)[0]
+    wrist = pose[:, :6].numpy()
+    up = np.float32(fitted.ratio) * pivot_offset(wrist[:, 3:6])
+    palm = wrist[:, :3] + up
+    palm[:, 2] = np.maximum(palm[:, 2], _NEAREST_M)
     nearest, farthest = map(float, joints[:, 2].aminmax())
     # A hidden finger is free to move in front of what hides it, which would then be taken for the
     # hand: while something hides the hand, it comes nearer only as its middle does.
     approach = _APPROACH_M_S * dt_s + max(0.0, -float(moved[2]))
     nearest = max(nearest, track.nearest_m - approach)
-    return Expected(nearest, farthest, tuple(joints.mean(0).tolist()))
+    depths = Expected(nearest, farthest, tuple(joints.mean(0).tolist()))
+    return Predicted(track, fitted, pose, joints, palm, up, depths)
 
 
 def run_filter(

@@ -27,15 +27,12 @@ from toftrack.render.scoring import Scorer
 from toftrack.render.segmentation import NearestSurface
 from toftrack.tracking.backend import Backend
 from toftrack.tracking.confidence import ConfidenceModel
-from toftrack.tracking.handedness import OTHER_SIDE, HandednessEstimate, HandednessSettings
 from toftrack.tracking.posterior import PosteriorWeights
-from toftrack.tracking.state import HandState, LastSeen, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, Slot, TrackerState
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
-_LONG_S = 1e3
-"""Another hand was looked for so long ago before any frame: it is as soon as there is a first."""
 _HANDS = 32
 """Hands of some side and shape that are kept made."""
 
@@ -44,13 +41,12 @@ _HANDS = 32
 class Hand:
     """The hand of a configuration: a shape, and how it is fitted to the user.
 
-    handedness: how its side is detected.  side_given: it is not, because the user gave it.
+    side_given: the user said its side, which is detected else.
     """
 
     shape: HandShape
     fit: ShapeFit
     side_given: bool
-    handedness: HandednessSettings = HandednessSettings()
 
 
 def make_hand(shape: str, side: str, length_m: float) -> Hand:
@@ -103,20 +99,22 @@ class FilterModel:
     gestures: Gestures | None
     backend: Backend
 
-    def first_hand(self, side: str, side_given: bool) -> HandState:
-        """A slot before any frame."""
-        prior = self.configured.handedness.given * (1 if side == "right" else -1)
-        handedness = HandednessEstimate(side_given, prior if side_given else 0.0)
-        seen = LastSeen(torch.zeros(1, 6 + self.space.dims), math.inf)
-        nothing = no_estimate(-1, math.nan, "lost", self.space.dims, math.nan)
-        return HandState(side, handedness, first_shape(), seen, nothing)
+    def first_state(self, seed: int, hands: int = 1, side: str | None = None) -> TrackerState:
+        """Before any frame.
 
-    def first_state(self, seed: int, hands: int = 1) -> TrackerState:
-        """Before any frame. A second slot is for the other side of the first one."""
+        side: of the first hand, right or left; None = as it was configured, "auto" = of either. A
+            second slot is for the other one.
+        """
+        told = self.configured.shape.side if self.configured.side_given else None
+        told = told if side is None else side if side in OTHER_SIDE else None
+        first = told or self.configured.shape.side
+        nothing = no_estimate(-1, math.nan, "lost", self.space.dims, math.nan)
+        slots = tuple(
+            Slot(OTHER_SIDE[first] if number % 2 else first, first_shape(), nothing)
+            for number in range(hands)
+        )
         generator = torch.Generator().manual_seed(seed)
-        side, given = self.configured.shape.side, self.configured.side_given
-        slots = (self.first_hand(side, given), self.first_hand(OTHER_SIDE[side], given))
-        return TrackerState(generator.get_state(), slots[:hands])
+        return TrackerState(generator.get_state(), slots, told)
 
     def at_quality(self, quality: Quality) -> FilterModel:
         """The same tracker with less effort; itself where nothing is left out."""
@@ -127,9 +125,9 @@ class FilterModel:
         """Whether the hand's shape is fitted to the user."""
         return False
 
-    def fitted(self, hand: HandState) -> HandShape:
+    def fitted(self, slot: Slot) -> HandShape:
         """A slot's hand, with how sure the fit is of it if there is one."""
-        return self.hand(hand.side, hand.shape).shape
+        return self.hand(slot.side, slot.shape).shape
 
     @property
     def device(self) -> torch.device:
@@ -204,15 +202,6 @@ class TrackerModel(FilterModel):
     def _at_quality(self) -> Callable[[Quality], TrackerModel]:
         return lru_cache(partial(_at_quality, self))
 
-    def first_state(self, seed: int, hands: int = 1) -> TrackerState:
-        """See FilterModel. Beside one hand that is asked for, the other one is watched."""
-        state = super().first_state(seed, 2)
-        if hands == 2:
-            return state
-        first, other = state.hands
-        watched = replace(self.first_hand(other.side, side_given=False), watched=True)
-        return replace(state, hands=(first, watched), watched=True, second_s=_LONG_S)
-
     @property
     def fit(self) -> ShapeFit:
         """How the hand's shape is fitted."""
@@ -223,12 +212,12 @@ class TrackerModel(FilterModel):
         """See FilterModel."""
         return not self.fit.fixed
 
-    def fitted(self, hand: HandState) -> HandShape:
+    def fitted(self, slot: Slot) -> HandShape:
         """See FilterModel; nothing is said of the fit before anything was fitted."""
-        shape = super().fitted(hand)
-        if not (self.fits and hand.shape.poses):
+        shape = super().fitted(slot)
+        if not (self.fits and slot.shape.poses):
             return shape
-        return replace(shape, fitted=hand.shape.summary(self.fit))
+        return replace(shape, fitted=slot.shape.summary(self.fit))
 
 
 def _at_quality(model: TrackerModel, quality: Quality) -> TrackerModel:

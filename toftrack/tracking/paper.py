@@ -23,12 +23,12 @@ from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import ToftrackError
 from toftrack.frames import DepthImage
 from toftrack.render.segmentation import Observation
+from toftrack.tracking.belief import Status
 from toftrack.tracking.candidates import image_term
 from toftrack.tracking.confidence import propagated_sigma
-from toftrack.tracking.filter import Found, predicted_depths, run_filter, velocity_after
-from toftrack.tracking.lifecycle import Absence, Status
+from toftrack.tracking.filter import Found, predict, run_filter, velocity_after
 from toftrack.tracking.model import FilterModel, FittedHand
-from toftrack.tracking.reporting import emitted, estimate_of, no_hand
+from toftrack.tracking.report import absent, emitted, estimate_of
 from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.step import Stepped
 
@@ -86,7 +86,9 @@ class RoughStart:
         there = on_device(particles, model.device)
         weights = there.new_full((n,), 1.0 / n, dtype=torch.float64)
         mean, still = particles[:1], particles.new_zeros(6 + space.dims)
-        return Track(there, weights, mean, still, still.new_zeros(21), model.decode(mean))
+        return Track(
+            there, weights, mean, still, model.decode(mean), side=model.configured.shape.side
+        )
 
 
 def palm_centre(observation: Observation) -> np.ndarray:
@@ -156,15 +158,17 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     """
     spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     state = state.at(image)
-    hand, track = state.hands[0], state.hands[0].track
-    fitted = model.hand(hand.side, hand.shape)
+    (slot,), track = state.slots, state.tracks[0] if state.tracks else None
+    fitted, sure = model.hand(slot.side, slot.shape), 1.0 if state.told else 0.5
     with spans("segmentation and evidence"):
-        expected = None if track is None else predicted_depths(track, dt_s, fitted, model)
+        expected = None if track is None else predict(track, dt_s, model).depths
         observation = model.segmentation(image.depth_m, image.k, expected)
         if observation.empty:
-            _, hand, info, estimate = no_hand(Absence(0, hand, observation), image, model)
-            info = replace(info, seconds=spans.seconds())
-            return replace(state, hands=(hand,)), (info,), (estimate,)
+            slot, estimate = absent(slot, image, model, 1)
+            estimate = replace(estimate, side=slot.side, side_probability=sure)
+            none = torch.zeros(0, 6 + model.space.dims, device=model.device)
+            info = StepInfo(observation, none, none[:, 0], spans.seconds())
+            return replace(state, slots=(slot,)), (info,), (estimate,)
         likelihood = image_term(observation, fitted, model)
     with spans("start"):
         track = model.start(observation, model, generator) if track is None else track
@@ -185,15 +189,17 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         velocity=velocity_after(track, filtered.mean, dt_s, model),
         pose=pose,
         age=track.age.extended(dt_s),
-        doubted=status.lost,
-        believed=track.believed or not status.lost,
+        confirmed=track.confirmed or not status.lost,
+        believed_s=track.believed_s + dt_s if status.lost else 0.0,
         nearest_m=expected.nearest_m if expected is not None and hidden else 0.0,
     )
     ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
     estimate = replace(estimate, joint_sigma_m=sigma_m, joint_ok=ok)
-    hand, estimate = emitted(replace(hand, track=track), image, estimate, fitted.shape, dt_s, model)
+    estimate = replace(estimate, side=slot.side, side_probability=sure)
+    slot, estimate = emitted(slot, image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
-    state = replace(state, generator=generator.get_state(), hands=(hand,))
+    slot = replace(slot, track=track.number)
+    state = replace(state, generator=generator.get_state(), slots=(slot,), tracks=(track,))
     return state, (info,), (estimate,)
 
 

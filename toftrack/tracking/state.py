@@ -11,15 +11,31 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.pace import Duration, elapsed_s
-from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.hand_detector import Detection
+from toftrack.detector.proposals import Places
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import GestureState
-from toftrack.refinement.shape_fit import ShapeEstimate
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import JOINT_FEATURES, NO_FEATURES, ConfidenceFeatures
-from toftrack.tracking.handedness import HandednessEstimate
+
+OTHER_SIDE = {"right": "left", "left": "right"}
+
+
+@dataclass(frozen=True)
+class SideEvidence:
+    """What comparisons of a hand's two sides have said, log odds of a right hand; see sides.py.
+
+    fits: by how much better a right hand explains the image than a left one, summed up.
+    body_m: how far the body is to the image's right of the hand, on average.
+    comparisons: how many there were.  age_s: how long ago the last one was.
+    """
+
+    fits: float = 0.0
+    body_m: float = 0.0
+    comparisons: int = 0
+    age_s: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +47,15 @@ class Track:
     mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a second.
     pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
+    number: tells it from all others.  side: right or left, and `evidence` for it.
+    shape: the estimate of the hand's shape.
     age: how long it has been followed.
     doubtful: how long its confidence has been below what a track is kept for.
     log_odds: that the estimate is right, smoothed over time.  whole_odds: that its mean error is
         below 40 mm, likewise.
-    surest: the highest log odds so far.
-    doubted: the last estimate was flagged lost.  believed: one of its estimates was not.
-    unseen_s: how long ago the pose network was asked about it.
+    confirmed: one of its estimates was believed; until then the track is tentative.
+    believed_s: how long ago one was, or since it began; 0 = the last one is not lost.
+    asked_s: how long ago the pose network was asked about it.
     features, joint_features: of the last estimate, (21, J); see confidence.py.
     nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
         at; 0 while nothing does.
@@ -49,122 +67,49 @@ class Track:
     velocity: Tensor
     pose: Tensor
     trend: Tensor = field(default_factory=lambda: torch.full((27,), math.nan))
+    number: int = 0
+    side: str = "right"
+    evidence: SideEvidence = SideEvidence()
+    shape: ShapeEstimate = field(default_factory=first_shape)
     age: Duration = Duration()
     doubtful: Duration = Duration()
     log_odds: float = 0.0
     whole_odds: float = 0.0
-    surest: float = -math.inf
-    doubted: bool = False
-    believed: bool = False
-    unseen_s: float = 0.0
+    confirmed: bool = False
+    believed_s: float = 0.0
+    asked_s: float = 0.0
     features: ConfidenceFeatures = NO_FEATURES
     joint_features: np.ndarray = field(default_factory=lambda: np.zeros((21, len(JOINT_FEATURES))))
     nearest_m: float = 0.0
 
-
-@dataclass(frozen=True, eq=False)
-class LastSeen:
-    """A hand as it was last believed.
-
-    particle: (1, 6 + d).  age_s: how long ago; inf = it never was.
-    surest: the highest log odds of its track that an estimate was right; -inf = none was believed.
-    """
-
-    particle: Tensor
-    age_s: float
-    surest: float = math.inf
-
     @property
-    def ever(self) -> bool:
-        """Whether there was one."""
-        return self.age_s < math.inf
-
-    @property
-    def centre_m(self) -> np.ndarray:
-        """(3,) middle of its palm."""
-        particle = self.particle.numpy()
-        centre: np.ndarray = particle[0, :3] + pivot_offset(particle[:, 3:6])[0]
-        return centre
-
-    def after(self, dt_s: float) -> LastSeen:
-        """As time goes on."""
-        return replace(self, age_s=self.age_s + dt_s)
+    def reliable(self) -> bool:
+        """Whether the last estimate was believed."""
+        return self.confirmed and self.believed_s == 0
 
 
 @dataclass(frozen=True, eq=False)
-class Seeking:
-    """A search of the whole image for a hand that goes on over frames; see seeking.py.
+class Slot:
+    """A place of the report: the hand that a user knows by its number.
 
-    centres_m: (P, 3) places that were not looked at yet.  heat: (P,) how likely the finder has a
-    hand there.  seen: what the pose network said of the others, and the finder's probability.
-    alone: the image is searched without the pixels of the other hand.  anew: ... from the next
-        frame on, for with them there was no place but that hand's.
-    """
-
-    centres_m: np.ndarray
-    heat: np.ndarray
-    seen: tuple[tuple[Detection, float], ...] = ()
-    alone: bool = False
-    anew: bool = False
-
-    @classmethod
-    def anew_alone(cls) -> Seeking:
-        """A search that begins once more, without the pixels of the other hand."""
-        return cls(np.zeros((0, 3)), np.zeros(0), alone=True, anew=True)
-
-    @property
-    def over(self) -> bool:
-        """Whether all places have been looked at."""
-        return not len(self.centres_m) and not self.anew
-
-
-NOWHERE = LastSeen(torch.zeros(1, 6), math.inf)
-"""Before anything was seen."""
-
-
-@dataclass(frozen=True, eq=False)
-class HandState:
-    """One hand, in its slot: the track, and what outlives it.
-
-    side: "right" or "left".  handedness: how sure the side is.
-    shape: the estimate of the hand's shape.
-    track: None while there is no hand to follow.
-    seen: the last hand that was believed.
+    track: number of the track that is reported here; -1 = none.
+    side, shape: of the hand that was here last.  known: how surely that is its side, log odds.
+    last: the last estimate that was believed, or that there was; lost and NaN before any.
     gesture: smoothed probabilities of the gestures, None where there are none.
-    last: the last estimate that there was; lost and NaN before any.
-    searched_s: how long ago the whole image was searched for this hand.
-    watched: nobody asked for it.
-    beside: it was believed while the first hand was, too, so that it is another one.
-    seeking: the search for this hand that goes on beside the other one.
-    tried: where a track ended last that was never believed.
+    away_s: how long ago a hand was believed here; inf = never.
     """
 
     side: str
-    handedness: HandednessEstimate
     shape: ShapeEstimate
-    seen: LastSeen
     last: Estimate
-    track: Track | None = None
+    track: int = -1
+    known: float = 0.0
     gesture: GestureState | None = None
-    searched_s: float = math.inf
-    watched: bool = False
-    beside: bool = False
-    seeking: Seeking | None = None
-    tried: LastSeen = NOWHERE
+    away_s: float = math.inf
 
-    @property
-    def believed(self) -> bool:
-        """Whether it is a hand that is followed, and not just a place that may be one."""
-        return self.track is not None and self.track.believed
 
-    def after(self, dt_s: float) -> HandState:
-        """The hand as time goes on."""
-        return replace(
-            self,
-            seen=self.seen.after(dt_s),
-            tried=self.tried.after(dt_s),
-            searched_s=self.searched_s + dt_s,
-        )
+NO_PLACES = Places(np.zeros((0, 3)), np.zeros(0))
+"""Of a frame in which the finder was not asked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,27 +117,29 @@ class TrackerState:
     """All that is carried between frames: from the same state and images, the same estimates.
 
     generator: the state of the random generator, as torch.Generator.get_state() gives it.
-    hands: one or two, each in its slot.
-    watched: nobody asked for the second hand: it is followed so that it is not taken for the first
-        one, and not reported.
-    second_s: how long ago a second hand was searched for; below 0 while none is.
-    merged: how long two tracks have seemed to be on one hand.
-    next_index: number of the next frame that comes without one.
+    tracks: the hands that are followed, each a row; the surest of them are reported.
+    slots: as many as hands are asked for.
+    told: the side that the user said of the first one; None = nobody did.
+    places: where the finder has seen hands in the last frame; `found_s` ago.
+    refused: (R, 4) middles of what was taken for a hand and was none, and how long ago that was.
+    next_track, next_index: numbers of the next track, and of the next frame without one.
     timestamp_s: of the last frame, None before any.
     """
 
     generator: Tensor
-    hands: tuple[HandState, ...]
-    watched: bool = False
-    second_s: float = math.inf
-    merged: Duration = Duration()
+    slots: tuple[Slot, ...]
+    told: str | None = None
+    tracks: tuple[Track, ...] = ()
+    places: Places = NO_PLACES
+    found_s: float = math.inf
+    refused: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    next_track: int = 0
     next_index: int = 0
     timestamp_s: float | None = None
 
-    @property
-    def reported(self) -> tuple[HandState, ...]:
-        """The hands that were asked for."""
-        return self.hands[:1] if self.watched else self.hands
+    def track_of(self, slot: Slot) -> Track | None:
+        """The hand that is reported in a slot."""
+        return next((track for track in self.tracks if track.number == slot.track), None)
 
     def elapsed_s(self, image: DepthImage) -> float:
         """Seconds from the last frame to an image, as motions are reckoned with."""
@@ -202,10 +149,12 @@ class TrackerState:
         """The state as time goes on to an image."""
         before = image.timestamp_s if self.timestamp_s is None else self.timestamp_s
         passed = max(0.0, image.timestamp_s - before)
+        refused = self.refused + np.array([0.0, 0.0, 0.0, passed])
         return replace(
             self,
-            hands=tuple(hand.after(passed) for hand in self.hands),
-            second_s=self.second_s + self.elapsed_s(image),
+            slots=tuple(replace(slot, away_s=slot.away_s + passed) for slot in self.slots),
+            found_s=self.found_s + passed,
+            refused=refused[refused[:, 3] < REFUSED_S],
             next_index=image.index + 1,
             timestamp_s=image.timestamp_s,
         )
@@ -215,6 +164,10 @@ class TrackerState:
         made = torch.Generator()
         made.set_state(self.generator)
         return made
+
+
+REFUSED_S = 1.5
+"""What was taken for a hand and was none is left alone for so long, if it stays where it is."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,264 +14,192 @@ from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.candidates import (
-    FilteredFrame,
-    HandFrame,
-    keypoints_of,
-    propose,
-    with_parts,
-)
-from toftrack.tracking.comparing import compared_beside, observed_shape
+from toftrack.tracking.association import are_one, assign, costs, ends, left_over, sureness
+from toftrack.tracking.belief import judge
+from toftrack.tracking.candidates import View, keypoints_of, propose
 from toftrack.tracking.confidence import confidence_features, joint_features
-from toftrack.tracking.filter import Filtered, Found, new_track, run_filter
-from toftrack.tracking.hands import Neighbour, PlacedHand, neighbours_of, partnered, seen_in
-from toftrack.tracking.lifecycle import (
-    Absence,
-    close,
-    goes_on,
-    open_hand,
-    reconcile,
+from toftrack.tracking.detect import detected
+from toftrack.tracking.filter import (
+    Found,
+    drawn_to,
+    new_track,
+    predict,
+    run_filter,
+    velocity_after,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.reporting import (
-    Concluded,
-    emitted,
-    estimate_of,
-    no_hand,
-    unseen,
-    vacant,
-)
-from toftrack.tracking.seeking import since_search, sought, start_seeking, taking_part
-from toftrack.tracking.select import Choice, select
-from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
-from toftrack.tracking.watching import first_estimate, watched_over
+from toftrack.tracking.report import Followed, estimate_of, report
+from toftrack.tracking.scene import Scene
+from toftrack.tracking.select import select
+from toftrack.tracking.state import StepInfo, Track, TrackerState
+from toftrack.tracking.views import begun, continued
 
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
-"""The next state, and for each slot what was seen, None where nobody asked, and the estimate."""
-
-
-@dataclass(frozen=True, eq=False)
-class HandTask:
-    """All that a hand's part of a frame needs, but for the model.
-
-    others: as the frame begins.
-    """
-
-    slot: int
-    hand: HandState
-    others: tuple[Neighbour, ...]
-    image: DepthImage
-    dt_s: float
-    generator: torch.Generator
+"""The next state, and for each slot what was seen, None where nothing was, and the estimate."""
 
 
 @small_operations()
 def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped:
-    """One frame of one hand or two; a pure function: the state given stays as it is.
+    """One frame of all hands; a pure function: the state given stays as it is.
 
-    A particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and
-    local optimisation of few hypotheses (Gall et al., IJCV 87, 2010). For each hand:
+    Tracking by detection (SORT: Bewley et al., ICIP 2016) of hands that are each followed by a
+    particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and local
+    optimisation of few hypotheses (Gall et al., IJCV 87, 2010):
 
-    1. Predict it, and *open*: detect (a network that votes for joints, as A2J: Xiong et al., ICCV
-       2019), compare the sides, segment, begin a track.
-    2. Filter: N particles (N, 6 + d) in the pose space, resampled, diffused and weighed by the
-       F-measure of the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
-    3. Wait for detections that ran beside it.
-    4. *Propose*: a table of hypotheses (M, 27), refined by Levenberg-Marquardt steps, scored by the
-       posterior.
-    5. *Select* the best pose.
-    6. *Close*: steady the pose, judge it, carry the track on or end it, learn the hand's shape.
-
-    Two hands know of each other where they are predicted; at the end their slots are reconciled.
+    1. Predict where the tracks' hands are, and whose the pixels are.
+    2. Detect: a network that votes for joints (A2J: Xiong et al., ICCV 2019) looks at each track's
+       place, and where another one that sees the whole image finds a hand that no track explains.
+    3. Associate detections with tracks; what is left over begins tentative ones.
+    4. Filter: N particles (N, 6 + d) of each track in the pose space, resampled, diffused, weighed
+       by the F-measure of the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
+    5. Refine a few hypotheses (M, 27) by Levenberg-Marquardt steps; the best posterior is the pose.
+    6. Judge it, learn the hand's shape, and end what nobody sees any more.
+    7. Report the tracks in the slots that the user asked for.
     """
     spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
     before = state.at(image)
     with spans("detector"):
-        before, seeking = start_seeking(before, image, model, dt_s)
-    found = followed(before, image, model, dt_s, generator, spans)
+        scene = Scene.of(before.tracks, image, dt_s, model)
+        seen, before, finding = detected(scene, before)
+        taken = assign(costs(scene.hands, seen, dt_s))
+        views = [
+            continued(scene, row, seen[column] if column >= 0 else None, before.told)
+            for row, column in enumerate(taken)
+        ]
+        new = begun(scene, left_over(seen, taken), before)
+        before = replace(before, next_track=before.next_track + len(new))
+        views += new
+    followed = [
+        follow(view, scene, dice, spans)
+        for view, dice in zip(views, _dice(generator, len(views)), strict=True)
+        if view is not None
+    ]
     with spans("detector"):
-        before = sought(before, seeking, model)
-    if seeking is not None:  # what it has found meanwhile
-        seekings = [hand.seeking for hand in before.hands]
-        found = [(s, replace(hand, seeking=seekings[s]), i, e) for s, hand, i, e in found]
-    before = replace(before, generator=generator.get_state())
-    return reconciled(before, found, image, model, dt_s, spans)
+        places = before.places if finding is None else finding()
+    after = replace(before, places=places, generator=generator.get_state())
+    after = kept(after, [one.track for one in followed], model)
+    return report(after, followed, image, model, dt_s, spans.seconds())
 
 
-def followed(
-    state: TrackerState,
-    image: DepthImage,
-    model: TrackerModel,
-    dt_s: float,
-    generator: torch.Generator,
-    spans: Spans,
-) -> list[Concluded]:
-    """The hands that a frame is about after it, the surest first."""
-    hands = partnered(state.hands, model)
-    slots = taking_part(state, model.configured.handedness.watch_s)
-    dice = [generator] + [_seeded_by(generator) for _ in slots[1:]]
-
-    def tasks() -> list[HandTask]:
-        others = neighbours_of(hands, slots, image, model, dt_s)
-        each = zip(slots, dice, strict=True)
-        return [HandTask(slot, hands[slot], others[slot], image, dt_s, own) for slot, own in each]
-
-    with spans("detector"):
-        todo = tasks()
-    both_go_on = len(todo) == 2 and all(goes_on(task.hand, task.others, dt_s) for task in todo)
-    opened = list[HandFrame | Absence]()
-    for number, slot in enumerate(slots):
-        with spans("detector"):
-            task = todo[number]
-            others = seen_in(task.others, image, model)
-            opened.append(open_hand(slot, task.hand, others, image, model, dt_s))
-            track = opened[-1].track
-            if track is not hands[slot].track and not both_go_on:  # the next one must know
-                hands[slot] = replace(opened[-1].hand, track=track)
-                todo = tasks()
-    return [concluded(one, task, model, spans) for one, task in zip(opened, todo, strict=True)]
+def _dice(generator: torch.Generator, count: int) -> list[torch.Generator]:
+    """A generator for each of the hands: what one draws does not depend on how many there are."""
+    seeds = torch.randint(2**62, (max(count - 1, 0),), generator=generator)
+    return [generator, *(torch.Generator().manual_seed(int(seed)) for seed in seeds)][:count]
 
 
-def _seeded_by(generator: torch.Generator) -> torch.Generator:
-    """Another one: a hand's random numbers do not depend on how many the other one uses."""
-    return torch.Generator().manual_seed(int(torch.randint(2**62, (1,), generator=generator)))
-
-
-def concluded(
-    opened: HandFrame | Absence, task: HandTask, model: TrackerModel, spans: Spans
-) -> Concluded:
-    """A slot's hand after a frame that it was opened for."""
-    image, dt_s, generator = task.image, task.dt_s, task.generator
-    if isinstance(opened, Absence):
-        return no_hand(opened, image, model)
+def follow(view: View, scene: Scene, generator: torch.Generator, spans: Spans) -> Followed:
+    """A track after a frame: its particles filtered, its pose chosen and judged."""
+    model, track, dt_s = view.model, view.track, scene.dt_s
     with spans("filter: rest"):
-        filtered = filtered_frame(opened, dt_s, generator, spans)
-    with spans("detector"):
-        frame = waited_for(opened, image)
-    if frame.track is not opened.track:  # the side has changed
-        with spans("filter: rest"):
-            filtered = filtered_frame(frame, dt_s, generator, spans)
+        filtered = run_filter(track, dt_s, view.image, model, generator, spans)
     with spans("refinement"):
-        candidates = FilteredFrame.of(frame, filtered.mean)
-        table = propose(candidates)
-        choice = select(table, frame.fitted.refiner.joints(table.pose), frame.hidden)
-    return conclude(frame, filtered, choice, image, dt_s)
-
-
-def filtered_frame(
-    frame: HandFrame, dt_s: float, generator: torch.Generator, spans: Spans
-) -> Filtered:
-    """The particles of a hand in a frame."""
-    return run_filter(frame.track, dt_s, frame.image, frame.model, generator, spans)
-
-
-def waited_for(frame: HandFrame, image: DepthImage) -> HandFrame:
-    """The frame with its detection, if that ran beside the filter, with both sides compared, if
-    that is due, and with what the detection says of its pixels.
-    """
-    detection = frame.pending()
-    if not detection.empty:
-        hand = observed_shape(frame.hand, detection, frame.model)
-        frame = replace(frame, hand=hand, detection=detection)
-        if frame.mirrored is not None:
-            frame = compared_beside(frame, frame.mirrored(), image)
-    return with_parts(frame)
-
-
-def conclude(
-    frame: HandFrame, filtered: Filtered, choice: Choice, image: DepthImage, dt_s: float
-) -> Concluded:
-    """A slot's hand after a frame, from the pose that was chosen."""
-    model, track, seen = frame.model, frame.track, frame.observation
+        table = propose(view, model.decode(filtered.mean))
+        choice = select(table, view.fitted.refiner.joints(table.pose), view.hidden)
     pose, trend = choice.pose, track.trend
     if choice.moved:
-        begun = new_track(pose, model)
-        track = replace(begun, believed=track.believed)
-        trend = begun.trend
+        fresh = new_track(pose, model)
+        track, trend = replace(track, age=fresh.age, doubtful=fresh.doubtful), fresh.trend
     elif model.refinement.iterations:
         pose, trend = steadied(pose, track.pose, trend, dt_s, model.backend.motions)
     found = Found(filtered, pose, trend, *model.nearest(pose))
-    score, joints = frame.image.score(pose), frame.fitted.refiner.joints(pose)[0]
-    age_s, last = track.age.seconds, track.features
+    score, joints = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
+    seen = view.observation
     features = confidence_features(
-        joints, score, age_s, frame.detection, last, seen.depth_m, seen.k
+        joints, score, track.age.seconds, view.detection, track.features, seen.depth_m, seen.k
     )
-    status, track, last_seen = close(replace(frame, track=track), found, features, dt_s)
-    estimate = estimate_of(image, found, score, status, frame.fitted, model)
+    beside = any(hand.track.confirmed for hand in scene.hands if hand.track.number != track.number)
+    new = model.lost.second if beside else model.lost.believe
+    status = judge(track, features, dt_s, new, model.lost)
+    estimate = estimate_of(scene.image, found, score, status, view.fitted, model)
+    image, last = scene.image, track.joint_features  # as the camera took it, and not reduced
     rows = joint_features(
-        estimate.joints_m,
-        frame.detection,
-        track.joint_features,
-        score,
-        status.log_odds,
-        image.depth_m,  # as the camera took it, and not reduced
-        image.k,
+        estimate.joints_m, view.detection, last, score, status.log_odds, image.depth_m, image.k
     )
     sigma, confidence = model.lost.joints.judge(rows)
     ok = (confidence >= model.lost.joint_ok) & (not status.lost)
     estimate = replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence, joint_ok=ok)
-    hand = replace(
-        frame.hand,
-        shape=frame.hand.shape if status.lost else learned_shape(frame, found),
-        track=None if status.ends else replace(track, joint_features=rows),
-        seen=last_seen,
+    # Without refinement the particles stay where they are.
+    drawn = drawn_to(found, model) if model.refinement.iterations else found.filtered
+    track = replace(
+        track,
+        particles=drawn.particles,
+        weights=drawn.weights,
+        mean=drawn.mean,
+        velocity=velocity_after(track, drawn.mean, dt_s, model),
+        pose=found.pose,
+        trend=found.trend,
+        shape=track.shape if status.lost else learned_shape(view, found),
+        age=track.age.extended(dt_s),
+        doubtful=status.doubtful,
+        log_odds=status.log_odds,
+        whole_odds=status.whole_odds,
+        confirmed=track.confirmed or not status.lost,
+        believed_s=track.believed_s + dt_s if status.lost else 0.0,
+        asked_s=track.asked_s + dt_s if view.detection.empty else 0.0,
+        features=features,
+        joint_features=rows,
+        nearest_m=view.expected_m if view.hidden else 0.0,
     )
-    hand, estimate = emitted(hand, image, estimate, frame.fitted.shape, dt_s, model)
-    detection = None if frame.detection.empty else frame.detection
-    particles, weights = filtered.particles, filtered.weights
-    info = StepInfo(seen, particles, weights, {}, features, rows, detection)
-    return frame.slot, hand, info, estimate
+    detection = None if view.detection.empty else view.detection
+    info = StepInfo(seen, filtered.particles, filtered.weights, {}, features, rows, detection)
+    return Followed(track, info, estimate, view.fitted)
 
 
-def learned_shape(frame: HandFrame, found: Found) -> shape_fit.ShapeEstimate:
+def learned_shape(view: View, found: Found) -> shape_fit.ShapeEstimate:
     """The estimate of the hand's shape after a believed estimate of its pose."""
-    shape, fitted, model = frame.hand.shape, frame.fitted, frame.model
-    if frame.detection.empty or frame.hidden or shape.applied != fitted.applied:
-        return shape  # of a hand that was given up in this very frame nothing is learned
+    shape, fitted = view.track.shape, view.fitted
+    if view.detection.empty or view.hidden or shape.applied != fitted.applied:
+        return shape
     return shape_fit.learned(
         shape,
         found.pose,
         fitted.shape,
         fitted.derivatives,
-        frame.detection,
-        keypoints_of(frame.detection, model),
-        model.fit,
+        view.detection,
+        keypoints_of(view.detection, view.model),
+        view.model.fit,
         fitted.first,
         fitted.refiner.pose,
     )
 
 
-def reconciled(
-    before: TrackerState,
-    found: Sequence[Concluded],
-    image: DepthImage,
-    model: TrackerModel,
-    dt_s: float,
-    spans: Spans,
-) -> Stepped:
-    """What a step returns; of two hands each in its slot, and vacant where none is followed."""
-    hands = list(before.hands)
-    infos: list[StepInfo | None] = [None] * len(hands)
-    seen: dict[int, Estimate] = {}
-    for slot, hand, info, estimate in found:
-        hands[slot], seen[slot] = hand, estimate
-        infos[slot] = replace(info, seconds=spans.seconds())
-    second_s = since_search(before, [slot for slot, _, _, _ in found])
-    after = replace(before, hands=tuple(hands), second_s=second_s)
-
-    def place(hand: HandState, track: Track) -> PlacedHand:  # of its image nothing is asked
-        return PlacedHand(track.pose, model.hand(hand.side, hand.shape), np.eye(3), (1, 1))
-
-    after, exchanged = reconcile(before, after, place, dt_s)
-    if before.watched:
-        after = watched_over(after, model.configured.handedness)
-        first = seen[0] if 0 in seen else unseen(before.hands[0], image, model)
-        return after, tuple(infos[:1]), (first_estimate(first, after),)
-    slots = list(range(len(hands)))
-    if exchanged:
-        infos, slots = infos[::-1], slots[::-1]
-    estimates = [
-        vacant(image, model) if hand.track is None or slot not in seen else seen[slot]
-        for slot, hand in zip(slots, after.hands, strict=True)
+def kept(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
+    """The state with the tracks that go on: hands that somebody sees, each of them once."""
+    confirmed = [track.confirmed for track in tracks]
+    beside = [sum(confirmed) > own for own in confirmed]
+    left = [
+        track
+        for track, other in zip(tracks, beside, strict=True)
+        if not ends(track, other, model.lost.patience)
     ]
-    return after, tuple(infos), tuple(estimates)
+    gone = {track.number for track in tracks} - {track.number for track in left}
+    for first in sorted(left, key=sureness, reverse=True):
+        for second in left:
+            if first.number in gone or second.number in gone or first.number == second.number:
+                continue
+            if on_one_hand(first, second, model):
+                gone.add(min(first, second, key=sureness).number)
+    refused = [
+        [*palm_of(track, model), 0.0]
+        for track in tracks
+        if track.number in gone and not track.confirmed
+    ]
+    return replace(
+        state,
+        tracks=tuple(track for track in tracks if track.number not in gone),
+        refused=np.concatenate((state.refused, np.reshape(refused, (-1, 4)))),
+    )
+
+
+def on_one_hand(first: Track, second: Track, model: TrackerModel) -> bool:
+    """Whether two tracks have come onto one hand."""
+    joints = [
+        model.hand(track.side, track.shape).refiner.joints(track.pose)[0].cpu()
+        for track in (first, second)
+    ]
+    return are_one(palm_of(first, model), palm_of(second, model), *joints)
+
+
+def palm_of(track: Track, model: TrackerModel) -> np.ndarray:
+    """(3,) the middle of the palm of a track's last pose."""
+    return predict(replace(track, velocity=torch.zeros_like(track.velocity)), 0.0, model).palm_m[0]

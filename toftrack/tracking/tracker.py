@@ -21,13 +21,14 @@ from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import PoseSpace
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Scorer
-from toftrack.tracking.handedness import OTHER_SIDE
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
-from toftrack.tracking.state import HandState, StepInfo, Track, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
 from toftrack.tracking.step import Stepped, step
 
 AUTO = "auto"
+_MOST_HANDS = 8
+"""More would take longer than anybody waits."""
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
 
@@ -50,12 +51,12 @@ class HandsTracker:
     ) -> None:
         """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`.
 
-        Raises ToftrackError when `hands` is neither 1 nor 2, or 2 without a detector.
+        Raises ToftrackError when `hands` is no number of hands, or several without a detector.
         """
-        check_number("hands", hands, 1, 2, whole=True)
+        check_number("hands", hands, 1, _MOST_HANDS, whole=True)
         if hands > 1 and isinstance(model, PaperModel):
             raise ToftrackError(
-                "hands=2 tells two hands apart by the networks, but experiment=paper has none;"
+                f"hands={hands} tells hands apart by the networks, but experiment=paper has none;"
                 " give hands=1, or leave experiment=paper out"
             )
         self.model, self.time = model, Timekeeper(pace, clock)
@@ -108,14 +109,14 @@ class HandsTracker:
         self.infos = (None,) * len(self.infos)
 
     @property
-    def states(self) -> tuple[HandState, ...]:
+    def states(self) -> tuple[Slot, ...]:
         """Of the slots."""
-        return self.state.reported
+        return self.state.slots
 
     @property
     def shapes(self) -> tuple[HandShape, ...]:
         """The hand of each slot that the next frame is compared with."""
-        return tuple(self.model.hand(hand.side, hand.shape).shape for hand in self.states)
+        return tuple(self.model.hand(slot.side, slot.shape).shape for slot in self.states)
 
     @property
     def fitted(self) -> tuple[HandShape, ...]:
@@ -125,7 +126,7 @@ class HandsTracker:
     @property
     def scorer(self) -> Scorer:
         """The back end's, for the first hand."""
-        return self.model.hand(self.state.hands[0].side, self.state.hands[0].shape).scorer
+        return self.model.hand(self.states[0].side, self.states[0].shape).scorer
 
     @property
     def space(self) -> PoseSpace:
@@ -200,7 +201,7 @@ class Tracker:
     @property
     def track(self) -> Track | None:
         """The hand that is followed; None while there is none."""
-        return self.state.hands[0].track
+        return self.state.track_of(self.state.slots[0])
 
     @property
     def shape(self) -> HandShape:
@@ -222,18 +223,12 @@ def restarted(state: TrackerState, model: FilterModel, side: str | None = None) 
 
     Raises ToftrackError for an unknown side.
     """
-    fresh = model.first_state(0, len(state.reported))
-    wanted = None if side == AUTO else side
-    keeps = side is None or isinstance(model, PaperModel)
-    given = wanted is not None or (keeps and state.hands[0].handedness.given)
-    first = state.hands[0].side if given else fresh.hands[0].side
-    first = model.configured.shape.of_side(wanted).side if wanted is not None else first
-    sides = (first, OTHER_SIDE[first])
-    hands = tuple(
-        replace(model.first_hand(sides[slot], given and not hand.watched), watched=hand.watched)
-        for slot, hand in enumerate(state.hands)
-    )
-    return replace(fresh, hands=hands, generator=state.generator, next_index=state.next_index)
+    if side is not None and side not in (AUTO, *OTHER_SIDE):
+        model.configured.shape.of_side(side)  # which says what it may be
+    if side is None or (side == AUTO and isinstance(model, PaperModel)):
+        side = state.told or (None if isinstance(model, PaperModel) else AUTO)
+    fresh = model.first_state(0, len(state.slots), side)
+    return replace(fresh, generator=state.generator, next_index=state.next_index)
 
 
 def _rendered_hand() -> DepthImage:

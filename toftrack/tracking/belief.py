@@ -1,0 +1,73 @@
+"""What is thought of an estimate, and of the track that it is of."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
+from toftrack.tracking.state import Track
+
+_HIDDEN = 0.3
+"""Share of the joints behind something from which on a hand is hidden."""
+_OUT_OF_VIEW = 0.4
+"""Share of the joints outside of the image from which on a hand is out of view."""
+_WHOLE_HAND = 0.9
+"""A new hand that is right as a whole with this probability is believed, whatever its confidence:
+of one that holds a thing, or lies beside another one, a joint is often far off."""
+_PATIENT = 10
+"""Times as long is waited for a hand that is hidden: each of its frames counts so much less."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """What is thought of a frame's estimate.
+
+    state_name, lost: as Estimate has them.
+    confidence: probability that every joint is within 40 mm; NaN where nothing says.
+    log_odds: the same, smoothed over time.  whole_odds: likewise of the mean joint error.
+    doubtful: as Track has it, with this frame.
+    """
+
+    state_name: str
+    lost: bool
+    confidence: float = math.nan
+    log_odds: float = 0.0
+    whole_odds: float = 0.0
+    doubtful: Duration = Duration()
+
+
+def judge(
+    track: Track, features: ConfidenceFeatures, dt_s: float, new: float, model: ConfidenceModel
+) -> Status:
+    """What is thought of an estimate, dt_s after the last.
+
+    new: confidence that a tentative track needs to be confirmed.
+    """
+    kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
+    smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
+    whole = kept * track.whole_odds + (1 - kept) * model.whole_odds(features)
+    confidence, probable = probability(smooth), probability(whole)
+    # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
+    passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
+    # What was never believed may be no hand, and may hide behind anything.
+    waits = track.confirmed and features.hidden > _HIDDEN
+    doubtful = Duration(track.doubtful.seconds + passed / (_PATIENT if waits else 1))
+    doubtful = doubtful if confidence < model.give_up else Duration()
+    confirmed = track.confirmed or confidence >= new or probable >= _WHOLE_HAND
+    lost = not confirmed or confidence < model.confidence or probable < model.whole
+    name = _state_name(features) if lost else "tracking"
+    return Status(name, lost, confidence, smooth, whole, doubtful)
+
+
+def probability(log_odds: float) -> float:
+    """Of log odds."""
+    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
+
+
+def _state_name(features: ConfidenceFeatures) -> str:
+    """Why an estimate is not to be used."""
+    if features.unseen > _OUT_OF_VIEW:
+        return "out of view"
+    return "hidden" if features.hidden > _HIDDEN else "searching"

@@ -1,0 +1,221 @@
+"""What is reported of a frame: which track is in which slot, and the estimate of each.
+
+Only here it matters what the user asked for: how many hands, and of which side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from toftrack.compute import particle_filter
+from toftrack.compute.pace import FRAME_S
+from toftrack.compute.transfer import on_device, on_host
+from toftrack.estimate import Estimate, lost_estimate, no_estimate
+from toftrack.frames import DepthImage
+from toftrack.gestures.recognition import tell_gesture
+from toftrack.hand.conventions import in_all_conventions
+from toftrack.hand.shape import HandShape
+from toftrack.tracking.belief import Status, probability
+from toftrack.tracking.filter import Found
+from toftrack.tracking.model import FilterModel, FittedHand
+from toftrack.tracking.sides import side_log_odds
+from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
+
+_OTHER_HAND = 0.4
+"""Where it is less probable than this that a hand is of the given side, the frame is flagged."""
+_STAYS, _BELIEVED, _CONFIRMED, _SIDE = 1.5, 3.0, 3.0, 3.0
+"""Of a slot's value for a track: that it was there before; that its estimate is not lost; that it
+was confirmed; and the log odds of the side that the slot is for, this at most."""
+_GONE_S = 2.0
+"""Where no side was said, a hand that has been away so long makes way for another one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A track after a frame, what was seen of it, its estimate, and the hand of that estimate."""
+
+    track: Track
+    info: StepInfo
+    estimate: Estimate
+    fitted: FittedHand
+
+
+def report(
+    state: TrackerState,
+    followed: Sequence[Followed],
+    image: DepthImage,
+    model: FilterModel,
+    dt_s: float,
+    seconds: Mapping[str, float],
+) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
+    """The state with its slots, and for each slot what was seen and the estimate.
+
+    state: with the tracks that go on.
+    """
+    sides = {one.track.number: log_odds_of(one.track, state) for one in followed}
+    chosen = assigned(state, followed, sides)
+    slots, infos, estimates = [], list[StepInfo | None](), []
+    for slot, one in zip(state.slots, chosen, strict=True):
+        if one is None:
+            slot, estimate = absent(slot, image, model, len(state.slots))
+            infos.append(None)
+        else:
+            right = sides[one.track.number]
+            slot, estimate = reported(slot, one, right, state, image, dt_s, model)
+            infos.append(replace(one.info, seconds=seconds))
+        slots.append(slot)
+        estimates.append(estimate)
+    return replace(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
+
+
+def log_odds_of(track: Track, state: TrackerState) -> float:
+    """Log odds that a track is a right hand, by all that is known."""
+    others = [one for one in state.tracks if one.confirmed and one.number != track.number]
+    return side_log_odds(track, others, state.told)
+
+
+def assigned(
+    state: TrackerState, followed: Sequence[Followed], sides: Mapping[int, float]
+) -> list[Followed | None]:
+    """The track of each slot: the sum of what they are worth to their slots is largest."""
+    worth = np.zeros((len(state.slots), len(followed) + len(state.slots)))
+    for number, slot in enumerate(state.slots):
+        for column, one in enumerate(followed):
+            worth[number, column] = _worth(number, slot, one.track, sides[one.track.number], state)
+    columns = linear_sum_assignment(-worth)[1]
+    return [
+        followed[column] if column < len(followed) and worth[number, column] > 0 else None
+        for number, column in enumerate(columns)
+    ]
+
+
+def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
+    """What a track is worth to a slot; at most 0 where it is not for it."""
+    worth = _BELIEVED * track.reliable + _CONFIRMED * track.confirmed
+    stays = slot.track == track.number
+    worth += _STAYS * stays + 0.1 / (1 + track.number) + 0.01 / (1 + number)
+    several = len(state.slots)
+    if several > 2:
+        return worth
+    if state.told is not None:
+        wanted = state.told if number == 0 else OTHER_SIDE[state.told]
+        agrees = right if wanted == "right" else -right
+        return worth + min(max(agrees, -_SIDE), _SIDE) + (0 if several == 1 else _SIDE)
+    if not slot.known or stays:
+        return worth + 0.1
+    agrees = right if slot.side == "right" else -right
+    if several == 1 and agrees < 0 and slot.away_s < _GONE_S:
+        return -1.0
+    return worth + 0.1 + 0.3 * min(max(agrees, -_SIDE), _SIDE)
+
+
+def reported(
+    slot: Slot,
+    one: Followed,
+    right: float,
+    state: TrackerState,
+    image: DepthImage,
+    dt_s: float,
+    model: FilterModel,
+) -> tuple[Slot, Estimate]:
+    """A slot with its track after a frame, and the estimate as it is reported."""
+    track, estimate = one.track, one.estimate
+    sure = probability(right if track.side == "right" else -right)
+    if state.told is None:
+        estimate = replace(estimate, confidence=estimate.confidence * sure)
+    else:
+        wanted = state.told if slot is state.slots[0] else OTHER_SIDE[state.told]
+        if probability(right if wanted == "right" else -right) < _OTHER_HAND:
+            none = np.zeros_like(estimate.joint_ok)
+            estimate = replace(estimate, lost=True, joint_ok=none, state_name="other hand")
+        sure = 1.0 if track.side == wanted else sure
+    estimate = replace(estimate, side=track.side, side_probability=sure)
+    fresh = slot.track != track.number
+    slot, estimate = emitted(
+        replace(slot, gesture=None if fresh else slot.gesture),
+        image,
+        estimate,
+        one.fitted.shape,
+        dt_s,
+        model,
+    )
+    known = right if track.confirmed else slot.known
+    away = slot.away_s if estimate.lost else 0.0
+    now = replace(slot, track=track.number, known=known, away_s=away)
+    return replace(now, side=track.side, shape=track.shape), estimate
+
+
+def absent(slot: Slot, image: DepthImage, model: FilterModel, count: int) -> tuple[Slot, Estimate]:
+    """A slot without a hand, and its estimate: of the only one, the last that was believed stands."""
+    nothing = no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
+    if count > 1:
+        return replace(slot, track=-1, gesture=None), nothing
+    estimate = lost_estimate(slot.last, image.index, image.timestamp_s, math.nan)
+    gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
+    return replace(slot, track=-1, gesture=gesture), estimate
+
+
+def estimate_of(
+    image: DepthImage,
+    found: Found,
+    score: float,
+    status: Status,
+    fitted: FittedHand,
+    model: FilterModel,
+) -> Estimate:
+    """The estimate of a frame, but for its joints' deviations and what `emitted` adds."""
+    particles, motions = found.filtered.particles, model.backend.motions
+    mean = on_device(found.filtered.mean, model.device)
+    tangents = motions.difference(particles, mean)
+    tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
+    covariance, effective = on_host(
+        particle_filter.covariance(tangents, found.filtered.weights),
+        particle_filter.effective_sample_size(found.filtered.weights),
+    )
+    return Estimate(
+        index=image.index,
+        timestamp_s=image.timestamp_s,
+        state_name=status.state_name,
+        lost=status.lost,
+        confidence=status.confidence,
+        outside_rad=found.off_rad,
+        joints_m=_host(fitted.refiner.joints(found.pose)[0]),
+        state=_host(found.pose[0]),
+        latent=_host(model.space.encode(found.pose[:, 6:])[0]),
+        score=score,
+        covariance=_host(covariance + torch.diag(model.model_variance)),
+        effective_sample_size=float(effective),
+        compute_s=math.nan,
+    )
+
+
+def emitted(
+    slot: Slot,
+    image: DepthImage,
+    estimate: Estimate,
+    shape: HandShape,
+    dt_s: float,
+    model: FilterModel,
+) -> tuple[Slot, Estimate]:
+    """The estimate with its gesture and other programs' conventions; and the slot with what is kept
+    of them.  shape: the hand of the estimate.
+    """
+    gesture, estimate = tell_gesture(
+        model.gestures, slot.gesture, estimate, model.space, dt_s / FRAME_S
+    )
+    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
+    estimate = in_all_conventions(estimate, shape, image.k, size_px)
+    # While there is no hand, the last estimate that was believed is reported, if one was.
+    kept = slot.last if estimate.lost and not slot.last.lost else estimate
+    return replace(slot, gesture=gesture, last=kept), estimate
+
+
+def _host(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().numpy().astype(np.float32)

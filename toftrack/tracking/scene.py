@@ -1,0 +1,139 @@
+"""A frame as it begins: where the tracks' hands are predicted, and to whom its pixels belong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+import torch
+
+from toftrack.frames import DepthImage
+from toftrack.render.model_image import cpu_surface, parted, range_image
+from toftrack.render.segmentation import Expected, Observation, reduce_image
+from toftrack.tracking.filter import Predicted, predict
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.state import Track
+
+_TOLERANCE_M = 0.02
+"""A pixel that is so near to a hand's surface may be the hand's."""
+_EDGE_M = 0.06
+"""Pixels on the outline of a hand mix it with what is behind, up to this."""
+_FAR_M = 5.0
+"""So far away is nothing for the detector."""
+_IN_FRONT_M = 0.03
+"""What is so much nearer than a hand's wrist may hide the hand."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An image, and the tracks' hands as they are predicted in it.
+
+    depth_m, k: (H, W) and (3, 3), the image as hands are segmented in it.
+    dt_s: since the last frame.
+    """
+
+    image: DepthImage
+    depth_m: np.ndarray
+    k: np.ndarray
+    hands: tuple[Predicted, ...]
+    dt_s: float
+    model: TrackerModel
+
+    @classmethod
+    def of(
+        cls, tracks: Sequence[Track], image: DepthImage, dt_s: float, model: TrackerModel
+    ) -> Scene:
+        """The scene of a frame that comes dt_s after the tracks' last one."""
+        depth_m, k = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
+        hands = tuple(predict(track, dt_s, model) for track in tracks)
+        return cls(image, depth_m, k, hands, dt_s, model)
+
+    @cached_property
+    def _deviations(self) -> np.ndarray:
+        """(B, H, W) how far each pixel is from each hand's surface, inf where there is none."""
+        height, width = self.depth_m.shape
+        surfaces = self._surfaces
+        there = (surfaces > 0) & (self.depth_m > 0)
+        off = np.where(there, np.abs(surfaces - self.depth_m), np.inf)
+        return off.reshape(-1, height, width)
+
+    @cached_property
+    def _surfaces(self) -> np.ndarray:
+        """(B, H, W) Z of the predicted hands' surfaces, 0 = none."""
+        height, width = self.depth_m.shape
+        each = [
+            range_image(
+                parted(cpu_surface(hand.fitted.shape).pose(hand.fitted.refiner.pose(hand.pose)))[0],
+                self.k,
+                height,
+                width,
+            )
+            for hand in self.hands
+        ]
+        return np.stack(each).astype(np.float32)
+
+    @cached_property
+    def owners(self) -> np.ndarray:
+        """(H, W) int8, the row of the hand that a pixel belongs to; -1 = to none of them.
+
+        It is the one whose surface is nearest. About the pixels of a hand lie the mixed ones of its
+        outline, which are its own as well. A hand that is not reliable owns none.
+        """
+        owner = np.full(self.depth_m.shape, -1, np.int8)
+        if not self.hands:
+            return owner
+        off = self._deviations
+        nearest = off.argmin(0)
+        sure = off.min(0) < _TOLERANCE_M
+        for row, hand in enumerate(self.hands):
+            if not hand.track.reliable:
+                continue
+            own = sure & (nearest == row)
+            near = cv2.dilate(own.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            surface = np.where(own, self._surfaces[row], np.float32(0))
+            around = cv2.dilate(surface, np.ones((3, 3), np.float32))
+            mixed = near & ~sure & (self.depth_m > around) & (self.depth_m < around + _EDGE_M)
+            owner[own | mixed] = row
+        return owner
+
+    def owned_by_others(self, row: int) -> np.ndarray | None:
+        """(H, W) bool: pixels of other hands than that of a row; None where none are known."""
+        others = (hand.track.reliable for at, hand in enumerate(self.hands) if at != row)
+        return (self.owners >= 0) & (self.owners != row) if any(others) else None
+
+    def image_for(self, row: int) -> DepthImage:
+        """The image as the pose network is to see it about a hand: with nothing where other hands
+        are, or keypoints lie on their fingers as well. What may hide the hand stays, for the
+        network knows things that hide hands.
+        """
+        others = self.owned_by_others(row)
+        if others is None:
+            return self.image
+        nearest = float(self.hands[row].pose[0, 2]) - _IN_FRONT_M
+        return self._without(others & (self.depth_m > nearest))
+
+    def unexplained(self) -> DepthImage:
+        """The image with nothing where the tracks' hands are."""
+        return self._without(self.owners >= 0) if self.hands else self.image
+
+    def _without(self, pixels: np.ndarray) -> DepthImage:
+        if not pixels.any():
+            return self.image
+        height, width = self.image.depth_m.shape
+        gone = cv2.resize(pixels.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        depth_m = np.where(gone, np.float32(_FAR_M), self.image.depth_m)
+        return replace(self.image, depth_m=depth_m)
+
+    def segment(self, expected: Expected, row: int) -> Observation:
+        """What can be the hand of a row where it is expected; of a hand without a row, -1."""
+        others = self.owned_by_others(row)
+        return self.model.segmentation(self.image.depth_m, self.image.k, expected, others)
+
+    def others_joints(self, row: int) -> tuple[torch.Tensor, ...]:
+        """(21, 3) each, the joints of the other hands that are reliable."""
+        return tuple(
+            hand.joints_m for at, hand in enumerate(self.hands) if at != row and hand.track.reliable
+        )

@@ -1,0 +1,153 @@
+"""Right or left: evidence for a track's side, summed up over comparisons.
+
+The same image is explained twice, by the pose network's poses of a right hand and by those of a
+left one, each brought onto the seen points; their posteriors are compared. The network's own word
+counts a little beside them: where the image says nothing, as of a fist that does not move, it is
+right more often, but it believes a wrong pose whose crop it sees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from toftrack.detector.hand_detector import Detection
+from toftrack.frames import DepthImage
+from toftrack.tracking.candidates import View, best_start
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
+
+_WEIGHT, _LARGEST, _MOST = 2.0, 3.0, 6.0
+"""A comparison counts so many times the difference of the log posteriors, this at most; and the log
+odds that all together are never more than."""
+_KEYPOINTS = 0.1
+"""Weight of the keypoints in a comparison; little, for the network sees a hand of either side where
+it looks for one."""
+_NETWORK, _LEAST_SIDE = 0.03, 1e-4
+"""Weight of the difference of the network's own log odds; it is never surer of a side than that."""
+_SHOULDER, _SHOULDER_MOST, _BODY_COMPARISONS = 10.0, 1.0, 20
+"""Log odds for each m that the body is beside the hand, for people face the camera, these at most;
+and comparisons over which the body's place is averaged."""
+_BEHIND_M, _BODY_M2, _BODY_ROWS = (0.12, 0.55), 0.03, 72
+"""The body lies so far behind a hand that is raised before it; its least area that is seen, and
+rows of the image that it is searched in."""
+_PARTNER = 2.0
+"""Log odds that two hands which are seen at once are of different sides."""
+_TOLD = 2.0
+"""Log odds that a hand which is seen alone is of the side that the user said."""
+_SURE, _FIRST = 3.0, 5
+"""Log odds from which on the sides are compared less often; a new hand's are, so often, before."""
+_UNSURE_S, _SURE_S = 0.08, 0.8
+"""Seconds between two comparisons."""
+_SWITCHED, _SWITCHED_TOLD = 0.2, 2.4
+"""Log odds by which the other side must be likelier for a track to change, so that it does not
+flicker; and where the user said a side."""
+_LEAST_PRESENT, _LEAST_LOG_ODDS = 0.5, -1.0
+"""Where a hand is less probable, or its estimate is less surely right, its sides are not compared:
+neither pose is the hand's, and which one explains more of the image is chance."""
+
+
+def side_log_odds(track: Track, others: Sequence[Track], told: str | None) -> float:
+    """Log odds that a track is a right hand, with what is known beside its own evidence.
+
+    others: the other tracks that are confirmed; a person's two hands are not of one side.
+    told: the side that the user said, of a hand that is seen alone.
+    """
+    evidence, total = track.evidence, track.evidence.fits
+    if told is None:
+        shoulder = _SHOULDER * evidence.body_m
+        total += min(max(shoulder, -_SHOULDER_MOST), _SHOULDER_MOST)
+    if len(others) == 1:
+        return total - _PARTNER * math.tanh(0.5 * others[0].evidence.fits)
+    if told is not None and not others:
+        total += _TOLD if told == "right" else -_TOLD
+    return total
+
+
+def comparison_due(track: Track, dt_s: float) -> bool:
+    """Whether both sides of a track's hand are to be compared in a frame, dt_s after the last."""
+    if track.confirmed and track.log_odds < _LEAST_LOG_ODDS:
+        return False
+    known = abs(track.evidence.fits) > _SURE and track.evidence.comparisons >= _FIRST
+    return track.evidence.age_s + dt_s >= (_SURE_S if known else _UNSURE_S)
+
+
+def compare(view: View, mirrored: Detection, image: DepthImage) -> SideEvidence:
+    """A track's evidence after one more comparison.
+
+    mirrored: what the pose network says of the other side at the hand's place.
+    image: without other hands.
+    """
+    evidence, side = view.track.evidence, view.track.side
+    if view.detection.empty or view.detection.present < _LEAST_PRESENT:
+        return evidence
+    gain = _best_of_side(view, view.detection, side)
+    gain -= _best_of_side(view, mirrored, OTHER_SIDE[side])
+    gain += _NETWORK * _said(view.detection, mirrored, side, image, view.model)
+    gain = gain if side == "right" else -gain
+    comparisons = evidence.comparisons + 1
+    fits = evidence.fits + _WEIGHT * min(max(gain, -_LARGEST), _LARGEST)
+    offset = body_offset_m(image, view.detection.centre_m.numpy())
+    body_m = evidence.body_m + (offset - evidence.body_m) / min(comparisons, _BODY_COMPARISONS)
+    return SideEvidence(min(max(fits, -_MOST), _MOST), body_m, comparisons, 0.0)
+
+
+def changes_side(track: Track, log_odds: float, told: str | None) -> bool:
+    """Whether a track's hand, a right one with these log odds, is of the other side after all."""
+    own = log_odds if track.side == "right" else -log_odds
+    return own < -(_SWITCHED if told is None else _SWITCHED_TOLD)
+
+
+def _best_of_side(view: View, detection: Detection, side: str) -> float:
+    """The log posterior of the best pose that the detector has for a side."""
+    fitted = view.model.hand(side, view.track.shape)
+    # Very different poses are compared: what explains more of the image counts in full.
+    image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
+    seen = replace(view, fitted=fitted, detection=detection, image=image)
+    return best_start(seen, _KEYPOINTS)[1]
+
+
+def _said(
+    detection: Detection, mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
+) -> float:
+    """How much surer the network is of a side than of the other one, log odds.
+
+    It is asked about the crop of either side's pose, for a crop that is turned as a pose has it
+    makes that pose's side the likelier one.
+    """
+    said = _of_network(detection) - _of_network(mirrored)
+    if mirrored.empty:
+        return said
+    centre, up = mirrored.centre_m.numpy()[None], mirrored.up[None]
+    own, other = (
+        model.detector.detect(image.depth_m, image.k, centre, one, up)[0]
+        for one in (side, OTHER_SIDE[side])
+    )
+    return 0.5 * (said + _of_network(own) - _of_network(other))
+
+
+def _of_network(detection: Detection) -> float:
+    """That a hand is of the side that was looked for, by the network; 0 where it was not asked.
+
+    Most hands that it was trained on are of that side, which cancels in the difference of both.
+    """
+    p = min(max(detection.right_side, _LEAST_SIDE), 1 - _LEAST_SIDE)
+    return math.log(p / (1 - p))
+
+
+def body_offset_m(image: DepthImage, centre_m: np.ndarray) -> float:
+    """How far a body behind a hand is to the image's right of it; 0 where none is seen.
+
+    Who faces the camera has the right hand to the image's left of the body, as a rule.
+    """
+    step = max(1, int(image.depth_m.shape[0] / _BODY_ROWS))
+    depth = image.depth_m[::step, ::step]
+    behind = (depth > centre_m[2] + _BEHIND_M[0]) & (depth < centre_m[2] + _BEHIND_M[1])
+    columns, z = np.nonzero(behind)[1] * step, depth[behind]
+    focal = float(image.k[0, 0])
+    if np.square(z * step / focal).sum() < _BODY_M2:
+        return 0.0
+    return float(np.median((columns - image.k[0, 2]) / focal * z)) - float(centre_m[0])

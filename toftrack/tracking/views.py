@@ -1,0 +1,166 @@
+"""Tracks as they go into a frame: continued with their detection, changed to the other side, begun."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.frames import DepthImage
+from toftrack.refinement import shape_fit
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
+from toftrack.render.segmentation import Expected
+from toftrack.tracking.association import Seen
+from toftrack.tracking.candidates import View, best_start, image_term, with_parts, without_things
+from toftrack.tracking.filter import new_track
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.scene import Scene
+from toftrack.tracking.sides import changes_side, compare, side_log_odds
+from toftrack.tracking.state import OTHER_SIDE, Track, TrackerState
+
+_SPARE = 1
+"""So many tracks may be followed beyond those that are asked for, or the two hands of a person."""
+
+
+def continued(scene: Scene, row: int, seen: Seen | None, told: str | None) -> View | None:
+    """A track in a frame, with its detection; None where nothing in the image can be its hand.
+
+    It begins anew where it was seen at another place than where it was predicted, or turns out to
+    be of the other side.
+    """
+    hand, model = scene.hands[row], scene.model
+    detection = NO_DETECTION if seen is None else seen.detection
+    away = 0.0
+    if not detection.empty:
+        away = float(np.linalg.norm(detection.centre_m.numpy() - hand.palm_m[0]))
+    moved = seen is not None and seen.row < 0 and away > SAME_PLACE_M
+    track = observed(hand.track, detection, model)
+    evidence = track.evidence
+    track = replace(track, evidence=replace(evidence, age_s=evidence.age_s + scene.dt_s))
+    view = viewed(scene, row, track, detection, expected_of(detection) if moved else hand.depths)
+    if view is None:
+        return None
+    if moved:
+        view = replace(view, track=started(view))
+    if seen is None or seen.mirrored is None:
+        return with_parts(view)
+    return of_likelier_side(scene, row, with_parts(view), seen.mirrored, told)
+
+
+def begun(scene: Scene, new: Sequence[Seen], state: TrackerState) -> list[View | None]:
+    """Tentative tracks of hands that are no track's, as many as there is room for."""
+    model, tracks = scene.model, state.tracks
+    room = max(len(state.slots), 2) + _SPARE - len(tracks)
+    if any(not track.confirmed for track in tracks):
+        room = 0
+    views: list[View | None] = []
+    for one in new[: max(room, 0)]:
+        detection, image = one.detection, scene.unexplained()
+        nothing = torch.zeros(1, 6 + model.space.dims)
+        track = Track(
+            nothing,
+            nothing[:, 0],
+            nothing,
+            nothing[0],
+            torch.zeros(1, 27),
+            number=state.next_track + len(views),
+            side=one.side,
+            shape=known_shape(one.side, state),
+        )
+        track = observed(track, detection, model)
+        view = viewed(scene, -1, track, detection, expected_of(detection))
+        if view is None:
+            views.append(None)
+            continue
+        at = detection.centre_m.numpy()[None], OTHER_SIDE[one.side], detection.up[None]
+        mirrored = model.detector.detect(image.depth_m, image.k, *at)[0]
+        view = of_likelier_side(scene, -1, view, mirrored, state.told)
+        views.append(with_parts(replace(view, track=started(view))))
+    return views
+
+
+def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
+    """The shape of the hand of a side that was last in a slot which now has none."""
+    numbers = {track.number for track in state.tracks}
+    vacant = (slot for slot in state.slots if slot.track not in numbers and slot.side == side)
+    return next((slot.shape for slot in vacant), first_shape())
+
+
+def viewed(
+    scene: Scene, row: int, track: Track, detection: Detection, expected: Expected
+) -> View | None:
+    """A track's hand in the image; None where nothing there can be one."""
+    model = scene.model
+    observation = scene.segment(expected, row)
+    if observation.empty:
+        return None
+    fitted = model.hand(track.side, track.shape)
+    return View(
+        track,
+        fitted,
+        observation,
+        expected.nearest_m,
+        detection,
+        scene.others_joints(row),
+        image_term(observation, fitted, model),
+        model,
+    )
+
+
+def of_likelier_side(
+    scene: Scene, row: int, view: View, mirrored: Detection, told: str | None
+) -> View:
+    """The view after its sides were compared; of the other one, begun anew, where that is likelier."""
+    image: DepthImage = scene.image_for(row) if row >= 0 else scene.unexplained()
+    track = replace(view.track, evidence=compare(view, mirrored, image))
+    others = [hand.track for at, hand in enumerate(scene.hands) if at != row]
+    others = [other for other in others if other.confirmed]
+    if not changes_side(track, side_log_odds(track, others, told), told):
+        return replace(view, track=track)
+    track = replace(track, side=OTHER_SIDE[track.side], shape=first_shape())
+    track = observed(replace(track, pose=track.pose), mirrored, scene.model)
+    other = viewed(scene, row, track, mirrored, expected_of(mirrored))
+    if other is None:
+        return view
+    return with_parts(replace(other, track=started(other)))
+
+
+def started(view: View) -> Track:
+    """The track begun anew with the best of the detection's poses; it is the same hand's."""
+    model, seen = view.model, without_things(view.observation, view.detection)
+    # Very different poses are compared: what explains more of the image counts in full.
+    image = image_term(seen, view.fitted, model, coverage=1.0)
+    pose, _ = best_start(replace(view, observation=seen, image=image))
+    fresh, old = new_track(pose, model), view.track
+    return replace(
+        fresh,
+        number=old.number,
+        side=old.side,
+        evidence=old.evidence,
+        shape=old.shape,
+        confirmed=old.confirmed,
+        believed_s=old.believed_s,
+    )
+
+
+def observed(track: Track, detection: Detection, model: TrackerModel) -> Track:
+    """The track with what a detection says of its hand's shape: the length to begin with, and
+    whether it still is the hand that was fitted.
+    """
+    if detection.empty:
+        return track
+    shape, first = track.shape, model.configured.shape
+    if not track.age.begun:
+        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
+    return replace(track, shape=shape_fit.contradicted(shape, detection, model.fit, first))
+
+
+def expected_of(detection: Detection) -> Expected:
+    """Where a hand is to be segmented that is not tracked yet."""
+    joints = detection.joints_m[0]
+    nearest, farthest = map(float, joints[:, 2].aminmax())
+    return Expected(nearest, farthest, tuple(detection.centre_m.tolist()))
