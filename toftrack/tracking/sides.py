@@ -50,6 +50,10 @@ _LEAST_PRESENT, _LEAST_LOG_ODDS = 0.5, -1.0
 neither pose is the hand's, and which one explains more of the image is chance."""
 
 
+_WORST = -1e6
+"""Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
+
+
 def side_log_odds(track: Track, others: Sequence[Track], told: str | None) -> float:
     """Log odds that a track is a right hand, with what is known beside its own evidence.
 
@@ -107,7 +111,7 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     # Very different poses are compared: what explains more of the image counts in full.
     image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
     seen = replace(view, fitted=fitted, detection=detection, image=image)
-    return best_start(seen, _KEYPOINTS)[1]
+    return max(best_start(seen, _KEYPOINTS)[1], _WORST)
 
 
 def _said(
