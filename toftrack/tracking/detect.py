@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from toftrack.tracking.association import Seen
 from toftrack.tracking.confidence import log_odds
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import comparison_due
-from toftrack.tracking.state import NO_PLACES, OTHER_SIDE, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, TrackerState
 
 _RARE_S = 0.1
 """After so long a prediction says little: hands are looked for in the whole image first."""
@@ -24,36 +24,50 @@ _AS_WELL, _WELL_M = 1.3, 0.02
 both smaller than this."""
 
 
-def detected(
-    scene: Scene, state: TrackerState
-) -> tuple[list[Seen], TrackerState, Callable[[], Places] | None]:
-    """All detections of a frame; the state with the time of the finder's look, and what waits for
-    its places where they are only needed in the next frame.
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """Networks that work on a frame.
 
-    While every hand is surely followed, the finder runs beside the filter, and what it sees is
-    looked at a frame later.
+    own: each waits for the detection at a track's place.  finding: waits for the finder's places;
+        None where it is not asked.
+    at_once: a hand is to be found anew, for which all wait; else what the finder sees is looked at
+        a frame later.
+    found: the finder looks at this frame.
     """
+
+    own: Sequence[Callable[[], Seen]]
+    finding: Callable[[], Places] | None
+    at_once: bool
+    found: bool
+
+
+def ask(scene: Scene, state: TrackerState) -> Asked:
+    """Begin to look at the tracks' places, and in the whole image, beside whatever comes next."""
     detector, image = scene.model.detector, scene.image
-    reliable = [hand.track.reliable for hand in scene.hands]
-    rare = scene.dt_s > _RARE_S
-    at_once = rare or not all(reliable) or not reliable
-    settings = detector.settings
-    frames = settings.search if at_once or threads() > 1 else max(settings.search, 2)
+    followed = bool(scene.hands) and all(hand.track.reliable for hand in scene.hands)
+    at_once = not followed or scene.dt_s > _RARE_S
+    frames = detector.settings.search
+    frames = frames if at_once or threads() > 1 else max(frames, 2)
     due = frames == 1 or Duration(state.found_s).reached(frames)
     finding = detector.start_search(image.depth_m, image.k) if due and at_once else None
     own = [_start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row)]
-    places = state.places
-    if finding is not None:
-        places, finding, state = finding(), None, replace(state, found_s=0.0)
-    seen = [wait() for wait in own]
     if due and not at_once:
         finding = detector.start_search(image.depth_m, image.k)
-        state = replace(state, found_s=0.0)
-    known = [] if rare else [h.palm_m[0] for h in scene.hands if h.track.reliable]
+    return Asked(own, finding, at_once, due)
+
+
+def detected(asked: Asked, scene: Scene, state: TrackerState) -> tuple[list[Seen], Asked]:
+    """All detections of a frame; and what is still waited for."""
+    places = state.places
+    if asked.at_once and asked.finding is not None:
+        places, asked = asked.finding(), replace(asked, finding=None)
+    seen = [wait() for wait in asked.own]
+    rare = scene.dt_s > _RARE_S
+    known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
     places = _apart_from([*known, *state.refused[:, :3]], places)
     if len(places.centre_m):
         seen += _elsewhere(scene, state, places, rare)
-    return seen, replace(state, places=NO_PLACES), finding
+    return seen, asked
 
 
 def _is_asked(scene: Scene, row: int) -> bool:

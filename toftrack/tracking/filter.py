@@ -119,6 +119,13 @@ def run_filter(
     return Filtered(particles, weights, motions.mean(particles, weights))
 
 
+def drifted(track: Track, dt_s: float, model: FilterModel) -> Filtered:
+    """A track's particles dt_s later, where no image says where its hand is."""
+    motions, moved = model.backend.motions, predicted_motion(track, dt_s, model.filter)[None]
+    particles = motions.compose(track.particles, on_device(moved, model.device))
+    return Filtered(particles, track.weights, motions.compose(track.mean, moved))
+
+
 @dataclass(frozen=True, eq=False)
 class Filtered:
     """What the filter makes of a frame.

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from toftrack.compute import particle_filter
 from toftrack.compute.pace import FRAME_S
+from toftrack.compute.spans import Spans
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
@@ -23,12 +24,15 @@ from toftrack.gestures.recognition import tell_gesture
 from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
 from toftrack.tracking.belief import Status, probability
+from toftrack.tracking.candidates import View
+from toftrack.tracking.confidence import joint_features
 from toftrack.tracking.filter import Found
 from toftrack.tracking.model import FilterModel, FittedHand
+from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import side_log_odds
 from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
 
-_OTHER_HAND = 0.4
+_OTHER = 0.4
 """Where it is less probable than this that a hand is of the given side, the frame is flagged."""
 _STAYS, _BELIEVED, _CONFIRMED, _SIDE = 1.5, 3.0, 3.0, 3.0
 """Of a slot's value for a track: that it was there before; that its estimate is not lost; that it
@@ -39,38 +43,36 @@ _GONE_S = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A track after a frame, what was seen of it, its estimate, and the hand of that estimate."""
+    """A track after a frame: what it was compared with, what was found, its F-measure, and what is
+    thought of it.
+    """
 
+    view: View
     track: Track
-    info: StepInfo
-    estimate: Estimate
-    fitted: FittedHand
+    found: Found
+    score: float
+    status: Status
 
 
 def report(
-    state: TrackerState,
-    followed: Sequence[Followed],
-    image: DepthImage,
-    model: FilterModel,
-    dt_s: float,
-    seconds: Mapping[str, float],
+    state: TrackerState, followed: Sequence[Followed], scene: Scene, spans: Spans
 ) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
     """The state with its slots, and for each slot what was seen and the estimate.
 
     state: with the tracks that go on.
     """
     sides = {one.track.number: log_odds_of(one.track, state) for one in followed}
-    chosen = assigned(state, followed, sides)
     slots, infos, estimates = [], list[StepInfo | None](), []
-    for slot, one in zip(state.slots, chosen, strict=True):
+    for number, one in enumerate(assigned(state, followed, sides)):
+        slot, info = state.slots[number], None
         if one is None:
-            slot, estimate = absent(slot, image, model, len(state.slots))
-            infos.append(None)
+            slot, estimate = absent(slot, scene.image, scene.model, len(state.slots))
         else:
             right = sides[one.track.number]
-            slot, estimate = reported(slot, one, right, state, image, dt_s, model)
-            infos.append(replace(one.info, seconds=seconds))
+            slot, info, estimate = reported(number, one, right, state, scene)
+            info = replace(info, seconds=spans.seconds())
         slots.append(slot)
+        infos.append(info)
         estimates.append(estimate)
     return replace(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
 
@@ -117,43 +119,69 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
 
 
 def reported(
-    slot: Slot,
-    one: Followed,
-    right: float,
-    state: TrackerState,
-    image: DepthImage,
-    dt_s: float,
-    model: FilterModel,
-) -> tuple[Slot, Estimate]:
-    """A slot with its track after a frame, and the estimate as it is reported."""
-    track, estimate = one.track, one.estimate
+    number: int, one: Followed, right: float, state: TrackerState, scene: Scene
+) -> tuple[Slot, StepInfo, Estimate]:
+    """A slot with its track after a frame, what was seen of it, and the estimate.
+
+    right: log odds that it is a right hand.
+    """
+    slot, track, view, model = state.slots[number], one.track, one.view, scene.model
+    if slot.track != track.number:
+        slot = replace(slot, gesture=None, joint_features=np.zeros_like(slot.joint_features))
+    estimate = estimate_of(scene.image, one.found, one.score, one.status, view.fitted, model)
+    image = scene.image  # as the camera took it, and not reduced
+    rows = joint_features(
+        estimate.joints_m,
+        view.detection,
+        slot.joint_features,
+        one.score,
+        track.log_odds,
+        image.depth_m,
+        image.k,
+    )
+    sigma, confidence = model.lost.joints.judge(rows)
     sure = probability(right if track.side == "right" else -right)
     if state.told is None:
         estimate = replace(estimate, confidence=estimate.confidence * sure)
     else:
-        wanted = state.told if slot is state.slots[0] else OTHER_SIDE[state.told]
-        if probability(right if wanted == "right" else -right) < _OTHER_HAND:
-            none = np.zeros_like(estimate.joint_ok)
-            estimate = replace(estimate, lost=True, joint_ok=none, state_name="other hand")
+        wanted = OTHER_SIDE[state.told] if number else state.told
         sure = 1.0 if track.side == wanted else sure
-    estimate = replace(estimate, side=track.side, side_probability=sure)
-    fresh = slot.track != track.number
-    slot, estimate = emitted(
-        replace(slot, gesture=None if fresh else slot.gesture),
-        image,
+        if len(state.slots) < 3 and probability(right if wanted == "right" else -right) < _OTHER:
+            estimate = replace(estimate, lost=True, state_name="other hand")
+    estimate = replace(
         estimate,
-        one.fitted.shape,
-        dt_s,
-        model,
+        side=track.side,
+        side_probability=sure,
+        joint_sigma_m=sigma,
+        joint_confidence=confidence,
+        joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
-    known = right if track.confirmed else slot.known
-    away = slot.away_s if estimate.lost else 0.0
-    now = replace(slot, track=track.number, known=known, away_s=away)
-    return replace(now, side=track.side, shape=track.shape), estimate
+    slot, estimate = emitted(slot, image, estimate, view.fitted.shape, scene.dt_s, model)
+    detection = None if view.detection.empty else view.detection
+    particles = one.found.filtered
+    info = StepInfo(
+        view.observation,
+        particles.particles,
+        particles.weights,
+        {},
+        track.features,
+        rows,
+        detection,
+    )
+    slot = replace(
+        slot,
+        track=track.number,
+        side=track.side,
+        shape=track.shape,
+        known=right if track.confirmed else slot.known,
+        away_s=slot.away_s if estimate.lost else 0.0,
+        joint_features=rows,
+    )
+    return slot, info, estimate
 
 
 def absent(slot: Slot, image: DepthImage, model: FilterModel, count: int) -> tuple[Slot, Estimate]:
-    """A slot without a hand, and its estimate: of the only one, the last that was believed stands."""
+    """A slot without a hand, and its estimate; of the only slot the last believed one stands."""
     nothing = no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
     if count > 1:
         return replace(slot, track=-1, gesture=None), nothing

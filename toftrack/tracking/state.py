@@ -56,7 +56,7 @@ class Track:
     confirmed: one of its estimates was believed; until then the track is tentative.
     believed_s: how long ago one was, or since it began; 0 = the last one is not lost.
     asked_s: how long ago the pose network was asked about it.
-    features, joint_features: of the last estimate, (21, J); see confidence.py.
+    features: of the last estimate, see confidence.py.
     nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
         at; 0 while nothing does.
     """
@@ -79,7 +79,6 @@ class Track:
     believed_s: float = 0.0
     asked_s: float = 0.0
     features: ConfidenceFeatures = NO_FEATURES
-    joint_features: np.ndarray = field(default_factory=lambda: np.zeros((21, len(JOINT_FEATURES))))
     nearest_m: float = 0.0
 
     @property
@@ -97,6 +96,7 @@ class Slot:
     last: the last estimate that was believed, or that there was; lost and NaN before any.
     gesture: smoothed probabilities of the gestures, None where there are none.
     away_s: how long ago a hand was believed here; inf = never.
+    joint_features: (21, J) of the last estimate, see confidence.py.
     """
 
     side: str
@@ -106,6 +106,7 @@ class Slot:
     known: float = 0.0
     gesture: GestureState | None = None
     away_s: float = math.inf
+    joint_features: np.ndarray = field(default_factory=lambda: np.zeros((21, len(JOINT_FEATURES))))
 
 
 NO_PLACES = Places(np.zeros((0, 3)), np.zeros(0))

@@ -17,22 +17,24 @@ from toftrack.refinement.steadying import steadied
 from toftrack.tracking.association import are_one, assign, costs, ends, left_over, sureness
 from toftrack.tracking.belief import judge
 from toftrack.tracking.candidates import View, keypoints_of, propose
-from toftrack.tracking.confidence import confidence_features, joint_features
-from toftrack.tracking.detect import detected
+from toftrack.tracking.confidence import confidence_features
+from toftrack.tracking.detect import ask, detected
 from toftrack.tracking.filter import (
+    Filtered,
     Found,
     drawn_to,
+    drifted,
     new_track,
     predict,
     run_filter,
     velocity_after,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.report import Followed, estimate_of, report
+from toftrack.tracking.report import Followed, report
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.select import select
-from toftrack.tracking.state import StepInfo, Track, TrackerState
-from toftrack.tracking.views import begun, continued
+from toftrack.tracking.state import NO_PLACES, StepInfo, Track, TrackerState
+from toftrack.tracking.views import begun, continued, most_new, predicted_view
 
 Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state, and for each slot what was seen, None where nothing was, and the estimate."""
@@ -60,40 +62,71 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
     before = state.at(image)
     with spans("detector"):
         scene = Scene.of(before.tracks, image, dt_s, model)
-        seen, before, finding = detected(scene, before)
+        asked = ask(scene, before)
+        views = [predicted_view(scene, row) for row in range(len(scene.hands))]
+    dice = _dice(generator, len(views) + most_new(before))
+    early = dict[int, Filtered]()
+    if not asked.at_once:  # the networks need nothing of it, and it needs little of them
+        shown = {slot.track for slot in before.slots}
+        early = {
+            row: filtered(view, dt_s, dice[row], spans, view.track.number in shown)
+            for row, view in enumerate(views)
+            if view is not None
+        }
+    with spans("detector"):
+        seen, asked = detected(asked, scene, before)
         taken = assign(costs(scene.hands, seen, dt_s))
         views = [
-            continued(scene, row, seen[column] if column >= 0 else None, before.told)
-            for row, column in enumerate(taken)
+            continued(scene, row, view, seen[column] if column >= 0 else None, before.told)
+            for row, (view, column) in enumerate(zip(views, taken, strict=True))
         ]
-        new = begun(scene, left_over(seen, taken), before)
-        before = replace(before, next_track=before.next_track + len(new))
-        views += new
+        views += begun(scene, left_over(seen, taken), before)
     followed = [
-        follow(view, scene, dice, spans)
-        for view, dice in zip(views, _dice(generator, len(views)), strict=True)
+        follow(view, early.get(row), scene, dice[row], spans)
+        for row, view in enumerate(views)
         if view is not None
     ]
     with spans("detector"):
-        places = before.places if finding is None else finding()
-    after = replace(before, places=places, generator=generator.get_state())
+        places = NO_PLACES if asked.finding is None else asked.finding()
+    after = replace(
+        before,
+        places=places,
+        found_s=0.0 if asked.found else before.found_s,
+        next_track=before.next_track + len(views) - len(taken),
+        generator=generator.get_state(),
+    )
     after = kept(after, [one.track for one in followed], model)
-    return report(after, followed, image, model, dt_s, spans.seconds())
+    return report(after, followed, scene, spans)
 
 
 def _dice(generator: torch.Generator, count: int) -> list[torch.Generator]:
-    """A generator for each of the hands: what one draws does not depend on how many there are."""
-    seeds = torch.randint(2**62, (max(count - 1, 0),), generator=generator)
-    return [generator, *(torch.Generator().manual_seed(int(seed)) for seed in seeds)][:count]
+    """A generator for each hand: what one draws does not depend on how many there are."""
+    seeds = torch.randint(2**62, (count - 1,), generator=generator).tolist()
+    return [generator, *(torch.Generator().manual_seed(seed) for seed in seeds)]
 
 
-def follow(view: View, scene: Scene, generator: torch.Generator, spans: Spans) -> Followed:
-    """A track after a frame: its particles filtered, its pose chosen and judged."""
-    model, track, dt_s = view.model, view.track, scene.dt_s
+def filtered(
+    view: View, dt_s: float, generator: torch.Generator, spans: Spans, shown: bool
+) -> Filtered:
+    """The particles of a frame; of a hand that nobody asked for only moved on."""
     with spans("filter: rest"):
-        filtered = run_filter(track, dt_s, view.image, model, generator, spans)
+        if not shown:
+            return drifted(view.track, dt_s, view.model)
+        return run_filter(view.track, dt_s, view.image, view.model, generator, spans)
+
+
+def follow(
+    view: View, early: Filtered | None, scene: Scene, generator: torch.Generator, spans: Spans
+) -> Followed:
+    """A track after a frame: its particles filtered, its pose chosen and judged.
+
+    early: its particles as of this frame, if it goes on where it was predicted.
+    """
+    model, track, dt_s = view.model, view.track, scene.dt_s
+    if early is None or track.age.seconds == 0:
+        early = filtered(view, dt_s, generator, spans, shown=True)
     with spans("refinement"):
-        table = propose(view, model.decode(filtered.mean))
+        table = propose(view, model.decode(early.mean))
         choice = select(table, view.fitted.refiner.joints(table.pose), view.hidden)
     pose, trend = choice.pose, track.trend
     if choice.moved:
@@ -101,25 +134,15 @@ def follow(view: View, scene: Scene, generator: torch.Generator, spans: Spans) -
         track, trend = replace(track, age=fresh.age, doubtful=fresh.doubtful), fresh.trend
     elif model.refinement.iterations:
         pose, trend = steadied(pose, track.pose, trend, dt_s, model.backend.motions)
-    found = Found(filtered, pose, trend, *model.nearest(pose))
+    found = Found(early, pose, trend, *model.nearest(pose))
     score, joints = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
-    seen = view.observation
-    features = confidence_features(
-        joints, score, track.age.seconds, view.detection, track.features, seen.depth_m, seen.k
-    )
+    age_s, last, seen = track.age.seconds, track.features, view.observation
+    features = confidence_features(joints, score, age_s, view.detection, last, seen.depth_m, seen.k)
     beside = any(hand.track.confirmed for hand in scene.hands if hand.track.number != track.number)
     new = model.lost.second if beside else model.lost.believe
     status = judge(track, features, dt_s, new, model.lost)
-    estimate = estimate_of(scene.image, found, score, status, view.fitted, model)
-    image, last = scene.image, track.joint_features  # as the camera took it, and not reduced
-    rows = joint_features(
-        estimate.joints_m, view.detection, last, score, status.log_odds, image.depth_m, image.k
-    )
-    sigma, confidence = model.lost.joints.judge(rows)
-    ok = (confidence >= model.lost.joint_ok) & (not status.lost)
-    estimate = replace(estimate, joint_sigma_m=sigma, joint_confidence=confidence, joint_ok=ok)
     # Without refinement the particles stay where they are.
-    drawn = drawn_to(found, model) if model.refinement.iterations else found.filtered
+    drawn = drawn_to(found, model) if model.refinement.iterations else early
     track = replace(
         track,
         particles=drawn.particles,
@@ -137,12 +160,9 @@ def follow(view: View, scene: Scene, generator: torch.Generator, spans: Spans) -
         believed_s=track.believed_s + dt_s if status.lost else 0.0,
         asked_s=track.asked_s + dt_s if view.detection.empty else 0.0,
         features=features,
-        joint_features=rows,
         nearest_m=view.expected_m if view.hidden else 0.0,
     )
-    detection = None if view.detection.empty else view.detection
-    info = StepInfo(seen, filtered.particles, filtered.weights, {}, features, rows, detection)
-    return Followed(track, info, estimate, view.fitted)
+    return Followed(view, track, found, score, status)
 
 
 def learned_shape(view: View, found: Found) -> shape_fit.ShapeEstimate:

@@ -1,4 +1,4 @@
-"""Tracks as they go into a frame: continued with their detection, changed to the other side, begun."""
+"""Tracks as they go into a frame: with their detection, of the likelier side, begun."""
 
 from __future__ import annotations
 
@@ -26,39 +26,54 @@ _SPARE = 1
 """So many tracks may be followed beyond those that are asked for, or the two hands of a person."""
 
 
-def continued(scene: Scene, row: int, seen: Seen | None, told: str | None) -> View | None:
-    """A track in a frame, with its detection; None where nothing in the image can be its hand.
+def predicted_view(scene: Scene, row: int) -> View | None:
+    """A track where it is predicted, before anything was detected; None where nothing in the image
+    can be its hand.
+    """
+    hand = scene.hands[row]
+    evidence = replace(hand.track.evidence, age_s=hand.track.evidence.age_s + scene.dt_s)
+    track = replace(hand.track, evidence=evidence)
+    return viewed(scene, row, track, NO_DETECTION, hand.depths)
+
+
+def continued(
+    scene: Scene, row: int, view: View | None, seen: Seen | None, told: str | None
+) -> View | None:
+    """A track in a frame with its detection; None where nothing in the image can be its hand.
 
     It begins anew where it was seen at another place than where it was predicted, or turns out to
     be of the other side.
     """
-    hand, model = scene.hands[row], scene.model
-    detection = NO_DETECTION if seen is None else seen.detection
-    away = 0.0
-    if not detection.empty:
-        away = float(np.linalg.norm(detection.centre_m.numpy() - hand.palm_m[0]))
-    moved = seen is not None and seen.row < 0 and away > SAME_PLACE_M
-    track = observed(hand.track, detection, model)
-    evidence = track.evidence
-    track = replace(track, evidence=replace(evidence, age_s=evidence.age_s + scene.dt_s))
-    view = viewed(scene, row, track, detection, expected_of(detection) if moved else hand.depths)
+    if seen is None:
+        return view
+    detection, palm = seen.detection, scene.hands[row].palm_m[0]
+    away = float(np.linalg.norm(detection.centre_m.numpy() - palm))
+    moved = seen.row < 0 and away > SAME_PLACE_M
+    if moved:
+        view = viewed(scene, row, scene.hands[row].track, detection, expected_of(detection))
     if view is None:
         return None
+    view = replace(view, detection=detection, track=observed(view.track, detection, scene.model))
     if moved:
         view = replace(view, track=started(view))
-    if seen is None or seen.mirrored is None:
-        return with_parts(view)
-    return of_likelier_side(scene, row, with_parts(view), seen.mirrored, told)
+    view = with_parts(view)
+    if seen.mirrored is None:
+        return view
+    return of_likelier_side(scene, row, view, seen.mirrored, told)
+
+
+def most_new(state: TrackerState) -> int:
+    """How many tracks may begin in a frame: not beside one that is tentative."""
+    if any(not track.confirmed for track in state.tracks):
+        return 0
+    return max(0, max(len(state.slots), 2) + _SPARE - len(state.tracks))
 
 
 def begun(scene: Scene, new: Sequence[Seen], state: TrackerState) -> list[View | None]:
     """Tentative tracks of hands that are no track's, as many as there is room for."""
-    model, tracks = scene.model, state.tracks
-    room = max(len(state.slots), 2) + _SPARE - len(tracks)
-    if any(not track.confirmed for track in tracks):
-        room = 0
+    model = scene.model
     views: list[View | None] = []
-    for one in new[: max(room, 0)]:
+    for one in new[: most_new(state)]:
         detection, image = one.detection, scene.unexplained()
         nothing = torch.zeros(1, 6 + model.space.dims)
         track = Track(
@@ -114,7 +129,7 @@ def viewed(
 def of_likelier_side(
     scene: Scene, row: int, view: View, mirrored: Detection, told: str | None
 ) -> View:
-    """The view after its sides were compared; of the other one, begun anew, where that is likelier."""
+    """The view after its sides were compared; begun anew, of the other one, where it is likelier."""
     image: DepthImage = scene.image_for(row) if row >= 0 else scene.unexplained()
     track = replace(view.track, evidence=compare(view, mirrored, image))
     others = [hand.track for at, hand in enumerate(scene.hands) if at != row]
@@ -122,7 +137,7 @@ def of_likelier_side(
     if not changes_side(track, side_log_odds(track, others, told), told):
         return replace(view, track=track)
     track = replace(track, side=OTHER_SIDE[track.side], shape=first_shape())
-    track = observed(replace(track, pose=track.pose), mirrored, scene.model)
+    track = observed(track, mirrored, scene.model)
     other = viewed(scene, row, track, mirrored, expected_of(mirrored))
     if other is None:
         return view
