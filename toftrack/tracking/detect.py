@@ -9,7 +9,9 @@ import numpy as np
 
 from toftrack.compute.pace import Duration
 from toftrack.compute.threads import threads
+from toftrack.detector.crops import CROP_M
 from toftrack.detector.hand_detector import Detection
+from toftrack.detector.parts import FOREARM_PART
 from toftrack.detector.proposals import SAME_PLACE_M, Places
 from toftrack.tracking.association import Seen
 from toftrack.tracking.confidence import log_odds
@@ -19,6 +21,8 @@ from toftrack.tracking.state import OTHER_SIDE, TrackerState
 
 _RARE_S = 0.1
 """After so long a prediction says little: hands are looked for in the whole image first."""
+_ARM_M, _ARM_RADIUS_M = 0.3, 0.06
+"""Length and radius of what may be a forearm with its sleeve."""
 _AS_WELL, _WELL_M = 1.3, 0.02
 """Hands are seen about as well when their expected errors differ by less than this factor, or are
 both smaller than this."""
@@ -66,7 +70,9 @@ def detected(asked: Asked, scene: Scene, state: TrackerState) -> tuple[list[Seen
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
     places = _apart_from([*known, *state.refused[:, :3]], places)
     if len(places.centre_m):
-        seen += _elsewhere(scene, state, places, rare)
+        arms = [] if rare else [_arm(scene, one) for one in seen]
+        found = _elsewhere(scene, state, places, rare)
+        seen += [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
     return seen, asked
 
 
@@ -107,6 +113,34 @@ def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) ->
             seen.append(Seen(one, side))
     seen.sort(key=lambda one: -one.detection.merit)
     return seen if tracks or state.told else held_out_first(seen)
+
+
+Arm = tuple[np.ndarray, np.ndarray]
+"""A wrist, and the direction of the forearm from there, (3,) each."""
+
+
+def _arm(scene: Scene, seen: Seen) -> Arm | None:
+    """The arm of a hand that is surely followed: where the pose network sees its forearm, or where
+    its fingers do not point.
+    """
+    hand = scene.hands[seen.row]
+    if not hand.track.reliable:
+        return None
+    wrist, up = seen.detection.keypoints.points_m[0].numpy(), seen.detection.up
+    near = scene.near(wrist, CROP_M / 2)
+    forearm = near[seen.detection.parts.at(near) == FOREARM_PART]
+    along = forearm.mean(0) - wrist if len(forearm) else -up
+    return wrist, along / max(float(np.linalg.norm(along)), 1e-6)
+
+
+def _is_on(arm: Arm | None, detection: Detection) -> bool:
+    """Whether a palm lies on an arm, which a bare one looks like, and no hand."""
+    if arm is None:
+        return False
+    away = detection.centre_m.numpy() - arm[0]
+    along = float(away @ arm[1])
+    beside = float(np.linalg.norm(away - along * arm[1]))
+    return 0 < along < _ARM_M and beside < _ARM_RADIUS_M
 
 
 def _apart_from(known: Sequence[np.ndarray], places: Places) -> Places:

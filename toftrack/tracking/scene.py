@@ -127,6 +127,15 @@ class Scene:
         depth_m = np.where(gone, np.float32(_FAR_M), self.image.depth_m)
         return replace(self.image, depth_m=depth_m)
 
+    def near(self, centre_m: np.ndarray, radius_m: float) -> np.ndarray:
+        """(P, 3) seen points within a cube about a point (3,)."""
+        row, column = np.nonzero(np.abs(self.depth_m - centre_m[2]) < radius_m)
+        z = self.depth_m[row, column]
+        x, y = (column - self.k[0, 2]) / self.k[0, 0] * z, (row - self.k[1, 2]) / self.k[1, 1] * z
+        points = np.stack((x, y, z), 1)
+        inside: np.ndarray = points[np.abs(points - centre_m).max(1) < radius_m]
+        return inside
+
     def segment(self, expected: Expected, row: int) -> Observation:
         """What can be the hand of a row where it is expected; of a hand without a row, -1."""
         others = self.owned_by_others(row)
