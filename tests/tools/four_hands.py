@@ -20,7 +20,7 @@ from toftrack.api import make_hands_tracker
 
 _BEHIND_M = 0.03
 """A joint that lies so far behind the reading there is hidden."""
-_VISIBLE = 0.3
+_VISIBLE = 0.5
 """Share of the joints from which on a hand is visible."""
 
 

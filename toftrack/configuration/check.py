@@ -47,7 +47,7 @@ _ABOVE_ZERO = frozenset(
     view.most_fps view.quality
     """.split()
 )
-_AT_MOST = {"hands": 2, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
+_AT_MOST = {"hands": 8, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
 """More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""

@@ -198,10 +198,15 @@ class HandDetector:
         ]
         return sorted((one for one in found if one.merit > least), key=lambda one: -one.merit)
 
-    def start_search(self, depth_m: np.ndarray, k: np.ndarray) -> Callable[[], Places]:
-        """Where hands may be, the first part of a search; begun beside whatever can do without."""
+    def start_search(
+        self, depth_m: np.ndarray, k: np.ndarray, known: int = 0
+    ) -> Callable[[], Places]:
+        """Where hands may be, the first part of a search; begun beside whatever can do without.
+
+        known: so many hands are, which are among these places.
+        """
         cfg = self.settings
-        return start_finding(self.finder, depth_m, k, cfg.places, cfg.least)
+        return start_finding(self.finder, depth_m, k, cfg.places + known, cfg.least)
 
 
 def merit(detection: Detection, heat: float) -> float:

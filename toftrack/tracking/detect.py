@@ -53,10 +53,11 @@ def ask(scene: Scene, state: TrackerState) -> Asked:
     frames = detector.settings.search
     frames = frames if at_once or threads() > 1 else max(frames, 2)
     due = frames == 1 or Duration(state.found_s).reached(frames)
-    finding = detector.start_search(image.depth_m, image.k) if due and at_once else None
+    whole = image.depth_m, image.k, len(scene.hands)
+    finding = detector.start_search(*whole) if due and at_once else None
     own = [_start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row)]
     if due and not at_once:
-        finding = detector.start_search(image.depth_m, image.k)
+        finding = detector.start_search(*whole)
     return Asked(own, finding, at_once, due)
 
 
@@ -103,8 +104,10 @@ def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) ->
     tracks = [hand.track for hand in scene.hands]
     missing = {track.side for track in tracks if rare or not track.reliable}
     confirmed = [track.side for track in tracks if track.confirmed]
-    if not tracks:
-        missing = {state.told} if state.told else {"right", "left"}
+    if len(state.slots) > 2 or not (tracks or state.told):
+        missing = set(OTHER_SIDE)
+    elif not tracks:
+        missing = {str(state.told)}
     elif len(confirmed) == 1:
         missing.add(OTHER_SIDE[confirmed[0]])
     seen: list[Seen] = []

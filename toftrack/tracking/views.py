@@ -63,10 +63,11 @@ def continued(
 
 
 def most_new(state: TrackerState) -> int:
-    """How many tracks may begin in a frame: not beside one that is tentative."""
-    if any(not track.confirmed for track in state.tracks):
-        return 0
-    return max(0, max(len(state.slots), 2) + _SPARE - len(state.tracks))
+    """How many tracks may begin in a frame: no more are tentative than hands are missing, or one."""
+    confirmed = sum(track.confirmed for track in state.tracks)
+    most = max(len(state.slots), 2)
+    tentative = len(state.tracks) - confirmed
+    return max(0, min(max(most - confirmed, 1) - tentative, most + _SPARE - len(state.tracks)))
 
 
 def begun(scene: Scene, new: Sequence[Seen], state: TrackerState) -> list[View | None]:
