@@ -47,7 +47,9 @@ class Asked:
 
 def ask(scene: Scene, state: TrackerState) -> Asked:
     """Begin to look at the tracks' places, and in the whole image, beside whatever comes next."""
-    detector, image = scene.model.detector, scene.image
+    detector = scene.model.detector
+    several = len(state.slots) > 2 and scene.dt_s <= _RARE_S
+    image = scene.unexplained() if several else scene.image
     followed = bool(scene.hands) and all(hand.track.reliable for hand in scene.hands)
     at_once = not followed or scene.dt_s > _RARE_S
     frames = detector.settings.search
