@@ -10,7 +10,7 @@ import numpy as np
 from toftrack.compute.pace import Duration
 from toftrack.compute.threads import threads
 from toftrack.detector.crops import CROP_M
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.hand_detector import Detection, merit
 from toftrack.detector.parts import FOREARM_PART
 from toftrack.detector.proposals import SAME_PLACE_M, Places
 from toftrack.tracking.association import Seen
@@ -125,11 +125,10 @@ Arm = tuple[np.ndarray, np.ndarray]
 
 
 def _arm(scene: Scene, seen: Seen) -> Arm | None:
-    """The arm of a hand that is surely followed: where the pose network sees its forearm, or where
-    its fingers do not point.
+    """The arm of a hand that is seen: where the pose network says that its forearm is, or where its
+    fingers do not point.
     """
-    hand = scene.hands[seen.row]
-    if not hand.track.reliable:
+    if merit(seen.detection, seen.detection.heat) < scene.model.detector.settings.merit:
         return None
     wrist, up = seen.detection.keypoints.points_m[0].numpy(), seen.detection.up
     near = scene.near(wrist, CROP_M / 2)
