@@ -101,9 +101,13 @@ def start_finding(
     """The same, begun in another thread if there may be one; what is returned waits for it."""
     if not isinstance(finder, OnnxFinder):
         return partial(find_hands, finder, depth_m, k, most, least)
-    image, wide_k = wide(depth_m, k)
-    wait = beside(partial(finder, image))
-    return lambda: _places(wait(), wide_k, most, least)
+
+    def look() -> tuple[Found, np.ndarray]:
+        image, wide_k = wide(depth_m, k)
+        return finder(image), wide_k
+
+    wait = beside(look)
+    return lambda: _places(*wait(), most, least)
 
 
 @torch.inference_mode()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,31 +36,28 @@ def finger_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
 
 
 def overlap_of_each(joints_m: Tensor, hand_length_m: float) -> Tensor:
-    """The same for each finger with all others, (N, 21, 3) to (N, 5)."""
-    first, second, apart, crossing = _tables(joints_m.device, joints_m.dtype)
-    fingers = joints_m[:, 1:].unflatten(1, (5, 4))
+    """The same for each finger with all others, (N, 21, 3) to (N, 5); both on the CPU."""
+    # In numpy: on a few hands each of torch's operations takes longer than its arithmetic.
+    fingers = joints_m.numpy()[:, 1:].reshape(-1, 5, 4, 3)
     steps = fingers[:, :, 1:] - fingers[:, :, :-1]
-    chord = steps.sum(2).norm(dim=-1)
-    straight = (chord / steps.norm(dim=-1).sum(2) - BENT) / (STRAIGHT - BENT)
-    straight = straight.clamp(0, 1)
+    chord = np.linalg.norm(steps.sum(2), axis=-1)
+    length = np.maximum(np.linalg.norm(steps, axis=-1).sum(2), 1e-9)
+    straight = ((chord / length - BENT) / (STRAIGHT - BENT)).clip(0, 1)
     # The thumb crosses the others, straight or not.
-    either = torch.maximum(straight[:, first], straight[:, second]) * crossing
+    either = np.maximum(straight[:, _FIRST], straight[:, _SECOND]) * (_FIRST > 0)
     ends = fingers[:, :, 1:]  # (N, 5, 3, 3)
-    points = torch.cat((ends, (ends[:, :, 1:] + ends[:, :, :-1]) / 2), 2)  # (N, 5, 5, 3)
-    gap = torch.cdist(points[:, first], points[:, second])  # (N, pairs, 5, 5)
+    points = np.concatenate((ends, (ends[:, :, 1:] + ends[:, :, :-1]) / 2), 2)  # (N, 5, 5, 3)
+    away = points[:, _FIRST, :, None] - points[:, _SECOND, None]  # (N, pairs, 5, 5, 3)
+    gap = np.sqrt(np.einsum("...a,...a->...", away, away))
     share = (SQUEEZED + (1 - SQUEEZED) * either) * (hand_length_m / DEFAULT_HAND_LENGTH_M)
-    depth = (1 - gap / (apart * share[:, :, None, None])).clamp(min=0)
-    pairs = (1 + (STRICT - 1) * either) * depth.amax(3).square().sum(2)
-    of_finger = pairs.new_zeros(len(pairs), 5)
-    return of_finger.index_add_(1, first, pairs).index_add_(1, second, pairs)
+    depth = (1 - gap / (_APART_M * share[:, :, None, None])).clip(0)
+    pairs = (1 + (STRICT - 1) * either) * np.square(depth.max(3)).sum(2)
+    return torch.from_numpy((pairs @ _OF_FINGER).astype(fingers.dtype))
 
 
-@functools.cache
-def _tables(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of the pairs: their fingers (10,), (10,); how far apart the points of fingers that touch are
-    (10, 5, 5), metres of the mean adult; and whether none of them is the thumb (10,), 1 or 0.
-    """
-    first, second = torch.tensor(PAIRS, device=device).unbind(1)
-    radii = torch.tensor(RADII_MM, device=device, dtype=dtype) / 1e3
-    apart = radii[first][:, :, None] + radii[second][:, None]
-    return first, second, apart, (first > 0).to(dtype)
+_FIRST, _SECOND = np.array(PAIRS).T
+_RADII_M = np.array(RADII_MM) / 1e3
+_APART_M = _RADII_M[_FIRST][:, :, None] + _RADII_M[_SECOND][:, None]
+"""(10, 5, 5) how far apart the points of fingers that touch are, of the mean adult."""
+_OF_FINGER = (np.eye(5)[_FIRST] + np.eye(5)[_SECOND]).astype(np.float64)
+"""(10, 5) whether a finger is one of a pair."""

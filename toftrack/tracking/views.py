@@ -63,7 +63,7 @@ def continued(
 
 
 def most_new(state: TrackerState) -> int:
-    """How many tracks may begin in a frame: no more are tentative than hands are missing, or one."""
+    """How many tracks may begin: no more are tentative than hands are missing, or one."""
     confirmed = sum(track.confirmed for track in state.tracks)
     most = max(len(state.slots), 2)
     tentative = len(state.tracks) - confirmed
@@ -130,7 +130,7 @@ def viewed(
 def of_likelier_side(
     scene: Scene, row: int, view: View, mirrored: Detection, told: str | None
 ) -> View:
-    """The view after its sides were compared; begun anew, of the other one, where it is likelier."""
+    """The view after its sides were compared; begun anew where the other one is likelier."""
     image: DepthImage = scene.image_for(row) if row >= 0 else scene.unexplained()
     track = replace(view.track, evidence=compare(view, mirrored, image))
     others = [hand.track for at, hand in enumerate(scene.hands) if at != row]
