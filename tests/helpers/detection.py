@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -118,37 +118,44 @@ def detection_of(states: torch.Tensor, log_size: float = 0.0, side: str = "right
 
 
 class FixedDetector:
-    """In the networks' place: finds what it is given, and records the places it was asked about.
+    """In the networks' place: finds what it is given, and records what it was asked.
 
-    found: what a search of the whole image finds, whichever side is searched for.
-    searched: the sides of all searches, "either" of those that are spread over frames, whose
-        images are kept.
-    likely: of the last one, None before any.
-    centres_m: (C, 3) of all calls of `detect` and `start`.
+    found: what the finder sees, and the pose network there, as a hand of whichever side; of the
+        sides in `of_side`, this instead.
+    looked: the sides that hands at the finder's places were looked for as.
+    images: those that the finder saw.
+    centres_m, sides: (C, 3) each and the side, of all calls of `detect` and `start`.
     """
 
-    def __init__(self, found: Sequence[Detection] = (), **settings: float) -> None:
+    def __init__(
+        self,
+        found: Sequence[Detection] = (),
+        of_side: Mapping[str, Sequence[Detection]] | None = None,
+        **settings: float,
+    ) -> None:
         self.settings = detector_settings(**settings)
         self.found = list(found)
-        self.searched: list[str] = []
+        self.of_side = of_side or {}
+        self.looked: list[str] = []
         self.images: list[np.ndarray] = []
         self.centres_m: list[np.ndarray] = []
-        self.likely: Callable[[np.ndarray], float] | None = None
+        self.sides: list[str] = []
 
-    def search(self, depth_m, k, side, likely) -> list[Detection]:
-        self.searched.append(side)
-        self.likely = likely
-        return self.found
+    def look(self, depth_m, k, places, side) -> list[Detection]:
+        self.looked.append(side)
+        found = self.of_side.get(side, self.found)
+        return [one for one in found if _is_at(one, places)]
 
     def start_search(self, depth_m, k) -> Callable[[], Places]:
-        self.searched.append("either")
         self.images.append(depth_m)
-        centres = np.array([one.centre_m.numpy() for one in self.found]).reshape(-1, 3)
+        found = [*self.found, *(one for each in self.of_side.values() for one in each)]
+        centres = np.array([one.centre_m.numpy() for one in found]).reshape(-1, 3)
         return lambda: Places(centres, np.full(len(centres), 0.9, np.float32))
 
     def detect(self, depth_m, k, centres_m, side, up=None) -> list[Detection]:
         """An open palm whose middle is at each place."""
         self.centres_m.append(np.array(centres_m))
+        self.sides.append(side)
         states = torch.zeros(len(centres_m), 27)
         states[:, :3] = torch.from_numpy(np.asarray(centres_m)).float()
         states[:, :3] -= rotated_pivot(states[:, 3:6])
@@ -157,6 +164,11 @@ class FixedDetector:
     def start(self, depth_m, k, centre_m, side, up=None) -> Callable[[], Detection]:
         found = self.detect(depth_m, k, np.asarray(centre_m)[None], side)[0]
         return lambda: found
+
+
+def _is_at(detection: Detection, places: Places) -> bool:
+    away = np.linalg.norm(places.centre_m - detection.centre_m.numpy(), axis=1)
+    return bool((away < 1e-3).any())
 
 
 def plain_scenes(

@@ -10,17 +10,17 @@ import torch
 from helpers.detection import FixedDetector, detection_of
 from helpers.tracking import make_tracker
 
-from toftrack.compute.pace import Duration
+from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.frames import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.model_image import model_range_image
-from toftrack.tracking.candidates import HandFrame, image_term
-from toftrack.tracking.detect import expected_of
+from toftrack.tracking.candidates import View, image_term
 from toftrack.tracking.filter import new_track
-from toftrack.tracking.hands import OtherHand
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.state import HandState, Track
+from toftrack.tracking.scene import Scene
+from toftrack.tracking.state import Track, TrackerState
+from toftrack.tracking.views import expected_of
 
 K = np.array([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 SIZE = 144, 176
@@ -71,39 +71,39 @@ def any_hand_model() -> TrackerModel:
 def track_of(pose: torch.Tensor, model: TrackerModel | None = None, **changes: object) -> Track:
     """A track at a pose that goes on for a second, and is surely right."""
     track = new_track(pose, model or right_hand_model())
-    usual = {"age": Duration(1.0), "log_odds": 5.0, "believed": True}
+    usual = {"age": Duration(1.0), "log_odds": 5.0, "confirmed": True}
     return replace(track, **(usual | changes))
 
 
-def slot_of(track: Track | None, model: TrackerModel | None = None, **changes: object) -> HandState:
-    """A slot that follows a hand, or none."""
-    return replace((model or right_hand_model()).first_state(0).hands[0], track=track, **changes)
+def state_of(
+    *tracks: Track, hands: int = 1, model: TrackerModel | None = None, **changes: object
+) -> TrackerState:
+    """A state with tracks, which get their numbers by their order and are in the slots by it."""
+    state = (model or right_hand_model()).first_state(0, hands)
+    numbered = tuple(replace(track, number=at) for at, track in enumerate(tracks))
+    slots = tuple(
+        replace(slot, track=at if at < len(tracks) else -1) for at, slot in enumerate(state.slots)
+    )
+    usual = {"tracks": numbered, "slots": slots, "next_track": len(tracks), "timestamp_s": 0.0}
+    return replace(state, **(usual | changes))
 
 
-def frame_of(
+def scene_of(*tracks: Track, image: DepthImage, model: TrackerModel | None = None) -> Scene:
+    """An image in the next frame of tracks."""
+    return Scene.of(tracks, image, FRAME_S, model or right_hand_model())
+
+
+def view_of(
     image: DepthImage,
     track: Track,
     detection: Detection = NO_DETECTION,
-    others: tuple[OtherHand, ...] = (),
+    others: tuple[torch.Tensor, ...] = (),
     model: TrackerModel | None = None,
-    slot: int = 0,
-) -> HandFrame:
-    """A slot's hand in an image, segmented where its track is."""
+) -> View:
+    """A hand in an image, segmented where its track is."""
     model = model or right_hand_model()
-    hand = slot_of(track, model)
-    fitted = model.hand(hand.side, hand.shape)
+    fitted = model.hand(track.side, track.shape)
     expected = expected_of(detection_of(track.pose))
-    observation = model.segmentation(image.depth_m, image.k, expected)
-    return HandFrame(
-        slot,
-        hand,
-        track,
-        fitted,
-        observation,
-        expected.nearest_m,
-        detection,
-        lambda: NO_DETECTION,
-        others,
-        image_term(observation, fitted, model),
-        model,
-    )
+    seen = model.segmentation(image.depth_m, image.k, expected)
+    term = image_term(seen, fitted, model)
+    return View(track, fitted, seen, expected.nearest_m, detection, others, term, model)

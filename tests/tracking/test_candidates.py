@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.configured import refinement
 from helpers.detection import FixedDetector, detection_of
-from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
+from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of, view_of
 
 from toftrack.detector.crops import crop_rotation
 from toftrack.detector.hand_detector import Detection
@@ -26,17 +26,16 @@ from toftrack.detector.parts import (
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import (
-    FilteredFrame,
+    View,
     best_start,
     hypotheses_of,
     keypoints_of,
-    posterior_of,
     propose,
     with_own_arm,
     without_things,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.select import Source
+from toftrack.tracking.select import Hypotheses, Source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -46,37 +45,39 @@ def model_with(**settings: float) -> TrackerModel:
     return replace(right_hand_model(), detector=FixedDetector(**settings))
 
 
-def filtered(
-    x: float,
-    seed: int = 0,
-    detection: Detection | None = None,
-    **changes: object,
-) -> FilteredFrame:
+def viewed(x: float, seed: int = 0) -> View:
     """A hand that the track has with other fingers than the image and the detector."""
     truth = bent(hand_at(x), seed, 0.4)
-    track = track_of(hand_at(x), **({"log_odds": 0.0} | changes))
-    detection = detection_of(truth) if detection is None else detection
-    frame = frame_of(image_of(truth), track, detection, model=model_with())
-    return FilteredFrame.of(frame, track.mean)
+    track = track_of(hand_at(x), log_odds=0.0)
+    return view_of(image_of(truth), track, detection_of(truth), model=model_with())
+
+
+def mean_of(view: View) -> torch.Tensor:
+    """(1, 27) the filter's estimate, which is the track's here."""
+    return view.model.decode(view.track.mean)
+
+
+def proposed(view: View) -> Hypotheses:
+    return propose(view, mean_of(view))
 
 
 def test_every_hypothesis_is_scored_by_the_posterior() -> None:
-    hand = filtered(-0.1, 1)
-    table = propose(hand)
-    torch.testing.assert_close(table.log_posterior, hand.posterior(table.pose))
+    view = viewed(-0.1, 1)
+    table = proposed(view)
+    torch.testing.assert_close(table.log_posterior, view.posterior()(table.pose))
 
 
 def test_each_source_proposes_its_poses() -> None:
-    found = propose(filtered(0.0)).source.tolist()
+    found = proposed(viewed(0.0)).source.tolist()
     assert found == [Source.PREVIOUS, Source.DYNAMICS, Source.DETECTOR, Source.DETECTOR], (
         "the detector's as it is, and bent to the keypoints"
     )
 
 
 def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> None:
-    hand = filtered(0.0)
-    table = propose(hand)
-    before = float(hand.posterior(hand.frame.track.pose))
+    view = viewed(0.0)
+    table = proposed(view)
+    before = float(view.posterior()(view.track.pose))
     assert float(table.log_posterior[table.source == Source.PREVIOUS]) > before
     assert float(table.log_posterior.max()) > before + 0.1
 
@@ -84,38 +85,36 @@ def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> Non
 def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    hand = filtered(0.0)
-    far = hand.pose.clone()
+    view = viewed(0.0)
+    mean = mean_of(view)
+    far = mean.clone()
     far[:, 2] += 0.5
-    assert bool(hand.posterior(far).isneginf())
-    monkeypatch.setattr(FilteredFrame, "refined", lambda _, poses: far.repeat(len(poses), 1))
-    table = propose(hand)
+    assert bool(view.posterior()(far).isneginf())
+    monkeypatch.setattr(View, "refined", lambda _, poses: far.repeat(len(poses), 1))
+    table = propose(view, mean)
     standing = table.source <= Source.DYNAMICS
-    torch.testing.assert_close(table.pose[standing, :3], hand.pose[:, :3].repeat(2, 1))
+    torch.testing.assert_close(table.pose[standing, :3], mean[:, :3].repeat(2, 1))
     assert bool(table.log_posterior[standing].isneginf().all())
 
 
 def test_without_refinement_the_filter_alone_proposes() -> None:
-    hand = filtered(0.0)
-    model = replace(hand.frame.model, refinement=refinement(iterations=0))
-    plain = replace(hand, frame=replace(hand.frame, model=model))
-    table = propose(plain)
-    assert table.source.tolist() == [Source.DYNAMICS] and torch.equal(table.pose, hand.pose)
+    view = viewed(0.0)
+    plain = replace(view, model=replace(view.model, refinement=refinement(iterations=0)))
+    table = proposed(plain)
+    assert table.source.tolist() == [Source.DYNAMICS] and torch.equal(table.pose, mean_of(view))
 
 
 def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
     truth = bent(hand_at(), 1, 0.4)
     detection = detection_of(torch.cat((bent(hand_at(), 2, 0.8), truth, hand_at())))
     detection = replace(detection, keypoints=detection_of(truth).keypoints)
-    frame = frame_of(image_of(truth), track_of(hand_at()), detection)
-    model = frame.model
-    posterior = posterior_of(frame.observation, frame.fitted, detection, (), model, frame.image)
-    pose, value = best_start(detection, frame.observation, frame.fitted, posterior, model)
+    view = view_of(image_of(truth), track_of(hand_at()), detection)
+    posterior, joints = view.posterior(), view.fitted.refiner.joints
+    pose, value = best_start(view)
     assert value == pytest.approx(float(posterior(pose)), abs=1e-5)
-    as_they_are = hypotheses_of(detection, frame.fitted, model.detector.settings.hypotheses)
+    as_they_are = hypotheses_of(detection, view.fitted, view.model.detector.settings.hypotheses)
     assert value >= float(posterior(as_they_are).max()) - 1e-5
-    off = (frame.fitted.refiner.joints(pose) - frame.fitted.refiner.joints(truth)).norm(dim=-1)
-    assert float(off.mean()) < 0.005
+    assert float((joints(pose) - joints(truth)).norm(dim=-1).mean()) < 0.005
 
 
 def test_keypoints_are_trusted_no_more_than_is_set() -> None:
@@ -138,7 +137,7 @@ def test_a_keypoint_weight_divides_the_deviations_and_0_leaves_them_without_effe
 
 @pytest.mark.parametrize("count", [0, 1, 4, 8])
 def test_only_likely_hypotheses_are_candidates_and_at_least_one(count: int) -> None:
-    hand = right_hand_model().hand("right", right_hand_model().first_state(0).hands[0].shape)
+    hand = right_hand_model().hand("right", first_shape())
     detection = detection_of(torch.cat([hand_at(0.01 * i) for i in range(6)]))
     likely = int((detection.log_probability > math.log(0.03)).sum())
     states = hypotheses_of(detection, hand, count)
@@ -148,7 +147,7 @@ def test_only_likely_hypotheses_are_candidates_and_at_least_one(count: int) -> N
 
 def test_a_hand_of_another_size_is_proposed_with_the_same_palm() -> None:
     model = right_hand_model()
-    hand = model.hand("right", model.first_state(0).hands[0].shape)
+    hand = model.hand("right", first_shape())
     small = detection_of(hand_at(), log_size=math.log(0.8))
     joints: Sequence[torch.Tensor] = (
         small.joints_m[0],
@@ -167,7 +166,7 @@ def seen_with(parts: np.ndarray) -> tuple[Observation, Observation, np.ndarray]:
     detection = detection_of(truth)
     centre = detection.keypoints.points_m[9].double().numpy()
     detection = replace(detection, parts=Parts(parts, crop_rotation(centre), centre, False))
-    observation = frame_of(image_of(truth), track_of(truth), detection).observation
+    observation = view_of(image_of(truth), track_of(truth), detection).observation
     return observation, without_things(observation, detection), centre
 
 
@@ -204,7 +203,7 @@ def behind(gap_m: float, kind: int = BACKGROUND_PART) -> tuple[Observation, Dete
     truth = hand_at()
     detection = detection_of(truth)
     centre = detection.keypoints.points_m[9].double().numpy()
-    seen = frame_of(image_of(truth), track_of(truth), detection).observation
+    seen = view_of(image_of(truth), track_of(truth), detection).observation
     before = torch.zeros_like(seen.hand)
     before[int(seen.hand.nonzero()[:, 0].float().mean()) :] = True
     parts = Parts(np.full((PARTS, PARTS), kind, np.uint8), crop_rotation(centre), centre, False)
@@ -223,11 +222,10 @@ def test_the_own_arm_alone_hides_nothing_of_the_hand_that_it_is_before(kind: int
 
 
 def test_a_hand_that_is_mostly_covered_is_held_where_it_was() -> None:
-    hand = filtered(0.0)
-    everything = torch.ones_like(hand.frame.observation.occluder)
-    near = torch.full_like(hand.frame.observation.depth_m, 0.3)
-    covered = replace(hand.frame.observation, depth_m=near, occluder=everything)
-    table = propose(replace(hand, frame=replace(hand.frame, observation=covered)))
-    assert torch.equal(table.pose, hand.frame.track.pose)
+    view = viewed(0.0)
+    seen = view.observation
+    near, everything = torch.full_like(seen.depth_m, 0.3), torch.ones_like(seen.occluder)
+    table = proposed(replace(view, observation=replace(seen, depth_m=near, occluder=everything)))
+    assert torch.equal(table.pose, view.track.pose)
     assert table.source.tolist() == [Source.PREVIOUS]
-    assert len(propose(hand)) == 4
+    assert len(proposed(view)) == 4

@@ -10,7 +10,6 @@ import torch
 from helpers.configured import confidence_model
 from helpers.detection import detection_of
 
-from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import NO_DETECTION
 from toftrack.errors import ToftrackError
 from toftrack.tracking.confidence import (
@@ -21,8 +20,6 @@ from toftrack.tracking.confidence import (
     LogOdds,
     confidence_features,
 )
-from toftrack.tracking.lifecycle import judge
-from toftrack.tracking.state import Track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -49,17 +46,6 @@ def model_of(**changes: object) -> ConfidenceModel:
     usual = {"memory": 0.0, "confidence": 0.5, "give_up": 0.1, "patience": 5, "log_odds": odds}
     usual |= {"whole": 0.0}
     return confidence_model(**(usual | changes))
-
-
-def with_odds(log_odds: float, **changes: float) -> ConfidenceFeatures:
-    """Features that such a model takes for these log odds."""
-    return replace(GOOD, log_score=(log_odds - 4.0) / 2.0, **changes)
-
-
-def followed() -> Track:
-    nothing = torch.zeros(1, 10)
-    track = Track(nothing, torch.ones(1), nothing, nothing[0], torch.zeros(21), torch.zeros(1, 27))
-    return replace(track, age=Duration(1.0), believed=True)
 
 
 def test_a_weight_of_an_unknown_feature_is_refused() -> None:
@@ -89,14 +75,6 @@ def test_log_odds_rise_and_fall_with_a_feature_as_its_weight_says(name: str) -> 
         log_odds = LogOdds(4.0, {name: weight})
         assert log_odds(more) - log_odds(GOOD) == pytest.approx(weight)
     assert LogOdds(4.0, {})(more) == 4.0
-
-
-@pytest.mark.parametrize("log_odds", [-1e9, -40.0, -2.0, 0.1, 3.0, 1e9])
-def test_the_confidence_is_the_probability_of_the_log_odds(log_odds: float) -> None:
-    found = judge(followed(), with_odds(log_odds), FRAME_S, 1.0, 0.0, model_of())
-    assert found.confidence == pytest.approx(1 / (1 + math.exp(-max(min(log_odds, 50), -50))))
-    assert 0 <= found.confidence <= 1
-    assert found.lost == (found.confidence < 0.5)
 
 
 def test_the_package_s_confidence_prefers_good_scores_and_agreement() -> None:
@@ -157,10 +135,3 @@ def test_joints_out_of_sight_are_counted() -> None:
     u = (200.0 * joints[:, 0] / joints[:, 2] + 87.5).round()
     half[:, : int(u.median())] = 0.3
     assert 0.2 < features_of(joints, half).hidden < 0.8
-
-
-def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:
-    model = model_of(whole=0.5, whole_odds=LogOdds(3.0, {"other_side": -2.0}))
-    for other_side, lost in ((0.0, False), (1.4, False), (1.6, True)):
-        found = judge(followed(), with_odds(4.0, other_side=other_side), FRAME_S, 1.0, 0.0, model)
-        assert found.lost == lost and found.whole_odds == pytest.approx(3.0 - 2.0 * other_side)

@@ -11,12 +11,11 @@ import pytest
 import torch
 from helpers.configured import posterior_weights
 from helpers.detection import detection_of
-from helpers.rendered import bent, frame_of, hand_at, image_of, right_hand_model, track_of
+from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of, view_of
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.overlap import RADII_MM
-from toftrack.tracking.candidates import HandFrame, keypoints_of, posterior_of
-from toftrack.tracking.hands import OtherHand
+from toftrack.tracking.candidates import View
 from toftrack.tracking.posterior import Posterior, touching
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -34,31 +33,28 @@ def poses(count: int = 24) -> torch.Tensor:
     return states
 
 
-def other_hand(x: float = 0.03, certain: bool = True) -> OtherHand:
-    """Another hand that is partly in this one."""
-    fitted = right_hand_model().hand("right", right_hand_model().first_state(0).hands[0].shape)
-    joints, none = fitted.refiner.joints(hand_at(x))[0], np.zeros((144, 176), bool)
-    return OtherHand(joints, joints.mean(0).numpy(), True, certain, none, none)
+def other_hand(x: float = 0.03) -> torch.Tensor:
+    """(21, 3) joints of another hand that is partly in this one."""
+    return detection_of(hand_at(x)).joints_m[0]
 
 
-def frame(*others: OtherHand) -> HandFrame:
-    return frame_of(image_of(TRUTH), track_of(TRUTH), detection_of(bent(TRUTH, 1)), others)
+def view(*others: torch.Tensor) -> View:
+    return view_of(image_of(TRUTH), track_of(TRUTH), detection_of(bent(TRUTH, 1)), others)
 
 
-def posterior(seen: HandFrame, coverage: float | None = None, **weights: float) -> Posterior:
+def posterior(seen: View, coverage: float | None = None, **weights: float) -> Posterior:
     """Only with the terms that are weighted here."""
     model = replace(seen.model, weights=posterior_weights(**(NONE | weights)))
-    image = replace(seen.image, coverage=coverage)
-    return posterior_of(seen.observation, seen.fitted, seen.detection, seen.others, model, image)
+    return replace(seen, model=model, image=replace(seen.image, coverage=coverage)).posterior()
 
 
-def added(seen: HandFrame, **weights: float) -> np.ndarray:
+def added(seen: View, **weights: float) -> np.ndarray:
     """(N,) what the terms add to the image's."""
     alone, all_terms = posterior(seen), posterior(seen, **weights)
     return (all_terms(poses()) - alone(poses())).numpy()
 
 
-def joints_of(seen: HandFrame) -> np.ndarray:
+def joints_of(seen: View) -> np.ndarray:
     return seen.fitted.refiner.joints(poses()).double().numpy()
 
 
@@ -66,7 +62,7 @@ def joints_of(seen: HandFrame) -> np.ndarray:
 def test_the_image_says_the_log_of_the_f_measure_and_of_what_is_explained(
     coverage: float | None,
 ) -> None:
-    seen, settings = frame(), right_hand_model().likelihood
+    seen, settings = view(), right_hand_model().likelihood
     counts = seen.fitted.scorer(poses(), seen.image.evidence)
     correct, false, missed, residual = (count.double().numpy() for count in counts)
     c, f = (
@@ -89,14 +85,14 @@ def test_the_image_says_the_log_of_the_f_measure_and_of_what_is_explained(
 def test_a_pose_that_explains_nothing_is_impossible() -> None:
     away = TRUTH.clone()
     away[0, 0] = 5.0
-    assert float(posterior(frame(), 1.0)(away)) == -math.inf
-    assert float(posterior(frame(), 0.0)(away)) == -math.inf
+    assert float(posterior(view(), 1.0)(away)) == -math.inf
+    assert float(posterior(view(), 0.0)(away)) == -math.inf
 
 
 def test_keypoints_cost_their_robust_squared_deviation() -> None:
     """Geman-McClure: x^2 / (1 + x^2 / 9), x in standard deviations."""
-    seen = frame()
-    keypoints = keypoints_of(seen.detection, seen.model)
+    seen = view()
+    keypoints = seen.keypoints
     points, sigma = keypoints.points_m.double().numpy(), keypoints.sigma_m.double().numpy()
     squared = (np.linalg.norm(joints_of(seen) - points, axis=-1) / sigma) ** 2
     expected = -0.4 * (squared / (1 + squared / 9)).mean(1)
@@ -122,7 +118,7 @@ def overlap_of(fingers: np.ndarray) -> float:
 
 
 def test_fingers_in_one_another_cost_their_overlap() -> None:
-    seen = frame()
+    seen = view()
     overlap = [overlap_of(hand[1:].reshape(5, 4, 3)) for hand in joints_of(seen)]
     assert max(overlap) > 0.1
     found = added(seen, overlap=0.5)
@@ -131,31 +127,24 @@ def test_fingers_in_one_another_cost_their_overlap() -> None:
 
 def test_another_hand_costs_the_joints_that_lie_in_it() -> None:
     other = other_hand()
-    seen, expected = frame(other), []
+    seen, expected = view(other), []
     for hand in joints_of(seen):
-        gaps = [
-            min(np.linalg.norm(mine - its) for its in other.joints_m.double().numpy())
-            for mine in hand
-        ]
+        gaps = [min(np.linalg.norm(mine - its) for its in other.double().numpy()) for mine in hand]
         expected.append(-3.0 * sum(max(0.0, 1 - gap / 0.018) for gap in gaps) / 21)
     assert min(expected) < -0.1
     np.testing.assert_allclose(added(seen, other_hand=3.0), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_a_hand_lies_wholly_in_itself_and_not_at_all_in_one_far_away() -> None:
-    other = other_hand().joints_m
+    other = other_hand()
     assert float(touching(other[None], other)) == pytest.approx(1, abs=1e-2)
     assert float(touching(other[None] + 0.5, other)) == 0
 
 
-def test_a_hand_that_is_not_certain_costs_nothing() -> None:
-    assert not added(frame(other_hand(certain=False)), other_hand=3.0).any()
-
-
 def test_each_other_hand_costs_its_own() -> None:
     one, two = other_hand(0.03), other_hand(-0.03)
-    both = added(frame(one, two), other_hand=2.0)
-    alone = added(frame(one), other_hand=2.0) + added(frame(two), other_hand=2.0)
+    both = added(view(one, two), other_hand=2.0)
+    alone = added(view(one), other_hand=2.0) + added(view(two), other_hand=2.0)
     np.testing.assert_allclose(both, alone, atol=1e-5)
 
 
@@ -163,7 +152,7 @@ ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0}
 
 
 def test_terms_are_independent_of_one_another() -> None:
-    seen = frame(other_hand())
+    seen = view(other_hand())
     each = sum(added(seen, **{name: weight}) for name, weight in ALL.items())
     np.testing.assert_allclose(added(seen, **ALL), each, rtol=1e-4, atol=1e-4)
 
@@ -178,16 +167,16 @@ def test_terms_are_independent_of_one_another() -> None:
 )
 def test_a_term_of_weight_0_is_left_out(names: tuple[str, ...], left: set[str]) -> None:
     weights = ALL | dict.fromkeys(names, 0.0)
-    assert set(posterior(frame(other_hand()), **weights).terms) == left
+    assert set(posterior(view(other_hand()), **weights).terms) == left
 
 
 def test_without_a_detection_keypoints_say_nothing() -> None:
-    blind = frame_of(image_of(TRUTH), track_of(TRUTH))
+    blind = view_of(image_of(TRUTH), track_of(TRUTH))
     assert not added(blind, keypoints=0.4).any()
 
 
 def test_the_posterior_of_a_pose_does_not_depend_on_the_others() -> None:
-    whole = posterior(frame(other_hand()), **ALL)
+    whole = posterior(view(other_hand()), **ALL)
     together = whole(poses())
     for rows in ([3], [7, 2], list(range(5, 20))):
         torch.testing.assert_close(whole(poses()[rows]), together[rows])
