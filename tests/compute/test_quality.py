@@ -15,6 +15,7 @@ from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import LEVELS, REDUCED, Pace, Timekeeper, pace_within
 from toftrack.compute.threads import at_most, threads
 from toftrack.errors import ToftrackError
+from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -118,8 +119,7 @@ def test_each_level_leaves_out_more() -> None:
         assert less.detector.settings.every > before.detector.settings.every
         assert less.detector.settings.search > before.detector.settings.search
         assert less.filter == model.filter
-        shape = model.first_state(0).hands[0].shape
-        assert less.hand("right", shape) is model.hand("right", shape)
+        assert less.hand("right", first_shape()) is model.hand("right", first_shape())
         before = less
 
 
@@ -159,21 +159,14 @@ def test_a_slow_machine_still_tracks_with_less_quality(hands: int) -> None:
 def test_the_search_is_bounded(search: int, searches: int) -> None:
     """In an empty room the whole image is searched each so many frames."""
 
-    class Counting(FixedDetector):
-        count = 0
-
-        def search(self, depth_m, k, side, likely) -> list:
-            self.count += 1
-            return super().search(depth_m, k, side, likely)
-
     usual = make_tracker("filter.particles=20", "hand.side=right")
-    reported = Counting(search=search)
-    tracker = Tracker(replace(usual.model, detector=reported))
+    detector = FixedDetector(search=search)
+    tracker = Tracker(replace(usual.model, detector=detector))
     image = np.full((72, 88), 0.9, np.float32)
     k = np.array([[100.0, 0, 44], [0, 100.0, 36], [0, 0, 1]])
     for i in range(12):
         assert tracker.step(image, k, i, i / 25).lost
-    assert reported.count == searches
+    assert len(detector.images) == searches
 
 
 def test_preparing_changes_nothing() -> None:

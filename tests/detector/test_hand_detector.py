@@ -81,11 +81,11 @@ def found_at(*centres: tuple[float, float, float]) -> Places:
     return Places(np.array(centres, np.float32).reshape(-1, 3), chances.astype(np.float32))
 
 
-def searched(monkeypatch: pytest.MonkeyPatch, found: Places, **changes: float):
-    """Detection of a search where the finder said so, and where the networks looked."""
+def looked(
+    monkeypatch: pytest.MonkeyPatch, places: Places, **changes: float
+) -> tuple[list[Detection], list[np.ndarray]]:
+    """The hands at places, and where the pose network looked."""
     inspected: list[np.ndarray] = []
-    here = detector(**changes)
-    monkeypatch.setattr(module, "find_hands", lambda *given: found)
     plain = module.run_pose_network
 
     def run_pose_network(pose, depth_m, k, centres_m, side, up=None):
@@ -93,38 +93,33 @@ def searched(monkeypatch: pytest.MonkeyPatch, found: Places, **changes: float):
         return plain(pose, depth_m, k, centres_m, side, up)
 
     monkeypatch.setattr(module, "run_pose_network", run_pose_network)
-    return here.search(sample().depth_m[0], sample().k, "right"), inspected
+    scene = sample()
+    return detector(**changes).look(scene.depth_m[0], scene.k, places, "right"), inspected
 
 
-def test_a_search_detects_twice_at_the_places_that_were_found(
+def test_hands_are_detected_twice_at_the_places_that_were_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = found_at((0, 0, 0.4), (0.2, 0, 0.5), (0, -0.2, 0.5))
-    detections, inspected = searched(monkeypatch, found, merit=-1e6, places=3)
+    centres = [(0, 0, 0.4), (0.2, 0, 0.5), (0, -0.2, 0.5)]
+    detections, inspected = looked(monkeypatch, found_at(*centres), merit=-1e6)
     assert len(inspected) == 2 and len(detections) == 3
-    assert inspected[0] == pytest.approx(np.array([(0, 0, 0.4), (0.2, 0, 0.5), (0, -0.2, 0.5)]))
+    assert inspected[0] == pytest.approx(np.array(centres))
     assert 1 <= len(inspected[1]) <= 3
     away = np.linalg.norm(inspected[1][:, None] - inspected[0], axis=-1).min(1)
     assert (away > 0).all(), "about the palms that the first one found"
 
 
-def test_each_place_says_how_much_speaks_for_a_hand(monkeypatch: pytest.MonkeyPatch) -> None:
-    places, _ = searched(monkeypatch, found_at((0, 0, 0.4), (0.2, 0, 0.5)))
-    assert [one.merit for one in places] == pytest.approx([merit(one, one.heat) for one in places])
-    assert searched(monkeypatch, found_at())[0] == []
-
-
-def test_the_best_place_comes_first_and_what_is_known_besides_counts() -> None:
-    here = detector(merit=-1e6, least=0.0)
-    depth, k = sample().depth_m[0], sample().k
-    plain = here.search(depth, k, "right")
-    assert len(plain) >= 2
-    last = plain[-1].centre_m.numpy()
-
-    def likely(centre_m: np.ndarray) -> float:
-        return 100.0 if np.linalg.norm(centre_m - last) < 1e-4 else 0.0
-
-    assert here.search(depth, k, "right", likely)[0].centre_m.numpy() == pytest.approx(last)
+def test_the_place_comes_first_of_which_most_speaks_for_a_hand(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    places = found_at((0, 0, 0.4), (0.2, 0, 0.5))
+    hands, _ = looked(monkeypatch, places, merit=-1e6)
+    merits = [one.merit for one in hands]
+    assert merits == pytest.approx([merit(one, one.heat) for one in hands])
+    assert merits == sorted(merits, reverse=True) and len(hands) == 2
+    between = sum(merits) / 2
+    assert len(looked(monkeypatch, places, merit=between)[0]) == 1, "the other may be none"
+    assert looked(monkeypatch, found_at())[0] == []
 
 
 def test_merit_rises_with_all_that_speaks_for_a_hand() -> None:
@@ -146,9 +141,10 @@ def test_merit_rises_with_all_that_speaks_for_a_hand() -> None:
     ids=["no readings", "no numbers", "3 x 3"],
 )
 def test_strange_images_are_searched_without_an_error(image: np.ndarray) -> None:
-    here = detector(merit=-1e6, least=0.0)
+    here, shown = detector(merit=-1e6, least=0.0), image.astype(np.float32)
     for side in ("right", "left"):
-        for seen in here.search(image.astype(np.float32), sample().k, side):
+        places = here.start_search(shown, sample().k)()
+        for seen in here.look(shown, sample().k, places, side):
             assert seen.joints_m.isfinite().all() and seen.keypoints.points_m.isfinite().all()
 
 

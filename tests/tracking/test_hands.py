@@ -117,12 +117,13 @@ def test_a_restart_forgets_both_hands(apart: TwoHands) -> None:
     for i in range(3):
         tracker.step(apart.depth_m[i], apart.k, i, i / 25)
     tracker.restart("left")
-    assert [hand.track for hand in tracker.states] == [None, None]
-    assert [hand.side for hand in tracker.states] == ["left", "right"]
+    assert tracker.state.tracks == ()
+    assert [slot.track for slot in tracker.states] == [-1, -1]
+    assert [slot.side for slot in tracker.states] == ["left", "right"]
     assert tracker.state.next_index == 3
 
 
-@pytest.mark.parametrize("hands", [0, 3, 1.5])
+@pytest.mark.parametrize("hands", [0, 9, 1.5])
 def test_other_numbers_of_hands_are_refused(hands: float) -> None:
     model = tracker_of().model
     with pytest.raises(ToftrackError, match="hands"):

@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 from toftrack.compute.rigid import MOTIONS, rotated_pivot
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.model import FilterModel
 from toftrack.tracking.paper import PaperModel, RoughStart, ScoreThreshold, palm_centre
@@ -73,7 +74,7 @@ def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     middle = (track.particles[:, :3] + rotated_pivot(track.particles[:, 3:6])).mean(0).numpy()
     assert np.linalg.norm(middle - scene.joints_m[0, PALM].mean(0)) < 0.06
     mean = MOTIONS.mean(track.particles, torch.full((300,), 1 / 300))
-    hand = model.hand("right", model.first_state(0).hands[0].shape)
+    hand = model.hand("right", first_shape())
     joints = hand.refiner.joints(model.decode(mean))[0]
     tips = joints[[8, 12, 16, 20]]
     assert (tips[:, 1] < joints[0, 1] - 0.1).all(), "the fingers point up"
@@ -153,8 +154,9 @@ def test_an_empty_image_does_not_end_the_track() -> None:
     tracker, scene = make_tracker(*PAPER), first(3)
     tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
     followed = tracker.track
+    assert followed is not None
     nothing = tracker.step(np.zeros_like(scene.depth_m[0]), scene.k, 1, 0.04)
-    assert nothing.lost and tracker.track is followed
+    assert nothing.lost and tracker.state.tracks == (followed,)
     again = tracker.step(scene.depth_m[2], scene.k, 2, 0.08)
     assert not again.lost and again.state_name == "tracking"
 

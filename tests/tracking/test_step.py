@@ -109,9 +109,9 @@ def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() 
     fresh = tracker.state
     tracked(tracker, scene, range(9))
     before = tracker.state
-    hand = before.hands[0]
-    assert hand.track is not None and hand.seen.ever and hand.gesture is not None
-    assert hand.shape.frames > 0 and np.isfinite(hand.last.joints_m).all()
+    slot = before.slots[0]
+    assert before.track_of(slot) is not None and slot.away_s == 0 and slot.gesture is not None
+    assert slot.shape.frames > 0 and np.isfinite(slot.last.joints_m).all()
     tracker.restart()
     after = tracker.state
     assert equal(replace(after, generator=fresh.generator, next_index=0), fresh)
