@@ -230,8 +230,9 @@ def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
         rectifying = time.perf_counter() - began
         tracker.step(rectified, camera.K, index, 0.04 * index)
         took = time.perf_counter() - began
-        assert tracker.info is not None
-        return took, {"rectification": rectifying, **tracker.info.seconds}
+        # Where no hand is reported, nothing was done but to look for one.
+        spent = tracker.info.seconds if tracker.info else {"detector": took - rectifying}
+        return took, {"rectification": rectifying, **spent}
 
     def row(what: str, found: Sequence[tuple[float, Mapping[str, float]]]) -> Row:
         n, pixels = tracker.model.filter.particles, camera.width * camera.height

@@ -1,0 +1,178 @@
+"""Which detection is of which track, which ones are left over, and which tracks end."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.detection import detection_of
+from helpers.rendered import EMPTY, hand_at, scene_of, track_of
+
+from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.tracking.association import (
+    Seen,
+    are_one,
+    assign,
+    costs,
+    ends,
+    left_over,
+    sureness,
+)
+from toftrack.tracking.state import Track
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def seen(x: float, side: str = "right", row: int = -1, **changes: object) -> Seen:
+    """A hand at a place of the finder, or of the track of a row."""
+    return Seen(replace(detection_of(hand_at(x), side=side), **changes), side, row)
+
+
+def costs_of(tracks: list[Track], found: list[Seen], dt_s: float = FRAME_S) -> np.ndarray:
+    return costs(scene_of(*tracks, image=EMPTY).hands, found, dt_s)
+
+
+# Assignment.
+
+
+def value(cost: np.ndarray, columns: tuple[int, ...]) -> tuple[int, float]:
+    """How many rows have no column, and the sum of the others' costs."""
+    each = [cost[row, column] for row, column in enumerate(columns) if column >= 0]
+    return len(columns) - len(each), sum(each)
+
+
+def best_value(cost: np.ndarray) -> tuple[int, float]:
+    """Of all possible assignments."""
+    rows, count = cost.shape
+    options = [*range(count), *[-1] * rows]
+    possible = (
+        columns
+        for columns in set(itertools.permutations(options, rows))
+        if all(column < 0 or math.isfinite(cost[row, column]) for row, column in enumerate(columns))
+    )
+    return min(value(cost, columns) for columns in possible)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 2), (3, 2), (2, 4), (3, 4), (4, 3), (3, 0), (0, 2)])
+def test_an_assignment_is_the_best_of_all_possible_ones(shape: tuple[int, int]) -> None:
+    draw = np.random.default_rng(7)
+    for impossible in (0.0, 0.3, 0.7, 1.0):
+        for _ in range(5):
+            cost = draw.normal(0, 4, shape)
+            cost[draw.random(shape) < impossible] = math.inf
+            found = assign(cost)
+            taken = [column for column in found if column >= 0]
+            assert len(found) == shape[0] and len(taken) == len(set(taken))
+            without, total = value(cost, tuple(found))
+            assert math.isfinite(total), "nothing impossible is assigned"
+            assert (without, total) == pytest.approx(best_value(cost))
+
+
+def test_a_detection_costs_the_more_the_farther_it_is_and_none_is_beyond_the_gate() -> None:
+    cost = costs_of([track_of(hand_at())], [seen(x) for x in (0.0, 0.05, 0.1, 0.5)])[0]
+    assert list(cost) == sorted(cost) and math.isfinite(cost[2]) and cost[3] == math.inf
+
+
+def test_a_hand_that_was_not_believed_for_long_may_be_farther_off() -> None:
+    far = [seen(0.25)]
+    assert np.isinf(costs_of([track_of(hand_at())], far)).all()
+    assert np.isfinite(costs_of([track_of(hand_at(), believed_s=0.5)], far)).all()
+    assert np.isfinite(costs_of([track_of(hand_at())], far, dt_s=0.5)).all()
+
+
+def test_a_hand_of_the_other_side_is_no_candidate() -> None:
+    right, left = track_of(hand_at()), track_of(hand_at(), side="left")
+    cost = costs_of([right, left], [seen(0.0), seen(0.0, "left")])
+    assert np.isfinite(cost).tolist() == [[True, False], [False, True]]
+
+
+def test_what_is_seen_at_a_track_s_place_is_no_other_track_s() -> None:
+    tracks = [track_of(hand_at()), track_of(hand_at(0.05))]
+    own = [seen(0.0, row=0), seen(0.05, "left", row=1)]
+    cost = costs_of(tracks, own)
+    assert np.isfinite(cost).tolist() == [[True, False], [False, True]]
+    assert assign(cost) == [0, 1]
+
+
+def test_of_two_detections_at_one_place_the_one_for_which_more_speaks_is_taken() -> None:
+    found = [seen(0.0, present=0.2), seen(0.0, present=0.9)]
+    assert assign(costs_of([track_of(hand_at())], found)) == [1]
+
+
+# What is left over.
+
+
+def test_what_is_no_track_s_is_left_over_each_hand_once() -> None:
+    found = [seen(0.0, row=0), seen(0.005), seen(0.3), seen(0.305), seen(0.3, "left"), seen(-0.3)]
+    assert left_over(found, [0]) == [found[2], found[5]]
+    assert left_over(found[:1], [-1]) == [], "a track's own place begins none"
+    assert left_over([], []) == []
+
+
+def test_a_detection_that_a_track_has_taken_is_not_left_over() -> None:
+    found = [seen(0.0), seen(0.3)]
+    assert left_over(found, [1]) == [found[0]]
+    assert left_over(found, [-1]) == found
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "behind_m", "one"),
+    [(0.0, 0.0, True), (0.015, 0.0, True), (0.0, 0.03, False), (0.06, 0.0, False)],
+    ids=["the same", "a little aside", "one behind the other", "beside each other"],
+)
+def test_two_hands_are_one_where_they_could_not_be_both(
+    apart_m: float, behind_m: float, one: bool
+) -> None:
+    first, second = (detection_of(hand) for hand in (hand_at(), hand_at(apart_m, 0.5 + behind_m)))
+    palms = first.centre_m.numpy(), second.centre_m.numpy()
+    assert are_one(*palms, first.joints_m[0], second.joints_m[0]) == one
+
+
+def test_palms_near_each_other_are_one_hand_s_where_much_of_one_lies_in_the_other() -> None:
+    joints, palm = torch.rand(21, 3, generator=torch.Generator().manual_seed(0)), np.zeros(3)
+    beside = palm + [0.03, 0.0, 0.0]
+    assert are_one(palm, beside, joints, joints)
+    assert not are_one(palm, beside, joints, joints + 1.0)
+    assert not are_one(palm, palm + [0.1, 0.0, 0.0], joints, joints)
+
+
+# Tracks.
+
+
+@pytest.mark.parametrize(
+    ("changes", "beside", "expected"),
+    [
+        ({}, True, False),
+        ({"doubtful": Duration(1.0)}, False, True),
+        ({"confirmed": False, "age": Duration(0.4)}, True, False),
+        ({"confirmed": False, "age": Duration(0.6)}, True, True),
+        ({"confirmed": False, "age": Duration(0.6)}, False, False),
+    ],
+    ids=[
+        "a sure one goes on",
+        "doubted for long",
+        "a tentative one is given time",
+        "but not for ever",
+        "unless there is no other hand",
+    ],
+)
+def test_a_track_ends_that_nobody_sees(
+    changes: dict[str, object], beside: bool, expected: bool
+) -> None:
+    assert ends(track_of(hand_at(), **changes), beside, 5) == expected
+
+
+def test_without_patience_a_doubtful_track_does_not_end() -> None:
+    assert not ends(track_of(hand_at(), doubtful=Duration(9.0)), False, 0)
+
+
+def test_a_confirmed_track_is_surer_than_any_tentative_one() -> None:
+    order = [
+        track_of(hand_at(), confirmed=confirmed, log_odds=odds)
+        for confirmed, odds in ((False, -3.0), (False, 9.0), (True, -3.0), (True, 2.0))
+    ]
+    assert sorted(order, key=sureness) == order
