@@ -102,7 +102,8 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
     """What a track is worth to a slot; at most 0 where it is not for it."""
     worth = _BELIEVED * track.reliable + _CONFIRMED * track.confirmed
     stays = slot.track == track.number
-    worth += _STAYS * stays + 0.1 / (1 + track.number) + 0.01 / (1 + number)
+    # Of hands that are worth the same, the one that was found first comes first.
+    worth += _STAYS * stays + 0.1 / ((1 + track.number) * (1 + number))
     several = len(state.slots)
     if several > 2:
         return worth

@@ -1,0 +1,203 @@
+"""Which hand is reported in which slot, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.hands import hand_estimate
+from helpers.rendered import EMPTY, any_hand_model, hand_at, state_of, track_of, view_of
+
+from toftrack.compute.pace import FRAME_S
+from toftrack.estimate import Estimate
+from toftrack.frames import DepthImage
+from toftrack.tracking.report import Followed, report
+from toftrack.tracking.state import SideEvidence, StepInfo, Track, TrackerState
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+IMAGE = replace(EMPTY, index=5, timestamp_s=0.2)
+SIDES = {"right": 5.0, "left": -5.0, "perhaps right": 0.3, "perhaps left": -0.3, "": 0.0}
+
+
+def hand(number: int, side: str = "right", lost: bool = False, **changes: object) -> Track:
+    """A track with evidence for a side."""
+    usual = {
+        "number": number,
+        "side": side.removeprefix("perhaps ") or "right",
+        "evidence": SideEvidence(SIDES[side], comparisons=9),
+        "believed_s": 0.2 * lost,
+    }
+    return track_of(hand_at(0.1 * number), any_hand_model(), **(usual | changes))
+
+
+def followed(track: Track) -> Followed:
+    """Its estimate; the wrist is where its number says."""
+    model = any_hand_model()
+    fitted, view = model.hand(track.side, track.shape), view_of(EMPTY, track, model=model)
+    estimate = hand_estimate(IMAGE.index, track.side, lost=not track.reliable)
+    joints = fitted.refiner.joints(track.pose)[0].numpy()
+    estimate = replace(estimate, joints_m=joints, timestamp_s=IMAGE.timestamp_s)
+    estimate = replace(estimate, state=track.pose[0].numpy())
+    none = torch.zeros(0)
+    return Followed(track, StepInfo(view.observation, none, none, {}), estimate, fitted)
+
+
+def before(hands: int = 1, told: str | None = None, **slot: object) -> TrackerState:
+    """With changes of the first slot."""
+    state = state_of(hands=hands, model=any_hand_model(), told=told)
+    first = told or "right"
+    sides = [first, "left" if first == "right" else "right"] * hands
+    slots = [replace(one, side=side) for one, side in zip(state.slots, sides, strict=False)]
+    return replace(state, slots=(replace(slots[0], **slot), *slots[1:]))
+
+
+def reported(
+    state: TrackerState, *tracks: Track, image: DepthImage = IMAGE
+) -> tuple[TrackerState, tuple[Estimate, ...]]:
+    each = [followed(track) for track in tracks]
+    state = replace(state, tracks=tracks)
+    state, infos, estimates = report(state, each, image, any_hand_model(), FRAME_S, {"rest": 1.0})
+    assert [info is None for info in infos] == [slot.track < 0 for slot in state.slots]
+    assert all(info is None or info.seconds == {"rest": 1.0} for info in infos)
+    return state, estimates
+
+
+def numbers(state: TrackerState, *tracks: Track) -> list[int]:
+    """Of the tracks in the slots; -1 = none."""
+    return [slot.track for slot in reported(state, *tracks)[0].slots]
+
+
+# Which one.
+
+
+@pytest.mark.parametrize(
+    ("told", "sides", "expected"),
+    [
+        ("right", ["left", "right"], 1),
+        ("left", ["left", "right"], 0),
+        ("right", ["perhaps left", "perhaps right"], 1),
+        (None, ["left", "right"], 0),
+        (None, ["right", "left"], 0),
+    ],
+    ids=["right", "left", "the likelier", "whichever was first", "whichever was first, too"],
+)
+def test_of_two_hands_the_one_that_was_asked_for_is_reported(
+    told: str | None, sides: Sequence[str], expected: int
+) -> None:
+    tracks = [hand(at, side) for at, side in enumerate(sides)]
+    assert numbers(before(told=told), *tracks) == [expected]
+    assert numbers(before(told=told), *tracks[::-1]) == [expected], "in whichever row"
+
+
+def test_a_hand_that_is_believed_comes_before_one_that_is_not() -> None:
+    assert numbers(before(), hand(0, lost=True), hand(1)) == [1]
+    assert numbers(before(), hand(0, confirmed=False), hand(1, lost=True)) == [1]
+
+
+@pytest.mark.parametrize("hands", [1, 2, 4])
+def test_a_hand_keeps_its_slot(hands: int) -> None:
+    state = before(hands, track=1, known=5.0)
+    assert numbers(state, hand(0), hand(1))[0] == 1
+    alone = [0] if hands == 1 else [1, 0]
+    assert numbers(state, hand(0), hand(1, lost=True))[:2] == alone, "of several, also while lost"
+
+
+@pytest.mark.parametrize("told", ["right", "left"])
+@pytest.mark.parametrize("first", ["right", "left"])
+def test_of_two_slots_the_first_is_of_the_told_side(told: str, first: str) -> None:
+    second = "left" if first == "right" else "right"
+    state, estimates = reported(before(2, told), hand(0, first), hand(1, second))
+    assert [slot.track for slot in state.slots] == ([0, 1] if first == told else [1, 0])
+    assert [one.side for one in estimates] == [told, "left" if told == "right" else "right"]
+    assert not any(one.lost for one in estimates)
+
+
+def test_where_a_side_was_said_a_hand_of_the_other_side_comes_into_the_second_slot() -> None:
+    assert numbers(before(2, "right"), hand(0, "left")) == [-1, 0]
+    assert numbers(before(2, "left"), hand(0, "left")) == [0, -1]
+
+
+def test_where_no_side_was_said_two_hands_come_in_their_order_and_back_into_their_slots() -> None:
+    state, _ = reported(before(2), hand(0, "left"), hand(1, "right"))
+    assert [slot.track for slot in state.slots] == [0, 1]
+    state, _ = reported(state)
+    assert [slot.track for slot in state.slots] == [-1, -1]
+    assert [slot.side for slot in state.slots] == ["left", "right"]
+    assert numbers(state, hand(2, "right")) == [-1, 2]
+    assert numbers(state, hand(2, "right"), hand(3, "left")) == [3, 2]
+
+
+def test_four_hands_of_any_sides_each_have_a_slot_and_keep_it() -> None:
+    tracks = [hand(at, side) for at, side in enumerate(("right", "right", "left", "right"))]
+    state, estimates = reported(before(4, "right"), *tracks)
+    assert [slot.track for slot in state.slots] == [0, 1, 2, 3]
+    assert len({float(one.joints_m[0, 0]) for one in estimates}) == 4
+    state, _ = reported(state, tracks[0], tracks[2], tracks[3])
+    assert [slot.track for slot in state.slots] == [0, -1, 2, 3]
+    assert numbers(state, tracks[0], tracks[2], tracks[3], hand(4)) == [0, 4, 2, 3]
+
+
+def test_of_more_hands_than_slots_the_first_ones_are_reported() -> None:
+    assert numbers(before(2), hand(0), hand(1, "left"), hand(2)) == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("side", "away_s", "taken"),
+    [("right", 0.5, True), ("left", 0.5, False), ("left", 3.0, True)],
+    ids=["of the same side", "of the other", "long after"],
+)
+def test_where_no_side_was_said_a_hand_that_comes_may_be_the_first_one_again(
+    side: str, away_s: float, taken: bool
+) -> None:
+    state = before(known=5.0, away_s=away_s)
+    assert numbers(state, hand(1, side)) == [1 if taken else -1]
+
+
+# What is said of it.
+
+
+def test_a_hand_of_the_other_side_than_was_said_is_flagged() -> None:
+    _, (estimate,) = reported(before(told="left"), hand(0, "right"))
+    assert estimate.lost and estimate.state_name == "other hand" and not estimate.joint_ok.any()
+    assert estimate.side == "right" and estimate.side_probability > 0.9
+    _, (unsure,) = reported(before(told="right"), hand(0, ""))
+    assert not unsure.lost and unsure.side_probability == 1.0
+
+
+@pytest.mark.parametrize("side", ["right", "left", "perhaps right", "perhaps left"])
+def test_where_no_side_was_said_a_wrong_one_makes_the_estimate_wrong(side: str) -> None:
+    _, (estimate,) = reported(before(), hand(0, side))
+    sure = 0.99 if "perhaps" not in side else 0.57
+    assert estimate.side_probability == pytest.approx(sure, abs=0.01)
+    assert estimate.confidence == pytest.approx(0.9 * estimate.side_probability)
+    assert side.endswith(estimate.side) and not estimate.lost
+
+
+def test_the_only_hand_that_was_lost_is_reported_where_it_was_last_believed() -> None:
+    state, (seen,) = reported(before(), hand(0))
+    assert state.slots[0].away_s == 0
+    for again in range(2):
+        state, (estimate,) = reported(state, image=replace(IMAGE, index=6 + again))
+        assert estimate.lost and estimate.state_name == "lost" and estimate.index == 6 + again
+        assert estimate.score == 0 and state.slots[0].track == -1
+        np.testing.assert_array_equal(estimate.joints_m, seen.joints_m)
+
+
+def test_a_slot_of_several_without_a_hand_is_empty() -> None:
+    state, _ = reported(before(2), hand(0, "right"), hand(1, "left"))
+    state, (first, second) = reported(state, hand(0, "right"))
+    assert not first.lost and second.lost and second.state_name == "lost"
+    assert second.side == "" and np.isnan(second.joints_m).all()
+    assert (second.index, second.timestamp_s) == (IMAGE.index, IMAGE.timestamp_s)
+    assert state.slots[1].side == "left", "which hand it was is remembered"
+
+
+def test_what_was_believed_last_stands_while_a_hand_is_lost() -> None:
+    state, (seen,) = reported(before(), hand(0))
+    state, _ = reported(state, hand(0, lost=True))
+    assert not state.slots[0].last.lost
+    np.testing.assert_array_equal(state.slots[0].last.joints_m, seen.joints_m)

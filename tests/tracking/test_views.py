@@ -1,0 +1,217 @@
+"""Tracks as they go into a frame: continued, begun, begun anew, changed to the other side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.detection import FixedDetector, detection_of
+from helpers.rendered import (
+    EMPTY,
+    any_hand_model,
+    bent,
+    hand_at,
+    image_of,
+    scene_of,
+    state_of,
+    track_of,
+)
+
+from toftrack.compute.pace import Duration
+from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.frames import DepthImage
+from toftrack.hand.shape import default_hand_shape
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape, with_network_length
+from toftrack.tracking.association import Seen
+from toftrack.tracking.candidates import View
+from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.sides import changes_side, side_log_odds
+from toftrack.tracking.state import SideEvidence, Slot, Track
+from toftrack.tracking.views import begun, continued, expected_of, known_shape, observed
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+ELSEWHERE = SAME_PLACE_M + 0.05
+HERE, THERE = hand_at(0.0), hand_at(ELSEWHERE)
+BOTH = image_of(HERE, THERE)
+
+
+def model() -> TrackerModel:
+    return replace(any_hand_model(), detector=FixedDetector())
+
+
+def seen(pose: torch.Tensor, side: str = "right", row: int = -1) -> Seen:
+    return Seen(detection_of(pose, side=side), side, row)
+
+
+def off_m(view: View, pose: torch.Tensor) -> float:
+    """How far the joints of a view's track are from a pose's, on average."""
+    joints = view.fitted.refiner.joints
+    return float((joints(view.track.pose) - joints(pose)).norm(dim=-1).mean())
+
+
+# Continued.
+
+
+def gone_on(
+    found: Seen | None, image: DepthImage = BOTH, told: str | None = None, **changes: object
+) -> View | None:
+    track = track_of(HERE, number=3, **changes)
+    return continued(scene_of(track, image=image, model=model()), 0, found, told)
+
+
+@pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(hand_at(0.02)), seen(HERE)])
+def test_a_track_goes_on_where_it_is_predicted(found: Seen | None) -> None:
+    view = gone_on(found)
+    assert view is not None and view.track.age == Duration(1.0)
+    assert view.detection.empty == (found is None)
+    torch.testing.assert_close(view.track.pose, HERE)
+
+
+def test_a_track_that_was_seen_elsewhere_begins_anew_there_and_is_the_same_hand() -> None:
+    view = gone_on(seen(bent(THERE, 2, 0.01)), log_odds=1.0)
+    assert view is not None and not view.track.age.begun
+    assert off_m(view, THERE) < 0.01
+    assert view.track.number == 3 and view.track.confirmed
+    assert bool((view.track.particles[:, 0] > 0.9 * ELSEWHERE).all())
+
+
+@pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(THERE)])
+def test_a_track_does_not_go_on_where_nothing_can_be_its_hand(found: Seen | None) -> None:
+    assert gone_on(found, EMPTY) is None
+
+
+def test_the_time_since_a_comparison_goes_on() -> None:
+    view = gone_on(None, evidence=SideEvidence(1.0, age_s=0.3))
+    assert view is not None and view.track.evidence.age_s == pytest.approx(0.34)
+
+
+# Of which side.
+
+
+def of_both(side: str = "right") -> Seen:
+    """What is seen at the track's place, as a hand of either side."""
+    other = detection_of(HERE, side="left" if side == "right" else "right")
+    return replace(seen(HERE, side, 0), mirrored=other)
+
+
+@pytest.mark.parametrize(
+    ("image_side", "fits", "told", "side"),
+    [
+        ("right", 0.0, None, "right"),
+        ("left", 0.0, None, "left"),
+        ("left", 6.0, None, "right"),
+        ("left", 0.0, "right", "right"),
+        ("left", -4.0, "right", "left"),
+    ],
+    ids=["as it was", "likelier now", "sure for long", "told otherwise", "but surely not"],
+)
+def test_a_track_changes_to_the_side_that_is_likelier(
+    image_side: str, fits: float, told: str | None, side: str
+) -> None:
+    image, evidence = image_of(HERE, side=image_side), SideEvidence(fits)
+    view = gone_on(of_both(), image, told, evidence=evidence)
+    assert view is not None
+    track = view.track
+    assert track.side == view.fitted.shape.side == side
+    assert (track.evidence.fits > fits) == (image_side == "right") and track.evidence.comparisons
+    changed = side != "right"
+    assert track.age.begun != changed and track.number == 3
+    assert changed or not changes_side(track, side_log_odds(track, [], told), told)
+
+
+# Begun.
+
+
+def began(
+    new: Sequence[Seen], *tracks: Track, image: DepthImage = BOTH, hands: int = 1, **changes: object
+) -> list[View]:
+    used = model()
+    state = state_of(*tracks, hands=hands, model=used, **changes)
+    views = begun(scene_of(*tracks, image=image, model=used), new, state)
+    return [view for view in views if view is not None]
+
+
+def test_a_track_begins_tentatively_at_the_pose_that_explains_the_image() -> None:
+    truth = bent(HERE, 1, 0.3)
+    detection = detection_of(torch.cat((HERE, bent(HERE, 2, 0.8), truth)))
+    detection = replace(detection, keypoints=detection_of(truth).keypoints)
+    (view,) = began([Seen(detection, "right")], image=image_of(truth))
+    assert off_m(view, truth) < 0.005
+    assert not (view.track.confirmed or view.track.reliable or view.track.age.begun)
+
+
+def test_where_nothing_can_be_a_hand_none_begins() -> None:
+    assert began([seen(HERE)], image=EMPTY) == [] and began([]) == []
+
+
+def test_a_track_begins_as_a_hand_of_the_likelier_side() -> None:
+    for side in ("right", "left"):
+        (view,) = began([seen(HERE, "right")], image=image_of(HERE, side=side))
+        assert view.track.side == side == view.fitted.shape.side
+
+
+def test_as_many_tracks_begin_as_there_is_room_for_each_with_a_number() -> None:
+    places = [hand_at(x) for x in (-0.15, -0.05, 0.05, 0.15)]
+    many = [seen(pose) for pose in places]
+    image = image_of(*places)
+    numbers = [view.track.number for view in began(many, image=image, next_track=7)]
+    assert numbers == list(range(7, 7 + len(numbers))) and 2 <= len(numbers) < len(many)
+    assert len(began(many, image=image, hands=4)) == len(many)
+    assert len(began(many[1:], track_of(places[0]), image=image)) == len(numbers) - 1
+
+
+def test_no_track_begins_beside_a_tentative_one() -> None:
+    assert began([seen(THERE)], track_of(HERE, confirmed=False)) == []
+    assert len(began([seen(THERE)], track_of(HERE))) == 1
+
+
+def test_a_new_track_keeps_off_a_reliable_hand_s_pixels_and_joints() -> None:
+    aside = hand_at(0.2)
+    (view,) = began([seen(aside)], track_of(HERE), image=image_of(HERE, aside))
+    assert len(view.others) == 1
+    mine = view.observation.hand.numpy()
+    assert mine.any() and not (mine & (image_of(HERE).depth_m < 1.0)).any()
+
+
+# The shape.
+
+SHORT = math.log(0.8)
+
+
+def length_m(shape: ShapeEstimate) -> float:
+    return any_hand_model().hand("right", shape).shape.hand_length_m
+
+
+def test_a_track_begins_with_the_length_that_was_detected_and_keeps_it() -> None:
+    short, new = detection_of(HERE, log_size=SHORT), track_of(HERE, age=Duration())
+    assert length_m(observed(new, short, model()).shape) == pytest.approx(0.152, rel=1e-3)
+    older = observed(track_of(HERE), short, model())
+    assert older.shape.applied == first_shape().applied
+
+
+def test_a_hand_that_is_back_has_the_shape_that_it_had() -> None:
+    of_length = with_network_length(first_shape(), 0.15, model().fit, default_hand_shape())
+    state = state_of(track_of(HERE), hands=2)
+    first, second = state.slots
+
+    def known(side: str, *slots: Slot) -> float:
+        return length_m(known_shape(side, replace(state, slots=slots)))
+
+    gone = replace(second, shape=of_length)
+    assert known("left", first, gone) == pytest.approx(0.15, rel=1e-3)
+    assert known("right", first, gone) == pytest.approx(0.19, rel=1e-3), "of the other side"
+    there = replace(first, shape=of_length)
+    assert known("right", there, second) == pytest.approx(0.19, rel=1e-3), "it is still there"
+
+
+def test_what_is_expected_of_a_hand_that_is_not_tracked_yet() -> None:
+    detection = detection_of(hand_at(0.1))
+    expected, z = expected_of(detection), detection.joints_m[0, :, 2].numpy()
+    depths = (expected.nearest_m, expected.farthest_m)
+    np.testing.assert_allclose(depths, (z.min(), z.max()), rtol=1e-6)
+    np.testing.assert_allclose(expected.centre_m, detection.centre_m.numpy(), rtol=1e-6)
