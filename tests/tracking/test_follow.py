@@ -1,0 +1,160 @@
+"""What becomes of tracks after a frame: moved, judged, ended, and each hand followed once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.configured import confidence_model
+from helpers.detection import detection_of
+from helpers.rendered import (
+    hand_at,
+    image_of,
+    right_hand_model,
+    scene_of,
+    state_of,
+    track_of,
+    view_of,
+)
+
+from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.compute.spans import Spans
+from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.tracking.confidence import LogOdds
+from toftrack.tracking.report import Followed
+from toftrack.tracking.state import REFUSED_S, Track, TrackerState
+from toftrack.tracking.step import follow, kept
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+HERE, THERE = hand_at(0.0), hand_at(SAME_PLACE_M + 0.05)
+IMAGE = image_of(HERE, THERE)
+
+
+def followed(
+    track: Track, odds: float, at: torch.Tensor = HERE, beside: tuple[Track, ...] = ()
+) -> Followed:
+    """After a frame in which the network sees the hand somewhere, with these log odds."""
+    plain = confidence_model(memory=0.0, whole=0.0, second=0.95)
+    plain = replace(plain, log_odds=LogOdds(odds, {}), whole_odds=LogOdds(0.0, {}))
+    model = replace(right_hand_model(), lost=plain)
+    view = view_of(IMAGE, track, detection_of(at), model=model)
+    scene = scene_of(track, *beside, image=IMAGE, model=model)
+    return follow(view, scene, torch.Generator().manual_seed(0), Spans())
+
+
+@pytest.mark.parametrize(("odds", "lost"), [(2.0, False), (-4.0, True)])
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_a_track_is_confirmed_once_and_not_believed_while_it_is_lost(
+    odds: float, lost: bool, confirmed: bool
+) -> None:
+    after = followed(track_of(HERE, confirmed=confirmed), odds)
+    assert after.estimate.lost == lost and after.track.reliable == (not lost)
+    assert after.track.confirmed == (confirmed or not lost)
+    assert after.track.believed_s == pytest.approx(FRAME_S * lost)
+    assert after.track.age.seconds == pytest.approx(1.0 + FRAME_S)
+    assert after.estimate.joint_ok.any() == (not lost)
+
+
+def test_beside_another_hand_a_new_one_must_be_surer() -> None:
+    new = track_of(HERE, confirmed=False, number=1)
+    other = track_of(THERE, number=0)
+    assert not followed(new, 1.0).estimate.lost
+    assert followed(new, 1.0, beside=(other,)).estimate.lost
+    assert not followed(new, 1.0, beside=(replace(other, confirmed=False),)).estimate.lost
+    assert not followed(new, 4.0, beside=(other,)).estimate.lost
+
+
+def test_the_particles_follow_the_pose_that_was_found() -> None:
+    after = followed(track_of(hand_at(-0.01)), 2.0).track
+    assert after.pose[0, :3].numpy() == pytest.approx(HERE[0, :3].numpy(), abs=0.003)
+    assert float(after.mean[0, 0]) == pytest.approx(float(after.pose[0, 0]), abs=1e-4)
+    assert float(after.particles[:, 0].mean()) == pytest.approx(0.0, abs=0.01)
+    assert after.velocity[0] > 0
+
+
+def test_a_pose_of_another_place_begins_the_track_anew_there() -> None:
+    wrong = track_of(hand_at(0.2), doubtful=Duration(0.1))
+    after = followed(wrong, 2.0, at=THERE).track
+    assert after.pose[0, 0] == pytest.approx(float(THERE[0, 0]), abs=0.01)
+    assert after.age == Duration(FRAME_S) and after.number == wrong.number
+    assert not after.velocity.any()
+
+
+# Which tracks go on.
+
+
+def going_on(*tracks: Track) -> TrackerState:
+    numbered = [replace(track, number=at) for at, track in enumerate(tracks)]
+    return kept(state_of(), numbered, right_hand_model())
+
+
+def numbers(*tracks: Track) -> list[int]:
+    return [track.number for track in going_on(*tracks).tracks]
+
+
+def fist(behind_m: float) -> torch.Tensor:
+    """(1, 27) about the palm of HERE, or behind it."""
+    state = HERE.clone()
+    state[0, 2] += behind_m
+    for finger in range(12, 27, 4):
+        state[0, finger : finger + 3] = 1.3
+    return state
+
+
+SURE, LESS_SURE = track_of(HERE, log_odds=4.0), track_of(HERE, log_odds=3.0)
+NEW = {"confirmed": False, "age": Duration(FRAME_S)}
+
+
+@pytest.mark.parametrize(
+    ("tracks", "left"),
+    [
+        ((SURE, LESS_SURE), [0]),
+        ((LESS_SURE, SURE), [1]),
+        ((SURE, track_of(HERE, log_odds=9.0, **NEW)), [0]),
+        ((track_of(HERE, log_odds=1.0, **NEW), track_of(HERE, log_odds=9.0, **NEW)), [1]),
+        ((SURE, track_of(fist(0.015), log_odds=3.0)), [0]),
+        ((SURE, LESS_SURE, track_of(HERE, log_odds=5.0)), [2]),
+        ((SURE, track_of(hand_at(0.05), log_odds=3.0)), [0, 1]),
+        ((SURE, track_of(THERE, **NEW)), [0, 1]),
+        ((SURE,), [0]),
+        ((), []),
+    ],
+    ids=[
+        "the surer one",
+        "whichever row it is in",
+        "one that was never confirmed ends",
+        "of two that were not, the less sure one",
+        "of two in one palm with other fingers, too",
+        "of three one is left",
+        "two that lie beside each other go on",
+        "and two that are apart",
+        "and one alone",
+        "none",
+    ],
+)
+def test_of_tracks_on_one_hand_the_surest_goes_on(
+    tracks: tuple[Track, ...], left: list[int]
+) -> None:
+    assert numbers(*tracks) == left
+
+
+def test_what_nobody_sees_ends_and_a_thing_is_left_alone_for_a_while() -> None:
+    long = Duration(1.0)
+    state = going_on(track_of(HERE, doubtful=long), track_of(THERE, doubtful=long, **NEW))
+    assert state.tracks == () and len(state.refused) == 1, "what was a hand may come back"
+    place = detection_of(THERE).centre_m.numpy()
+    assert state.refused[0] == pytest.approx([*place, 0.0], abs=0.01)
+    state = replace(state, timestamp_s=0.0)
+    for passed, expected in ((0.9, 1), (1.1, 0)):
+        later = state.at(replace(IMAGE, timestamp_s=passed * REFUSED_S))
+        assert len(later.refused) == expected
+
+
+def test_a_tentative_track_ends_beside_a_confirmed_one_but_not_alone() -> None:
+    waiting = track_of(THERE, confirmed=False, age=Duration(0.6))
+    assert numbers(SURE, waiting) == [0] and numbers(waiting) == [0]
+    assert numbers(waiting, track_of(HERE, confirmed=False)) == [0, 1]
+    assert np.isfinite(going_on(SURE, waiting).refused).all()
