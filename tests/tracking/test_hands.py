@@ -133,3 +133,23 @@ def test_other_numbers_of_hands_are_refused(hands: float) -> None:
 def test_two_hands_without_networks_are_refused() -> None:
     with pytest.raises(ToftrackError, match="hands=2 .*leave experiment=paper out"):
         tracker_of("hands=2", "experiment=paper")
+
+
+def test_the_other_hand_is_not_taken_for_one_that_has_left(apart: TwoHands) -> None:
+    tracker, mine = tracker_of("hand.side=right"), sample().cut(*ROWS).depth_m
+    alone = np.where(apart.depth_m == mine, np.float32(1.5), apart.depth_m)
+    depths = [*apart.depth_m[:8], *alone[8:]]
+    found = [tracker.step(depth, apart.k, i, i / 25)[0] for i, depth in enumerate(depths)]
+    off = [
+        np.linalg.norm(found[i].joints_m - apart.joints_m[0, i], axis=1).mean() for i in range(8)
+    ]
+    assert not any(one.lost for one in found[3:8]) and max(off[3:8]) < 0.03
+    assert all(one.lost for one in found[12:])
+
+
+def test_a_slot_more_than_there_are_hands_stays_empty(apart: TwoHands) -> None:
+    tracker = tracker_of("hands=3")
+    for i in range(10):
+        estimates = tracker.step(apart.depth_m[i], apart.k, i, i / 25)
+    assert [one.lost for one in estimates] == [False, False, True]
+    assert {one.side for one in estimates[:2]} == {"left", "right"}
