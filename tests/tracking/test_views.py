@@ -194,6 +194,14 @@ def test_a_track_begins_with_the_length_that_was_detected_and_keeps_it() -> None
     assert older.shape.applied == first_shape().applied
 
 
+def test_a_track_that_changes_its_side_takes_the_length_that_was_detected_anew() -> None:
+    short = detection_of(HERE, log_size=SHORT, side="left")
+    surely, image = SideEvidence(-6.0), image_of(HERE, side="left")
+    view = gone_on(replace(of_both(), mirrored=short), image, evidence=surely)
+    assert view is not None and view.track.side == "left"
+    assert view.fitted.shape.hand_length_m == pytest.approx(0.152, rel=1e-3)
+
+
 def test_a_hand_that_is_back_has_the_shape_that_it_had() -> None:
     of_length = with_network_length(first_shape(), 0.15, model().fit, default_hand_shape())
     state = state_of(track_of(HERE), hands=2)

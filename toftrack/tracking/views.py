@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from toftrack.compute.pace import Duration
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
@@ -138,7 +139,7 @@ def of_likelier_side(
     if not changes_side(track, side_log_odds(track, others, told), told):
         return replace(view, track=track)
     track = replace(track, side=OTHER_SIDE[track.side], shape=first_shape())
-    track = observed(track, mirrored, scene.model)
+    track = observed(replace(track, age=Duration()), mirrored, scene.model)
     other = viewed(scene, row, track, mirrored, expected_of(mirrored))
     if other is None:
         return view
