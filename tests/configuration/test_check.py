@@ -22,7 +22,7 @@ WRONG = (
     ("filter.exponent=nan", "filter.exponent=nan .*a number"),
     ("refine.point_m=[1]", "refine.point_m=.*a number"),
     ("device.repeat=5", "device.repeat=5 .*true or false"),
-    ("hands=3", "hands=3 .*whole number above 0 and at most 2"),
+    ("hands=9", "hands=9 .*whole number above 0 and at most 8"),
 )
 
 

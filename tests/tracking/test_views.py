@@ -197,7 +197,8 @@ def test_a_track_begins_with_the_length_that_was_detected_and_keeps_it() -> None
 def test_a_track_that_changes_its_side_takes_the_length_that_was_detected_anew() -> None:
     short = detection_of(HERE, log_size=SHORT, side="left")
     surely, image = SideEvidence(-6.0), image_of(HERE, side="left")
-    view = gone_on(replace(of_both(), mirrored=short), image, evidence=surely)
+    fitted = replace(first_shape(), poses=9)  # to the hand of the other side
+    view = gone_on(replace(of_both(), mirrored=short), image, evidence=surely, shape=fitted)
     assert view is not None and view.track.side == "left"
     assert view.fitted.shape.hand_length_m == pytest.approx(0.152, rel=1e-3)
 
