@@ -201,3 +201,16 @@ def test_what_was_believed_last_stands_while_a_hand_is_lost() -> None:
     state, _ = reported(state, hand(0, lost=True))
     assert not state.slots[0].last.lost
     np.testing.assert_array_equal(state.slots[0].last.joints_m, seen.joints_m)
+
+
+def test_gestures_are_smoothed_over_a_hand_s_frames_and_not_from_one_hand_to_another() -> None:
+    state, (palm,) = reported(before(), hand(0))
+    fist = hand_at()
+    fist[:, 18:27] = 1.3
+
+    def gesture(state: TrackerState, number: int) -> np.ndarray:
+        return reported(state, replace(hand(number), pose=fist))[0].slots[0].gesture.probabilities
+
+    assert palm.gesture == "palm"
+    np.testing.assert_allclose(gesture(state, 1), gesture(before(), 1), rtol=1e-5)
+    assert np.abs(gesture(state, 0) - gesture(before(), 0)).max() > 0.1
