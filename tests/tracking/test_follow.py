@@ -83,6 +83,20 @@ def test_a_pose_of_another_place_begins_the_track_anew_there() -> None:
     assert not after.velocity.any()
 
 
+def test_it_is_kept_what_was_asked_and_what_hides_the_hand() -> None:
+    track = track_of(HERE, asked_s=0.1, nearest_m=0.3)
+    scene, dice = scene_of(track, image=IMAGE), torch.Generator().manual_seed(0)
+    plain, seen = view_of(IMAGE, track), view_of(IMAGE, track, detection_of(HERE))
+    hand = plain.observation.hand
+    before = torch.zeros_like(hand)
+    before[int(hand.nonzero()[:, 0].float().mean()) :] = True
+    part = replace(plain.observation, occluder=hand & before, hand=hand & ~before)
+    hidden = replace(plain, observation=part)
+    after = [follow(view, scene, dice, Spans()).track for view in (plain, seen, hidden)]
+    assert [one.asked_s for one in after[:2]] == pytest.approx([0.1 + FRAME_S, 0.0])
+    assert [one.nearest_m for one in after] == pytest.approx([0.0, 0.0, hidden.expected_m])
+
+
 # Which tracks go on.
 
 
