@@ -172,3 +172,19 @@ def test_a_tentative_track_ends_beside_a_confirmed_one_but_not_alone() -> None:
     assert numbers(SURE, waiting) == [0] and numbers(waiting) == [0]
     assert numbers(waiting, track_of(HERE, confirmed=False)) == [0, 1]
     assert np.isfinite(going_on(SURE, waiting).refused).all()
+
+
+def test_time_goes_on_with_the_images_and_not_where_a_clock_goes_back() -> None:
+    state = replace(state_of(timestamp_s=1.0), found_s=0.2)
+    state = replace(state, slots=(replace(state.slots[0], away_s=0.1),))
+    for now_s, passed in ((1.5, 0.5), (0.2, 0.0), (float("nan"), 0.0)):
+        later = state.at(replace(IMAGE, index=7, timestamp_s=now_s))
+        assert later.found_s == pytest.approx(0.2 + passed) and later.next_index == 8
+        assert later.slots[0].away_s == pytest.approx(0.1 + passed)
+
+
+def test_what_hides_a_hand_is_not_expected_to_be_it() -> None:
+    plain, behind = track_of(HERE), track_of(HERE, nearest_m=0.55)
+    scene = scene_of(plain, behind, image=IMAGE)
+    free, hidden = (hand.depths.nearest_m for hand in scene.hands)
+    assert free < 0.5 and hidden == pytest.approx(0.55, abs=0.01)
