@@ -59,9 +59,7 @@ def measure(paths: tuple[Path, Path], *overrides: str) -> dict[str, float]:
     lost = np.array([[one.lost for one in frame] for frame in said])
     off = np.linalg.norm(found[:, :, None] - joints[:, None], axis=-1)  # (T, slot, hand, 21)
     mean = np.where(lost[..., None], 0.3, np.nan_to_num(off, nan=0.3).mean(-1))
-    slots = min(
-        itertools.permutations(range(4)), key=lambda order: mean[:, order, range(4)].sum()
-    )
+    slots = min(itertools.permutations(range(4)), key=lambda order: mean[:, order, range(4)].sum())
     own = off[:, slots, range(4)]  # (T, hand, 21)
     right = np.where(shown, own, 0).max(-1) < 0.04
     usable = right & ~lost[:, slots]
@@ -86,7 +84,9 @@ def main() -> None:
         raise SystemExit(__doc__)
     for pair in itertools.pairwise(paths):
         figures = measure(pair, *overrides)
-        print(*(path.stem for path in pair), *(f"{k} {v:.1f}" for k, v in figures.items()), sep="; ")
+        print(
+            *(path.stem for path in pair), *(f"{k} {v:.1f}" for k, v in figures.items()), sep="; "
+        )
 
 
 if __name__ == "__main__":
