@@ -115,8 +115,12 @@ def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) ->
         missing.add(OTHER_SIDE[confirmed[0]])
     seen: list[Seen] = []
     for side in sorted(missing, reverse=True):  # right first
-        for one in scene.model.detector.look(image.depth_m, image.k, places, side):
-            seen.append(Seen(one, side))
+        # A hand that is hardly seen may look like one of the other side.
+        known = [hand.palm_m[0] for hand in scene.hands if hand.track.side != side and not rare]
+        there = _apart_from(known, places)
+        if len(there.centre_m):
+            found = scene.model.detector.look(image.depth_m, image.k, there, side)
+            seen += [Seen(one, side) for one in found]
     seen.sort(key=lambda one: -one.detection.merit)
     return seen if tracks or state.told else held_out_first(seen)
 

@@ -34,9 +34,9 @@ from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerSt
 
 _OTHER = 0.4
 """Where it is less probable than this that a hand is of the given side, the frame is flagged."""
-_STAYS, _BELIEVED, _CONFIRMED, _SIDE = 1.5, 3.0, 3.0, 3.0
-"""Of a slot's value for a track: that it was there before; that its estimate is not lost; that it
-was confirmed; and the log odds of the side that the slot is for, this at most."""
+_STAYS, _CONFIRMED, _MOST = 4.0, 6.0, 3.0
+"""What a track is worth to a slot, log odds: that it was there before; that it was confirmed; and
+what its estimate is believed, and its side agrees, at most."""
 _GONE_S = 2.0
 """Where no side was said, a hand that has been away so long makes way for another one."""
 
@@ -100,7 +100,7 @@ def assigned(
 
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
     """What a track is worth to a slot; at most 0 where it is not for it."""
-    worth = _BELIEVED * track.reliable + _CONFIRMED * track.confirmed
+    worth = _CONFIRMED * track.confirmed + min(max(track.log_odds, -_MOST), _MOST) + _MOST
     stays = slot.track == track.number
     # Of hands that are worth the same, the one that was found first comes first.
     worth += _STAYS * stays + 0.1 / ((1 + track.number) * (1 + number))
@@ -110,13 +110,13 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
     if state.told is not None:
         wanted = state.told if number == 0 else OTHER_SIDE[state.told]
         agrees = right if wanted == "right" else -right
-        return worth + min(max(agrees, -_SIDE), _SIDE) + (0 if several == 1 else _SIDE)
+        return worth + min(max(agrees, -_MOST), _MOST) + (0 if several == 1 else _MOST)
     if not slot.known or stays:
         return worth + 0.1
     agrees = right if slot.side == "right" else -right
     if several == 1 and agrees < 0 and slot.away_s < _GONE_S:
         return -1.0
-    return worth + 0.1 + 0.3 * min(max(agrees, -_SIDE), _SIDE)
+    return worth + 0.1 + 0.3 * min(max(agrees, -_MOST), _MOST)
 
 
 def reported(
