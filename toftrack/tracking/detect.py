@@ -106,13 +106,13 @@ def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) ->
     image = scene.image if rare else scene.unexplained()
     tracks = [hand.track for hand in scene.hands]
     missing = {track.side for track in tracks if rare or not track.reliable}
-    confirmed = [track.side for track in tracks if track.confirmed]
+    confirmed = [track for track in tracks if track.confirmed]
     if len(state.slots) > 2 or not (tracks or state.told):
         missing = set(OTHER_SIDE)
     elif not tracks:
         missing = {str(state.told)}
-    elif len(confirmed) == 1:
-        missing.add(OTHER_SIDE[confirmed[0]])
+    elif len(confirmed) == 1 and confirmed[0].reliable:  # else what is seen may be its hand
+        missing.add(OTHER_SIDE[confirmed[0].side])
     seen: list[Seen] = []
     for side in sorted(missing, reverse=True):  # right first
         # A hand that is hardly seen may look like one of the other side.
