@@ -16,6 +16,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from toftrack.detector.hand_detector import Detection, merit
+from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.filter import Predicted
 from toftrack.tracking.posterior import touching
 from toftrack.tracking.state import Track
@@ -91,14 +92,18 @@ def left_over(seen: Sequence[Seen], taken: Sequence[int]) -> list[Seen]:
     new = [one for column, one in enumerate(seen) if one.row < 0 and column not in taken]
     found: list[Seen] = []
     for one in new:
-        if not any(_same(one.detection, other.detection) for other in [*explained, *found]):
+        if not any(_same(one, other) for other in [*explained, *found]):
             found.append(one)
     return found
 
 
-def _same(first: Detection, second: Detection) -> bool:
-    palms = first.centre_m.numpy(), second.centre_m.numpy()
-    return are_one(*palms, first.keypoints.points_m, second.keypoints.points_m)
+def _same(first: Seen, second: Seen) -> bool:
+    """Whether two detections are of one hand; two hands of one side are never close to another."""
+    palms = [one.detection.centre_m.numpy() for one in (first, second)]
+    if first.side == second.side and np.linalg.norm(palms[0] - palms[1]) < SAME_PLACE_M:
+        return True
+    joints = [one.detection.keypoints.points_m for one in (first, second)]
+    return are_one(palms[0], palms[1], joints[0], joints[1])
 
 
 def ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
