@@ -62,7 +62,7 @@ def test_a_tracker_of_two_hands_gives_an_estimate_a_slot() -> None:
     assert len(estimates) == len(tracker.shapes) == len(tracker.insights) == 2
     assert not all(estimate.lost for estimate in estimates)
     assert {estimate.index for estimate in estimates} == {0}
-    with pytest.raises(toftrack.ToftrackError, match="make_hands_tracker follows two"):
+    with pytest.raises(toftrack.ToftrackError, match="make_hands_tracker follows several"):
         toftrack.make_tracker("hands=2")
 
 

@@ -11,7 +11,7 @@ For a program of one's own:
     toftrack.draw(depth_m, estimate, K)  # a picture
     toftrack.read_run("outputs/...").arrays["joints_m"]  # of a finished run
 
-or, of two hands:
+or, of several hands, here two:
 
     tracker = toftrack.make_hands_tracker("hands=2")
     for estimate in tracker.step(depth_m, K):

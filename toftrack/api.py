@@ -33,20 +33,20 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
         config_dir: a folder with your own config.yaml and its groups, instead of toftrack's.
 
     Raises:
-        ToftrackError: an override or a file that it names cannot be used, or hands=2 is asked for.
+        ToftrackError: an override or a file that it names cannot be used, or hands is above 1.
     """
     config = configuration(*overrides, config_dir=config_dir)
     if config.get("hands", 1) != 1:
         raise ToftrackError(
             f"make_tracker follows one hand, but hands={config.hands} is given; "
-            "toftrack.make_hands_tracker follows two"
+            "toftrack.make_hands_tracker follows several"
         )
     with one_sentence():
         return build_tracker(config)
 
 
 def make_hands_tracker(*overrides: str, config_dir: str | Path | None = None) -> HandsTracker:
-    """A tracker whose `step` gives a tuple of estimates, one for each slot of `hands=2` or 1.
+    """A tracker whose `step` gives a tuple of estimates, one for each of the N slots of `hands=N`.
 
         tracker = make_hands_tracker("hands=2")
         first, second = tracker.step(depth_m, K)
@@ -54,7 +54,7 @@ def make_hands_tracker(*overrides: str, config_dir: str | Path | None = None) ->
     A slot keeps to its hand; Estimate.side says whose it is. A slot without a hand is lost, and its
     arrays are NaN.
 
-    Args and raises as make_tracker, but for hands=2.
+    Args and raises as make_tracker, but for the number of hands.
     """
     config = configuration(*overrides, config_dir=config_dir)
     with one_sentence():

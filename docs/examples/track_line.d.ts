@@ -70,10 +70,10 @@ export interface Hand {
   openxr_radius_m: (number | null)[];
 }
 
-/** Which of two hands it is. */
+/** Which of several hands it is. */
 export interface Slot {
   /** Stays the same while the hand is followed. */
-  slot: 0 | 1;
+  slot: 0 | 1 | 2 | 3 | 4 | 5 | 6 | 7;
 }
 
 /** A hand, and its slot. */
@@ -81,15 +81,15 @@ export type HandInSlot = Slot & Hand;
 
 /** The hands that are there. */
 export interface Hands {
-  /** None to two. */
+  /** None to N. */
   hands: HandInSlot[];
 }
 
 /** A line with hands=1. */
 export type OneHand = Frame & Hand;
 
-/** A line with hands=2. */
-export type TwoHands = Frame & Hands;
+/** A line with hands=N, 2 to 8. */
+export type SeveralHands = Frame & Hands;
 
 /** A line of track.jsonl, and of stream=stdout, udp and websocket with all fields. What is no number (NaN) is null. */
-export type Line = OneHand | TwoHands;
+export type Line = OneHand | SeveralHands;

@@ -108,6 +108,11 @@ def test_of_two_slots_each_hand_has_its_own() -> None:
     found = measured(Estimates(joints, np.zeros((6, 2), bool)), true)
     assert found.slots == (1, 0) and found.ghost_pct is None and found.second is not None
     assert found.first.trust.usable_pct == found.second.trust.usable_pct == 100
+    more = np.concatenate((joints, joints[:, :1]), 1)
+    ghost = measured(
+        Estimates(more, np.array([[False, False, False]] * 3 + [[False, False, True]] * 3)), true
+    )
+    assert ghost.slots == (1, 0) and ghost.ghost_pct == 50 and ghost.second is not None
     alone = measured(Estimates(joints, np.zeros((6, 2), bool)), truth())
     assert alone.second is None and alone.ghost_pct == 100
 

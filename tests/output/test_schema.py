@@ -41,7 +41,7 @@ def test_lines_of_one_hand_of_two_and_of_none_are_as_the_schema_says() -> None:
 def test_a_line_that_is_none_is_refused(changes: dict[str, Any]) -> None:
     assert refused(ONE | changes)
     other = copy.deepcopy(TWO)
-    other["hands"][1] |= changes if "slot" not in changes else {"slot": 2}
+    other["hands"][1] |= changes if "slot" not in changes else {"slot": 8}
     assert refused(other)
 
 

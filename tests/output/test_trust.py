@@ -97,16 +97,18 @@ def test_two_hands_get_the_slots_that_fit_for_the_whole_recording() -> None:
     joints[4:] = joints[4:, ::-1]  # a swap is an error
     lost = np.zeros((5, 2), bool)
     assert slots_of_hands(joints, lost, [left, right]) == (1, 0)
-    assert slots_of_hands(joints, lost, [right]) == (0, 1)
+    more = np.concatenate((joints[:, :1] + 0.5, joints), 1)
+    assert slots_of_hands(more, np.zeros((5, 3), bool), [left, right]) == (2, 1)
+    assert slots_of_hands(joints, lost, [right]) == (0,)
     lost[:, 0] = True  # as bad as far away
-    assert slots_of_hands(joints, lost, [right]) == (1, 0)
+    assert slots_of_hands(joints, lost, [right]) == (1,)
 
 
 def test_shapes_must_fit() -> None:
     true = hand([True] * 4)
     with pytest.raises(ToftrackError, match="same joints"):
         trust(true.joints_m[:3], flags("..."), true)
-    with pytest.raises(ToftrackError, match="two slots"):
+    with pytest.raises(ToftrackError, match="S at least 1"):
         slots_of_hands(true.joints_m, flags("...."), [true])
 
 

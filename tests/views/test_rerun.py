@@ -194,7 +194,7 @@ def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> 
     assert list(joints) == [5]
     labels = rows(path, "world/hand_2/label", "Points3D:labels")
     assert {number: words.tolist() for number, words in labels.items()} == {5: ["left"]}
-    scores = rows(path, "plots/score/second", "Scalars:scalars")
+    scores = rows(path, "plots/score/hand_2", "Scalars:scalars")
     assert scores[5][0] == pytest.approx(both.estimates[1].score)
     assert sorted(rows(path, "world/hand/joints", "Points3D:positions")) == [5, 7]
 

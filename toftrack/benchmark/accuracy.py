@@ -35,6 +35,7 @@ from toftrack.benchmark.results import (
 from toftrack.benchmark.runs import SIDES, Job, jobs, run_jobs, sources
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.estimate import MOST_HANDS
 from toftrack.output.accuracy import Row
 from toftrack.output.accuracy_tables import accuracy_tables, markdown, plain
 from toftrack.safe_files import write_whole
@@ -90,7 +91,7 @@ def _peer(options: argparse.Namespace) -> tuple[str, str] | None:
             f"say where that is; {MAKE_ENVIRONMENT}; then give --peer-python peer/bin/python"
         )
     if options.hands > 1:
-        raise ToftrackError("--peer is measured with one hand; leave out --hands 2, or --peer")
+        raise ToftrackError("--peer is measured with one hand; leave out --hands, or --peer")
     return options.peer, str(options.peer_python)
 
 
@@ -207,7 +208,8 @@ def _parser() -> argparse.ArgumentParser:
         default="told",
         help="handedness: told, by the truth, or auto, detected while tracking (told)",
     )
-    parser.add_argument("--hands", type=int, choices=(1, 2), default=1, help="followed at once (1)")
+    hands = range(1, MOST_HANDS + 1)
+    parser.add_argument("--hands", type=int, choices=hands, default=1, help="followed at once (1)")
     parser.add_argument(
         "--labels",
         type=Path,

@@ -274,7 +274,7 @@ def _points(job: Job, labels: Points) -> Iterator[tuple[str, dict[str, Any]]]:
     with Replay(job.source.path) as device:
         track, _, _ = _tracked(device, job, labels.side)
         if track.joints_m.ndim == 4:
-            raise ToftrackError("labelled images are of one hand; leave out --hands 2")
+            raise ToftrackError("labelled images are of one hand; leave out --hands")
         assert track.joint_ok is not None
         rows = point_rows(labels, track.joints_m, track.lost, track.joint_ok, device.camera.K, TIPS)
     for number, figures in rows.items():
@@ -289,7 +289,7 @@ def _stills(job: Job, labels: Stills) -> Iterator[tuple[str, dict[str, Any]]]:
             for index in range(labels.shown_frames):
                 reported = tracker.step(depth, device.camera.K, index, index / device.fps)
             if len(reported) != 1:
-                raise ToftrackError("labelled images are of one hand; leave out --hands 2")
+                raise ToftrackError("labelled images are of one hand; leave out --hands")
             figures = still_row(reported[0].gesture, reported[0].lost, labels.called[shown])
             about = {"kind": "stills", "shown": shown, "gesture": reported[0].gesture}
             yield f"{job.source.name}#{number:04d}", about | figures

@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
+from toftrack.estimate import MOST_HANDS
 
 _ABOVE_ZERO = frozenset(
     """
@@ -47,7 +48,7 @@ _ABOVE_ZERO = frozenset(
     view.most_fps view.quality
     """.split()
 )
-_AT_MOST = {"hands": 8, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
+_AT_MOST = {"hands": MOST_HANDS, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
 """More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""

@@ -92,7 +92,7 @@ def json_line(estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS)
 def line_content(
     estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS
 ) -> dict[str, Any]:
-    """What a line says: of one slot its fields; of two the frame's, and `hands`, those that are
+    """What a line says: of one slot its fields; of several the frame's, and `hands`, those that are
     there, each with its slot and its side.
     """
     if len(estimates) == 1:

@@ -105,19 +105,19 @@ class Measured:
 class MeasuredRecording:
     """What was measured of a recording.
 
-    slots: that of the first hand, and the other one; None where the track has no slots.
-    ghost_pct: frames in which the slot without a hand says that it has one; None where there is no
+    slots: of the hands; None where the track has no slots.
+    ghost_pct: frames in which a slot without a hand says that it has one; None where there is no
         such slot.
     """
 
     first: Measured
     second: Measured | None = None
     ghost_pct: float | None = None
-    slots: tuple[int, int] | None = None
+    slots: tuple[int, ...] | None = None
 
 
 def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
-    """All measures of a track of one hand or of two slots.
+    """All measures of a track of one hand or of several slots.
 
     Raises ToftrackError when estimates and truth differ in shape.
     """
@@ -126,13 +126,11 @@ def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
     truths = [truth] if truth.other is None else [truth, truth.other]
     hands = [Hand(one.joints_m, one.visible) for one in truths]
     slots = slots_of_hands(estimates.joints_m, estimates.lost, hands)
-    first, *second = (
-        _of_hand(estimates.slot(slot), one) for slot, one in zip(slots, truths, strict=False)
-    )
-    if second:
-        return MeasuredRecording(first, second[0], None, slots)
-    there = ~np.asarray(estimates.lost, bool)[:, slots[1]]
-    return MeasuredRecording(first, None, 100.0 * float(there.sum()) / max(len(there), 1), slots)
+    each = [_of_hand(estimates.slot(slot), one) for slot, one in zip(slots, truths, strict=True)]
+    others = ~np.delete(np.asarray(estimates.lost, bool), slots, axis=1)
+    there = int(others.any(1).sum())
+    ghosts = 100.0 * there / max(len(others), 1) if others.shape[1] else None
+    return MeasuredRecording(each[0], each[1] if each[1:] else None, ghosts, slots)
 
 
 def _of_hand(estimates: Estimates, truth: Truth) -> Measured:

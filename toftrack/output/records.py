@@ -5,8 +5,8 @@ in track.jsonl; those of a run that was killed are made of its lines, which take
 the end each field's column is copied from there into the archive, piece by piece. Some 25 bytes a
 frame are held meanwhile.
 
-Of two hands every field that speaks of a hand, not of the frame, has an axis of slots behind that
-of the frames. A slot without a hand is lost, its numbers are NaN, its texts empty.
+With several slots every field that speaks of a hand, not of the frame, has an axis of slots behind
+that of the frames. A slot without a hand is lost, its numbers are NaN, its texts empty.
 """
 
 from __future__ import annotations
@@ -36,8 +36,6 @@ from toftrack.output.lines import (
 )
 from toftrack.safe_files import open_to_read
 
-SLOTS = 2
-"""Of lines with `hands`."""
 _PIECE = 256
 """Records that are in memory at a time; a line's numbers take some 10 kB as Python objects."""
 _LEVEL = 1
@@ -52,7 +50,7 @@ class Records:
         folder: exists; where the records are kept, under no name.
         like: what a line says of a hand, or of a frame of one; tells which fields there are, and
             their shapes.
-        slots: 2 where lines are of two hands, else 1.
+        slots: of each frame; of several, a line has `hands`.
 
     Raises:
         OSError: (by `append`, too) the records cannot be kept there.
@@ -70,13 +68,11 @@ class Records:
     def of_lines(cls, lines: Path, latent_size: int = 4, slots: int = 1) -> Records:
         """The records of a track.jsonl, which is read at once.
 
-        latent_size: of the columns of a file without a hand.  slots: of a file without lines.
+        latent_size: of the columns of a file without a hand.  slots: of the run.
 
         Raises ToftrackError for a damaged line, OSError when the lines cannot be read.
         """
-        first = next(read_lines(lines), None)
-        slots = slots if first is None else SLOTS if "hands" in first else 1
-        like = first
+        like = next(read_lines(lines), None)
         if slots > 1:  # which fields there are, any hand says
             like = next((hand for line in read_lines(lines) for hand in _hands(line)), None)
         with open_to_read(lines) as stream:
@@ -184,7 +180,7 @@ class Records:
 
     def _side_by_side(self, line: Mapping[str, Any]) -> dict[str, Any]:
         """A line of several hands whose fields are lists with a value for each slot."""
-        slots = [self._vacant] * SLOTS
+        slots = [self._vacant] * self.slots
         for hand in line["hands"]:
             slots[hand["slot"]] = hand
         frame = {name: line[name] for name in FRAME_FIELDS}

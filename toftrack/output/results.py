@@ -18,7 +18,7 @@ import numpy as np
 
 from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.estimate import MOST_HANDS, Estimate
 from toftrack.frames import Truth
 from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way
@@ -154,7 +154,7 @@ def records_of(folder: Path, facts: dict[str, Any]) -> Records:
     metadata = facts["metadata"]
     latent_size = (metadata.get("pose_space") or {}).get("dims", 4)
     slots = (metadata.get("config") or {}).get("hands", 1)
-    if latent_size not in range(1, _MOST_DIMS + 1) or slots not in (1, 2):
+    if latent_size not in range(1, _MOST_DIMS + 1) or slots not in range(1, MOST_HANDS + 1):
         raise ToftrackError(
             f"'{folder / 'run.json'}' is damaged: a run does not follow {slots} hands in "
             f"{latent_size} dimensions"
@@ -241,8 +241,8 @@ def _reported_dropped(state_names: np.ndarray, dropped: np.ndarray) -> np.ndarra
 def read_results(path: str | Path) -> dict[str, Any]:
     """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
 
-    Of a run with `hands=2` all arrays but index, timestamp_s and compute_s have an axis of two
-    slots behind that of the frames.
+    Of a run with `hands=N` above 1 all arrays but index, timestamp_s, compute_s and dropped have
+    an axis of N slots behind that of the frames.
 
     Raises ToftrackError when the file is missing, damaged or not a result.
     """

@@ -48,7 +48,7 @@ class Run:
     frames: np.ndarray
     """(T,) int64 numbers of the input frames."""
     state_names: tuple[str, ...]
-    """T texts, of a dropped frame that of the one before; of two slots that of the first."""
+    """T texts, of a dropped frame that of the one before; of slots that of the first."""
     summary: dict[str, Any]
     """Of summary.json."""
     shapes: tuple[HandShape, ...]
@@ -60,7 +60,7 @@ class Run:
     @property
     def arrays(self) -> dict[str, np.ndarray]:
         """What was estimated, by name: the fields of Estimate, each with a row a frame, as
-        `joints_m` (T, 21, 3); with two hands (T, 2, 21, 3). docs/formats.md lists them.
+        `joints_m` (T, 21, 3); with `hands=N` (T, N, 21, 3). docs/formats.md lists them.
         """
         return {
             name: value for name, value in self.results.items() if isinstance(value, np.ndarray)
@@ -107,7 +107,7 @@ class Run:
 
     @property
     def shape(self) -> HandShape:
-        """The hand at the end of the run, of two that of the first slot."""
+        """The hand at the end of the run, of several that of the first slot."""
         return self.shapes[0]
 
     def slot(self, number: int) -> Run:

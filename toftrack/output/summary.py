@@ -1,10 +1,10 @@
 """What summary.json says of a run: how many frames, how long they took, and how good they are.
 
-Of a run with two slots a frame is lost when no slot has a hand that can be used, and the mean score
-is that of the hands that are there; `slots` says the same of each. The metrics are those of the
-recording's first hand, in the slot that followed it; under `second` stand those of its other hand,
-or, where the recording has one hand, `ghost_pct` says how often the other slot had one all the
-same. What measures.py adds to trust.py stands under `further`.
+Of a run with several slots a frame is lost when none has a hand that can be used, and the mean
+score is that of the hands that are there; `slots` says the same of each. The metrics are those of
+the recording's first hand, in the slot that followed it; under `second` stand those of its other
+hand, and where there are more slots than hands, `ghost_pct` says how often another slot had one all
+the same. What measures.py adds to trust.py stands under `further`.
 """
 
 from __future__ import annotations
@@ -135,12 +135,14 @@ def run_metrics(
     found = truth.of_frames(index[known])
     done = {name: records.column(name, rows[known]) for name in _MEASURED if name in records.names}
     both = measured(Estimates(**found_side(done)), found)
-    metrics = _metrics(both.first, done, found, both.slots and both.slots[0], position)
     if both.slots is None:
-        return metrics
+        return _metrics(both.first, done, found, None, position)
+    metrics = _metrics(both.first, done, found, both.slots[0], position)
     metrics = {"slot": both.slots[0]} | metrics
+    if both.ghost_pct is not None:
+        metrics["ghost_pct"] = both.ghost_pct
     if both.second is None or found.other is None:
-        return metrics | {"ghost_pct": both.ghost_pct}
+        return metrics
     second = _metrics(both.second, done, found.other, both.slots[1], position)
     return metrics | {"second": {"slot": both.slots[1]} | second}
 

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from toftrack.errors import ToftrackError
 
@@ -159,34 +160,32 @@ def judged(joints_m: np.ndarray, lost: np.ndarray, hand: Hand) -> Judged:
 
 def slots_of_hands(
     joints_m: np.ndarray, lost: np.ndarray, hands: Sequence[Hand]
-) -> tuple[int, int]:
-    """The slot of the first hand, and the other one.
+) -> tuple[int, ...]:
+    """The slot of each hand.
 
-    Each true hand has one slot for the whole recording, the one with the smaller sum of errors; a
+    Each true hand has one slot for the whole recording, so that the sum of errors is smallest; a
     swap on the way counts as error.
 
     Args:
-        joints_m: (T, 2, J, 3) metres, camera frame.
-        lost: (T, 2) bool.
-        hands: one or two.
+        joints_m: (T, S, J, 3) metres, camera frame.
+        lost: (T, S) bool.
+        hands: at most S.
 
     Raises:
-        ToftrackError: as `trust`, or there are not two slots.
+        ToftrackError: as `trust`, or there are no slots, or fewer than hands.
     """
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
-    if estimate.ndim != 4 or estimate.shape[1] != 2 or lost.shape != estimate.shape[:2]:
+    fits = estimate.ndim == 4 and lost.shape == estimate.shape[:2]
+    if not fits or estimate.shape[1] < len(hands):
         raise ToftrackError(
-            "a track of two slots must have joints of the shape (T, 2, J, 3) and lost of (T, 2), "
-            f"but they are {estimate.shape} and {lost.shape}"
+            f"a track of {len(hands)} hands must have joints of the shape (T, S, J, 3) and lost of "
+            f"(T, S), S at least {len(hands)}, but they are {estimate.shape} and {lost.shape}"
         )
     for hand in hands:
         _check(estimate[:, 0].shape, lost[:, 0].shape, hand)
-
-    def cost(order: tuple[int, int]) -> float:
-        pairs = zip(order, hands, strict=False)  # one hand leaves a slot over
-        return sum(_cost(estimate[:, slot], lost[:, slot], hand) for slot, hand in pairs)
-
-    return min(((0, 1), (1, 0)), key=cost)
+    slots = range(estimate.shape[1])
+    costs = [[_cost(estimate[:, slot], lost[:, slot], hand) for slot in slots] for hand in hands]
+    return tuple(linear_sum_assignment(costs)[1].tolist())
 
 
 def interval(shares: Sequence[float], draws: int = 2000, seed: int = 0) -> Share:

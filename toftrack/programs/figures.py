@@ -11,8 +11,8 @@ Writes five PNG files into the run's folder, below `figures`:
 | `latent.png` | the way of the estimates over the training poses |
 
 The first three need the recording that the run tracked; of a run with a live camera there is none,
-and only the others are drawn. Of a run with two hands those of the second slot are `measurement_2`
-and so on; the filmstrip shows both.
+and only the others are drawn. With several hands those of the second slot are `measurement_2`
+and so on; the filmstrip shows all.
 """
 
 from __future__ import annotations

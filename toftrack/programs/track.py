@@ -304,7 +304,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
 
 
 def configured_side(config: Mapping[str, Any], side: str) -> str | None:
-    """The side that was given; None where either hand may come, or both.
+    """The side that was given; None where either hand may come, or several.
 
     config: of the run.  side: of the hand that is looked for.
     """
@@ -320,8 +320,8 @@ def opening(metadata: dict[str, Any], device: Device) -> str:
     side = shape["side"]
     length_mm = 1e3 * float(shape["hand_length_m"])
     fitted = "to be fitted from" if shape["fitted"] else "of"
-    if config.get("hands", 1) > 1:
-        what = "up to two hands, their lengths"
+    if (hands := config.get("hands", 1)) > 1:
+        what = f"up to {hands} hands, their lengths"
     elif side == "auto":
         what = "a hand of either side (hand.side=right or left to say which), its length"
     else:
@@ -331,7 +331,7 @@ def opening(metadata: dict[str, Any], device: Device) -> str:
 
 
 class ShapeFiles:
-    """The hands' files of a run, hand_shape.json and of a second slot hand_shape_2.json.
+    """The hands' files of a run, hand_shape.json, of a second slot hand_shape_2.json and so on.
 
     They are there from the start on and follow what is fitted. Between the first and the last time
     they are a second old at most: they serve runs that are killed.

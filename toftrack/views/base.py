@@ -40,7 +40,7 @@ class TrackedFrame:
     """(H, W) float32 metres, rectified Z on the camera's undistorted grid, 0 = no reading."""
     camera: Camera
     hands: tuple[TrackedHand, ...]
-    """One for each slot, of which there are one or two."""
+    """One for each slot."""
     side_given: bool = False
     """The first hand's side is told, and not detected."""
     advice: tuple[str, ...] = ()

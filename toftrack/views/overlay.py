@@ -35,9 +35,9 @@ _FONT, _GAP = cv2.FONT_HERSHEY_SIMPLEX, "   "
 _LARGEST, _LEAST = 1.1, 0.9
 """Of the text. The least can be read in a filmstrip that is 1280 px wide."""
 CAPTION_PX = 46
-"""Height of the caption above a panel's two sides."""
+"""Height of the caption above a panel's two sides, for each two hands."""
 _TINT = 0.5
-"""How much of its slot's colour is mixed into the range image of one of two hands."""
+"""How much of its slot's colour is mixed into the range image of one of several hands."""
 _NEAREST_GREY, _FARTHEST_GREY = 40, 215
 
 VIDEO, STRIP = "overlay.mp4", "overlay.png"
@@ -63,7 +63,7 @@ def draw_panel(
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
     Above the left, frame number, gesture and confidence; above the right, state and score. A red
-    caption and frame mark an estimate that is lost, of two hands that both are. The skeleton is
+    caption and frame mark an estimate that is lost, of several hands that all are. The skeleton is
     missing where the estimate is NaN; see draw_hands for the rest.
 
     Args:
@@ -72,8 +72,8 @@ def draw_panel(
         camera: projects the joints.
         estimates: of this frame, one a slot.
         models: of each, (H, W) metres of the estimate's surface, anything not positive and finite
-            is background; None leaves it out. Nearer is darker, on white; two hands are tinted with
-            their slots' colours.
+            is background; None leaves it out. Nearer is darker, on white; several hands are tinted
+            with their slots' colours.
         scale: panel pixels per image pixel.
 
     Returns:
@@ -93,6 +93,11 @@ def draw_panel(
         for side in (left, right):
             mark_lost(side)
     return np.vstack([_caption(estimates, size[0]), np.hstack([left, right])])
+
+
+def caption_px(hands: int) -> int:
+    """Height of the caption of so many hands."""
+    return CAPTION_PX * ((hands + 1) // 2)
 
 
 def mark_lost(picture: np.ndarray) -> None:
@@ -231,7 +236,7 @@ def range_grey(model_depth: np.ndarray) -> np.ndarray:
 
 
 def _model_picture(surfaces: Sequence[np.ndarray]) -> np.ndarray:
-    """(H, W, 3): the nearest of the surfaces, each (H, W) metres; of two in their colours."""
+    """(H, W, 3): the nearest of the surfaces, each (H, W) metres; of several in their colours."""
     if len(surfaces) == 1:
         return cv2.cvtColor(range_grey(surfaces[0]), cv2.COLOR_GRAY2BGR)
     stack = np.stack([np.where(np.isfinite(s) & (s > 0), s, np.inf) for s in surfaces])
@@ -243,10 +248,11 @@ def _model_picture(surfaces: Sequence[np.ndarray]) -> np.ndarray:
 
 def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
     """A strip of text above the panel, half of it above each side: so few words that they can be
-    read in the filmstrip, where the halves lie one below the other. Of two hands a half each.
+    read in the filmstrip, where the halves lie one below the other. Each of several hands has half a row.
     """
     colour = _RED if all(estimate.lost for estimate in estimates) else (48, 48, 48)
-    halves = [np.full((CAPTION_PX, half_width, 3), colour, np.uint8) for _ in range(2)]
+    count = 2 * caption_px(len(estimates)) // CAPTION_PX
+    halves = [np.full((CAPTION_PX, half_width, 3), colour, np.uint8) for _ in range(count)]
     number = f"frame {estimates[0].index}"
     if len(estimates) == 1:
         one = estimates[0]
@@ -254,14 +260,14 @@ def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
         facts = [_state(one), confidence_words(one.confidence), f"score {_score(one)}"]
         _write_line(halves[1], facts, 8)
         return np.hstack(halves)
-    for slot, (one, half) in enumerate(zip(estimates, halves, strict=True)):
+    for slot, (one, half) in enumerate(zip(estimates, halves, strict=False)):
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), SLOT_RGB[slot][::-1], -1)
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), _WHITE, 1)
         reported = _state(one) if one.lost else gesture_words(one) or _state(one)
         facts = [reported, side_words(one), confidence_words(one.confidence)]
         facts = ["no hand"] if is_vacant(one) else facts
         _write_line(half, facts if slot else [number, *facts], 38)
-    return np.hstack(halves)
+    return np.vstack([np.hstack(halves[row : row + 2]) for row in range(0, count, 2)])
 
 
 def _score(estimate: Estimate) -> str:

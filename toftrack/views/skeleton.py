@@ -1,4 +1,4 @@
-"""Skeletons drawn into the camera's image, and how those of two hands are told apart.
+"""Skeletons drawn into the camera's image, and how those of several hands are told apart.
 
 Pictures are (h, w, 3) uint8 BGR.
 """
@@ -16,8 +16,11 @@ from toftrack.estimate import Estimate, is_vacant
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
 FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
-SLOT_RGB = ((0, 114, 178), (213, 94, 0))
-"""Of the same palette; of the first and the second of two hands."""
+SLOT_RGB = (
+    *((0, 114, 178), (213, 94, 0), (0, 125, 125), (140, 60, 160)),
+    *((125, 95, 0), (90, 90, 90), (75, 75, 215), (0, 100, 30)),
+)
+"""Of the slots of several hands, the first two of the same palette; dark enough for white text."""
 _BLACK, _WHITE = (0, 0, 0), (255, 255, 255)
 _BONE_M = 0.004
 _DASH, _GAP = 0.5, 2.0
@@ -31,9 +34,9 @@ def draw_hands(
     picture: np.ndarray, camera: Camera, estimates: Sequence[Estimate], scale: tuple[float, float]
 ) -> None:
     """Draw the skeletons of the slots into the camera's image, in place, as wide as 4 mm would look
-    there; of two hands the nearer over the farther, each outlined in its slot's colour and with its
-    side below the wrist. Joints that are not ok are hollow, and the bones that end there dashed;
-    of two hands all of one that is lost.
+    there; of several hands the nearer over the farther, each outlined in its slot's colour and with
+    its side below the wrist. Joints that are not ok are hollow, and the bones that end there
+    dashed; of several hands all of one that is lost.
 
     scale: picture pixels per image pixel, across and down.
     """
@@ -50,9 +53,9 @@ def draw_hands(
         wrist = _draw_skeleton(picture, camera, one.joints_m, doubted, *scale, rim)
         if wrist is not None:
             labels.append((side_words(one) or "?", wrist, rim))
-    above: tuple[int, int, int, int] | None = None
+    taken: list[tuple[int, int, int, int]] = []
     for label in labels:  # last, because they are smaller than a hand
-        above = _draw_label(picture, *label, above)
+        taken.append(_draw_label(picture, *label, taken))
 
 
 def side_words(estimate: Estimate) -> str:
@@ -68,12 +71,12 @@ def _draw_label(
     text: str,
     below: tuple[int, int],
     colour: tuple[int, ...],
-    beside: tuple[int, int, int, int] | None,
+    taken: Sequence[tuple[int, int, int, int]],
 ) -> tuple[int, int, int, int]:
     """Text in a box below a place, moved so that all of it is in the picture where it fits, and
     does not cover another one.
 
-    beside: left, top, right and bottom of the other one; returns those of this one.
+    taken: left, top, right and bottom of the other ones; returns those of this one.
     """
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 3
     (width, height), base = cv2.getTextSize(text, font, _LABEL, 1)
@@ -81,10 +84,11 @@ def _draw_label(
     lowest = picture.shape[0] - base - margin
     y = int(np.clip(below[1] + height + 2 * _LABEL_GAP_PX, height + margin, lowest))
     left, top, right, bottom = x - margin, y - height - margin, x + width + margin, y + base
-    if beside is not None and left < beside[2] and right > beside[0]:
-        down = beside[3] + 1 - top if beside[1] <= bottom and top <= beside[3] else 0
-        fits = y + down <= lowest
-        y, top, bottom = (v + (down if fits else -down) for v in (y, top, bottom))
+    for other in sorted(taken, key=lambda box: box[1]):
+        if left < other[2] and right > other[0] and other[1] <= bottom and top <= other[3]:
+            down = other[3] + 1 - top
+            down = down if y + down <= lowest else other[1] - 1 - bottom
+            y, top, bottom = (v + down for v in (y, top, bottom))
     cv2.rectangle(picture, (left, top), (right, bottom), colour, -1)
     cv2.putText(picture, text, (x, y), font, _LABEL, _WHITE, 1, cv2.LINE_AA)
     return left, top, right, bottom

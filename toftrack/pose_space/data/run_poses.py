@@ -19,7 +19,7 @@ _ANGLES = slice(6, 6 + len(ANGLE_NAMES))
 
 
 def run_data(path: str, poses: int | None, confidence: float) -> PoseData:
-    """Joint angles of the frames of a run that can be used; of two hands those of both.
+    """Joint angles of the frames of a run that can be used; of several hands those of all.
 
     Poses that follow each other are a clip, as neighbours in time resemble each other.
 

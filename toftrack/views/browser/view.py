@@ -41,7 +41,7 @@ from toftrack.estimate import is_vacant, state_words
 from toftrack.json_text import parse_json
 from toftrack.output.web.server import ANY_PORT, WebServer
 from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand
-from toftrack.views.overlay import CAPTION_PX, draw_tracked
+from toftrack.views.overlay import caption_px, draw_tracked
 
 _RATE_S = 2.0
 """The frames a second are those of so long."""
@@ -277,7 +277,7 @@ def _stay(seconds: float) -> None:
 def _encode(tracked: TrackedFrame, quality: int) -> bytes:
     # The page writes larger and sharper what the caption says.
     with small_operations():
-        panel = draw_tracked(tracked)[CAPTION_PX:]
+        panel = draw_tracked(tracked)[caption_px(len(tracked.hands)) :]
     done, jpeg = cv2.imencode(".jpg", panel, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ToftrackError("the picture cannot be encoded as JPEG; choose view=none")
@@ -287,7 +287,7 @@ def _encode(tracked: TrackedFrame, quality: int) -> bytes:
 def _facts(tracked: TrackedFrame) -> dict[str, Any]:
     """What the page writes beside the picture, JSON-able: of the frame and of a hand, or `hands`.
 
-    Of two hands the frame is lost when neither can be used, and its state is the first slot's.
+    Of several hands the frame is lost when none can be used, and its state is the first slot's.
     """
     first = tracked.hands[0]
     of_frame = {

@@ -10,8 +10,8 @@ Entities, on the timelines `frame` (its number) and `time` (seconds of the recor
 | `plots` | `score` (confidence, lost), `latent` coordinates, `pinch`, `time` (milliseconds) |
 | `log` | changes of state, gesture and pinching |
 
-Of two hands the second one's are `world/hand_2`, `world/tracker_2` and, in the same plots,
-`plots/score/second` and so on; `label` in each hand says whose it is.
+Of several hands the second one's are `world/hand_2`, `world/tracker_2` and, in the same plots,
+`plots/score/hand_2`, and so on; `label` in each hand says whose it is.
 
 The world is the camera's frame: x right, y down, z forward, metres.
 """
@@ -207,16 +207,16 @@ class Entities:
             self._stream.log(_plot(name, slot), rr.Scalars(numbers))
 
     def _name_plots(self, dims: int, slot: int) -> None:
-        second = ", second hand" if slot else ""
+        which = f", hand {slot + 1}" if slot else ""
         coordinates = [f"coordinate {n}" for n in range(1, dims + 1)]
         for plot, names, colours in (
             ("score", ["score", "confidence", "lost"], _SCORE_RGB),
             ("latent", coordinates, [FINGER_RGB[n % len(FINGER_RGB)] for n in range(dims)]),
             ("pinch", ["pinch"], [FINGER_RGB[1]]),
         ):
-            # Paler, so that the first hand's lines are told from the second one's.
+            # Paler, so that the first hand's lines are told from the others'.
             shown = [tuple((c + 255) // 2 for c in rgb) if slot else rgb for rgb in colours]
-            lines = rr.SeriesLines(names=[f"{name}{second}" for name in names], colors=shown)
+            lines = rr.SeriesLines(names=[f"{name}{which}" for name in names], colors=shown)
             self._stream.log(_plot(plot, slot), lines, static=True)
 
     def _log_changes(self, estimate: Estimate, slot: int) -> None:
@@ -224,7 +224,7 @@ class Entities:
         if now == self._reported.get(slot):
             return
         self._reported[slot] = now
-        which = "second hand" if slot else ""
+        which = f"hand {slot + 1}" if slot else ""
         lost = "lost" if estimate.lost else ""
         words = (which, lost, state_words(estimate), gesture_words(estimate))
         text = ", ".join(filter(None, words))
@@ -237,7 +237,7 @@ def _of_slot(entity: str, slot: int) -> str:
 
 
 def _plot(name: str, slot: int) -> str:
-    return f"plots/{name}" if slot == 0 else f"plots/{name}/second"
+    return f"plots/{name}" if slot == 0 else f"plots/{name}/hand_{slot + 1}"
 
 
 def bone_strips(
