@@ -339,6 +339,25 @@ def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) ->
         np.testing.assert_array_equal(after[name], before[name])
 
 
+def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
+    facts = {"config": {"hands": 3}}
+    with ResultWriter(tmp_path, facts, NAMES) as writer:
+        for i in range(4):
+            vacant = no_estimate(i, 0.04 * i, "searching", 4, 0.01)
+            there = estimate(i, lost=False, side="left")
+            writer.append((vacant, there, there if i else vacant))
+    lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
+    assert [[hand["slot"] for hand in line["hands"]] for line in lines] == [[1], *[[1, 2]] * 3]
+    before = read_results(tmp_path / "track.npz")
+    assert before["joints_m"].shape == (4, 3, 21, 3) and before["timestamp_s"].shape == (4,)
+    assert before["lost"].tolist() == [[True, False, True], *[[True, False, False]] * 3]
+    assert before["side"][3].tolist()[2] == "left" and np.isnan(before["joints_m"][:, 0]).all()
+    recover(tmp_path)
+    after = read_results(tmp_path / "track.npz")
+    for name in LINE_FIELDS:
+        np.testing.assert_array_equal(after[name], before[name])
+
+
 def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])
     path = tmp_path / "track.jsonl"

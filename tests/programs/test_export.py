@@ -45,7 +45,10 @@ def run(tmp_path: Path) -> Path:
     return run_of(tmp_path / "run", "right")
 
 
-SLOTS = [("right",), ("left",), ("right", "left"), ("right", None), (None, "left")]
+SLOTS = [
+    *[("right",), ("left",), ("right", "left"), ("right", None), (None, "left")],
+    (None, "left", None, "right"),
+]
 
 
 @pytest.mark.parametrize("sides", SLOTS)

@@ -28,8 +28,12 @@ from toftrack.estimate import STATES
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import read_results
+from toftrack.output.run_folder import read_run
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
+from toftrack.programs.export import export
+from toftrack.programs.figures import draw_figures
 from toftrack.programs.recover import recover
+from toftrack.views.overlay import caption_px
 
 K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])
 
@@ -171,7 +175,7 @@ def test_a_recording_is_tracked_by_its_name_alone_and_a_killed_run_recovered(
 def test_two_hands_are_written_slot_by_slot(here, tmp_path: Path) -> None:
     status, out, err = here("hands=2", "device.stop=3", "stream=stdout", "view=video", *QUICK)
     assert status == 0, err
-    assert "up to two hands, their lengths to be fitted" in err and "a right hand" not in err
+    assert "up to 2 hands, their lengths to be fitted" in err and "a right hand" not in err
     folder = tmp_path / "out"
     result = read_results(folder / "track.npz")
     assert result["joints_m"].shape == (3, 2, 21, 3) and result["index"].shape == (3,)
@@ -185,6 +189,25 @@ def test_two_hands_are_written_slot_by_slot(here, tmp_path: Path) -> None:
     assert [slot["slot"] for slot in summary["slots"]] == [0, 1] and "hand" not in summary
     assert summary["metrics"]["trust"]["visible"] == 3 and "ghost_pct" in summary["metrics"]
     assert len(video_frames(folder / "overlay.mp4")) == 3
+
+
+def test_of_three_slots_that_are_asked_for_two_have_a_hand(tmp_path: Path) -> None:
+    sample = ("device=sample", "device.name=two_hands", "device.stop=5", "hydra.run.dir=out")
+    status, _, err = programs.call(*sample, "hands=3", "view=video", *QUICK, folder=tmp_path)
+    assert status == 0 and "up to 3 hands, their lengths to be fitted" in err, err
+    folder = tmp_path / "out"
+    run = read_run(folder)
+    assert run.results["joints_m"].shape == (5, 3, 21, 3) and len(run.shapes) == 3
+    assert run.results["lost"].all(0).tolist() == [False, False, True]
+    assert set(run.results["side"][-1].tolist()) == {"right", "left", ""}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert [slot["frames"] for slot in summary["slots"]] == [5, 5, 0]
+    assert summary["metrics"]["ghost_pct"] == 0 and summary["metrics"]["second"]["slot"] in (0, 1)
+    height = video_frames(folder / "overlay.mp4")[0].shape[0]
+    assert height == caption_px(3) + 3 * 144
+    assert [path.name for path in export(folder, "bvh")] == ["hand1.bvh", "hand2.bvh"]
+    drawn = {path.stem for path in draw_figures(folder)}
+    assert {"filmstrip", "course", "course_2"} <= drawn and "course_3" not in drawn
 
 
 def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:

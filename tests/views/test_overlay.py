@@ -14,18 +14,19 @@ from helpers.videos import video_frames
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, no_estimate
+from toftrack.estimate import MOST_HANDS, Estimate, no_estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
 from toftrack.views.base import TrackedFrame
 from toftrack.views.overlay import (
     CAPTION_PX,
     VideoView,
+    caption_px,
     draw_panel,
     film_tile,
     filmstrip,
 )
-from toftrack.views.skeleton import SLOT_RGB, side_words
+from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB, side_words
 
 W, H = 176, 144
 CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), W, H)
@@ -105,6 +106,19 @@ def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
     assert int(blue[0]) > int(blue[2]) + 50, "the nearer hides the farther"
     assert int(orange[2]) > int(orange[0]) + 50
     assert (right[300, 300] == 255).all()
+
+
+def test_each_of_eight_hands_has_its_colour_and_its_label() -> None:
+    assert len(set(SLOT_RGB)) == MOST_HANDS and not set(SLOT_RGB) & set(FINGER_RGB)
+    estimates = tuple(present() for _ in range(MOST_HANDS))
+    caption = draw_panel(DEPTH, AMPLITUDE, CAMERA, estimates, [None] * MOST_HANDS, 3)
+    caption, rest = np.split(caption, [caption_px(MOST_HANDS)])
+    assert len(rest) == 3 * H
+    for rgb in SLOT_RGB:  # all at one place, so that their labels are moved apart
+        assert colour_share(caption, rgb[::-1]) > 5e-4 and colour_share(rest, rgb[::-1]) > 1e-4
+    assert len(draw_panel(DEPTH, AMPLITUDE, CAMERA, estimates[:3], [None] * 3, 3)) == (
+        caption_px(4) + 3 * H
+    )
 
 
 def test_a_slot_without_a_hand_is_not_drawn_and_not_called_lost() -> None:

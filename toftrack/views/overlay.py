@@ -248,7 +248,8 @@ def _model_picture(surfaces: Sequence[np.ndarray]) -> np.ndarray:
 
 def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
     """A strip of text above the panel, half of it above each side: so few words that they can be
-    read in the filmstrip, where the halves lie one below the other. Each of several hands has half a row.
+    read in the filmstrip, where the halves lie one below the other. Each hand of several has half
+    a row.
     """
     colour = _RED if all(estimate.lost for estimate in estimates) else (48, 48, 48)
     count = 2 * caption_px(len(estimates)) // CAPTION_PX
