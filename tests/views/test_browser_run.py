@@ -218,6 +218,11 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
     assert of_slots("state") == ["tracking", "tracking"] and of_slots("gesture")[1] == "ok"
     assert of_slots("pinching") == ["", "pinching"]
     assert not chromium.find_element("id", "state").is_displayed()
+    eight = replace(moments()[1], hands=4 * two_hands(moments()[1]).hands)
+    view.show(eight)
+    eventually(lambda: of_slots("side") == 4 * ["right", "left"])
+    colours = "return [...document.querySelectorAll('.hand')].map(e => e.style.cssText)"
+    assert len(set(chromium.execute_script(colours))) == 8
     view.show(two_hands(moments()[1], lost=True))
     eventually(lambda: of_slots("state") == ["tracking", "LOST"])
     view.show(moments()[1])

@@ -137,7 +137,7 @@ def metrics_table(summary: dict[str, Any]) -> str:
             rows = _trust_rows(metrics["trust"]) + rows
         rows += _error_rows(metrics)
         if metrics.get("ghost_pct") is not None:
-            rows.append(("another hand, where none is known", f"{_figure(metrics['ghost_pct'])} %"))
+            rows.append(("another hand, where is none", f"{_figure(metrics['ghost_pct'])} %"))
         if second := metrics.get("second"):
             rows.append(("the other hand", f"in slot {second['slot']}"))
             rows += _trust_rows(second["trust"]) + _error_rows(second)
