@@ -13,7 +13,7 @@ from toftrack.checks import check_number
 from toftrack.compute.quality import Pace, Timekeeper
 from toftrack.compute.threads import at_most, small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.estimate import MOST_HANDS, Estimate
 from toftrack.frames import DepthImage, checked_image
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -27,8 +27,6 @@ from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerSt
 from toftrack.tracking.step import Stepped, step
 
 AUTO = "auto"
-_MOST_HANDS = 8
-"""More would take longer than anybody waits."""
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
 
@@ -53,7 +51,7 @@ class HandsTracker:
 
         Raises ToftrackError when `hands` is no number of hands, or several without a detector.
         """
-        check_number("hands", hands, 1, _MOST_HANDS, whole=True)
+        check_number("hands", hands, 1, MOST_HANDS, whole=True)
         if hands > 1 and isinstance(model, PaperModel):
             raise ToftrackError(
                 f"hands={hands} tells hands apart by the networks, but experiment=paper has none;"
