@@ -52,15 +52,6 @@ class Scene:
         return cls(image, depth_m, k, hands, dt_s, model)
 
     @cached_property
-    def _deviations(self) -> np.ndarray:
-        """(B, H, W) how far each pixel is from each hand's surface, inf where there is none."""
-        height, width = self.depth_m.shape
-        surfaces = self._surfaces
-        there = (surfaces > 0) & (self.depth_m > 0)
-        off = np.where(there, np.abs(surfaces - self.depth_m), np.inf)
-        return off.reshape(-1, height, width)
-
-    @cached_property
     def _surfaces(self) -> np.ndarray:
         """(B, H, W) Z of the predicted hands' surfaces, 0 = none."""
         height, width = self.depth_m.shape
@@ -73,7 +64,7 @@ class Scene:
             )
             for hand in self.hands
         ]
-        return np.stack(each).astype(np.float32)
+        return np.array(each, np.float32).reshape(-1, height, width)
 
     @cached_property
     def owners(self) -> np.ndarray:
@@ -83,26 +74,39 @@ class Scene:
         outline, which are its own as well. A hand that is not reliable owns none.
         """
         owner = np.full(self.depth_m.shape, -1, np.int8)
-        if not self.hands:
+        rows, columns = (np.flatnonzero((self._surfaces > 0).any((0, axis))) for axis in (2, 1))
+        if not len(rows):
             return owner
-        off = self._deviations
-        nearest = off.argmin(0)
-        sure = off.min(0) < _TOLERANCE_M
+        # Within their box, and a pixel around: most of the image is far from them.
+        box = (
+            slice(max(rows[0] - 1, 0), rows[-1] + 2),
+            slice(max(columns[0] - 1, 0), columns[-1] + 2),
+        )
+        depth_m, surfaces = self.depth_m[box], self._surfaces[:, *box]
+        there = (surfaces > 0) & (depth_m > 0)
+        off = np.where(there, np.abs(surfaces - depth_m), np.float32(np.inf))
+        nearest, sure = off.argmin(0), off.min(0) < _TOLERANCE_M
         for row, hand in enumerate(self.hands):
             if not hand.track.reliable:
                 continue
             own = sure & (nearest == row)
             near = cv2.dilate(own.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            surface = np.where(own, self._surfaces[row], np.float32(0))
-            around = cv2.dilate(surface, np.ones((3, 3), np.float32))
-            mixed = near & ~sure & (self.depth_m > around) & (self.depth_m < around + _EDGE_M)
-            owner[own | mixed] = row
+            around = cv2.dilate(np.where(own, surfaces[row], 0), np.ones((3, 3), np.float32))
+            mixed = near & ~sure & (depth_m > around) & (depth_m < around + _EDGE_M)
+            owner[box][own | mixed] = row
         return owner
 
     def owned_by_others(self, row: int) -> np.ndarray | None:
         """(H, W) bool: pixels of other hands than that of a row; None where none are known."""
-        others = (hand.track.reliable for at, hand in enumerate(self.hands) if at != row)
-        return (self.owners >= 0) & (self.owners != row) if any(others) else None
+        if row not in self._others:
+            others = (hand.track.reliable for at, hand in enumerate(self.hands) if at != row)
+            mask = (self.owners >= 0) & (self.owners != row) if any(others) else None
+            self._others[row] = mask
+        return self._others[row]
+
+    @cached_property
+    def _others(self) -> dict[int, np.ndarray | None]:
+        return {}
 
     def image_for(self, row: int) -> DepthImage:
         """The image as the pose network is to see it about a hand: with nothing where other hands
