@@ -344,9 +344,8 @@ class ConfidenceModel:
     """When an estimate is not to be used, and when its track is given up; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time.  second: or of the second of
-        two hands that are asked for while the first one is believed; any hand beside another one
-        needs at least this.
+    believe: likewise, until a track was believed for the first time.  second: or of another hand
+        beside one that was believed.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     whole: estimates whose mean joint error is below 40 mm with a lower probability are flagged lost
         as well: a hand taken for another one, or turned round, is not to be used at all, while one
