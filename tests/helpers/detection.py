@@ -146,7 +146,7 @@ class FixedDetector:
         found = self.of_side.get(side, self.found)
         return [one for one in found if _is_at(one, places)]
 
-    def start_search(self, depth_m, k) -> Callable[[], Places]:
+    def start_search(self, depth_m, k, known=0) -> Callable[[], Places]:
         self.images.append(depth_m)
         found = [*self.found, *(one for each in self.of_side.values() for one in each)]
         centres = np.array([one.centre_m.numpy() for one in found]).reshape(-1, 3)

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
-from helpers.rendered import (
-    WALL_M,
-    any_hand_model,
-    hand_at,
-    image_of,
-    state_of,
-    track_of,
-)
+from helpers.rendered import any_hand_model, hand_at, image_of, scene_of, state_of, track_of
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.compute.rigid import PIVOT_M
+from toftrack.detector.crops import crop_rotation
 from toftrack.detector.hand_detector import Detection
+from toftrack.detector.network import PARTS
+from toftrack.detector.parts import FOREARM_PART, Parts
 from toftrack.detector.proposals import Places
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.refinement.shape_fit import first_shape, with_network_length
 from toftrack.tracking.association import Seen
-from toftrack.tracking.detect import detected, held_out_first
+from toftrack.tracking.detect import Asked, ask, detected, held_out_first
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.state import SideEvidence, Track, TrackerState
+from toftrack.tracking.state import SideEvidence, Track
+from toftrack.tracking.step import step
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -41,18 +38,26 @@ def known(pose: torch.Tensor = HERE, **changes: object) -> Track:
     return track_of(pose, any_hand_model(), **({"evidence": SURE} | changes))
 
 
-def asked(
+LOST = known(believed_s=0.2)
+
+
+def looked(
     *tracks: Track, found: Sequence[Detection] = (), dt_s: float = FRAME_S, **changes: object
-) -> tuple[FixedDetector, list[Seen], TrackerState, Callable[[], Places] | None]:
-    """What a detector was asked in a frame of tracks, and what it has seen."""
+) -> tuple[FixedDetector, list[Seen], Asked]:
+    """What a detector was asked in a frame of tracks, what it has seen, and what it still does."""
     detector = changes.pop("detector", None) or FixedDetector(found)
     model = replace(any_hand_model(), detector=detector)
     state = state_of(*tracks, model=model, **changes)
-    return detector, *detected(Scene.of(state.tracks, IMAGE, dt_s, model), state)
+    scene = Scene.of(state.tracks, IMAGE, dt_s, model)
+    return detector, *detected(ask(scene, state), scene, state)
 
 
 def at(detection: Detection) -> np.ndarray:
     return detection.centre_m.numpy()
+
+
+def places_of(*found: Detection) -> Places:
+    return Places(np.array([at(one) for one in found]), np.ones(len(found)))
 
 
 FOUND = [detection_of(HERE), detection_of(THERE)]
@@ -62,7 +67,7 @@ FOUND = [detection_of(HERE), detection_of(THERE)]
 
 
 def test_each_track_is_looked_at_where_it_will_be_as_a_hand_of_its_side() -> None:
-    detector, seen, _, _ = asked(known(), known(THERE, side="left"))
+    detector, seen, _ = looked(known(), known(THERE, side="left"))
     assert [(one.side, one.row) for one in seen] == [("right", 0), ("left", 1)]
     for one, pose in zip(seen, (HERE, THERE), strict=True):
         assert at(one.detection) == pytest.approx(at(detection_of(pose)), abs=0.01)
@@ -71,7 +76,7 @@ def test_each_track_is_looked_at_where_it_will_be_as_a_hand_of_its_side() -> Non
 
 
 def test_both_sides_are_looked_at_while_it_is_not_known_which_one_it_is() -> None:
-    detector, (seen,), _, _ = asked(known(evidence=SideEvidence()))
+    detector, (seen,), _ = looked(known(evidence=SideEvidence()))
     assert seen.mirrored is not None and detector.sides == ["right", "left"]
 
 
@@ -93,7 +98,7 @@ def test_the_pose_network_is_asked_about_a_sure_hand_only_every_few_frames(
 ) -> None:
     track = known(asked_s=asked_s, **changes)
     for every, expected in ((3, due), (1, True)):
-        detector, *_ = asked(track, detector=FixedDetector(every=every))
+        detector, *_ = looked(track, detector=FixedDetector(every=every))
         assert bool(detector.sides) == expected
 
 
@@ -101,7 +106,7 @@ def test_the_pose_network_is_asked_about_a_sure_hand_only_every_few_frames(
 def test_it_is_asked_about_the_middle_of_a_palm_of_that_size(factor: float) -> None:
     length_m, first = factor * DEFAULT_HAND_LENGTH_M, default_hand_shape()
     small = with_network_length(first_shape(), length_m, any_hand_model().fit, first)
-    detector, *_ = asked(known(shape=small))
+    detector, *_ = looked(known(shape=small))
     joints = any_hand_model().hand("right", small).refiner.joints(HERE)[0].numpy()
     along = (joints[9] - joints[0]) / np.linalg.norm(joints[9] - joints[0])
     off = detector.centres_m[0][0] - joints[0]
@@ -109,7 +114,7 @@ def test_it_is_asked_about_the_middle_of_a_palm_of_that_size(factor: float) -> N
 
 
 def test_it_is_asked_about_a_hand_at_the_lens_all_the_same() -> None:
-    detector, *_ = asked(known(hand_at(z=0.01)))
+    detector, *_ = looked(known(hand_at(z=0.01)))
     assert detector.centres_m[0][0, 2] >= 0.1
 
 
@@ -121,60 +126,164 @@ def elsewhere(seen: Sequence[Seen]) -> list[tuple[str, float]]:
     return [(one.side, round(float(one.detection.centre_m[0]), 2)) for one in seen if one.row < 0]
 
 
-def test_while_no_hand_is_followed_any_is_looked_for_of_the_told_side_if_one_was_told() -> None:
-    for told, sides in ((None, ["right", "left"]), ("right", ["right"]), ("left", ["left"])):
-        detector, seen, state, finding = asked(found=FOUND, told=told)
-        assert detector.looked == sides and finding is None and len(seen) == 2 * len(sides)
-        assert state.found_s == 0 and len(detector.images) == 1
+@pytest.mark.parametrize(
+    ("told", "sides"), [(None, ["right", "left"]), ("right", ["right"]), ("left", ["left"])]
+)
+def test_while_no_hand_is_followed_any_is_looked_for_of_the_told_side_if_one_was_told(
+    told: str | None, sides: list[str]
+) -> None:
+    detector, seen, _ = looked(found=FOUND, told=told)
+    assert detector.looked == sides and len(seen) == 2 * len(sides)
 
 
-def test_beside_sure_hands_what_the_finder_sees_is_looked_at_a_frame_later() -> None:
-    detector, seen, state, finding = asked(known(), found=FOUND, found_s=9.0)
-    assert elsewhere(seen) == [] and not len(state.places.centre_m) and finding is not None
-    again, seen, _, _ = asked(known(), found=FOUND, found_s=0.0, places=finding())
+@pytest.mark.parametrize(
+    ("tracks", "dt_s", "at_once"),
+    [
+        ((known(),), FRAME_S, False),
+        ((known(), known(THERE, side="left")), FRAME_S, False),
+        ((), FRAME_S, True),
+        ((LOST,), FRAME_S, True),
+        ((known(), known(THERE, confirmed=False)), FRAME_S, True),
+        ((known(),), 0.2, True),
+    ],
+    ids=["one", "both", "none", "lost", "one of two tentative", "rare frames"],
+)
+def test_what_the_finder_sees_is_looked_at_at_once_but_a_frame_later_while_all_hands_are_sure(
+    tracks: tuple[Track, ...], dt_s: float, at_once: bool
+) -> None:
+    third = [detection_of(hand_at(-0.3))]
+    detector, seen, asked = looked(*tracks, found=third, dt_s=dt_s)
+    assert asked.found and len(detector.images) == 1
+    assert bool(elsewhere(seen)) == at_once == (asked.finding is None)
+
+
+def test_what_the_finder_saw_a_frame_ago_is_looked_at() -> None:
+    _, _, asked = looked(known(), found=FOUND)
+    again, seen, asked = looked(known(), found=FOUND, found_s=FRAME_S, places=asked.finding())
+    assert not asked.found and asked.finding is None
     assert elsewhere(seen) == [("left", 0.3)] and again.looked == ["left"], "the other hand"
 
 
 @pytest.mark.parametrize(
-    ("tracks", "looked"),
+    ("tracks", "hands", "sides"),
     [
-        ([known(believed_s=0.2)], {"right", "left"}),
-        ([known(confirmed=False)], {"right"}),
-        ([known(), known(THERE, side="left")], set()),
-        ([known(), known(THERE, side="left", believed_s=0.2)], {"left"}),
+        ([LOST], 1, {"right", "left"}),
+        ([known(confirmed=False)], 1, {"right"}),
+        ([known(), known(THERE, side="left")], 2, set()),
+        ([known(), known(THERE, side="left", believed_s=0.2)], 2, {"left"}),
+        ([known()], 4, {"right", "left"}),
+        ([known(), known(THERE, side="left")], 4, {"right", "left"}),
     ],
-    ids=["lost", "tentative", "both there", "one of two lost"],
+    ids=["lost", "tentative", "both there", "one of two lost", "of four", "two of four"],
 )
-def test_a_hand_is_looked_for_that_is_missing(tracks: list[Track], looked: set[str]) -> None:
+def test_a_hand_is_looked_for_that_is_missing(
+    tracks: list[Track], hands: int, sides: set[str]
+) -> None:
     third = [detection_of(hand_at(-0.3))]
-    places = Places(np.array([at(one) for one in third]), np.ones(1))
-    detector, *_ = asked(*tracks, found=third, places=places)
-    assert set(detector.looked) == looked
+    detector, *_ = looked(*tracks, found=third, places=places_of(*third), hands=hands)
+    assert set(detector.looked) == sides
 
 
-def test_what_is_a_track_s_or_was_no_hand_a_moment_ago_is_not_looked_at() -> None:
-    for refused, expected in ((np.zeros((0, 4)), [("left", 0.3)]), (at(FOUND[1]), [])):
-        refused = np.append(refused, 0.2)[None] if refused.ndim == 1 else refused
-        places = Places(np.array([at(one) for one in FOUND]), np.ones(2))
-        _, seen, *_ = asked(known(), found=FOUND, places=places, refused=refused)
-        assert elsewhere(seen) == expected
+@pytest.mark.parametrize(
+    ("hands", "dt_s", "whole"), [(1, FRAME_S, True), (4, FRAME_S, False), (4, 0.2, True)]
+)
+def test_of_more_than_two_hands_the_finder_sees_what_no_track_explains(
+    hands: int, dt_s: float, whole: bool
+) -> None:
+    detector, *_ = looked(known(), known(THERE, believed_s=0.2), hands=hands, dt_s=dt_s)
+    mine = image_of(HERE).depth_m < 1.0
+    assert ((detector.images[0] < 1.0)[mine] == whole).all()
+    np.testing.assert_array_equal(detector.images[0][~mine], IMAGE.depth_m[~mine])
 
 
-def test_where_frames_are_rare_hands_are_looked_for_everywhere_at_once() -> None:
-    detector, seen, _, finding = asked(known(), found=FOUND, dt_s=0.2)
-    assert (
-        finding is None and ("right", 0.0) in elsewhere(seen) and ("right", 0.3) in elsewhere(seen)
-    )
-    assert detector.images[0].min() < WALL_M
+@pytest.mark.parametrize(
+    ("refused", "expected"), [(np.zeros((0, 4)), [("left", 0.3)]), ([[*at(FOUND[1]), 0.2]], [])]
+)
+def test_what_is_a_track_s_or_was_no_hand_a_moment_ago_is_not_looked_at(
+    refused: object, expected: list[tuple[str, float]]
+) -> None:
+    places = places_of(*FOUND)
+    _, seen, _ = looked(known(), found=FOUND, places=places, refused=np.array(refused))
+    assert elsewhere(seen) == expected
 
 
-@pytest.mark.parametrize(("every", "frames", "due"), [(1, 0, True), (5, 4, False), (5, 5, True)])
-def test_the_finder_is_asked_every_so_many_frames(every: int, frames: int, due: bool) -> None:
-    for tracks in ((), (known(believed_s=0.2),)):
-        detector, *_ = asked(
-            *tracks, detector=FixedDetector(search=every), found_s=frames * FRAME_S
-        )
+def test_where_frames_are_rare_hands_are_looked_for_where_the_tracks_are_as_well() -> None:
+    _, seen, _ = looked(known(), found=FOUND, dt_s=0.2)
+    assert {("right", 0.0), ("right", 0.3)} < set(elsewhere(seen))
+
+
+@pytest.mark.parametrize(("search", "frames", "due"), [(1, 0, True), (5, 4, False), (5, 5, True)])
+@pytest.mark.parametrize("tracks", [(), (LOST,)], ids=["none", "lost"])
+def test_the_finder_is_asked_every_so_many_frames(
+    tracks: tuple[Track, ...], search: int, frames: int, due: bool
+) -> None:
+    detector, *_ = looked(*tracks, detector=FixedDetector(search=search), found_s=frames * FRAME_S)
+    assert bool(detector.images) == due
+
+
+@pytest.mark.parametrize("search", [1, 3])
+def test_the_finder_is_asked_half_as_often_while_all_hands_are_sure(search: int) -> None:
+    for frames, due in ((search, False), (2 * search - 1, False), (2 * search, True)):
+        found_s = frames * FRAME_S
+        detector, *_ = looked(known(), detector=FixedDetector(search=search), found_s=found_s)
         assert bool(detector.images) == due
+
+
+# On the arm of a hand that is seen.
+
+
+def moved(x: float, y: float) -> torch.Tensor:
+    """(1, 27) an open palm there."""
+    state = HERE.clone()
+    state[0, :2] += torch.tensor([x, y])
+    return state
+
+
+DOWN_THE_ARM, BESIDE, ACROSS = moved(0.0, 0.16), moved(0.12, 0.16), moved(0.16, 0.09)
+
+
+@pytest.mark.parametrize(
+    ("place", "begins"),
+    [(DOWN_THE_ARM, False), (BESIDE, True), (moved(0.0, -0.18), True)],
+    ids=["on the arm", "beside it", "beyond the fingers"],
+)
+def test_on_the_arm_of_a_hand_that_is_seen_no_track_begins(
+    place: torch.Tensor, begins: bool
+) -> None:
+    found = [detection_of(place, side="left")]
+    model = replace(any_hand_model(), detector=FixedDetector(found, every=1))
+    state = state_of(known(), model=model, places=places_of(*found), timestamp_s=0.0)
+    after, *_ = step(state, replace(image_of(HERE, place), timestamp_s=FRAME_S), model)
+    assert [track.number for track in after.tracks] == [0, 1][: 1 + begins]
+
+
+def left_of(seen: Detection, dt_s: float = FRAME_S) -> set[torch.Tensor]:
+    """Of hands about the one that the pose network sees, those that are none of its arm."""
+    others = {pose: detection_of(pose, side="left") for pose in (DOWN_THE_ARM, BESIDE, ACROSS)}
+    model = replace(any_hand_model(), detector=FixedDetector(list(others.values())))
+    depth = IMAGE.depth_m.copy()
+    depth[105:112, 90:150] = 0.5  # a forearm to the right
+    state = state_of(known(), model=model, places=places_of(*others.values()))
+    scene = scene_of(*state.tracks, image=replace(IMAGE, depth_m=depth), model=model)
+    asked = Asked([lambda: Seen(seen, "right", 0)], None, False, False)
+    found, _ = detected(asked, replace(scene, dt_s=dt_s), state)
+    return {pose for pose, one in others.items() if any(one is each.detection for each in found)}
+
+
+def test_the_arm_is_where_the_network_sees_it_or_the_fingers_do_not_point() -> None:
+    seen = FOUND[0]
+    assert left_of(seen) == {BESIDE, ACROSS}
+    kind = np.zeros((PARTS, PARTS), np.uint8)
+    kind[:, PARTS * 3 // 4 :] = FOREARM_PART
+    wrist = seen.keypoints.points_m[0].double().numpy()
+    parts = Parts(kind, crop_rotation(wrist), wrist, False)
+    assert left_of(replace(seen, parts=parts)) == {DOWN_THE_ARM, BESIDE}
+
+
+def test_what_is_hardly_a_hand_or_was_seen_long_ago_has_no_arm() -> None:
+    everything = {DOWN_THE_ARM, BESIDE, ACROSS}
+    assert left_of(replace(FOUND[0], present=1e-4)) == everything
+    assert left_of(FOUND[0], dt_s=0.2) == everything
 
 
 # Which one is meant.
@@ -198,6 +307,6 @@ def test_the_hand_that_is_held_out_comes_first_unless_a_side_was_said(told: str 
     far = detection_of(hand_at(0.1, z=0.7))
     near = detection_of(hand_at(-0.1, z=0.4), side="left")
     detector = FixedDetector(of_side={"right": [far], "left": [near]})
-    seen = asked(detector=detector, told=told)[1]
+    seen = looked(detector=detector, told=told)[1]
     assert seen[0].detection is (far if told == "right" else near)
     assert len(seen) == (2 if told is None else 1)

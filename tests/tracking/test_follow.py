@@ -23,9 +23,10 @@ from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.compute.spans import Spans
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.confidence import LogOdds
+from toftrack.tracking.filter import drifted
 from toftrack.tracking.report import Followed
 from toftrack.tracking.state import REFUSED_S, Track, TrackerState
-from toftrack.tracking.step import follow, kept
+from toftrack.tracking.step import filtered, follow, kept, step
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -42,7 +43,7 @@ def followed(
     model = replace(right_hand_model(), lost=plain)
     view = view_of(IMAGE, track, detection_of(at), model=model)
     scene = scene_of(track, *beside, image=IMAGE, model=model)
-    return follow(view, scene, torch.Generator().manual_seed(0), Spans())
+    return follow(view, None, scene, torch.Generator().manual_seed(0), Spans())
 
 
 @pytest.mark.parametrize(("odds", "lost"), [(2.0, False), (-4.0, True)])
@@ -51,20 +52,19 @@ def test_a_track_is_confirmed_once_and_not_believed_while_it_is_lost(
     odds: float, lost: bool, confirmed: bool
 ) -> None:
     after = followed(track_of(HERE, confirmed=confirmed), odds)
-    assert after.estimate.lost == lost and after.track.reliable == (not lost)
+    assert after.status.lost == lost and after.track.reliable == (not lost)
     assert after.track.confirmed == (confirmed or not lost)
     assert after.track.believed_s == pytest.approx(FRAME_S * lost)
     assert after.track.age.seconds == pytest.approx(1.0 + FRAME_S)
-    assert after.estimate.joint_ok.any() == (not lost)
 
 
 def test_beside_another_hand_a_new_one_must_be_surer() -> None:
     new = track_of(HERE, confirmed=False, number=1)
     other = track_of(THERE, number=0)
-    assert not followed(new, 1.0).estimate.lost
-    assert followed(new, 1.0, beside=(other,)).estimate.lost
-    assert not followed(new, 1.0, beside=(replace(other, confirmed=False),)).estimate.lost
-    assert not followed(new, 4.0, beside=(other,)).estimate.lost
+    assert not followed(new, 1.0).status.lost
+    assert followed(new, 1.0, beside=(other,)).status.lost
+    assert not followed(new, 1.0, beside=(replace(other, confirmed=False),)).status.lost
+    assert not followed(new, 4.0, beside=(other,)).status.lost
 
 
 def test_the_particles_follow_the_pose_that_was_found() -> None:
@@ -92,9 +92,34 @@ def test_it_is_kept_what_was_asked_and_what_hides_the_hand() -> None:
     before[int(hand.nonzero()[:, 0].float().mean()) :] = True
     part = replace(plain.observation, occluder=hand & before, hand=hand & ~before)
     hidden = replace(plain, observation=part)
-    after = [follow(view, scene, dice, Spans()).track for view in (plain, seen, hidden)]
+    after = [follow(view, None, scene, dice, Spans()).track for view in (plain, seen, hidden)]
     assert [one.asked_s for one in after[:2]] == pytest.approx([0.1 + FRAME_S, 0.0])
     assert [one.nearest_m for one in after] == pytest.approx([0.0, 0.0, hidden.expected_m])
+
+
+def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> None:
+    track = track_of(HERE)
+    track = replace(track, velocity=torch.full_like(track.velocity, 0.1))
+    view = view_of(IMAGE, track)
+    dice, spans = torch.Generator().manual_seed(0), Spans()
+    shown, other = (filtered(view, FRAME_S, dice, spans, asked) for asked in (True, False))
+    assert shown.particles.std(0).any() and not other.particles.std(0).any()
+    torch.testing.assert_close(other.mean, drifted(track, FRAME_S, right_hand_model()).mean)
+    torch.testing.assert_close(other.weights, track.weights)
+    assert 0.0 < float(other.mean[0, 0]) < 0.1 * FRAME_S
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_while_all_hands_are_sure_those_that_are_not_reported_are_followed_without_the_filter(
+    sure: bool,
+) -> None:
+    second = track_of(THERE, confirmed=sure)
+    state = state_of(track_of(HERE), second)
+    after, _, (estimate,) = step(state, replace(IMAGE, timestamp_s=FRAME_S), right_hand_model())
+    reported, other = after.tracks
+    assert reported.particles.std(0).any() and not estimate.lost
+    assert bool(other.particles.std(0).any()) != sure
+    torch.testing.assert_close(other.pose[:, :3], THERE[:, :3], atol=0.01, rtol=0.0)
 
 
 # Which tracks go on.

@@ -7,15 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from helpers.hands import hand_estimate
-from helpers.rendered import EMPTY, any_hand_model, hand_at, state_of, track_of, view_of
+from helpers.rendered import (
+    EMPTY,
+    any_hand_model,
+    hand_at,
+    scene_of,
+    state_of,
+    track_of,
+    view_of,
+)
 
-from toftrack.compute.pace import FRAME_S
+from toftrack.compute.spans import Spans
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
+from toftrack.tracking.belief import Status
+from toftrack.tracking.confidence import JOINT_FEATURES
+from toftrack.tracking.filter import Filtered, Found
 from toftrack.tracking.report import Followed, report
-from toftrack.tracking.state import SideEvidence, StepInfo, Track, TrackerState
+from toftrack.tracking.state import SideEvidence, Track, TrackerState
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -35,15 +44,13 @@ def hand(number: int, side: str = "right", lost: bool = False, **changes: object
 
 
 def followed(track: Track) -> Followed:
-    """Its estimate; the wrist is where its number says."""
+    """Its pose is what was found; the wrist is where its number says."""
     model = any_hand_model()
-    fitted, view = model.hand(track.side, track.shape), view_of(EMPTY, track, model=model)
-    estimate = hand_estimate(IMAGE.index, track.side, lost=not track.reliable)
-    joints = fitted.refiner.joints(track.pose)[0].numpy()
-    estimate = replace(estimate, joints_m=joints, timestamp_s=IMAGE.timestamp_s)
-    estimate = replace(estimate, state=track.pose[0].numpy())
-    none = torch.zeros(0)
-    return Followed(track, StepInfo(view.observation, none, none, {}), estimate, fitted)
+    particles = Filtered(track.particles, track.weights, track.mean)
+    found = Found(particles, track.pose, track.trend, *model.nearest(track.pose))
+    lost = not track.reliable
+    status = Status("searching" if lost else "tracking", lost, confidence=0.9)
+    return Followed(view_of(EMPTY, track, model=model), track, found, 0.8, status)
 
 
 def before(hands: int = 1, told: str | None = None, **slot: object) -> TrackerState:
@@ -60,9 +67,10 @@ def reported(
 ) -> tuple[TrackerState, tuple[Estimate, ...]]:
     each = [followed(track) for track in tracks]
     state = replace(state, tracks=tracks)
-    state, infos, estimates = report(state, each, image, any_hand_model(), FRAME_S, {"rest": 1.0})
+    scene = scene_of(*tracks, image=image, model=any_hand_model())
+    state, infos, estimates = report(state, each, scene, Spans())
     assert [info is None for info in infos] == [slot.track < 0 for slot in state.slots]
-    assert all(info is None or info.seconds == {"rest": 1.0} for info in infos)
+    assert all(info is None or set(info.seconds) == {"rest"} for info in infos)
     return state, estimates
 
 
@@ -190,7 +198,8 @@ def test_the_only_hand_that_was_lost_is_reported_where_it_was_last_believed() ->
 def test_a_slot_of_several_without_a_hand_is_empty() -> None:
     state, _ = reported(before(2), hand(0, "right"), hand(1, "left"))
     state, (first, second) = reported(state, hand(0, "right"))
-    assert not first.lost and second.lost and second.state_name == "lost"
+    assert not first.lost and first.joint_ok.any()
+    assert second.lost and second.state_name == "lost"
     assert second.side == "" and np.isnan(second.joints_m).all()
     assert (second.index, second.timestamp_s) == (IMAGE.index, IMAGE.timestamp_s)
     assert state.slots[1].side == "left", "which hand it was is remembered"
@@ -214,3 +223,14 @@ def test_gestures_are_smoothed_over_a_hand_s_frames_and_not_from_one_hand_to_ano
     assert palm.gesture == "palm"
     np.testing.assert_allclose(gesture(state, 1), gesture(before(), 1), rtol=1e-5)
     assert np.abs(gesture(state, 0) - gesture(before(), 0)).max() > 0.1
+
+
+@pytest.mark.parametrize(("number", "holds"), [(0, True), (1, False)])
+def test_what_is_known_of_a_hand_s_joints_holds_and_not_of_another_hand_s(
+    number: int, holds: bool
+) -> None:
+    features = np.full((21, len(JOINT_FEATURES)), 7.0)
+    state, _ = reported(before(track=0, joint_features=features), hand(number))
+    found = state.slots[0].joint_features
+    assert (found[:, :3] == 7.0 * holds).all(), "the network was not asked"
+    assert (found != 7.0).any()

@@ -31,7 +31,15 @@ from toftrack.tracking.candidates import View
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.sides import changes_side, side_log_odds
 from toftrack.tracking.state import SideEvidence, Slot, Track
-from toftrack.tracking.views import begun, continued, expected_of, known_shape, observed
+from toftrack.tracking.views import (
+    begun,
+    continued,
+    expected_of,
+    known_shape,
+    most_new,
+    observed,
+    predicted_view,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -61,7 +69,8 @@ def gone_on(
     found: Seen | None, image: DepthImage = BOTH, told: str | None = None, **changes: object
 ) -> View | None:
     track = track_of(HERE, number=3, **changes)
-    return continued(scene_of(track, image=image, model=model()), 0, found, told)
+    scene = scene_of(track, image=image, model=model())
+    return continued(scene, 0, predicted_view(scene, 0), found, told)
 
 
 @pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(hand_at(0.02)), seen(HERE)])
@@ -155,19 +164,34 @@ def test_a_track_begins_as_a_hand_of_the_likelier_side() -> None:
         assert view.track.side == side == view.fitted.shape.side
 
 
-def test_as_many_tracks_begin_as_there_is_room_for_each_with_a_number() -> None:
-    places = [hand_at(x) for x in (-0.15, -0.05, 0.05, 0.15)]
-    many = [seen(pose) for pose in places]
-    image = image_of(*places)
-    numbers = [view.track.number for view in began(many, image=image, next_track=7)]
-    assert numbers == list(range(7, 7 + len(numbers))) and 2 <= len(numbers) < len(many)
-    assert len(began(many, image=image, hands=4)) == len(many)
-    assert len(began(many[1:], track_of(places[0]), image=image)) == len(numbers) - 1
+@pytest.mark.parametrize(
+    ("confirmed", "tentative", "hands", "most"),
+    [
+        (0, 0, 1, 2),
+        (0, 1, 1, 1),
+        (0, 2, 1, 0),
+        (1, 0, 1, 1),
+        (1, 1, 1, 0),
+        (2, 0, 2, 1),
+        (2, 1, 2, 0),
+        (3, 0, 2, 0),
+        (0, 0, 4, 4),
+        (2, 1, 4, 1),
+        (4, 0, 4, 1),
+    ],
+)
+def test_as_many_tracks_are_tentative_as_hands_are_missing_or_one(
+    confirmed: int, tentative: int, hands: int, most: int
+) -> None:
+    sure, new = [track_of(HERE)] * confirmed, [track_of(THERE, confirmed=False)] * tentative
+    assert most_new(state_of(*new, *sure, hands=hands)) == most
 
 
-def test_no_track_begins_beside_a_tentative_one() -> None:
-    assert began([seen(THERE)], track_of(HERE, confirmed=False)) == []
-    assert len(began([seen(THERE)], track_of(HERE))) == 1
+def test_tracks_begin_where_there_is_room_the_first_ones_first_each_with_a_number() -> None:
+    places = [hand_at(x) for x in (-0.15, -0.05, 0.05)]
+    views = began([seen(pose) for pose in places], image=image_of(*places), next_track=7)
+    assert [view.track.number for view in views] == [7, 8]
+    assert all(off_m(view, pose) < 0.01 for view, pose in zip(views, places, strict=False))
 
 
 def test_a_new_track_keeps_off_a_reliable_hand_s_pixels_and_joints() -> None:
