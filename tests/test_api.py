@@ -110,19 +110,6 @@ def test_an_image_of_any_floating_type_and_layout_gives_the_same_hand() -> None:
     assert all(np.array_equal(joints[0], other) for other in joints[1:])
 
 
-def test_the_size_of_the_image_may_change_on_the_way() -> None:
-    scene = sample()
-    tracker = toftrack.make_tracker(*QUICK)
-    found = []
-    for i in range(6):
-        depth, k = scene.depth_m[i], scene.k.copy()
-        if i >= 3:
-            depth, k[1, 2] = depth[10:], k[1, 2] - 10
-        found.append(tracker.step(depth, k))
-    assert not found[-1].lost
-    assert np.linalg.norm(found[-1].joints_m - scene.joints_m[5], axis=-1).mean() < 0.02
-
-
 K = [[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]]
 METRES = np.full((30, 40), 0.6, np.float32)
 

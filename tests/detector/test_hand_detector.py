@@ -148,6 +148,12 @@ def test_strange_images_are_searched_without_an_error(image: np.ndarray) -> None
             assert seen.joints_m.isfinite().all() and seen.keypoints.points_m.isfinite().all()
 
 
+@pytest.mark.parametrize("known", [0, 3])
+def test_hands_that_are_known_take_no_place_from_those_that_are_not(known: int) -> None:
+    search = detector(places=2, least=0.0).start_search
+    assert len(search(sample().depth_m[0], sample().k, known)().centre_m) == 2 + known
+
+
 def test_settings_are_checked() -> None:
     for name, value in {
         "places": 0,

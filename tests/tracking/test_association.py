@@ -1,4 +1,4 @@
-"""Which detection is of which track, which ones are left over, and which tracks end."""
+"""Which detection is of which track, and which ones are left over."""
 
 from __future__ import annotations
 
@@ -12,16 +12,8 @@ import torch
 from helpers.detection import detection_of
 from helpers.rendered import EMPTY, hand_at, scene_of, track_of
 
-from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.tracking.association import (
-    Seen,
-    are_one,
-    assign,
-    costs,
-    ends,
-    left_over,
-    sureness,
-)
+from toftrack.compute.pace import FRAME_S
+from toftrack.tracking.association import Seen, are_one, assign, costs, left_over
 from toftrack.tracking.state import Track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -138,41 +130,3 @@ def test_palms_near_each_other_are_one_hand_s_where_much_of_one_lies_in_the_othe
     assert are_one(palm, beside, joints, joints)
     assert not are_one(palm, beside, joints, joints + 1.0)
     assert not are_one(palm, palm + [0.1, 0.0, 0.0], joints, joints)
-
-
-# Tracks.
-
-
-@pytest.mark.parametrize(
-    ("changes", "beside", "expected"),
-    [
-        ({}, True, False),
-        ({"doubtful": Duration(1.0)}, False, True),
-        ({"confirmed": False, "age": Duration(0.4)}, True, False),
-        ({"confirmed": False, "age": Duration(0.6)}, True, True),
-        ({"confirmed": False, "age": Duration(0.6)}, False, False),
-    ],
-    ids=[
-        "a sure one goes on",
-        "doubted for long",
-        "a tentative one is given time",
-        "but not for ever",
-        "unless there is no other hand",
-    ],
-)
-def test_a_track_ends_that_nobody_sees(
-    changes: dict[str, object], beside: bool, expected: bool
-) -> None:
-    assert ends(track_of(hand_at(), **changes), beside, 5) == expected
-
-
-def test_without_patience_a_doubtful_track_does_not_end() -> None:
-    assert not ends(track_of(hand_at(), doubtful=Duration(9.0)), False, 0)
-
-
-def test_a_confirmed_track_is_surer_than_any_tentative_one() -> None:
-    order = [
-        track_of(hand_at(), confirmed=confirmed, log_odds=odds)
-        for confirmed, odds in ((False, -3.0), (False, 9.0), (True, -3.0), (True, 2.0))
-    ]
-    assert sorted(order, key=sureness) == order

@@ -16,7 +16,6 @@ from toftrack.tracking.confidence import (
     FEATURES,
     NO_FEATURES,
     ConfidenceFeatures,
-    ConfidenceModel,
     LogOdds,
     confidence_features,
 )
@@ -40,14 +39,6 @@ GOOD = ConfidenceFeatures(
 K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 
 
-def model_of(**changes: object) -> ConfidenceModel:
-    """Of the score alone: log odds 4 at a good score, 0 at 2 below, and so on; no memory."""
-    odds = LogOdds(4.0, {"log_score": 2.0})
-    usual = {"memory": 0.0, "confidence": 0.5, "give_up": 0.1, "patience": 5, "log_odds": odds}
-    usual |= {"whole": 0.0}
-    return confidence_model(**(usual | changes))
-
-
 def test_a_weight_of_an_unknown_feature_is_refused() -> None:
     with pytest.raises(ToftrackError, match="weights.luck is unknown; the features are log_"):
         LogOdds(0.0, {"luck": 1.0})
@@ -55,17 +46,11 @@ def test_a_weight_of_an_unknown_feature_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [
-        ("confidence", 1.5),
-        ("give_up", -0.1),
-        ("memory", 1.0),
-        ("patience", -1),
-        ("patience", 2.5),
-    ],
+    [("confidence", 1.5), ("give_up", -0.1), ("memory", 1.0), ("patience", -1), ("patience", 2.5)],
 )
 def test_settings_that_cannot_be_are_refused(name: str, value: object) -> None:
     with pytest.raises(ToftrackError, match=f"lost.{name}"):
-        model_of(**{name: value})
+        confidence_model(**{name: value})
 
 
 @pytest.mark.parametrize("name", FEATURES)

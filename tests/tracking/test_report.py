@@ -7,15 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.rendered import (
-    EMPTY,
-    any_hand_model,
-    hand_at,
-    scene_of,
-    state_of,
-    track_of,
-    view_of,
-)
+from helpers.rendered import EMPTY, any_hand_model, hand_at, scene_of, state_of, track_of, view_of
 
 from toftrack.compute.spans import Spans
 from toftrack.estimate import Estimate

@@ -13,6 +13,7 @@ from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION
+from toftrack.errors import ToftrackError
 from toftrack.frames import DepthImage
 from toftrack.tracking.sides import (
     body_offset_m,
@@ -193,3 +194,6 @@ def test_a_restart_may_say_a_side_or_have_it_detected() -> None:
         tracker.restart(side)
         said.append(tracker.step(scene.depth_m[i], scene.k, i, i / 25).side_probability)
     assert max(said[:2]) < 1.0 and said[2:] == [1.0, 1.0], "it stays so"
+    assert tracker.shape.side == "right"
+    with pytest.raises(ToftrackError, match="hand.side=middle"):
+        tracker.restart("middle")

@@ -9,7 +9,6 @@ import pytest
 import torch
 from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.hand.skeleton import forward_kinematics
@@ -44,15 +43,10 @@ def default() -> Run:
     return Run(first(FRAMES))
 
 
-def same(one: Estimate, two: Estimate) -> bool:
-    names = ("joints_m", "state", "latent", "covariance")
-    arrays = all(np.array_equal(getattr(one, n), getattr(two, n), equal_nan=True) for n in names)
-    return arrays and (one.score, one.lost, one.state_name) == (two.score, two.lost, two.state_name)
-
-
 def test_the_mean_error_on_the_sample_is_below_12_mm(default: Run) -> None:
     assert default.error_mm[5:].mean() < 12
     assert default.error_mm.max() < 40
+    assert default.tracker.shape.hand_length_m == pytest.approx(0.19, rel=0.06)
     lost = [estimate.lost for estimate in default.estimates]
     assert np.mean(lost) < 0.2
     for estimate in default.estimates:
@@ -95,24 +89,6 @@ def test_the_range_image_shows_the_hand_where_it_was_seen(default: Run) -> None:
     assert close.mean() > 0.75
 
 
-def test_a_restart_forgets_the_hand_and_may_change_its_side() -> None:
-    scene = first(8)
-    tracker = make_tracker("hand.side=right")
-    before = tracker.shape
-    tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
-    tracker.restart()
-    assert tracker.track is None and tracker.shape is before
-    right = tracker.step(scene.depth_m[1], scene.k, 1, 0.04)
-    assert errors_mm([right], scene.cut(1))[0] < 25
-    tracker.restart("left")
-    assert tracker.shape.side == "left"
-    left = scene.mirrored()
-    found = [tracker.step(left.depth_m[i], left.k, i, i / 25) for i in range(2, 8)]
-    assert errors_mm(found[-1:], left.cut(7))[0] < 20
-    with pytest.raises(ToftrackError, match="hand.side=middle"):
-        tracker.restart("middle")
-
-
 def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
     scene = first(3)
     quick = ("hand.shape=default", "filter.particles=60")
@@ -126,23 +102,17 @@ def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
 def test_the_same_seed_gives_the_same_bits_and_another_one_others_that_are_as_good() -> None:
     scene = first(12)
     one, two, other = (follow(scene, f"seed={seed}") for seed in (3, 3, 4))
-    assert all(map(same, one, two))
-    assert not any(map(same, one, other))
+    joints = [np.stack([one.joints_m for one in found]) for found in (one, two, other)]
+    assert np.array_equal(*joints[:2]) and (joints[0] != joints[2]).any((1, 2)).all()
     assert all(errors_mm(found, scene)[5:].mean() < 12 for found in (one, other))
 
 
-def without_hand(scene: Scene, gone: range) -> Scene:
-    """Only the wall is left in the given frames."""
-    depth = scene.depth_m.copy()
-    depth[gone.start : gone.stop] = 1.4
-    return Scene(depth, scene.k, scene.joints_m)
-
-
 def test_a_frame_with_no_hand_is_lost_and_the_hand_is_found_again() -> None:
-    gone = range(6, 10)
-    scene = without_hand(first(18), gone)
+    gone = list(range(6, 10))
+    scene = first(18)
+    scene.depth_m[gone] = 1.4  # only the wall is left
     found = follow(scene)
-    assert [i for i in gone if found[i].lost and found[i].state_name == "lost"] == list(gone)
+    assert [i for i in gone if found[i].lost and found[i].state_name == "lost"] == gone
     for i in gone:
         assert found[i].score == 0
         assert (found[i].index, found[i].timestamp_s) == (i, i / 25)
@@ -167,23 +137,6 @@ def test_a_recording_that_begins_without_a_hand_has_no_estimate_until_there_is_o
     assert errors_mm([found], scene)[0] < 25
 
 
-def test_what_is_no_number_or_negative_is_taken_as_no_reading() -> None:
-    """The camera's rectification makes it 0, and the tracker sees the same as of 0."""
-    scene = first(6)
-    camera = Camera(scene.k, 176, 144)
-    rng = np.random.default_rng(0)
-    holes = rng.random(scene.depth_m.shape) < 0.05
-    values = rng.choice(np.float32([math.nan, math.inf, -math.inf, -0.4]), holes.shape)
-    ways = []
-    for hole in (values, 0.0):
-        raw = np.where(holes, hole, scene.depth_m)
-        depth = np.stack([camera.rectify(image, radial=False) for image in raw])
-        assert np.isfinite(depth).all() and (depth >= 0).all()
-        ways.append(follow(Scene(depth, scene.k, scene.joints_m)))
-    assert all(map(same, *ways))
-    assert errors_mm(ways[0], scene)[-1] < 15
-
-
 @pytest.mark.parametrize("factor", [0.85, 1.15])
 def test_the_size_of_the_hand_is_found(factor: float) -> None:
     """A scene of another scale looks the same but for its depths."""
@@ -194,10 +147,6 @@ def test_the_size_of_the_hand_is_found(factor: float) -> None:
     assert run.error_mm[-6:].mean() < 13 * factor
     # The default hand is 15 % off, and stays so where nothing is fitted.
     assert make_tracker("hand.shape=default").shape.hand_length_m == pytest.approx(0.19)
-
-
-def test_the_size_of_the_default_hand_stays(default: Run) -> None:
-    assert default.tracker.shape.hand_length_m == pytest.approx(0.19, rel=0.06)
 
 
 def test_a_mirrored_sequence_of_a_left_hand_gives_the_same_error(default: Run) -> None:

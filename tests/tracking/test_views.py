@@ -165,26 +165,15 @@ def test_a_track_begins_as_a_hand_of_the_likelier_side() -> None:
 
 
 @pytest.mark.parametrize(
-    ("confirmed", "tentative", "hands", "most"),
-    [
-        (0, 0, 1, 2),
-        (0, 1, 1, 1),
-        (0, 2, 1, 0),
-        (1, 0, 1, 1),
-        (1, 1, 1, 0),
-        (2, 0, 2, 1),
-        (2, 1, 2, 0),
-        (3, 0, 2, 0),
-        (0, 0, 4, 4),
-        (2, 1, 4, 1),
-        (4, 0, 4, 1),
-    ],
+    ("hands", "confirmed", "most"),
+    [(1, 0, 2), (1, 1, 1), (2, 2, 1), (2, 3, 0), (4, 1, 3), (4, 4, 1)],
 )
 def test_as_many_tracks_are_tentative_as_hands_are_missing_or_one(
-    confirmed: int, tentative: int, hands: int, most: int
+    hands: int, confirmed: int, most: int
 ) -> None:
-    sure, new = [track_of(HERE)] * confirmed, [track_of(THERE, confirmed=False)] * tentative
-    assert most_new(state_of(*new, *sure, hands=hands)) == most
+    for tentative in range(most + 1):
+        tracks = [track_of(HERE, confirmed=at < confirmed) for at in range(confirmed + tentative)]
+        assert most_new(state_of(*tracks, hands=hands)) == most - tentative
 
 
 def test_tracks_begin_where_there_is_room_the_first_ones_first_each_with_a_number() -> None:

@@ -41,15 +41,6 @@ def test_a_recording_without_a_hand_is_lost_in_every_frame(scene: np.ndarray) ->
         assert (estimate.index, estimate.timestamp_s) == (i, i / 25)
 
 
-def test_the_hand_is_found_after_a_wall_and_lost_before_one() -> None:
-    scene, tracker = sample(), make_tracker()
-    shown = [wall(1.4), scene.depth_m[0], scene.depth_m[1], wall(1.4), scene.depth_m[2]]
-    found = [tracker.step(depth, scene.k, i, i / 25) for i, depth in enumerate(shown)]
-    assert found[0].lost and found[3].lost
-    for row, frame in ((2, 1), (4, 2)):
-        assert errors_mm([found[row]], scene.cut(frame))[0] < 40
-
-
 def test_no_number_is_no_reading_to_the_networks_too() -> None:
     scene, rng = sample(), np.random.default_rng(0)
     found = []
