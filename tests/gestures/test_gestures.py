@@ -11,7 +11,7 @@ import torch
 from helpers.settings import gestures, part
 from helpers.shown_gestures import GESTURES, ON, SURE, fingers, label_of, pose, seen
 from helpers.tracking import follow as follow_scene
-from helpers.tracking import make_tracker, sample
+from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
@@ -363,12 +363,3 @@ def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
     reach = scene.joints_m[rows[-1], 8] - scene.joints_m[rows[-1], 5]
     cosine = last.pointing_direction @ reach / np.linalg.norm(reach)
     assert cosine > math.cos(math.radians(15))
-
-
-def test_a_frame_without_a_hand_has_no_gesture() -> None:
-    scene, tracker = sample(), make_tracker()
-    first = tracker.step(scene.depth_m[0], scene.k, 0, 0.0)
-    empty = tracker.step(np.zeros_like(scene.depth_m[0]), scene.k, 1, 0.04)
-    assert (first.gesture, empty.gesture) == ("palm", "")
-    assert math.isnan(empty.gesture_probability)
-    assert make_tracker("gestures=none").step(scene.depth_m[0], scene.k, 0, 0.0).gesture == ""

@@ -144,7 +144,8 @@ class FixedDetector:
     def look(self, depth_m, k, places, side) -> list[Detection]:
         self.looked.append(side)
         found = self.of_side.get(side, self.found)
-        return [one for one in found if _is_at(one, places)]
+        away = [np.linalg.norm(places.centre_m - one.centre_m.numpy(), axis=1) for one in found]
+        return [one for one, off in zip(found, away, strict=True) if (off < 1e-3).any()]
 
     def start_search(self, depth_m, k, known=0) -> Callable[[], Places]:
         self.images.append(depth_m)
@@ -164,11 +165,6 @@ class FixedDetector:
     def start(self, depth_m, k, centre_m, side, up=None) -> Callable[[], Detection]:
         found = self.detect(depth_m, k, np.asarray(centre_m)[None], side)[0]
         return lambda: found
-
-
-def _is_at(detection: Detection, places: Places) -> bool:
-    away = np.linalg.norm(places.centre_m - detection.centre_m.numpy(), axis=1)
-    return bool((away < 1e-3).any())
 
 
 def plain_scenes(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import hydra
 import numpy as np
 import pytest
 import torch
@@ -85,13 +84,6 @@ def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
 def test_a_pose_that_is_not_six_numbers_is_refused(pose: tuple[float, ...]) -> None:
     with pytest.raises(ToftrackError, match=f"start.pose has {len(pose)} numbers"):
         rough_start(pose=pose)
-
-
-def test_a_pose_can_be_given_on_the_command_line() -> None:
-    config = configuration("experiment=paper", "start.pose=[0,0.1,0.5,0,0,0]")
-    _, track = begun(hydra.utils.instantiate(config.start), n=100)
-    place = track.particles[:, :3].mean(0)
-    assert float((place - torch.tensor([0, 0.1, 0.5])).norm()) < 0.02
 
 
 @pytest.mark.parametrize("frame", range(0, 100, 20))

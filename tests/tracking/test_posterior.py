@@ -16,7 +16,7 @@ from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of
 from toftrack.errors import ToftrackError
 from toftrack.hand.overlap import RADII_MM
 from toftrack.tracking.candidates import View
-from toftrack.tracking.posterior import Posterior, touching
+from toftrack.tracking.posterior import Posterior
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -135,12 +135,6 @@ def test_another_hand_costs_the_joints_that_lie_in_it() -> None:
     np.testing.assert_allclose(added(seen, other_hand=3.0), expected, rtol=1e-3, atol=1e-4)
 
 
-def test_a_hand_lies_wholly_in_itself_and_not_at_all_in_one_far_away() -> None:
-    other = other_hand()
-    assert float(touching(other[None], other)) == pytest.approx(1, abs=1e-2)
-    assert float(touching(other[None] + 0.5, other)) == 0
-
-
 def test_each_other_hand_costs_its_own() -> None:
     one, two = other_hand(0.03), other_hand(-0.03)
     both = added(view(one, two), other_hand=2.0)
@@ -173,13 +167,6 @@ def test_a_term_of_weight_0_is_left_out(names: tuple[str, ...], left: set[str]) 
 def test_without_a_detection_keypoints_say_nothing() -> None:
     blind = view_of(image_of(TRUTH), track_of(TRUTH))
     assert not added(blind, keypoints=0.4).any()
-
-
-def test_the_posterior_of_a_pose_does_not_depend_on_the_others() -> None:
-    whole = posterior(view(other_hand()), **ALL)
-    together = whole(poses())
-    for rows in ([3], [7, 2], list(range(5, 20))):
-        torch.testing.assert_close(whole(poses()[rows]), together[rows])
 
 
 @pytest.mark.parametrize("name", list(NONE))
