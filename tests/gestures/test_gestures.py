@@ -16,12 +16,7 @@ from helpers.tracking import sample
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.gestures.features import features
-from toftrack.gestures.recognition import (
-    GestureState,
-    pointing_ray,
-    tell_gesture,
-    update,
-)
+from toftrack.gestures.recognition import GestureState, pointing_ray, tell_gesture, update
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.pose_space.data.training_poses import synthetic_training_poses
@@ -338,14 +333,7 @@ def test_without_gestures_there_are_no_labels() -> None:
     assert state is None and reported.gesture == "" and math.isnan(reported.gesture_probability)
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"flexion_rad": 0.0},
-        {"smoothing": 1.0},
-        {"known": "most"},
-    ],
-)
+@pytest.mark.parametrize("bad", [{"flexion_rad": 0.0}, {"smoothing": 1.0}, {"known": "most"}])
 def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures"):
         gestures(**bad)

@@ -22,20 +22,6 @@ from toftrack.tracking.confidence import (
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-GOOD = ConfidenceFeatures(
-    log_score=-0.1,
-    keypoints_off=0.0,
-    farthest_keypoint_off=0.5,
-    pose_off=0.0,
-    likeliest_off=0.0,
-    expected_error=0.0,
-    unsure=-0.5,
-    absent=0.02,
-    other_side=0.05,
-    unseen=0.0,
-    hidden=0.0,
-    young=0.0,
-)
 K = torch.tensor([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 
 
@@ -55,19 +41,18 @@ def test_settings_that_cannot_be_are_refused(name: str, value: object) -> None:
 
 @pytest.mark.parametrize("name", FEATURES)
 def test_log_odds_rise_and_fall_with_a_feature_as_its_weight_says(name: str) -> None:
-    more = replace(GOOD, **{name: getattr(GOOD, name) + 1.0})
+    more = replace(NO_FEATURES, **{name: 1.0})
     for weight in (-0.7, 0.4):
         log_odds = LogOdds(4.0, {name: weight})
-        assert log_odds(more) - log_odds(GOOD) == pytest.approx(weight)
+        assert log_odds(more) - log_odds(NO_FEATURES) == pytest.approx(weight)
     assert LogOdds(4.0, {})(more) == 4.0
 
 
 def test_the_package_s_confidence_prefers_good_scores_and_agreement() -> None:
     model = confidence_model()
-    worse = replace(
-        GOOD, log_score=-2.0, keypoints_off=2.5, farthest_keypoint_off=3.0, pose_off=2.5
-    )
-    assert model.log_odds(GOOD) > model.log_odds(worse)
+    off = dict.fromkeys(("keypoints_off", "farthest_keypoint_off", "pose_off"), 2.5)
+    worse = replace(NO_FEATURES, log_score=-2.0, **off)
+    assert model.log_odds(NO_FEATURES) > model.log_odds(worse)
 
 
 def palm_at(z: float = 0.5) -> torch.Tensor:

@@ -75,17 +75,9 @@ def test_a_given_side_is_that_of_the_first_slot_and_the_other_one_is_of_the_othe
         assert first.side in ("left", "") and second.side in ("right", "")
     assert first.side == "left" and second.side == "right"
     assert first.joints_m[0, 0] > second.joints_m[0, 0], "each on its own hand"
-
-
-def test_a_restart_forgets_both_hands(apart: TwoHands) -> None:
-    tracker = tracker_of("hands=2")
-    for i in range(3):
-        tracker.step(apart.depth_m[i], apart.k, i, i / 25)
-    tracker.restart("left")
-    assert tracker.state.tracks == ()
-    assert [slot.track for slot in tracker.states] == [-1, -1]
-    assert [slot.side for slot in tracker.states] == ["left", "right"]
-    assert tracker.state.next_index == 3
+    tracker.restart("right")
+    assert tracker.state.tracks == () and tracker.state.next_index == 10
+    assert [(slot.side, slot.track) for slot in tracker.states] == [("right", -1), ("left", -1)]
 
 
 def test_other_numbers_of_hands_and_two_without_networks_are_refused() -> None:

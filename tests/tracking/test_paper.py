@@ -30,17 +30,13 @@ def first(n: int) -> Scene:
     return sample().cut(*range(n))
 
 
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 def observed(scene: Scene) -> Observation:
     return nearest_surface()(scene.depth_m[0], scene.k)
 
 
 def begun(start: RoughStart, n: int = 300, seed: int = 0) -> tuple[FilterModel, Track]:
     model = make_tracker("experiment=paper", f"filter.particles={n}").model
-    return model, start(observed(first(1)), model, generator(seed))
+    return model, start(observed(first(1)), model, torch.Generator().manual_seed(seed))
 
 
 def test_a_start_has_as_many_particles_as_asked_for_inside_the_pose_space() -> None:

@@ -59,34 +59,13 @@ def joints_of(seen: View) -> np.ndarray:
 
 
 @pytest.mark.parametrize("coverage", [0.0, 0.7, None])
-def test_the_image_says_the_log_of_the_f_measure_and_of_what_is_explained(
-    coverage: float | None,
-) -> None:
-    seen, settings = view(), right_hand_model().likelihood
+def test_the_image_says_its_likelihood(coverage: float | None) -> None:
+    seen, likelihood = view(), right_hand_model().likelihood
     counts = seen.fitted.scorer(poses(), seen.image.evidence)
-    correct, false, missed, residual = (count.double().numpy() for count in counts)
-    c, f = (
-        correct - settings.residual_weight * residual,
-        false + settings.residual_weight * residual,
-    )
-    first, second = (missed, f) if settings.naming == "printed" else (f, missed)
-    precision, recall = c / (c + first), c / (c + second)
-    b2 = settings.beta**2
-    f_measure = (1 + b2) * precision * recall / (b2 * precision + recall)
-    share = settings.coverage if coverage is None else coverage
-    expected = np.log(f_measure) + share * np.log(correct)
-    found = posterior(seen, coverage)(poses()).numpy()
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
-    one = poses()[:1]
-    assert seen.image.score(one) == pytest.approx(f_measure[0], rel=1e-4)
-    assert np.ptp(expected) > 1, "the poses differ"
-
-
-def test_a_pose_that_explains_nothing_is_impossible() -> None:
-    away = TRUTH.clone()
-    away[0, 0] = 5.0
-    assert float(posterior(view(), 1.0)(away)) == -math.inf
-    assert float(posterior(view(), 0.0)(away)) == -math.inf
+    expected = likelihood.log_score(counts, coverage)
+    torch.testing.assert_close(posterior(seen, coverage)(poses()), expected)
+    assert seen.image.score(poses()[:1]) == pytest.approx(float(likelihood.score(counts)[0]))
+    assert np.ptp(expected.numpy()) > 1, "the poses differ"
 
 
 def test_keypoints_cost_their_robust_squared_deviation() -> None:

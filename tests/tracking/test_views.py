@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
@@ -34,7 +33,6 @@ from toftrack.tracking.state import SideEvidence, Slot, Track
 from toftrack.tracking.views import (
     begun,
     continued,
-    expected_of,
     known_shape,
     most_new,
     observed,
@@ -229,11 +227,3 @@ def test_a_hand_that_is_back_has_the_shape_that_it_had() -> None:
     assert known("right", first, gone) == pytest.approx(0.19, rel=1e-3), "of the other side"
     there = replace(first, shape=of_length)
     assert known("right", there, second) == pytest.approx(0.19, rel=1e-3), "it is still there"
-
-
-def test_what_is_expected_of_a_hand_that_is_not_tracked_yet() -> None:
-    detection = detection_of(hand_at(0.1))
-    expected, z = expected_of(detection), detection.joints_m[0, :, 2].numpy()
-    depths = (expected.nearest_m, expected.farthest_m)
-    np.testing.assert_allclose(depths, (z.min(), z.max()), rtol=1e-6)
-    np.testing.assert_allclose(expected.centre_m, detection.centre_m.numpy(), rtol=1e-6)
