@@ -9,12 +9,7 @@ import torch
 from toftrack.errors import ToftrackError
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
-from toftrack.hand.skeleton import (
-    ANGLE_LIMITS,
-    ANGLE_NAMES,
-    JOINT_NAMES,
-    forward_kinematics,
-)
+from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, JOINT_NAMES, forward_kinematics
 from toftrack.hand.surface import hand_surface
 
 

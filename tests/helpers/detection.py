@@ -123,7 +123,7 @@ class FixedDetector:
     found: what the finder sees, and the pose network there, as a hand of whichever side; of the
         sides in `of_side`, this instead.
     looked: the sides that hands at the finder's places were looked for as.
-    images: those that the finder saw.
+    images: those that the finder saw.  known: how many hands were, each time.
     centres_m, sides: (C, 3) each and the side, of all calls of `detect` and `start`.
     """
 
@@ -138,6 +138,7 @@ class FixedDetector:
         self.of_side = of_side or {}
         self.looked: list[str] = []
         self.images: list[np.ndarray] = []
+        self.known: list[int] = []
         self.centres_m: list[np.ndarray] = []
         self.sides: list[str] = []
 
@@ -149,6 +150,7 @@ class FixedDetector:
 
     def start_search(self, depth_m, k, known=0) -> Callable[[], Places]:
         self.images.append(depth_m)
+        self.known.append(known)
         found = [*self.found, *(one for each in self.of_side.values() for one in each)]
         centres = np.array([one.centre_m.numpy() for one in found]).reshape(-1, 3)
         return lambda: Places(centres, np.full(len(centres), 0.9, np.float32))

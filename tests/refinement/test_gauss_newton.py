@@ -278,12 +278,7 @@ def test_unknown_landmarks_count_as_none_and_a_wrong_one_little() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("iterations", -1),
-        ("point_m", -0.01),
-        ("angle_rad", "wide"),
-    ],
+    ("key", "value"), [("iterations", -1), ("point_m", -0.01), ("angle_rad", "wide")]
 )
 def test_impossible_settings_are_refused(key: str, value: object) -> None:
     with pytest.raises(ToftrackError, match=f"^refine.{key}={value} "):

@@ -126,9 +126,7 @@ def test_an_image_of_one_pixel_is_a_point() -> None:
 def test_an_occluder_is_part_of_the_silhouette_and_has_no_points() -> None:
     observation = observed(0)
     covered = replace(
-        observation,
-        hand=torch.zeros_like(observation.hand),
-        occluder=observation.hand.clone(),
+        observation, hand=torch.zeros_like(observation.hand), occluder=observation.hand.clone()
     )
     seen, plain = seen_points(covered), seen_points(observation)
     assert len(seen.points_m) == 0

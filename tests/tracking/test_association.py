@@ -102,13 +102,7 @@ def test_what_is_no_track_s_is_left_over_each_hand_once() -> None:
     found = [seen(0.0, row=0), seen(0.005), seen(0.3), seen(0.305), seen(0.3, "left"), seen(-0.3)]
     assert left_over(found, [0]) == [found[2], found[5]]
     assert left_over(found[:1], [-1]) == [], "a track's own place begins none"
-    assert left_over([], []) == []
-
-
-def test_a_detection_that_a_track_has_taken_is_not_left_over() -> None:
-    found = [seen(0.0), seen(0.3)]
-    assert left_over(found, [1]) == [found[0]]
-    assert left_over(found, [-1]) == found
+    assert left_over(found[2:], [0]) == found[-1:], "nor what a track has taken"
 
 
 @pytest.mark.parametrize(

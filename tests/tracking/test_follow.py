@@ -109,6 +109,17 @@ def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> No
     assert 0.0 < float(other.mean[0, 0]) < 0.1 * FRAME_S
 
 
+@pytest.mark.parametrize("age_s", [0.0, 1.0])
+def test_particles_that_were_filtered_before_are_not_those_of_a_track_that_begins_anew(
+    age_s: float,
+) -> None:
+    track = track_of(HERE, age=Duration(age_s))
+    early, scene = drifted(track, FRAME_S, right_hand_model()), scene_of(track, image=IMAGE)
+    dice = torch.Generator().manual_seed(0)
+    after = follow(view_of(IMAGE, track), early, scene, dice, Spans())
+    assert (after.found.filtered is early) == (age_s > 0)
+
+
 @pytest.mark.parametrize("sure", [True, False])
 def test_while_all_hands_are_sure_those_that_are_not_reported_are_followed_without_the_filter(
     sure: bool,

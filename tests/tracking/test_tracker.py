@@ -158,10 +158,8 @@ def test_a_mirrored_sequence_of_a_left_hand_gives_the_same_error(default: Run) -
         ("filter.bounds=clip", "filter.bounds=clip is unknown"),
         ("filter.passes=1.5", "filter.passes=1.5 is not possible; give a whole number"),
         ("lost.believe=60", "lost.believe=60 is not possible; give a number of at least 0 and at"),
-        ("renderer=opengl", "renderer=opengl is unknown"),
         ("compute=tpu", "compute=tpu is unknown"),
         ("hand.side=both", "hand.side"),
-        ("likelihood.naming=usual", "likelihood.naming=usual is unknown"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_one_clear_error(override: str, words: str) -> None:
