@@ -167,7 +167,7 @@ def test_what_the_finder_saw_a_frame_ago_is_looked_at() -> None:
 @pytest.mark.parametrize(
     ("tracks", "hands", "sides"),
     [
-        ([LOST], 1, {"right", "left"}),
+        ([LOST], 1, {"right"}),
         ([known(confirmed=False)], 1, {"right"}),
         ([known(), known(THERE, side="left")], 2, set()),
         ([known(), known(THERE, side="left", believed_s=0.2)], 2, {"left"}),
