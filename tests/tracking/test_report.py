@@ -31,7 +31,7 @@ def hand(number: int, side: str = "right", lost: bool = False, **changes: object
         "side": side.removeprefix("perhaps ") or "right",
         "evidence": SideEvidence(SIDES[side], comparisons=9),
         "believed_s": 0.2 * lost,
-        "log_odds": -2.0 if lost else 2.0,
+        "log_odds": -1.0 if lost else 2.0,
     }
     return track_of(hand_at(0.1 * number), any_hand_model(), **(usual | changes))
 
