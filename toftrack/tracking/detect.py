@@ -107,7 +107,8 @@ def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) ->
     tracks = [hand.track for hand in scene.hands]
     missing = {track.side for track in tracks if rare or not track.reliable}
     confirmed = [track for track in tracks if track.confirmed]
-    if len(state.slots) > 2 or not (tracks or state.told):
+    slots = len(state.slots)
+    if slots > 2 or (not tracks and (slots > 1 or not state.told)):
         missing = set(OTHER_SIDE)
     elif not tracks:
         missing = {str(state.told)}
