@@ -8,6 +8,9 @@ from typing import Any
 
 from toftrack.errors import ToftrackError
 
+MOST_HANDS = 8
+"""That are followed at once."""
+
 
 def check_number(
     key: str,

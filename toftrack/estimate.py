@@ -21,8 +21,6 @@ STATES = {
     "dropped": "the frame came too late",
 }
 """What the tracker does, Estimate.state_name, and how it is said to people."""
-MOST_HANDS = 8
-"""That are followed at once."""
 
 
 @fields_in_help

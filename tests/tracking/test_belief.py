@@ -17,14 +17,14 @@ from toftrack.tracking.state import Track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+NEW = 0.6
 PLAIN = replace(
-    confidence_model(memory=0.0, confidence=0.3, give_up=0.1, whole=0.0),
+    confidence_model(memory=0.0, believe=NEW, confidence=0.3, give_up=0.1, whole=0.0),
     log_odds=LogOdds(0.0, {"log_score": 1.0}),
     whole_odds=LogOdds(0.0, {}),
 )
 """Log odds are just the feature log_score."""
 HIDDEN = {"hidden": 0.5}
-NEW = 0.6
 
 
 def followed(**changes: object) -> Track:
@@ -39,7 +39,7 @@ def judged(
     **features: float,
 ) -> Status:
     log_odds = math.log(chance / (1 - chance))
-    return judge(track, replace(NO_FEATURES, log_score=log_odds, **features), dt_s, NEW, model)
+    return judge(track, replace(NO_FEATURES, log_score=log_odds, **features), dt_s, model)
 
 
 def frames_until_end(
@@ -131,7 +131,7 @@ def test_the_log_odds_are_smoothed_over_time_but_in_a_first_frame() -> None:
     model, features = replace(PLAIN, memory=0.5), replace(NO_FEATURES, log_score=2.0)
     older, new = followed(log_odds=-2.0), followed(age=Duration(), log_odds=-2.0)
     found = [
-        judge(track, features, dt_s, NEW, model).log_odds
+        judge(track, features, dt_s, model).log_odds
         for track, dt_s in ((older, FRAME_S), (older, 2 * FRAME_S), (new, FRAME_S))
     ]
     assert found == pytest.approx([0.0, 1.0, 2.0])

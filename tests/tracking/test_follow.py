@@ -34,15 +34,13 @@ HERE, THERE = hand_at(0.0), hand_at(SAME_PLACE_M + 0.05)
 IMAGE = image_of(HERE, THERE)
 
 
-def followed(
-    track: Track, odds: float, at: torch.Tensor = HERE, beside: tuple[Track, ...] = ()
-) -> Followed:
+def followed(track: Track, odds: float, at: torch.Tensor = HERE) -> Followed:
     """After a frame in which the network sees the hand somewhere, with these log odds."""
-    plain = confidence_model(memory=0.0, whole=0.0, second=0.95)
+    plain = confidence_model(memory=0.0, whole=0.0)
     plain = replace(plain, log_odds=LogOdds(odds, {}), whole_odds=LogOdds(0.0, {}))
     model = replace(right_hand_model(), lost=plain)
     view = view_of(IMAGE, track, detection_of(at), model=model)
-    scene = scene_of(track, *beside, image=IMAGE, model=model)
+    scene = scene_of(track, image=IMAGE, model=model)
     return follow(view, None, scene, torch.Generator().manual_seed(0), Spans())
 
 
@@ -56,15 +54,6 @@ def test_a_track_is_confirmed_once_and_not_believed_while_it_is_lost(
     assert after.track.confirmed == (confirmed or not lost)
     assert after.track.believed_s == pytest.approx(FRAME_S * lost)
     assert after.track.age.seconds == pytest.approx(1.0 + FRAME_S)
-
-
-def test_beside_another_hand_a_new_one_must_be_surer() -> None:
-    new = track_of(HERE, confirmed=False, number=1)
-    other = track_of(THERE, number=0)
-    assert not followed(new, 1.0).status.lost
-    assert followed(new, 1.0, beside=(other,)).status.lost
-    assert not followed(new, 1.0, beside=(replace(other, confirmed=False),)).status.lost
-    assert not followed(new, 4.0, beside=(other,)).status.lost
 
 
 def test_the_particles_follow_the_pose_that_was_found() -> None:

@@ -13,8 +13,9 @@ from helpers.moments import one_hand
 from helpers.videos import video_frames
 
 from toftrack.camera import Camera
+from toftrack.checks import MOST_HANDS
 from toftrack.errors import ToftrackError
-from toftrack.estimate import MOST_HANDS, Estimate, no_estimate
+from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
 from toftrack.views.base import TrackedFrame

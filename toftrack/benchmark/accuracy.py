@@ -33,9 +33,9 @@ from toftrack.benchmark.results import (
     write_text,
 )
 from toftrack.benchmark.runs import SIDES, Job, jobs, run_jobs, sources
+from toftrack.checks import MOST_HANDS
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.estimate import MOST_HANDS
 from toftrack.output.accuracy import Row
 from toftrack.output.accuracy_tables import accuracy_tables, markdown, plain
 from toftrack.safe_files import write_whole

@@ -19,9 +19,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toftrack.checks import check_number
+from toftrack.checks import MOST_HANDS, check_number
 from toftrack.errors import ToftrackError
-from toftrack.estimate import MOST_HANDS
 
 _ABOVE_ZERO = frozenset(
     """

@@ -17,8 +17,9 @@ from typing import Any, Self
 import numpy as np
 
 from toftrack.archives import read_archive
+from toftrack.checks import MOST_HANDS
 from toftrack.errors import ToftrackError
-from toftrack.estimate import MOST_HANDS, Estimate
+from toftrack.estimate import Estimate
 from toftrack.frames import Truth
 from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way

@@ -39,12 +39,9 @@ class Status:
 
 
 def judge(
-    track: Track, features: ConfidenceFeatures, dt_s: float, new: float, model: ConfidenceModel
+    track: Track, features: ConfidenceFeatures, dt_s: float, model: ConfidenceModel
 ) -> Status:
-    """What is thought of an estimate, dt_s after the last.
-
-    new: confidence that a tentative track needs to be confirmed.
-    """
+    """What is thought of an estimate, dt_s after the last."""
     kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
     smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
     whole = kept * track.whole_odds + (1 - kept) * model.whole_odds(features)
@@ -55,7 +52,7 @@ def judge(
     waits = track.confirmed and features.hidden > _HIDDEN
     doubtful = Duration(track.doubtful.seconds + passed / (_PATIENT if waits else 1))
     doubtful = doubtful if confidence < model.give_up else Duration()
-    confirmed = track.confirmed or confidence >= new or probable >= _WHOLE_HAND
+    confirmed = track.confirmed or confidence >= model.believe or probable >= _WHOLE_HAND
     lost = not confirmed or confidence < model.confidence or probable < model.whole
     name = _state_name(features) if lost else "tracking"
     return Status(name, lost, confidence, smooth, whole, doubtful)

@@ -344,8 +344,7 @@ class ConfidenceModel:
     """When an estimate is not to be used, and when its track is given up; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time.  second: or of another hand
-        beside one that was believed.
+    believe: likewise, until a track was believed for the first time.
     give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
     whole: estimates whose mean joint error is below 40 mm with a lower probability are flagged lost
         as well: a hand taken for another one, or turned round, is not to be used at all, while one
@@ -358,7 +357,6 @@ class ConfidenceModel:
 
     confidence: float
     believe: float
-    second: float
     give_up: float
     patience: int
     memory: float
@@ -369,7 +367,7 @@ class ConfidenceModel:
     joints: JointConfidence
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "second", "whole", "give_up", "joint_ok"):
+        for name in ("confidence", "believe", "whole", "give_up", "joint_ok"):
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
         check_number("lost.memory", self.memory, 0, 0.99)
         check_number("lost.patience", self.patience, 0, whole=True)

@@ -138,9 +138,7 @@ def follow(
     score, joints = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
     age_s, last, seen = track.age.seconds, track.features, view.observation
     features = confidence_features(joints, score, age_s, view.detection, last, seen.depth_m, seen.k)
-    beside = any(hand.track.confirmed for hand in scene.hands if hand.track.number != track.number)
-    new = model.lost.second if beside else model.lost.believe
-    status = judge(track, features, dt_s, new, model.lost)
+    status = judge(track, features, dt_s, model.lost)
     # Without refinement the particles stay where they are.
     drawn = drawn_to(found, model) if model.refinement.iterations else early
     track = replace(

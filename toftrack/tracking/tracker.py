@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from toftrack.checks import check_number
+from toftrack.checks import MOST_HANDS, check_number
 from toftrack.compute.quality import Pace, Timekeeper
 from toftrack.compute.threads import at_most, small_operations
 from toftrack.errors import ToftrackError
-from toftrack.estimate import MOST_HANDS, Estimate
+from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage, checked_image
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
