@@ -13,18 +13,18 @@ from helpers.detection import detection_of
 from helpers.rendered import EMPTY, hand_at, scene_of, track_of
 
 from toftrack.compute.pace import FRAME_S
-from toftrack.tracking.association import Seen, are_one, assign, costs, left_over
+from toftrack.tracking.association import SideDetection, assign, costs, same_hand, unassigned
 from toftrack.tracking.state import Track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def seen(x: float, side: str = "right", row: int = -1, **changes: object) -> Seen:
+def seen(x: float, side: str = "right", row: int = -1, **changes: object) -> SideDetection:
     """A hand at a place of the finder, or of the track of a row."""
-    return Seen(replace(detection_of(hand_at(x), side=side), **changes), side, row)
+    return SideDetection(replace(detection_of(hand_at(x), side=side), **changes), side, row)
 
 
-def costs_of(tracks: list[Track], found: list[Seen], dt_s: float = FRAME_S) -> np.ndarray:
+def costs_of(tracks: list[Track], found: list[SideDetection], dt_s: float = FRAME_S) -> np.ndarray:
     return costs(scene_of(*tracks, image=EMPTY).hands, found, dt_s)
 
 
@@ -100,9 +100,9 @@ def test_of_two_detections_at_one_place_the_one_for_which_more_speaks_is_taken()
 
 def test_what_is_no_track_s_is_left_over_each_hand_once() -> None:
     found = [seen(0.0, row=0), seen(0.005), seen(0.3), seen(0.305), seen(0.3, "left"), seen(-0.3)]
-    assert left_over(found, [0]) == [found[2], found[5]]
-    assert left_over(found[:1], [-1]) == [], "a track's own place begins none"
-    assert left_over(found[2:], [0]) == found[-1:], "nor what a track has taken"
+    assert unassigned(found, [0]) == [found[2], found[5]]
+    assert unassigned(found[:1], [-1]) == [], "a track's own place begins none"
+    assert unassigned(found[2:], [0]) == found[-1:], "nor what a track has taken"
 
 
 @pytest.mark.parametrize(
@@ -115,12 +115,12 @@ def test_two_hands_are_one_where_they_could_not_be_both(
 ) -> None:
     first, second = (detection_of(hand) for hand in (hand_at(), hand_at(apart_m, 0.5 + behind_m)))
     palms = first.centre_m.numpy(), second.centre_m.numpy()
-    assert are_one(*palms, first.joints_m[0], second.joints_m[0]) == one
+    assert same_hand(*palms, first.joints_m[0], second.joints_m[0]) == one
 
 
 def test_palms_near_each_other_are_one_hand_s_where_much_of_one_lies_in_the_other() -> None:
     joints, palm = torch.rand(21, 3, generator=torch.Generator().manual_seed(0)), np.zeros(3)
     beside = palm + [0.03, 0.0, 0.0]
-    assert are_one(palm, beside, joints, joints)
-    assert not are_one(palm, beside, joints, joints + 1.0)
-    assert not are_one(palm, palm + [0.1, 0.0, 0.0], joints, joints)
+    assert same_hand(palm, beside, joints, joints)
+    assert not same_hand(palm, beside, joints, joints + 1.0)
+    assert not same_hand(palm, palm + [0.1, 0.0, 0.0], joints, joints)

@@ -10,7 +10,7 @@ from helpers.configured import confidence_model
 from helpers.rendered import hand_at, track_of
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.tracking.association import ends
+from toftrack.tracking.association import track_ends
 from toftrack.tracking.belief import Status, judge, probability
 from toftrack.tracking.confidence import NO_FEATURES, ConfidenceModel, LogOdds
 from toftrack.tracking.state import Track
@@ -49,7 +49,7 @@ def frames_until_end(
     track = track or followed()
     for number in range(1, 500):
         track = replace(track, doubtful=judged(track, 0.05, dt_s, **features).doubtful)
-        if ends(track, False, patience):
+        if track_ends(track, False, patience):
             return number
     return None
 
@@ -84,8 +84,8 @@ def test_a_frame_that_is_not_doubtful_begins_the_patience_anew() -> None:
     track = followed()
     for chance in [0.05] * 4 + [0.2] + [0.05] * 4:
         track = replace(track, doubtful=judged(track, chance).doubtful)
-        assert not ends(track, False, 5)
-    assert ends(replace(track, doubtful=judged(track, 0.05).doubtful), False, 5)
+        assert not track_ends(track, False, 5)
+    assert track_ends(replace(track, doubtful=judged(track, 0.05).doubtful), False, 5)
 
 
 @pytest.mark.parametrize(

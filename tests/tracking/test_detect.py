@@ -20,8 +20,13 @@ from toftrack.detector.parts import FOREARM_PART, Parts
 from toftrack.detector.proposals import Places
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.refinement.shape_fit import first_shape, with_network_length
-from toftrack.tracking.association import Seen
-from toftrack.tracking.detect import Asked, ask, detected, held_out_first
+from toftrack.tracking.association import SideDetection
+from toftrack.tracking.detect import (
+    PendingDetections,
+    finish_detection,
+    held_out_first,
+    start_detection,
+)
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.state import SideEvidence, Track
 from toftrack.tracking.step import step
@@ -43,13 +48,13 @@ LOST = known(believed_s=0.2)
 
 def looked(
     *tracks: Track, found: Sequence[Detection] = (), dt_s: float = FRAME_S, **changes: object
-) -> tuple[FixedDetector, list[Seen], Asked]:
+) -> tuple[FixedDetector, list[SideDetection], PendingDetections]:
     """What a detector was asked in a frame of tracks, what it has seen, and what it still does."""
     detector = changes.pop("detector", None) or FixedDetector(found)
     model = replace(any_hand_model(), detector=detector)
     state = state_of(*tracks, model=model, **changes)
     scene = Scene.of(state.tracks, IMAGE, dt_s, model)
-    return detector, *detected(ask(scene, state), scene, state)
+    return detector, *finish_detection(start_detection(scene, state), scene, state)
 
 
 def at(detection: Detection) -> np.ndarray:
@@ -121,7 +126,7 @@ def test_it_is_asked_about_a_hand_at_the_lens_all_the_same() -> None:
 # Elsewhere.
 
 
-def elsewhere(seen: Sequence[Seen]) -> list[tuple[str, float]]:
+def elsewhere(seen: Sequence[SideDetection]) -> list[tuple[str, float]]:
     """Sides and places of what is seen where no track is."""
     return [(one.side, round(float(one.detection.centre_m[0]), 2)) for one in seen if one.row < 0]
 
@@ -268,8 +273,8 @@ def left_of(seen: Detection, dt_s: float = FRAME_S) -> set[torch.Tensor]:
     depth[105:112, 90:150] = 0.5  # a forearm to the right
     state = state_of(known(), model=model, places=places_of(*others.values()))
     scene = scene_of(*state.tracks, image=replace(IMAGE, depth_m=depth), model=model)
-    asked = Asked([lambda: Seen(seen, "right", 0)], None, False, False)
-    found, _ = detected(asked, replace(scene, dt_s=dt_s), state)
+    asked = PendingDetections([lambda: SideDetection(seen, "right", 0)], None, False, False)
+    found, _ = finish_detection(asked, replace(scene, dt_s=dt_s), state)
     return {pose for pose, one in others.items() if any(one is each.detection for each in found)}
 
 
@@ -292,7 +297,9 @@ def test_what_is_hardly_a_hand_or_was_seen_long_ago_has_no_arm() -> None:
 
 
 def order(*detections: Detection) -> list[Detection]:
-    return [one.detection for one in held_out_first([Seen(one, "right") for one in detections])]
+    return [
+        one.detection for one in held_out_first([SideDetection(one, "right") for one in detections])
+    ]
 
 
 def test_where_nobody_said_which_hand_is_meant_it_is_the_one_that_is_held_out() -> None:

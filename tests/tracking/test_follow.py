@@ -23,10 +23,10 @@ from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.compute.spans import Spans
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.confidence import LogOdds
-from toftrack.tracking.filter import drifted
-from toftrack.tracking.report import Followed
+from toftrack.tracking.filter import predict_particles
+from toftrack.tracking.report import TrackResult
 from toftrack.tracking.state import REFUSED_S, Track, TrackerState
-from toftrack.tracking.step import filtered, follow, kept, step
+from toftrack.tracking.step import filter_track, keep_tracks, step, update_track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -34,14 +34,14 @@ HERE, THERE = hand_at(0.0), hand_at(SAME_PLACE_M + 0.05)
 IMAGE = image_of(HERE, THERE)
 
 
-def followed(track: Track, odds: float, at: torch.Tensor = HERE) -> Followed:
+def followed(track: Track, odds: float, at: torch.Tensor = HERE) -> TrackResult:
     """After a frame in which the network sees the hand somewhere, with these log odds."""
     plain = confidence_model(memory=0.0, whole=0.0)
     plain = replace(plain, log_odds=LogOdds(odds, {}), whole_odds=LogOdds(0.0, {}))
     model = replace(right_hand_model(), lost=plain)
     view = view_of(IMAGE, track, detection_of(at), model=model)
     scene = scene_of(track, image=IMAGE, model=model)
-    return follow(view, None, scene, torch.Generator().manual_seed(0), Spans())
+    return update_track(view, None, scene, torch.Generator().manual_seed(0), Spans())
 
 
 @pytest.mark.parametrize(("odds", "lost"), [(2.0, False), (-4.0, True)])
@@ -81,7 +81,7 @@ def test_it_is_kept_what_was_asked_and_what_hides_the_hand() -> None:
     before[int(hand.nonzero()[:, 0].float().mean()) :] = True
     part = replace(plain.observation, occluder=hand & before, hand=hand & ~before)
     hidden = replace(plain, observation=part)
-    after = [follow(view, None, scene, dice, Spans()).track for view in (plain, seen, hidden)]
+    after = [update_track(view, None, scene, dice, Spans()).track for view in (plain, seen, hidden)]
     assert [one.asked_s for one in after[:2]] == pytest.approx([0.1 + FRAME_S, 0.0])
     assert [one.nearest_m for one in after] == pytest.approx([0.0, 0.0, hidden.expected_m])
 
@@ -91,9 +91,11 @@ def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> No
     track = replace(track, velocity=torch.full_like(track.velocity, 0.1))
     view = view_of(IMAGE, track)
     dice, spans = torch.Generator().manual_seed(0), Spans()
-    shown, other = (filtered(view, FRAME_S, dice, spans, asked) for asked in (True, False))
+    shown, other = (filter_track(view, FRAME_S, dice, spans, asked) for asked in (True, False))
     assert shown.particles.std(0).any() and not other.particles.std(0).any()
-    torch.testing.assert_close(other.mean, drifted(track, FRAME_S, right_hand_model()).mean)
+    torch.testing.assert_close(
+        other.mean, predict_particles(track, FRAME_S, right_hand_model()).mean
+    )
     torch.testing.assert_close(other.weights, track.weights)
     assert 0.0 < float(other.mean[0, 0]) < 0.1 * FRAME_S
 
@@ -103,9 +105,12 @@ def test_particles_that_were_filtered_before_are_not_those_of_a_track_that_begin
     age_s: float,
 ) -> None:
     track = track_of(HERE, age=Duration(age_s))
-    early, scene = drifted(track, FRAME_S, right_hand_model()), scene_of(track, image=IMAGE)
+    early, scene = (
+        predict_particles(track, FRAME_S, right_hand_model()),
+        scene_of(track, image=IMAGE),
+    )
     dice = torch.Generator().manual_seed(0)
-    after = follow(view_of(IMAGE, track), early, scene, dice, Spans())
+    after = update_track(view_of(IMAGE, track), early, scene, dice, Spans())
     assert (after.found.filtered is early) == (age_s > 0)
 
 
@@ -127,7 +132,7 @@ def test_while_all_hands_are_sure_those_that_are_not_reported_are_followed_witho
 
 def going_on(*tracks: Track) -> TrackerState:
     numbered = [replace(track, number=at) for at, track in enumerate(tracks)]
-    return kept(state_of(), numbered, right_hand_model())
+    return keep_tracks(state_of(), numbered, right_hand_model())
 
 
 def numbers(*tracks: Track) -> list[int]:

@@ -14,8 +14,8 @@ from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.tracking.belief import Status
 from toftrack.tracking.confidence import JOINT_FEATURES
-from toftrack.tracking.filter import Filtered, Found
-from toftrack.tracking.report import Followed, report
+from toftrack.tracking.filter import ParticleSet, PoseEstimate
+from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.state import SideEvidence, Track, TrackerState
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -36,14 +36,14 @@ def hand(number: int, side: str = "right", lost: bool = False, **changes: object
     return track_of(hand_at(0.1 * number), any_hand_model(), **(usual | changes))
 
 
-def followed(track: Track) -> Followed:
+def followed(track: Track) -> TrackResult:
     """Its pose is what was found; the wrist is where its number says."""
     model = any_hand_model()
-    particles = Filtered(track.particles, track.weights, track.mean)
-    found = Found(particles, track.pose, track.trend, *model.nearest(track.pose))
+    particles = ParticleSet(track.particles, track.weights, track.mean)
+    found = PoseEstimate(particles, track.pose, track.trend, *model.nearest(track.pose))
     lost = not track.reliable
     status = Status("searching" if lost else "tracking", lost, confidence=0.9)
-    return Followed(view_of(EMPTY, track, model=model), track, found, 0.8, status)
+    return TrackResult(view_of(EMPTY, track, model=model), track, found, 0.8, status)
 
 
 def before(hands: int = 1, told: str | None = None, **slot: object) -> TrackerState:

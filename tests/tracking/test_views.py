@@ -25,18 +25,18 @@ from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape, with_network_length
-from toftrack.tracking.association import Seen
+from toftrack.tracking.association import SideDetection
 from toftrack.tracking.candidates import View
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.sides import changes_side, side_log_odds
 from toftrack.tracking.state import SideEvidence, Slot, Track
 from toftrack.tracking.views import (
-    begun,
-    continued,
+    begin_tracks,
+    continue_track,
     known_shape,
-    most_new,
-    observed,
+    max_new_tracks,
     predicted_view,
+    update_shape,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -50,8 +50,8 @@ def model() -> TrackerModel:
     return replace(any_hand_model(), detector=FixedDetector())
 
 
-def seen(pose: torch.Tensor, side: str = "right", row: int = -1) -> Seen:
-    return Seen(detection_of(pose, side=side), side, row)
+def seen(pose: torch.Tensor, side: str = "right", row: int = -1) -> SideDetection:
+    return SideDetection(detection_of(pose, side=side), side, row)
 
 
 def off_m(view: View, pose: torch.Tensor) -> float:
@@ -64,15 +64,18 @@ def off_m(view: View, pose: torch.Tensor) -> float:
 
 
 def gone_on(
-    found: Seen | None, image: DepthImage = BOTH, told: str | None = None, **changes: object
+    found: SideDetection | None,
+    image: DepthImage = BOTH,
+    told: str | None = None,
+    **changes: object,
 ) -> View | None:
     track = track_of(HERE, number=3, **changes)
     scene = scene_of(track, image=image, model=model())
-    return continued(scene, 0, predicted_view(scene, 0), found, told)
+    return continue_track(scene, 0, predicted_view(scene, 0), found, told)
 
 
 @pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(hand_at(0.02)), seen(HERE)])
-def test_a_track_goes_on_where_it_is_predicted(found: Seen | None) -> None:
+def test_a_track_goes_on_where_it_is_predicted(found: SideDetection | None) -> None:
     view = gone_on(found)
     assert view is not None and view.track.age == Duration(1.0)
     assert view.detection.empty == (found is None)
@@ -88,7 +91,7 @@ def test_a_track_that_was_seen_elsewhere_begins_anew_there_and_is_the_same_hand(
 
 
 @pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(THERE)])
-def test_a_track_does_not_go_on_where_nothing_can_be_its_hand(found: Seen | None) -> None:
+def test_a_track_does_not_go_on_where_nothing_can_be_its_hand(found: SideDetection | None) -> None:
     assert gone_on(found, EMPTY) is None
 
 
@@ -100,7 +103,7 @@ def test_the_time_since_a_comparison_goes_on() -> None:
 # Of which side.
 
 
-def of_both(side: str = "right") -> Seen:
+def of_both(side: str = "right") -> SideDetection:
     """What is seen at the track's place, as a hand of either side."""
     other = detection_of(HERE, side="left" if side == "right" else "right")
     return replace(seen(HERE, side, 0), mirrored=other)
@@ -135,11 +138,15 @@ def test_a_track_changes_to_the_side_that_is_likelier(
 
 
 def began(
-    new: Sequence[Seen], *tracks: Track, image: DepthImage = BOTH, hands: int = 1, **changes: object
+    new: Sequence[SideDetection],
+    *tracks: Track,
+    image: DepthImage = BOTH,
+    hands: int = 1,
+    **changes: object,
 ) -> list[View]:
     used = model()
     state = state_of(*tracks, hands=hands, model=used, **changes)
-    views = begun(scene_of(*tracks, image=image, model=used), new, state)
+    views = begin_tracks(scene_of(*tracks, image=image, model=used), new, state)
     return [view for view in views if view is not None]
 
 
@@ -147,7 +154,7 @@ def test_a_track_begins_tentatively_at_the_pose_that_explains_the_image() -> Non
     truth = bent(HERE, 1, 0.3)
     detection = detection_of(torch.cat((HERE, bent(HERE, 2, 0.8), truth)))
     detection = replace(detection, keypoints=detection_of(truth).keypoints)
-    (view,) = began([Seen(detection, "right")], image=image_of(truth))
+    (view,) = began([SideDetection(detection, "right")], image=image_of(truth))
     assert off_m(view, truth) < 0.005
     assert not (view.track.confirmed or view.track.reliable or view.track.age.begun)
 
@@ -171,7 +178,7 @@ def test_as_many_tracks_are_tentative_as_hands_are_missing_or_one(
 ) -> None:
     for tentative in range(most + 1):
         tracks = [track_of(HERE, confirmed=at < confirmed) for at in range(confirmed + tentative)]
-        assert most_new(state_of(*tracks, hands=hands)) == most - tentative
+        assert max_new_tracks(state_of(*tracks, hands=hands)) == most - tentative
 
 
 def test_tracks_begin_where_there_is_room_the_first_ones_first_each_with_a_number() -> None:
@@ -200,8 +207,8 @@ def length_m(shape: ShapeEstimate) -> float:
 
 def test_a_track_begins_with_the_length_that_was_detected_and_keeps_it() -> None:
     short, new = detection_of(HERE, log_size=SHORT), track_of(HERE, age=Duration())
-    assert length_m(observed(new, short, model()).shape) == pytest.approx(0.152, rel=1e-3)
-    older = observed(track_of(HERE), short, model())
+    assert length_m(update_shape(new, short, model()).shape) == pytest.approx(0.152, rel=1e-3)
+    older = update_shape(track_of(HERE), short, model())
     assert older.shape.applied == first_shape().applied
 
 

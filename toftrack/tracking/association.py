@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from toftrack.detector.hand_detector import Detection, merit
 from toftrack.detector.proposals import SAME_PLACE_M
-from toftrack.tracking.filter import Predicted
+from toftrack.tracking.filter import PredictedHand
 from toftrack.tracking.posterior import touching
 from toftrack.tracking.state import Track
 
@@ -36,7 +36,7 @@ _TENTATIVE_S = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SideDetection:
     """A detection as a hand of a side.
 
     row: of the track at whose place it was; -1 = a place of the finder.
@@ -49,7 +49,7 @@ class Seen:
     mirrored: Detection | None = None
 
 
-def costs(hands: Sequence[Predicted], seen: Sequence[Seen], dt_s: float) -> np.ndarray:
+def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: float) -> np.ndarray:
     """(B, D) minus the log likelihood of each detection as each track's hand; inf where it is none.
 
     It is half the squared distance of the palms in standard deviations, less what speaks for a hand
@@ -76,7 +76,7 @@ def assign(cost: np.ndarray) -> list[int]:
     return [int(column) if column < columns else -1 for column in found]
 
 
-def are_one(
+def same_hand(
     first_m: np.ndarray, second_m: np.ndarray, first: torch.Tensor, second: torch.Tensor
 ) -> bool:
     """Whether two hands are one.  first_m, second_m: (3,) palms.  first, second: (21, 3) joints."""
@@ -86,27 +86,27 @@ def are_one(
     return apart < _SAME_PALM_M or float(touching(first[None], second)) > _SAME_JOINTS
 
 
-def left_over(seen: Sequence[Seen], taken: Sequence[int]) -> list[Seen]:
+def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[SideDetection]:
     """The detections at places of the finder that are no track's, each hand once."""
     explained = [seen[column] for column in taken if column >= 0]
     new = [one for column, one in enumerate(seen) if one.row < 0 and column not in taken]
-    found: list[Seen] = []
+    found: list[SideDetection] = []
     for one in new:
         if not any(_same(one, other) for other in [*explained, *found]):
             found.append(one)
     return found
 
 
-def _same(first: Seen, second: Seen) -> bool:
+def _same(first: SideDetection, second: SideDetection) -> bool:
     """Whether two detections are of one hand; two hands of one side are never close to another."""
     palms = [one.detection.centre_m.numpy() for one in (first, second)]
     if first.side == second.side and np.linalg.norm(palms[0] - palms[1]) < SAME_PLACE_M:
         return True
     joints = [one.detection.keypoints.points_m for one in (first, second)]
-    return are_one(palms[0], palms[1], joints[0], joints[1])
+    return same_hand(palms[0], palms[1], joints[0], joints[1])
 
 
-def ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
+def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
     """Whether a track ends: nobody sees its hand any more, or it is none."""
     if patience and track.doubtful.begun and track.doubtful.reached(patience):
         return True

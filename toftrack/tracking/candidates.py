@@ -152,7 +152,7 @@ def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tenso
     return detection.first(max(1, min(count, likely))).states(fitted.ratio)
 
 
-def detected_poses(
+def detector_poses(
     detection: Detection,
     observation: Observation,
     fitted: FittedHand,
@@ -185,7 +185,7 @@ def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, floa
     """
     model = view.model
     count = model.detector.settings.hypotheses
-    poses = detected_poses(view.detection, view.observation, view.fitted, model, count)
+    poses = detector_poses(view.detection, view.observation, view.fitted, model, count)
     if model.refinement.iterations:
         poses = torch.cat((poses, view.refined(poses)))
     values = view.posterior(keypoints)(poses)
@@ -207,7 +207,7 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
     if view.covered:
         held = Hypotheses.of(view.track.pose, Source.PREVIOUS)
         return replace(held, log_posterior=posterior(view.track.pose))
-    detected = detected_poses(view.detection, view.observation, view.fitted, model, 1)
+    detected = detector_poses(view.detection, view.observation, view.fitted, model, 1)
     previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
     tables = [
         Hypotheses.of(previous, Source.PREVIOUS),

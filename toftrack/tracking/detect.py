@@ -12,7 +12,7 @@ from toftrack.detector.crops import CROP_M
 from toftrack.detector.hand_detector import Detection, merit
 from toftrack.detector.parts import FOREARM_PART
 from toftrack.detector.proposals import SAME_PLACE_M, Places
-from toftrack.tracking.association import Seen
+from toftrack.tracking.association import SideDetection
 from toftrack.tracking.confidence import log_odds
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import comparison_due
@@ -31,7 +31,7 @@ both smaller than this."""
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class PendingDetections:
     """Networks that work on a frame.
 
     own: each waits for the detection at a track's place.  finding: waits for the finder's places;
@@ -41,13 +41,13 @@ class Asked:
     found: the finder looks at this frame.
     """
 
-    own: Sequence[Callable[[], Seen]]
+    own: Sequence[Callable[[], SideDetection]]
     finding: Callable[[], Places] | None
     at_once: bool
     found: bool
 
 
-def ask(scene: Scene, state: TrackerState) -> Asked:
+def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     """Begin to look at the tracks' places, and in the whole image, beside whatever comes next."""
     detector = scene.model.detector
     several = len(state.slots) > 2 and scene.dt_s <= _RARE_S
@@ -61,10 +61,12 @@ def ask(scene: Scene, state: TrackerState) -> Asked:
     own = [_start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row)]
     if due and not at_once:
         finding = detector.start_search(*whole)
-    return Asked(own, finding, at_once, due)
+    return PendingDetections(own, finding, at_once, due)
 
 
-def detected(asked: Asked, scene: Scene, state: TrackerState) -> tuple[list[Seen], Asked]:
+def finish_detection(
+    asked: PendingDetections, scene: Scene, state: TrackerState
+) -> tuple[list[SideDetection], PendingDetections]:
     """All detections of a frame; and what is still waited for."""
     places = state.places
     if asked.at_once and asked.finding is not None:
@@ -88,7 +90,7 @@ def _is_asked(scene: Scene, row: int) -> bool:
     return not sure or waited or comparison_due(track, scene.dt_s)
 
 
-def _start(scene: Scene, row: int) -> Callable[[], Seen]:
+def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
     """The detection at a track's place, begun beside whatever does not need it; of both sides where
     they are to be compared.
     """
@@ -98,10 +100,12 @@ def _start(scene: Scene, row: int) -> Callable[[], Seen]:
     wait, mirrored = start(*at, side, hand.up_m[0]), None
     if comparison_due(hand.track, scene.dt_s):
         mirrored = start(*at, OTHER_SIDE[side], hand.up_m[0])
-    return lambda: Seen(wait(), side, row, None if mirrored is None else mirrored())
+    return lambda: SideDetection(wait(), side, row, None if mirrored is None else mirrored())
 
 
-def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) -> list[Seen]:
+def _elsewhere(
+    scene: Scene, state: TrackerState, places: Places, rare: bool
+) -> list[SideDetection]:
     """What is seen at places of the finder, as a hand of any side that is missing."""
     image = scene.image if rare else scene.unexplained()
     tracks = [hand.track for hand in scene.hands]
@@ -114,14 +118,14 @@ def _elsewhere(scene: Scene, state: TrackerState, places: Places, rare: bool) ->
         missing = {str(state.told)}
     elif len(confirmed) == 1 and confirmed[0].reliable:  # else what is seen may be its hand
         missing.add(OTHER_SIDE[confirmed[0].side])
-    seen: list[Seen] = []
+    seen: list[SideDetection] = []
     for side in sorted(missing, reverse=True):  # right first
         # A hand that is hardly seen may look like one of the other side.
         known = [hand.palm_m[0] for hand in scene.hands if hand.track.side != side and not rare]
         there = _apart_from(known, places)
         if len(there.centre_m):
             found = scene.model.detector.look(image.depth_m, image.k, there, side)
-            seen += [Seen(one, side) for one in found]
+            seen += [SideDetection(one, side) for one in found]
     seen.sort(key=lambda one: -one.detection.merit)
     return seen if tracks or state.told else held_out_first(seen)
 
@@ -130,7 +134,7 @@ Arm = tuple[np.ndarray, np.ndarray]
 """A wrist, and the direction of the forearm from there, (3,) each."""
 
 
-def _arm(scene: Scene, seen: Seen) -> Arm | None:
+def _arm(scene: Scene, seen: SideDetection) -> Arm | None:
     """The arm of a hand that is seen: where the pose network says that its forearm is, or where its
     fingers do not point.
     """
@@ -163,7 +167,7 @@ def _apart_from(known: Sequence[np.ndarray], places: Places) -> Places:
     return Places(places.centre_m[rows], places.probability[rows])
 
 
-def held_out_first(seen: Sequence[Seen]) -> list[Seen]:
+def held_out_first(seen: Sequence[SideDetection]) -> list[SideDetection]:
     """First the nearest of those hands that are seen about as well as the best one: where nobody
     said which hand is meant, it is the one that is held out to the camera.
     """

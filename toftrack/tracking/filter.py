@@ -42,7 +42,7 @@ def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Ten
 
 
 @dataclass(frozen=True, eq=False)
-class Predicted:
+class PredictedHand:
     """A track's hand as it is expected in a frame.
 
     pose: (1, 27).  joints_m: (21, 3).
@@ -61,7 +61,7 @@ class Predicted:
     depths: Expected
 
 
-def predict(track: Track, dt_s: float, model: FilterModel) -> Predicted:
+def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
     """A track's hand dt_s after its last frame: moved on, its fingers as they were."""
     fitted = model.hand(track.side, track.shape)
     moved = predicted_motion(track, dt_s, model.filter)
@@ -78,7 +78,7 @@ def predict(track: Track, dt_s: float, model: FilterModel) -> Predicted:
     approach = _APPROACH_M_S * dt_s + max(0.0, -float(moved[2]))
     nearest = max(nearest, track.nearest_m - approach)
     depths = Expected(nearest, farthest, tuple(joints.mean(0).tolist()))
-    return Predicted(track, fitted, pose, joints, palm, up, depths)
+    return PredictedHand(track, fitted, pose, joints, palm, up, depths)
 
 
 def run_filter(
@@ -88,7 +88,7 @@ def run_filter(
     model: FilterModel,
     generator: torch.Generator,
     spans: Spans,
-) -> Filtered:
+) -> ParticleSet:
     """The filter's particles of a frame, weighed by the image.
 
     Nothing within waits for the device, so that it is not held up between passes.
@@ -116,18 +116,18 @@ def run_filter(
         motions.redraw,
         generator_on(model.device, generator),
     )
-    return Filtered(particles, weights, motions.mean(particles, weights))
+    return ParticleSet(particles, weights, motions.mean(particles, weights))
 
 
-def drifted(track: Track, dt_s: float, model: FilterModel) -> Filtered:
+def predict_particles(track: Track, dt_s: float, model: FilterModel) -> ParticleSet:
     """A track's particles dt_s later, where no image says where its hand is."""
     motions, moved = model.backend.motions, predicted_motion(track, dt_s, model.filter)[None]
     particles = motions.compose(track.particles, on_device(moved, model.device))
-    return Filtered(particles, track.weights, motions.compose(track.mean, moved))
+    return ParticleSet(particles, track.weights, motions.compose(track.mean, moved))
 
 
 @dataclass(frozen=True, eq=False)
-class Filtered:
+class ParticleSet:
     """What the filter makes of a frame.
 
     particles, weights: (N, 6 + d) and (N,), on the model's device.  mean: (1, 6 + d) of them.
@@ -139,14 +139,14 @@ class Filtered:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class PoseEstimate:
     """What a frame's filter and choice found.
 
     filtered: the particles.  pose: (1, 27) the estimate.  trend: (27,) see steadying.
     particle: (1, 6 + d) the pose in the pose space.  offset: (21,) rad, how far the pose lies off.
     """
 
-    filtered: Filtered
+    filtered: ParticleSet
     pose: Tensor
     trend: Tensor
     particle: Tensor
@@ -158,7 +158,7 @@ class Found:
         return float(self.offset.square().mean().sqrt())
 
 
-def drawn_to(found: Found, model: FilterModel) -> Filtered:
+def shift_particles(found: PoseEstimate, model: FilterModel) -> ParticleSet:
     """The particles as they follow the estimate."""
     filtered, motions = found.filtered, model.backend.motions
     space = model.space_of(filtered.particles)
@@ -166,10 +166,10 @@ def drawn_to(found: Found, model: FilterModel) -> Filtered:
     particles = motions.compose(filtered.particles, on_device(change, model.device))
     latent = bound(particles[:, 6:], space.lower, space.upper, "truncate")
     particles[:, 6:] = latent
-    return Filtered(particles, filtered.weights, found.particle)
+    return ParticleSet(particles, filtered.weights, found.particle)
 
 
-def velocity_after(track: Track, mean: Tensor, dt_s: float, model: FilterModel) -> Tensor:
+def update_velocity(track: Track, mean: Tensor, dt_s: float, model: FilterModel) -> Tensor:
     """(6 + d,) a second, smoothed; 0 in a track's first frame."""
     if not track.age.begun:
         return torch.zeros_like(track.velocity)

@@ -26,11 +26,11 @@ from toftrack.render.segmentation import Observation
 from toftrack.tracking.belief import Status
 from toftrack.tracking.candidates import image_term
 from toftrack.tracking.confidence import propagated_sigma
-from toftrack.tracking.filter import Found, predict, run_filter, velocity_after
+from toftrack.tracking.filter import PoseEstimate, predict, run_filter, update_velocity
 from toftrack.tracking.model import FilterModel, FittedHand
-from toftrack.tracking.report import absent, emitted, estimate_of
+from toftrack.tracking.report import finish_estimate, make_estimate, report_absence
 from toftrack.tracking.state import StepInfo, Track, TrackerState
-from toftrack.tracking.step import Stepped
+from toftrack.tracking.step import StepResult
 
 _WIDEST_PALM_M = 0.06
 """Half the breadth of the broadest hand's palm with the ball of the thumb."""
@@ -150,13 +150,13 @@ class PaperModel(FilterModel):
 
 
 @small_operations()
-def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Stepped:
+def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> StepResult:
     """One frame: segment, start if there is no hand yet, filter, take the mean.
 
     A pure function: the state given stays as it is, and gives the same again. In an image without
     anything in it, the particles wait as they were.
     """
-    spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
+    spans, generator, dt_s = Spans(), state.random_generator(), state.elapsed_s(image)
     state = state.at(image)
     (slot,), track = state.slots, state.tracks[0] if state.tracks else None
     fitted, sure = model.hand(slot.side, slot.shape), 1.0 if state.told else 0.5
@@ -164,7 +164,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         expected = None if track is None else predict(track, dt_s, model).depths
         observation = model.segmentation(image.depth_m, image.k, expected)
         if observation.empty:
-            slot, estimate = absent(slot, image, model, 1)
+            slot, estimate = report_absence(slot, image, model, 1)
             estimate = replace(estimate, side=slot.side, side_probability=sure)
             none = torch.zeros(0, 6 + model.space.dims, device=model.device)
             info = StepInfo(observation, none, none[:, 0], spans.seconds())
@@ -177,8 +177,8 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         pose = model.decode(filtered.mean)
     score = likelihood.score(pose)
     status = model.lost.judge(track, score)
-    found = Found(filtered, pose, track.trend, *model.nearest(pose))
-    estimate = estimate_of(image, found, score, status, fitted, model)
+    found = PoseEstimate(filtered, pose, track.trend, *model.nearest(pose))
+    estimate = make_estimate(image, found, score, status, fitted, model)
     sigma_m = _particles_sigma(estimate.joints_m, found, track, fitted, model)
     hidden = expected is not None and bool(observation.occluder.any())
     track = replace(
@@ -186,7 +186,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         particles=filtered.particles,
         weights=filtered.weights,
         mean=filtered.mean,
-        velocity=velocity_after(track, filtered.mean, dt_s, model),
+        velocity=update_velocity(track, filtered.mean, dt_s, model),
         pose=pose,
         age=track.age.extended(dt_s),
         confirmed=track.confirmed or not status.lost,
@@ -196,7 +196,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
     estimate = replace(estimate, joint_sigma_m=sigma_m, joint_ok=ok)
     estimate = replace(estimate, side=slot.side, side_probability=sure)
-    slot, estimate = emitted(slot, image, estimate, fitted.shape, dt_s, model)
+    slot, estimate = finish_estimate(slot, image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
     slot = replace(slot, track=track.number)
     state = replace(state, generator=generator.get_state(), slots=(slot,), tracks=(track,))
@@ -204,7 +204,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
 
 
 def _particles_sigma(
-    joints_m: np.ndarray, found: Found, track: Track, fitted: FittedHand, model: FilterModel
+    joints_m: np.ndarray, found: PoseEstimate, track: Track, fitted: FittedHand, model: FilterModel
 ) -> np.ndarray:
     """(21, 3) standard deviations of joints by the particles alone, as joint_sigma_m has them."""
     motions, filtered = model.backend.motions, found.filtered

@@ -26,7 +26,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.tracking.belief import Status, probability
 from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import joint_features
-from toftrack.tracking.filter import Found
+from toftrack.tracking.filter import PoseEstimate
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import side_log_odds
@@ -42,34 +42,34 @@ _GONE_S = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class TrackResult:
     """A track after a frame: what it was compared with, what was found, its F-measure, and what is
     thought of it.
     """
 
     view: View
     track: Track
-    found: Found
+    found: PoseEstimate
     score: float
     status: Status
 
 
 def report(
-    state: TrackerState, followed: Sequence[Followed], scene: Scene, spans: Spans
+    state: TrackerState, followed: Sequence[TrackResult], scene: Scene, spans: Spans
 ) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
     """The state with its slots, and for each slot what was seen and the estimate.
 
     state: with the tracks that go on.
     """
-    sides = {one.track.number: log_odds_of(one.track, state) for one in followed}
+    sides = {one.track.number: right_log_odds(one.track, state) for one in followed}
     slots, infos, estimates = [], list[StepInfo | None](), []
-    for number, one in enumerate(assigned(state, followed, sides)):
+    for number, one in enumerate(assign_slots(state, followed, sides)):
         slot, info = state.slots[number], None
         if one is None:
-            slot, estimate = absent(slot, scene.image, scene.model, len(state.slots))
+            slot, estimate = report_absence(slot, scene.image, scene.model, len(state.slots))
         else:
             right = sides[one.track.number]
-            slot, info, estimate = reported(number, one, right, state, scene)
+            slot, info, estimate = report_track(number, one, right, state, scene)
             info = replace(info, seconds=spans.seconds())
         slots.append(slot)
         infos.append(info)
@@ -77,15 +77,15 @@ def report(
     return replace(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
 
 
-def log_odds_of(track: Track, state: TrackerState) -> float:
+def right_log_odds(track: Track, state: TrackerState) -> float:
     """Log odds that a track is a right hand, by all that is known."""
     others = [one for one in state.tracks if one.confirmed and one.number != track.number]
     return side_log_odds(track, others, state.told)
 
 
-def assigned(
-    state: TrackerState, followed: Sequence[Followed], sides: Mapping[int, float]
-) -> list[Followed | None]:
+def assign_slots(
+    state: TrackerState, followed: Sequence[TrackResult], sides: Mapping[int, float]
+) -> list[TrackResult | None]:
     """The track of each slot: the sum of what they are worth to their slots is largest."""
     worth = np.zeros((len(state.slots), len(followed) + len(state.slots)))
     for number, slot in enumerate(state.slots):
@@ -119,8 +119,8 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
     return worth + 0.1 + 0.3 * min(max(agrees, -_MOST), _MOST)
 
 
-def reported(
-    number: int, one: Followed, right: float, state: TrackerState, scene: Scene
+def report_track(
+    number: int, one: TrackResult, right: float, state: TrackerState, scene: Scene
 ) -> tuple[Slot, StepInfo, Estimate]:
     """A slot with its track after a frame, what was seen of it, and the estimate.
 
@@ -129,7 +129,7 @@ def reported(
     slot, track, view, model = state.slots[number], one.track, one.view, scene.model
     if slot.track != track.number:
         slot = replace(slot, gesture=None, joint_features=np.zeros_like(slot.joint_features))
-    estimate = estimate_of(scene.image, one.found, one.score, one.status, view.fitted, model)
+    estimate = make_estimate(scene.image, one.found, one.score, one.status, view.fitted, model)
     image = scene.image  # as the camera took it, and not reduced
     rows = joint_features(
         estimate.joints_m,
@@ -157,7 +157,7 @@ def reported(
         joint_confidence=confidence,
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
-    slot, estimate = emitted(slot, image, estimate, view.fitted.shape, scene.dt_s, model)
+    slot, estimate = finish_estimate(slot, image, estimate, view.fitted.shape, scene.dt_s, model)
     detection = None if view.detection.empty else view.detection
     particles = one.found.filtered
     info = StepInfo(
@@ -181,7 +181,9 @@ def reported(
     return slot, info, estimate
 
 
-def absent(slot: Slot, image: DepthImage, model: FilterModel, count: int) -> tuple[Slot, Estimate]:
+def report_absence(
+    slot: Slot, image: DepthImage, model: FilterModel, count: int
+) -> tuple[Slot, Estimate]:
     """A slot without a hand, and its estimate; of the only slot the last believed one stands."""
     nothing = no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
     if count > 1:
@@ -191,9 +193,9 @@ def absent(slot: Slot, image: DepthImage, model: FilterModel, count: int) -> tup
     return replace(slot, track=-1, gesture=gesture), estimate
 
 
-def estimate_of(
+def make_estimate(
     image: DepthImage,
-    found: Found,
+    found: PoseEstimate,
     score: float,
     status: Status,
     fitted: FittedHand,
@@ -225,7 +227,7 @@ def estimate_of(
     )
 
 
-def emitted(
+def finish_estimate(
     slot: Slot,
     image: DepthImage,
     estimate: Estimate,

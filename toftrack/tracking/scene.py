@@ -13,7 +13,7 @@ import torch
 from toftrack.frames import DepthImage
 from toftrack.render.model_image import cpu_surface, parted, range_image
 from toftrack.render.segmentation import Expected, Observation, reduce_image
-from toftrack.tracking.filter import Predicted, predict
+from toftrack.tracking.filter import PredictedHand, predict
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
 
@@ -38,7 +38,7 @@ class Scene:
     image: DepthImage
     depth_m: np.ndarray
     k: np.ndarray
-    hands: tuple[Predicted, ...]
+    hands: tuple[PredictedHand, ...]
     dt_s: float
     model: TrackerModel
 

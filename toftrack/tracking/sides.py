@@ -79,7 +79,7 @@ def comparison_due(track: Track, dt_s: float) -> bool:
     return track.evidence.age_s + dt_s >= (_SURE_S if known else _UNSURE_S)
 
 
-def compare(view: View, mirrored: Detection, image: DepthImage) -> SideEvidence:
+def compare_sides(view: View, mirrored: Detection, image: DepthImage) -> SideEvidence:
     """A track's evidence after one more comparison.
 
     mirrored: what the pose network says of the other side at the hand's place.
@@ -90,7 +90,7 @@ def compare(view: View, mirrored: Detection, image: DepthImage) -> SideEvidence:
         return evidence
     gain = _best_of_side(view, view.detection, side)
     gain -= _best_of_side(view, mirrored, OTHER_SIDE[side])
-    gain += _NETWORK * _said(view.detection, mirrored, side, image, view.model)
+    gain += _NETWORK * _network_lead(view.detection, mirrored, side, image, view.model)
     gain = gain if side == "right" else -gain
     comparisons = evidence.comparisons + 1
     fits = evidence.fits + _WEIGHT * min(max(gain, -_LARGEST), _LARGEST)
@@ -114,7 +114,7 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     return max(best_start(seen, _KEYPOINTS)[1], _WORST)
 
 
-def _said(
+def _network_lead(
     detection: Detection, mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
 ) -> float:
     """How much surer the network is of a side than of the other one, log odds.
@@ -122,7 +122,7 @@ def _said(
     It is asked about the crop of either side's pose, for a crop that is turned as a pose has it
     makes that pose's side the likelier one.
     """
-    said = _of_network(detection) - _of_network(mirrored)
+    said = _network_log_odds(detection) - _network_log_odds(mirrored)
     if mirrored.empty:
         return said
     centre, up = mirrored.centre_m.numpy()[None], mirrored.up[None]
@@ -130,10 +130,10 @@ def _said(
         model.detector.detect(image.depth_m, image.k, centre, one, up)[0]
         for one in (side, OTHER_SIDE[side])
     )
-    return 0.5 * (said + _of_network(own) - _of_network(other))
+    return 0.5 * (said + _network_log_odds(own) - _network_log_odds(other))
 
 
-def _of_network(detection: Detection) -> float:
+def _network_log_odds(detection: Detection) -> float:
     """That a hand is of the side that was looked for, by the network; 0 where it was not asked.
 
     Most hands that it was trained on are of that side, which cancels in the difference of both.

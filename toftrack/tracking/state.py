@@ -160,7 +160,7 @@ class TrackerState:
             timestamp_s=image.timestamp_s,
         )
 
-    def resumed(self) -> torch.Generator:
+    def random_generator(self) -> torch.Generator:
         """The random generator, on the CPU."""
         made = torch.Generator()
         made.set_state(self.generator)

@@ -14,34 +14,34 @@ from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.association import are_one, assign, costs, ends, left_over, sureness
+from toftrack.tracking.association import assign, costs, same_hand, sureness, track_ends, unassigned
 from toftrack.tracking.belief import judge
 from toftrack.tracking.candidates import View, keypoints_of, propose
 from toftrack.tracking.confidence import confidence_features
-from toftrack.tracking.detect import ask, detected
+from toftrack.tracking.detect import finish_detection, start_detection
 from toftrack.tracking.filter import (
-    Filtered,
-    Found,
-    drawn_to,
-    drifted,
+    ParticleSet,
+    PoseEstimate,
     new_track,
     predict,
+    predict_particles,
     run_filter,
-    velocity_after,
+    shift_particles,
+    update_velocity,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.report import Followed, report
+from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.select import select
 from toftrack.tracking.state import NO_PLACES, StepInfo, Track, TrackerState
-from toftrack.tracking.views import begun, continued, most_new, predicted_view
+from toftrack.tracking.views import begin_tracks, continue_track, max_new_tracks, predicted_view
 
-Stepped = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
+StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state, and for each slot what was seen, None where nothing was, and the estimate."""
 
 
 @small_operations()
-def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped:
+def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepResult:
     """One frame of all hands; a pure function: the state given stays as it is.
 
     Tracking by detection (SORT: Bewley et al., ICIP 2016) of hands that are each followed by a
@@ -58,31 +58,31 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
     6. Judge it, learn the hand's shape, and end what nobody sees any more.
     7. Report the tracks in the slots that the user asked for.
     """
-    spans, generator, dt_s = Spans(), state.resumed(), state.elapsed_s(image)
+    spans, generator, dt_s = Spans(), state.random_generator(), state.elapsed_s(image)
     before = state.at(image)
     with spans("detector"):
         scene = Scene.of(before.tracks, image, dt_s, model)
-        asked = ask(scene, before)
+        asked = start_detection(scene, before)
         views = [predicted_view(scene, row) for row in range(len(scene.hands))]
-    dice = _dice(generator, len(views) + most_new(before))
-    early = dict[int, Filtered]()
+    dice = _dice(generator, len(views) + max_new_tracks(before))
+    early = dict[int, ParticleSet]()
     if not asked.at_once:  # the networks need nothing of it, and it needs little of them
         shown = {slot.track for slot in before.slots}
         early = {
-            row: filtered(view, dt_s, dice[row], spans, view.track.number in shown)
+            row: filter_track(view, dt_s, dice[row], spans, view.track.number in shown)
             for row, view in enumerate(views)
             if view is not None
         }
     with spans("detector"):
-        seen, asked = detected(asked, scene, before)
+        seen, asked = finish_detection(asked, scene, before)
         taken = assign(costs(scene.hands, seen, dt_s))
         views = [
-            continued(scene, row, view, seen[column] if column >= 0 else None, before.told)
+            continue_track(scene, row, view, seen[column] if column >= 0 else None, before.told)
             for row, (view, column) in enumerate(zip(views, taken, strict=True))
         ]
-        views += begun(scene, left_over(seen, taken), before)
+        views += begin_tracks(scene, unassigned(seen, taken), before)
     followed = [
-        follow(view, early.get(row), scene, dice[row], spans)
+        update_track(view, early.get(row), scene, dice[row], spans)
         for row, view in enumerate(views)
         if view is not None
     ]
@@ -95,7 +95,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> Stepped
         next_track=before.next_track + len(views) - len(taken),
         generator=generator.get_state(),
     )
-    after = kept(after, [one.track for one in followed], model)
+    after = keep_tracks(after, [one.track for one in followed], model)
     return report(after, followed, scene, spans)
 
 
@@ -105,26 +105,26 @@ def _dice(generator: torch.Generator, count: int) -> list[torch.Generator]:
     return [generator, *(torch.Generator().manual_seed(seed) for seed in seeds)]
 
 
-def filtered(
+def filter_track(
     view: View, dt_s: float, generator: torch.Generator, spans: Spans, shown: bool
-) -> Filtered:
+) -> ParticleSet:
     """The particles of a frame; of a hand that nobody asked for only moved on."""
     with spans("filter: rest"):
         if not shown:
-            return drifted(view.track, dt_s, view.model)
+            return predict_particles(view.track, dt_s, view.model)
         return run_filter(view.track, dt_s, view.image, view.model, generator, spans)
 
 
-def follow(
-    view: View, early: Filtered | None, scene: Scene, generator: torch.Generator, spans: Spans
-) -> Followed:
+def update_track(
+    view: View, early: ParticleSet | None, scene: Scene, generator: torch.Generator, spans: Spans
+) -> TrackResult:
     """A track after a frame: its particles filtered, its pose chosen and judged.
 
     early: its particles as of this frame, if it goes on where it was predicted.
     """
     model, track, dt_s = view.model, view.track, scene.dt_s
     if early is None or track.age.seconds == 0:
-        early = filtered(view, dt_s, generator, spans, shown=True)
+        early = filter_track(view, dt_s, generator, spans, shown=True)
     with spans("refinement"):
         table = propose(view, model.decode(early.mean))
         choice = select(table, view.fitted.refiner.joints(table.pose), view.hidden)
@@ -134,22 +134,22 @@ def follow(
         track, trend = replace(track, age=fresh.age, doubtful=fresh.doubtful), fresh.trend
     elif model.refinement.iterations:
         pose, trend = steadied(pose, track.pose, trend, dt_s, model.backend.motions)
-    found = Found(early, pose, trend, *model.nearest(pose))
+    found = PoseEstimate(early, pose, trend, *model.nearest(pose))
     score, joints = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
     age_s, last, seen = track.age.seconds, track.features, view.observation
     features = confidence_features(joints, score, age_s, view.detection, last, seen.depth_m, seen.k)
     status = judge(track, features, dt_s, model.lost)
     # Without refinement the particles stay where they are.
-    drawn = drawn_to(found, model) if model.refinement.iterations else early
+    drawn = shift_particles(found, model) if model.refinement.iterations else early
     track = replace(
         track,
         particles=drawn.particles,
         weights=drawn.weights,
         mean=drawn.mean,
-        velocity=velocity_after(track, drawn.mean, dt_s, model),
+        velocity=update_velocity(track, drawn.mean, dt_s, model),
         pose=found.pose,
         trend=found.trend,
-        shape=track.shape if status.lost else learned_shape(view, found),
+        shape=track.shape if status.lost else learn_shape(view, found),
         age=track.age.extended(dt_s),
         doubtful=status.doubtful,
         log_odds=status.log_odds,
@@ -160,10 +160,10 @@ def follow(
         features=features,
         nearest_m=view.expected_m if view.hidden else 0.0,
     )
-    return Followed(view, track, found, score, status)
+    return TrackResult(view, track, found, score, status)
 
 
-def learned_shape(view: View, found: Found) -> shape_fit.ShapeEstimate:
+def learn_shape(view: View, found: PoseEstimate) -> shape_fit.ShapeEstimate:
     """The estimate of the hand's shape after a believed estimate of its pose."""
     shape, fitted = view.track.shape, view.fitted
     if view.detection.empty or view.hidden or shape.applied != fitted.applied:
@@ -181,21 +181,21 @@ def learned_shape(view: View, found: Found) -> shape_fit.ShapeEstimate:
     )
 
 
-def kept(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
+def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
     """The state with the tracks that go on: hands that somebody sees, each of them once."""
     confirmed = [track.confirmed for track in tracks]
     beside = [sum(confirmed) > own for own in confirmed]
     left = [
         track
         for track, other in zip(tracks, beside, strict=True)
-        if not ends(track, other, model.lost.patience)
+        if not track_ends(track, other, model.lost.patience)
     ]
     gone = {track.number for track in tracks} - {track.number for track in left}
     for first in sorted(left, key=sureness, reverse=True):
         for second in left:
             if first.number in gone or second.number in gone or first.number == second.number:
                 continue
-            if on_one_hand(first, second, model):
+            if on_same_hand(first, second, model):
                 gone.add(min(first, second, key=sureness).number)
     refused = [
         [*palm_of(track, model), 0.0]
@@ -209,13 +209,13 @@ def kept(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> T
     )
 
 
-def on_one_hand(first: Track, second: Track, model: TrackerModel) -> bool:
+def on_same_hand(first: Track, second: Track, model: TrackerModel) -> bool:
     """Whether two tracks have come onto one hand."""
     joints = [
         model.hand(track.side, track.shape).refiner.joints(track.pose)[0].cpu()
         for track in (first, second)
     ]
-    return are_one(palm_of(first, model), palm_of(second, model), *joints)
+    return same_hand(palm_of(first, model), palm_of(second, model), *joints)
 
 
 def palm_of(track: Track, model: TrackerModel) -> np.ndarray:

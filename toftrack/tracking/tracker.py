@@ -24,7 +24,7 @@ from toftrack.render.scoring import Scorer
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
 from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
-from toftrack.tracking.step import Stepped, step
+from toftrack.tracking.step import StepResult, step
 
 AUTO = "auto"
 _RENDERED_PX = 72, 88
@@ -87,14 +87,14 @@ class HandsTracker:
         image = DepthImage(depth_m, k, index, timestamp_s)
         with at_most(quality.threads):
             model = self.model.at_quality(quality)
-            self.state, self.infos, estimates = _stepped(self.state, image, model)
+            self.state, self.infos, estimates = _step(self.state, image, model)
         took_s = self.time.took_s()
         return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
 
     @small_operations()
     def prepare(self) -> None:
         """Load and compile now what the first frame would have to wait for; changes nothing."""
-        _stepped(self.state, _rendered_hand(), self.model)
+        _step(self.state, _rendered_hand(), self.model)
 
     def restart(self, side: str | None = None) -> None:
         """Forget the hands, also their size, and search for them anew; a side is the first hand's.
@@ -103,7 +103,7 @@ class HandsTracker:
 
         Only random numbers and frame numbers go on. Raises ToftrackError for an unknown side.
         """
-        self.state = restarted(self.state, self.model, side)
+        self.state = restart_state(self.state, self.model, side)
         self.infos = (None,) * len(self.infos)
 
     @property
@@ -207,7 +207,7 @@ class Tracker:
         return self.hands.shapes[0]
 
 
-def _stepped(state: TrackerState, image: DepthImage, model: FilterModel) -> Stepped:
+def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepResult:
     """One frame, by the tracker that a model is of: see step and paper_step."""
     if isinstance(model, PaperModel):
         return paper_step(state, image, model)
@@ -215,7 +215,7 @@ def _stepped(state: TrackerState, image: DepthImage, model: FilterModel) -> Step
     return step(state, image, model)
 
 
-def restarted(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
+def restart_state(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
     """A state that has seen nothing, but for its random and frame numbers; of a side if one is
     given, which is certain from then on, with auto of either. The paper's tracker detects none.
 

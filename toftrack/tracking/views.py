@@ -15,12 +15,12 @@ from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Expected
-from toftrack.tracking.association import Seen
+from toftrack.tracking.association import SideDetection
 from toftrack.tracking.candidates import View, best_start, image_term, with_parts, without_things
 from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.sides import changes_side, compare, side_log_odds
+from toftrack.tracking.sides import changes_side, compare_sides, side_log_odds
 from toftrack.tracking.state import OTHER_SIDE, Track, TrackerState
 
 _SPARE = 1
@@ -34,11 +34,11 @@ def predicted_view(scene: Scene, row: int) -> View | None:
     hand = scene.hands[row]
     evidence = replace(hand.track.evidence, age_s=hand.track.evidence.age_s + scene.dt_s)
     track = replace(hand.track, evidence=evidence)
-    return viewed(scene, row, track, NO_DETECTION, hand.depths)
+    return make_view(scene, row, track, NO_DETECTION, hand.depths)
 
 
-def continued(
-    scene: Scene, row: int, view: View | None, seen: Seen | None, told: str | None
+def continue_track(
+    scene: Scene, row: int, view: View | None, seen: SideDetection | None, told: str | None
 ) -> View | None:
     """A track in a frame with its detection; None where nothing in the image can be its hand.
 
@@ -51,19 +51,21 @@ def continued(
     away = float(np.linalg.norm(detection.centre_m.numpy() - palm))
     moved = seen.row < 0 and away > SAME_PLACE_M
     if moved:
-        view = viewed(scene, row, scene.hands[row].track, detection, expected_of(detection))
+        view = make_view(scene, row, scene.hands[row].track, detection, expected_of(detection))
     if view is None:
         return None
-    view = replace(view, detection=detection, track=observed(view.track, detection, scene.model))
+    view = replace(
+        view, detection=detection, track=update_shape(view.track, detection, scene.model)
+    )
     if moved:
-        view = replace(view, track=started(view))
+        view = replace(view, track=restart_track(view))
     view = with_parts(view)
     if seen.mirrored is None:
         return view
-    return of_likelier_side(scene, row, view, seen.mirrored, told)
+    return choose_side(scene, row, view, seen.mirrored, told)
 
 
-def most_new(state: TrackerState) -> int:
+def max_new_tracks(state: TrackerState) -> int:
     """How many tracks may begin: no more are tentative than hands are missing, or one."""
     confirmed = sum(track.confirmed for track in state.tracks)
     most = max(len(state.slots), 2)
@@ -71,11 +73,13 @@ def most_new(state: TrackerState) -> int:
     return max(0, min(max(most - confirmed, 1) - tentative, most + _SPARE - len(state.tracks)))
 
 
-def begun(scene: Scene, new: Sequence[Seen], state: TrackerState) -> list[View | None]:
+def begin_tracks(
+    scene: Scene, new: Sequence[SideDetection], state: TrackerState
+) -> list[View | None]:
     """Tentative tracks of hands that are no track's, as many as there is room for."""
     model = scene.model
     views: list[View | None] = []
-    for one in new[: most_new(state)]:
+    for one in new[: max_new_tracks(state)]:
         detection, image = one.detection, scene.unexplained()
         nothing = torch.zeros(1, 6 + model.space.dims)
         track = Track(
@@ -88,15 +92,15 @@ def begun(scene: Scene, new: Sequence[Seen], state: TrackerState) -> list[View |
             side=one.side,
             shape=known_shape(one.side, state),
         )
-        track = observed(track, detection, model)
-        view = viewed(scene, -1, track, detection, expected_of(detection))
+        track = update_shape(track, detection, model)
+        view = make_view(scene, -1, track, detection, expected_of(detection))
         if view is None:
             views.append(None)
             continue
         at = detection.centre_m.numpy()[None], OTHER_SIDE[one.side], detection.up[None]
         mirrored = model.detector.detect(image.depth_m, image.k, *at)[0]
-        view = of_likelier_side(scene, -1, view, mirrored, state.told)
-        views.append(with_parts(replace(view, track=started(view))))
+        view = choose_side(scene, -1, view, mirrored, state.told)
+        views.append(with_parts(replace(view, track=restart_track(view))))
     return views
 
 
@@ -107,7 +111,7 @@ def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
     return next((slot.shape for slot in vacant), first_shape())
 
 
-def viewed(
+def make_view(
     scene: Scene, row: int, track: Track, detection: Detection, expected: Expected
 ) -> View | None:
     """A track's hand in the image; None where nothing there can be one."""
@@ -128,25 +132,23 @@ def viewed(
     )
 
 
-def of_likelier_side(
-    scene: Scene, row: int, view: View, mirrored: Detection, told: str | None
-) -> View:
+def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
     """The view after its sides were compared; begun anew where the other one is likelier."""
     image: DepthImage = scene.image_for(row) if row >= 0 else scene.unexplained()
-    track = replace(view.track, evidence=compare(view, mirrored, image))
+    track = replace(view.track, evidence=compare_sides(view, mirrored, image))
     others = [hand.track for at, hand in enumerate(scene.hands) if at != row]
     others = [other for other in others if other.confirmed]
     if not changes_side(track, side_log_odds(track, others, told), told):
         return replace(view, track=track)
     track = replace(track, side=OTHER_SIDE[track.side], shape=first_shape())
-    track = observed(replace(track, age=Duration()), mirrored, scene.model)
-    other = viewed(scene, row, track, mirrored, expected_of(mirrored))
+    track = update_shape(replace(track, age=Duration()), mirrored, scene.model)
+    other = make_view(scene, row, track, mirrored, expected_of(mirrored))
     if other is None:
         return view
-    return with_parts(replace(other, track=started(other)))
+    return with_parts(replace(other, track=restart_track(other)))
 
 
-def started(view: View) -> Track:
+def restart_track(view: View) -> Track:
     """The track begun anew with the best of the detection's poses; it is the same hand's."""
     model, seen = view.model, without_things(view.observation, view.detection)
     # Very different poses are compared: what explains more of the image counts in full.
@@ -164,7 +166,7 @@ def started(view: View) -> Track:
     )
 
 
-def observed(track: Track, detection: Detection, model: TrackerModel) -> Track:
+def update_shape(track: Track, detection: Detection, model: TrackerModel) -> Track:
     """The track with what a detection says of its hand's shape: the length to begin with, and
     whether it still is the hand that was fitted.
     """
