@@ -158,14 +158,14 @@ def test_what_the_finder_sees_is_looked_at_at_once_but_a_frame_later_while_all_h
 ) -> None:
     third = [detection_of(hand_at(-0.3))]
     detector, seen, asked = looked(*tracks, found=third, dt_s=dt_s)
-    assert asked.found and detector.known == [len(tracks)]
-    assert bool(elsewhere(seen)) == at_once == (asked.finding is None)
+    assert asked.finder_asked and detector.known == [len(tracks)]
+    assert bool(elsewhere(seen)) == at_once == (asked.finder is None)
 
 
 def test_what_the_finder_saw_a_frame_ago_is_looked_at() -> None:
     _, _, asked = looked(known(), found=FOUND)
-    again, seen, asked = looked(known(), found=FOUND, found_s=FRAME_S, places=asked.finding())
-    assert not asked.found and asked.finding is None
+    again, seen, asked = looked(known(), found=FOUND, found_s=FRAME_S, places=asked.finder())
+    assert not asked.finder_asked and asked.finder is None
     assert elsewhere(seen) == [("left", 0.3)] and again.looked == ["left"], "the other hand"
 
 

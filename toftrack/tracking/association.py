@@ -1,8 +1,8 @@
-"""Which detection is of which track, which ones begin tracks, and which tracks end.
+"""Association of detections with tracks, new tracks, and the end of tracks.
 
 Multi-object tracking by detection as in SORT (Bewley et al., ICIP 2016): predicted places and
-detections are assigned to each other so that the sum of all costs is least; what is left over
-begins tentative tracks, and tracks that nobody sees end.
+detections are assigned to each other so that the sum of all costs is least; unassigned detections
+begin tentative tracks, and tracks that stay doubtful end.
 """
 
 from __future__ import annotations
@@ -22,25 +22,24 @@ from toftrack.tracking.posterior import touching
 from toftrack.tracking.state import Track
 
 _STEP_M, _SPEED_M_S = 0.04, 0.25
-"""Standard deviation of where a hand is that was believed in the last frame, and what it grows by
-in a second."""
+"""Standard deviation of a predicted palm, and its growth from the last believed frame on."""
 _GATE = 3.5
-"""Standard deviations from which on a detection is no track's."""
+"""Standard deviations from which on a detection at the finder's place is not of a track."""
 _SAME_PALM_M, _SAME_HAND_M, _SAME_JOINTS = 0.022, 0.045, 0.3
-"""Two hands are one where the middles of their palms are nearer than a palm is thick; or so near,
-and so much of one lies in the other."""
+"""Two hands are the same where their palms' middles are nearer than a palm is thick; or less near,
+and more than this share of one lies in the other, see posterior.touching."""
 _IMPOSSIBLE = 1e6
-"""Cost beyond the gate."""
+"""Cost of an impossible pair; half of it, that of a track without detection."""
 _TENTATIVE_S = 0.5
-"""A tentative track beside a confirmed one ends when it was not confirmed for so long."""
+"""A tentative track beside a confirmed one ends at this age."""
 
 
 @dataclass(frozen=True, eq=False)
 class SideDetection:
-    """A detection as a hand of a side.
+    """A detection of a hand as one of `side`.
 
-    row: of the track at whose place it was; -1 = a place of the finder.
-    mirrored: what is seen there as a hand of the other side, where both are to be compared.
+    row: of the track that was looked at; -1 = a place of the finder.
+    mirrored: the detection there as a hand of the other side, where both are to be compared.
     """
 
     detection: Detection
@@ -50,10 +49,10 @@ class SideDetection:
 
 
 def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: float) -> np.ndarray:
-    """(B, D) minus the log likelihood of each detection as each track's hand; inf where it is none.
+    """(B, D) cost of each detection for each of B tracks: half the squared distance of their palms
+    in standard deviations, less the detection's merit; inf where it cannot be the track's.
 
-    It is half the squared distance of the palms in standard deviations, less what speaks for a hand
-    there. What was seen at a track's place is no other's, nor is a hand of the other side.
+    A detection made at a track is no other's; one of the finder needs the track's side and gate.
     """
     cost = np.full((len(hands), len(seen)), math.inf)
     for row, hand in enumerate(hands):
@@ -66,7 +65,7 @@ def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: f
 
 
 def assign(cost: np.ndarray) -> list[int]:
-    """(B, D) costs to the column of each row, -1 where it has none: as many rows as possible have
+    """The column of each row of (B, D) costs, -1 where it has none: as many rows as possible have
     one, and the sum of their costs is least.
     """
     rows, columns = cost.shape
@@ -79,7 +78,7 @@ def assign(cost: np.ndarray) -> list[int]:
 def same_hand(
     first_m: np.ndarray, second_m: np.ndarray, first: torch.Tensor, second: torch.Tensor
 ) -> bool:
-    """Whether two hands are one.  first_m, second_m: (3,) palms.  first, second: (21, 3) joints."""
+    """Whether palms (3,) and joints (21, 3), all in metres, are of the same hand."""
     apart = float(np.linalg.norm(first_m - second_m))
     if apart > _SAME_HAND_M:
         return False
@@ -87,7 +86,7 @@ def same_hand(
 
 
 def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[SideDetection]:
-    """The detections at places of the finder that are no track's, each hand once."""
+    """The finder's detections that are of no track's hand, each hand once.  taken: see assign."""
     explained = [seen[column] for column in taken if column >= 0]
     new = [one for column, one in enumerate(seen) if one.row < 0 and column not in taken]
     found: list[SideDetection] = []
@@ -98,7 +97,7 @@ def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[Side
 
 
 def _same(first: SideDetection, second: SideDetection) -> bool:
-    """Whether two detections are of one hand; two hands of one side are never close to another."""
+    """Whether two detections are of the same hand, as all of one side at one place are."""
     palms = [one.detection.centre_m.numpy() for one in (first, second)]
     if first.side == second.side and np.linalg.norm(palms[0] - palms[1]) < SAME_PLACE_M:
         return True
@@ -107,12 +106,12 @@ def _same(first: SideDetection, second: SideDetection) -> bool:
 
 
 def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
-    """Whether a track ends: nobody sees its hand any more, or it is none."""
+    """Whether a track ends: doubtful for `patience` frames (0 = never), or tentative too long."""
     if patience and track.doubtful.begun and track.doubtful.reached(patience):
         return True
     return not track.confirmed and confirmed_beside and track.age.seconds > _TENTATIVE_S
 
 
 def sureness(track: Track) -> float:
-    """How surely a track is of a hand: one that was confirmed comes before one that was not."""
+    """A track's log odds, raised so that any confirmed track is surer than any tentative one."""
     return track.log_odds + 20.0 * track.confirmed

@@ -1,4 +1,4 @@
-"""What is thought of an estimate, and of the track that it is of."""
+"""Status of an estimate and its track: the confidence, and whether it is lost."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from toftrack.tracking.confidence import ConfidenceFeatures, ConfidenceModel
 from toftrack.tracking.state import Track
 
 _HIDDEN = 0.3
-"""Share of the joints behind something from which on a hand is hidden."""
+"""A hand is hidden where more than this share of its joints is behind something."""
 _OUT_OF_VIEW = 0.4
-"""Share of the joints outside of the image from which on a hand is out of view."""
+"""A hand is out of view where more than this share of its joints is outside of the image."""
 _WHOLE_HAND = 0.9
-"""A new hand that is right as a whole with this probability is believed, whatever its confidence:
-of one that holds a thing, or lies beside another one, a joint is often far off."""
+"""A tentative track is confirmed from this probability of the whole hand on, whatever its
+confidence: of a hand that holds a thing or lies beside another one a joint is often far off."""
 _PATIENT = 10
-"""Times as long is waited for a hand that is hidden: each of its frames counts so much less."""
+"""A frame in which a confirmed hand is hidden makes its track so much less doubtful."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Status:
 def judge(
     track: Track, features: ConfidenceFeatures, dt_s: float, model: ConfidenceModel
 ) -> Status:
-    """What is thought of an estimate, dt_s after the last."""
+    """The status of a track's estimate, dt_s after its last one."""
     kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
     smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
     whole = kept * track.whole_odds + (1 - kept) * model.whole_odds(features)
@@ -59,12 +59,12 @@ def judge(
 
 
 def probability(log_odds: float) -> float:
-    """Of log odds."""
+    """The probability of log odds, which count up to 30 either way."""
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
 
 
 def _state_name(features: ConfidenceFeatures) -> str:
-    """Why an estimate is not to be used."""
+    """The state name of a lost estimate."""
     if features.unseen > _OUT_OF_VIEW:
         return "out of view"
     return "hidden" if features.hidden > _HIDDEN else "searching"

@@ -1,7 +1,7 @@
-"""The hypotheses of a frame: proposed, brought onto the seen points, scored.
+"""The hypotheses of a frame: proposed by the filter and the detector, refined, scored.
 
-As in ICONDENSATION (Isard and Blake, ECCV 1998) with local optimisation (Gall et al., "Optimization
-and filtering for human motion capture", IJCV 87, 2010): what the filter and the detector propose.
+Data-driven proposals are as in ICONDENSATION (Isard and Blake, ECCV 1998), local optimisation as in
+Gall et al., "Optimization and filtering for human motion capture" (IJCV 87, 2010).
 """
 
 from __future__ import annotations
@@ -34,35 +34,35 @@ from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import Track
 
 _SURELY_PRESENT = 0.97
-"""Probability of a hand from which on the network is believed which pixels are the hand's arm: a
-chair's back was taken for a hand otherwise."""
+"""From this probability of a hand on, the network tells the arm's pixels: else a chair's back was
+taken for a hand."""
 _COVERED = 0.6
-"""Share of the joints behind something from which on a hand is held where it was: it slips onto
+"""A hand with more than this share of its joints behind something keeps its pose: it slips onto
 what passes in front otherwise (a bottle: usable 94 instead of 44 % in one of six seeds)."""
 _HIDDEN = 0.03
-"""Share of the hand's pixels that must be hidden for it to matter."""
+"""A hand is hidden when its occluder has more than this share of the pixels that it has."""
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no candidates."""
 _BENT_STEPS, _BENT_M, _BENT_RAD = 6, 0.010, 0.8
 """In how many steps a pose is bent to the keypoints; how sure the keypoints are at best, and how
 far an angle may go."""
 _NO_WEIGHT = 1e-6
-"""Instead of 0, so that deviations stay numbers: kilometres."""
+"""The least weight of keypoints: divided by 0, standard deviations would be no numbers."""
 _LEAST_PARTS = 4
-"""Parts of a crop, of 9 mm, that a thing in the hand has at least."""
+"""A thing in the hand has at least so many cells of the crop's parts, of 9 mm each."""
 _MOSTLY, _UNKNOWN = 0.5, 255
-"""Of a surface in front of the hand, so much must be its arm where the network sees it; and the
-class of what it does not see."""
+"""A surface in front is the hand's arm when more than this share of it is, where the network sees
+it; and the class of what it does not see."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A track's hand in one frame: what its poses are compared with.
+    """A track's hand in one frame, and what its poses are compared with.
 
-    fitted: the hand as it is applied.  observation: not empty.
-    expected_m: the depth at which its nearest joint was expected; 0 where the track begins.
-    detection: what the pose network says of it; empty where it was not asked.
-    others: (21, 3) each, joints of other hands.  image: the likelihood of the image.
+    fitted: the hand in the applied shape.  observation: not empty.
+    expected_m: the depth of its nearest joint, as predicted, or as detected where it (re)starts.
+    detection: empty where the pose network did not look.
+    others: joints (21, 3) m of each other hand.  image: the likelihood of the image.
     """
 
     track: Track
@@ -82,28 +82,28 @@ class View:
 
     @property
     def covered(self) -> bool:
-        """Whether so much of the hand is behind something that it is held where it was."""
+        """Whether so much of the hand's last pose is behind something that the pose is kept."""
         seen, joints = self.observation, self.fitted.refiner.joints(self.track.pose)[0]
         hiding_m = seen.depth_m * seen.occluder  # not another hand: the networks know both apart
         return out_of_sight(joints, hiding_m, seen.k)[1] > _COVERED
 
     @cached_property
     def keypoints(self) -> Keypoints:
-        """The detection's, as the refinement takes them."""
+        """The detection's keypoints, see keypoints_of."""
         return keypoints_of(self.detection, self.model)
 
     @cached_property
     def seen(self) -> SeenPoints:
-        """The points that poses are brought onto."""
+        """The points of the image that poses are refined onto."""
         return seen_points(self.observation)
 
-    def refined(self, poses: Tensor) -> Tensor:
-        """Hands (N, 27) brought onto the seen points and the keypoints."""
+    def refine(self, poses: Tensor) -> Tensor:
+        """(N, 27) poses (N, 27), refined onto the seen points and the keypoints."""
         cfg = self.model.refinement
         return self.fitted.refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
 
     def posterior(self, keypoints: float | None = None) -> Posterior:
-        """The posterior of the hand's pose.  keypoints: their weight, instead of its own."""
+        """The posterior of the hand's pose.  keypoints: their weight; None = the model's."""
         weights, terms = self.model.weights, dict[str, Term]()
         keypoints = weights.keypoints if keypoints is None else keypoints
         if keypoints and not self.detection.empty:
@@ -117,8 +117,8 @@ class View:
 
 
 def with_parts(view: View) -> View:
-    """The view with what the pose network says of its pixels: those of a thing in the hand are not
-    the hand's, and where something hides the hand, those of its own arm do not.
+    """The view with pixels told apart by the pose network: those of a thing in the hand are no more the
+    hand's, and where it is hidden those of its own arm are, instead of its occluder's.
     """
     seen = without_things(view.observation, view.detection)
     if view.hidden and view.detection.present >= _SURELY_PRESENT:
@@ -134,20 +134,20 @@ def image_term(
     model: FilterModel,
     coverage: float | None = None,
 ) -> ImageTerm:
-    """The likelihood of a segmented image, which is not empty."""
+    """The likelihood of an observation, which must not be empty.  coverage: see ImageTerm."""
     evidence = model.likelihood.evidence(observation).to(model.device)
     return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
 
 
 def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
-    """The detector's keypoints as the refinement takes them."""
+    """A detection's keypoints, with the configured least deviation and weight."""
     cfg, found = model.detector.settings, detection.keypoints
     sigma = found.sigma_m.clamp(min=cfg.keypoint_m)
     return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, _NO_WEIGHT))
 
 
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
-    """(H, 27) the likeliest hypotheses as states of a hand; at least one, where there is any."""
+    """(H, 27) the likely hypotheses, `count` at most, as poses of a hand; the best one at least."""
     likely = int((detection.log_probability > math.log(_UNLIKELY)).sum())
     return detection.first(max(1, min(count, likely))).states(fitted.ratio)
 
@@ -159,10 +159,10 @@ def detector_poses(
     model: TrackerModel,
     count: int,
 ) -> Tensor:
-    """(1 + H, 27) the detector's poses: the likeliest bent to the keypoints, and all as they are.
+    """(1 + H, 27) a detection's poses: the likeliest one bent to the keypoints, and H <= `count`
+    hypotheses. (0, 27) of an empty detection; without refinement, only the H.
 
-    The keypoints are more exact than the hypotheses where a finger is seen, but no pose by
-    themselves. None where nothing was detected.
+    Keypoints are more exact than hypotheses where a finger is seen, but no pose by themselves.
     """
     if detection.empty:
         return torch.zeros(0, 27)
@@ -179,27 +179,27 @@ def detector_poses(
 
 
 def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, float]:
-    """The best (1, 27) of the detector's poses, as they are and refined, and its log posterior.
+    """The best (1, 27) of the detector's poses, raw or refined, and its log posterior.
 
-    keypoints: their weight in the posterior, instead of its own.
+    The detection must not be empty.  keypoints: see View.posterior.
     """
     model = view.model
     count = model.detector.settings.hypotheses
     poses = detector_poses(view.detection, view.observation, view.fitted, model, count)
     if model.refinement.iterations:
-        poses = torch.cat((poses, view.refined(poses)))
+        poses = torch.cat((poses, view.refine(poses)))
     values = view.posterior(keypoints)(poses)
     best = int(values.argmax())
     return poses[best][None], float(values[best])
 
 
 def propose(view: View, mean: Tensor) -> Hypotheses:
-    """The scored hypotheses of a frame's hand: the last frame's fingers where the filter has the
-    hand, the filter's estimate (1, 27), and the detector's likeliest pose; refined.
+    """Refined and scored hypotheses of a frame: the filter's `mean` (1, 27), its wrist with the
+    last frame's fingers, and the detector's likeliest pose, raw and bent.
 
-    A hand that is mostly covered is held where it was. Poses that explain nothing of the image once
-    they are refined stay as they were proposed: of a hand that leaves the image a few points are
-    left, which may draw it anywhere.
+    A covered hand has its last pose alone; without refinement there is `mean` alone. A pose that
+    explains nothing once refined stays as proposed: the few points that are left of a hand that
+    leaves the image may draw it anywhere.
     """
     model, posterior = view.model, view.posterior()
     if not model.refinement.iterations:
@@ -215,29 +215,33 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
         Hypotheses.of(detected, Source.DETECTOR),
     ]
     table = Hypotheses.joined(tables)
-    pose = view.refined(table.pose)
+    pose = view.refine(table.pose)
     values = posterior(pose)
     pose = torch.where(values.isneginf()[:, None], table.pose, pose)
     return replace(table, pose=pose, log_posterior=values)
 
 
 def without_things(observation: Observation, detection: Detection) -> Observation:
-    """The same without the pixels of a thing in the hand, as the pose network tells them.
+    """The observation without the pixels that the pose network calls a thing in the hand.
 
     Else the best pose is one whose fingers explain the thing.
     """
     kind = detection.parts.kind
     if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
         return observation
-    thing = _pixels_of(observation.hand, observation, detection, THING_PART)
+    row, column = np.nonzero(observation.hand.cpu().numpy())
+    of = detection.parts.at(_points_of(row, column, observation)) == THING_PART
+    mask = np.zeros(observation.hand.shape, bool)
+    mask[row[of], column[of]] = True
+    thing = torch.from_numpy(mask).to(observation.hand.device)
     return replace(observation, hand=observation.hand & ~thing, thing=thing)
 
 
 def with_own_arm(observation: Observation, detection: Detection) -> Observation:
-    """The same with what the pose network calls the hand's forearm told from what hides it.
+    """The observation with the hand's forearm moved from its occluders to the hand.
 
-    Who wears the camera has the arm nearer to it than the hand, which it does not hide as what
-    passes in front does. A surface in front is the arm when the network says so of most of it.
+    Who wears the camera has the arm nearer to it than the hand, which it does not hide. A surface
+    in front is the arm when the pose network calls most of it a forearm.
     """
     occluder = observation.occluder.cpu().numpy()
     count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
@@ -250,19 +254,15 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     return replace(observation, hand=observation.hand | arm, occluder=observation.occluder & ~arm)
 
 
-def _pixels_of(
-    among: Tensor, observation: Observation, detection: Detection, *kinds: int
-) -> Tensor:
-    """(H, W) bool: those pixels of a mask that the pose network says are of some classes."""
-    row, column = np.nonzero(among.cpu().numpy())
-    chosen = np.isin(detection.parts.at(_points_of(row, column, observation)), kinds)
-    mask = np.zeros(among.shape, bool)
-    mask[row[chosen], column[chosen]] = True
-    return torch.from_numpy(mask).to(among.device)
-
-
 def _points_of(row: np.ndarray, column: np.ndarray, observation: Observation) -> np.ndarray:
-    """(P, 3) what is seen at pixels, camera frame."""
-    k, z = observation.k.cpu().numpy(), observation.depth_m.cpu().numpy()[row, column]
+    depth_m, k = observation.depth_m.cpu().numpy(), observation.k.cpu().numpy()
+    return points_at(row, column, depth_m, k)
+
+
+def points_at(
+    row: np.ndarray, column: np.ndarray, depth_m: np.ndarray, k: np.ndarray
+) -> np.ndarray:
+    """(P, 3) m, the points that an image (H, W) shows at pixels (P,), camera frame."""
+    z = depth_m[row, column]
     x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
     return np.stack((x, y, z), 1)

@@ -1,4 +1,4 @@
-"""What the networks say of an image: at the tracks' places, and where else hands may be."""
+"""The detections of a frame: at the predicted hands, and where else hands may be."""
 
 from __future__ import annotations
 
@@ -19,36 +19,35 @@ from toftrack.tracking.sides import comparison_due
 from toftrack.tracking.state import OTHER_SIDE, TrackerState
 
 _RARE_S = 0.1
-"""After so long a prediction says little: hands are looked for in the whole image first."""
+"""Frames farther apart are rare: predictions say little, so that the finder looks first."""
 _ARM_M, _ARM_RADIUS_M = 0.3, 0.06
-"""Length and radius of what may be a forearm with its sleeve."""
+"""Length and radius of a forearm with its sleeve, at most."""
 _FOLLOWED = 2
-"""The whole image is looked at so much more rarely while every hand is surely followed: it takes a
-fifth of a frame's time."""
+"""While every track is reliable the finder, which takes a fifth of a frame's time, is asked so much
+more rarely."""
 _AS_WELL, _WELL_M = 1.3, 0.02
-"""Hands are seen about as well when their expected errors differ by less than this factor, or are
-both smaller than this."""
+"""Hands are seen about as well as the best one when their expected errors are less than so many
+times its error, or than this."""
 
 
 @dataclass(frozen=True, eq=False)
 class PendingDetections:
-    """Networks that work on a frame.
+    """The networks at work on a frame.
 
-    own: each waits for the detection at a track's place.  finding: waits for the finder's places;
-        None where it is not asked.
-    at_once: a hand is to be found anew, for which all wait; else what the finder sees is looked at
-        a frame later.
-    found: the finder looks at this frame.
+    at_tracks: each waits for the detection at a predicted hand.
+    finder: waits for the finder's places; None where it is not asked, or was waited for.
+    at_once: the finder's places are used in this frame, to find a hand anew; else in the next one.
+    finder_asked: whether the finder looks at this frame.
     """
 
-    own: Sequence[Callable[[], SideDetection]]
-    finding: Callable[[], Places] | None
+    at_tracks: Sequence[Callable[[], SideDetection]]
+    finder: Callable[[], Places] | None
     at_once: bool
-    found: bool
+    finder_asked: bool
 
 
 def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
-    """Begin to look at the tracks' places, and in the whole image, beside whatever comes next."""
+    """The networks that are due in a frame, started: they work beside whatever comes next."""
     detector = scene.model.detector
     several = len(state.slots) > 2 and scene.dt_s <= _RARE_S
     image = scene.unexplained() if several else scene.image
@@ -57,21 +56,21 @@ def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     frames = detector.settings.search * (1 if at_once else _FOLLOWED)
     due = frames == 1 or Duration(state.found_s).reached(frames)
     whole = image.depth_m, image.k, len(scene.hands)
-    finding = detector.start_search(*whole) if due and at_once else None
-    own = [_start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row)]
+    finder = detector.start_search(*whole) if due and at_once else None
+    at_tracks = [_start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row)]
     if due and not at_once:
-        finding = detector.start_search(*whole)
-    return PendingDetections(own, finding, at_once, due)
+        finder = detector.start_search(*whole)
+    return PendingDetections(at_tracks, finder, at_once, due)
 
 
 def finish_detection(
-    asked: PendingDetections, scene: Scene, state: TrackerState
+    pending: PendingDetections, scene: Scene, state: TrackerState
 ) -> tuple[list[SideDetection], PendingDetections]:
-    """All detections of a frame; and what is still waited for."""
+    """All detections of a frame, those at tracks first; and what is still pending."""
     places = state.places
-    if asked.at_once and asked.finding is not None:
-        places, asked = asked.finding(), replace(asked, finding=None)
-    seen = [wait() for wait in asked.own]
+    if pending.at_once and pending.finder is not None:
+        places, pending = pending.finder(), replace(pending, finder=None)
+    seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
     places = _apart_from([*known, *state.refused[:, :3]], places)
@@ -79,11 +78,11 @@ def finish_detection(
         arms = [] if rare else [_arm(scene, one) for one in seen]
         found = _elsewhere(scene, state, places, rare)
         seen += [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
-    return seen, asked
+    return seen, pending
 
 
 def _is_asked(scene: Scene, row: int) -> bool:
-    """Whether the pose network is asked about a track; not always if it is sure."""
+    """Whether the pose network looks at a track; it skips frames of sure ones."""
     track, settings = scene.hands[row].track, scene.model.detector.settings
     sure = track.reliable and track.log_odds > log_odds(settings.sure)
     waited = Duration(track.asked_s + scene.dt_s).reached(settings.every)
@@ -91,8 +90,8 @@ def _is_asked(scene: Scene, row: int) -> bool:
 
 
 def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
-    """The detection at a track's place, begun beside whatever does not need it; of both sides where
-    they are to be compared.
+    """A function that waits for the detection at a predicted hand, started here; with the other
+    side's where a comparison is due.
     """
     hand, image = scene.hands[row], scene.image_for(row)
     at = image.depth_m, image.k, hand.palm_m[0]
@@ -106,7 +105,7 @@ def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
 def _elsewhere(
     scene: Scene, state: TrackerState, places: Places, rare: bool
 ) -> list[SideDetection]:
-    """What is seen at places of the finder, as a hand of any side that is missing."""
+    """Detections at the finder's places as hands of each missing side, by merit or as held out."""
     image = scene.image if rare else scene.unexplained()
     tracks = [hand.track for hand in scene.hands]
     missing = {track.side for track in tracks if rare or not track.reliable}
@@ -135,8 +134,8 @@ Arm = tuple[np.ndarray, np.ndarray]
 
 
 def _arm(scene: Scene, seen: SideDetection) -> Arm | None:
-    """The arm of a hand that is seen: where the pose network says that its forearm is, or where its
-    fingers do not point.
+    """The arm of a detected hand, None where its merit is too low: towards what the pose network
+    calls its forearm, else away from its fingers.
     """
     if merit(seen.detection, seen.detection.heat) < scene.model.detector.settings.merit:
         return None
@@ -148,7 +147,7 @@ def _arm(scene: Scene, seen: SideDetection) -> Arm | None:
 
 
 def _is_on(arm: Arm | None, detection: Detection) -> bool:
-    """Whether a palm lies on an arm, which a bare one looks like, and no hand."""
+    """Whether a detected palm lies on an arm: then it is that arm, which may look like a hand."""
     if arm is None:
         return False
     away = detection.centre_m.numpy() - arm[0]
@@ -158,7 +157,7 @@ def _is_on(arm: Arm | None, detection: Detection) -> bool:
 
 
 def _apart_from(known: Sequence[np.ndarray], places: Places) -> Places:
-    """The places that are none of the known ones (3,)."""
+    """The places that are farther than SAME_PLACE_M from each known one (3,)."""
     rows = [
         row
         for row, at in enumerate(places.centre_m)
@@ -168,8 +167,8 @@ def _apart_from(known: Sequence[np.ndarray], places: Places) -> Places:
 
 
 def held_out_first(seen: Sequence[SideDetection]) -> list[SideDetection]:
-    """First the nearest of those hands that are seen about as well as the best one: where nobody
-    said which hand is meant, it is the one that is held out to the camera.
+    """The detections, but first the nearest to the camera of those seen about as well as the best:
+    where nobody said which hand is meant, it is the one that is held out.
     """
     if not seen:
         return []

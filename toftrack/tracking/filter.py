@@ -1,4 +1,4 @@
-"""The particle filter in the tracker: where a hand is predicted, filtered, and carried on.
+"""Prediction and particle filter of a track.
 
 The filter itself is compute/particle_filter.py.
 """
@@ -27,15 +27,15 @@ from toftrack.tracking.state import Track, generator_on
 _MOVEMENT_S = 0.3
 """How long a movement goes on (to 1/e)."""
 _APPROACH_M_S = 0.05
-"""How much faster than its middle a partly hidden hand may come nearer, m/s."""
+"""How much faster than its wrist the nearest joint of a partly hidden hand may come nearer."""
 _NEAREST_M = 0.15
-"""A camera sees nothing nearer."""
+"""No palm is predicted nearer: no camera sees it there."""
 
 
 def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:
-    """(6 + d,) how far a hand is expected to move on, in tangent coordinates.
+    """(6 + d,) the tangent by which a hand is expected to move in dt_s.
 
-    A movement fades: `settings.velocity` of it is expected in the first FRAME_S.
+    Of what its velocity means, `settings.velocity` is expected in the first FRAME_S, later less.
     """
     reach_s = FRAME_S * math.expm1(-dt_s / _MOVEMENT_S) / math.expm1(-FRAME_S / _MOVEMENT_S)
     return track.velocity * (settings.velocity * reach_s)
@@ -43,12 +43,11 @@ def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Ten
 
 @dataclass(frozen=True, eq=False)
 class PredictedHand:
-    """A track's hand as it is expected in a frame.
+    """A track's hand as it is predicted in a frame.
 
-    pose: (1, 27).  joints_m: (21, 3).
-    palm_m: (1, 3) middle of its palm.  up_m: (1, 3) from its wrist to there, where fingers point.
-        Poses are the more exact the nearer the crop's centre is to the middle of the palm, so that
-        a small hand's is not where a large one's would be.
+    pose: (1, 27).  joints_m: (21, 3).  up_m: (1, 3) from its wrist to the palm's middle.
+    palm_m: (1, 3) the palm's middle, by the hand's own length: the nearer to it a crop is centred,
+        the more exact are the poses that the network sees there.
     depths: where it is to be segmented.
     """
 
@@ -62,7 +61,7 @@ class PredictedHand:
 
 
 def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
-    """A track's hand dt_s after its last frame: moved on, its fingers as they were."""
+    """A track's hand dt_s after its last frame: moved on, its finger angles as they were."""
     fitted = model.hand(track.side, track.shape)
     moved = predicted_motion(track, dt_s, model.filter)
     tangent = torch.cat((moved[:6], moved.new_zeros(21)))[None]
@@ -89,7 +88,7 @@ def run_filter(
     generator: torch.Generator,
     spans: Spans,
 ) -> ParticleSet:
-    """The filter's particles of a frame, weighed by the image.
+    """A track's particles after dt_s: predicted, then diffused, weighed by the image, resampled.
 
     Nothing within waits for the device, so that it is not held up between passes.
     """
@@ -120,7 +119,7 @@ def run_filter(
 
 
 def predict_particles(track: Track, dt_s: float, model: FilterModel) -> ParticleSet:
-    """A track's particles dt_s later, where no image says where its hand is."""
+    """A track's particles dt_s later, moved as predicted; weights and spread stay."""
     motions, moved = model.backend.motions, predicted_motion(track, dt_s, model.filter)[None]
     particles = motions.compose(track.particles, on_device(moved, model.device))
     return ParticleSet(particles, track.weights, motions.compose(track.mean, moved))
@@ -128,9 +127,10 @@ def predict_particles(track: Track, dt_s: float, model: FilterModel) -> Particle
 
 @dataclass(frozen=True, eq=False)
 class ParticleSet:
-    """What the filter makes of a frame.
+    """The particles of a track in a frame.
 
-    particles, weights: (N, 6 + d) and (N,), on the model's device.  mean: (1, 6 + d) of them.
+    particles, weights: (N, 6 + d) and (N,), on the model's device.
+    mean: (1, 6 + d) of them, on the CPU.
     """
 
     particles: Tensor
@@ -140,10 +140,10 @@ class ParticleSet:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """What a frame's filter and choice found.
+    """The pose of a track in a frame.
 
-    filtered: the particles.  pose: (1, 27) the estimate.  trend: (27,) see steadying.
-    particle: (1, 6 + d) the pose in the pose space.  offset: (21,) rad, how far the pose lies off.
+    filtered: the particles, before they follow it.  pose: (1, 27).  trend: (27,) see Track.
+    particle: (1, 6 + d) the nearest in the pose space.  offset: (21,) rad, from there to the pose.
     """
 
     filtered: ParticleSet
@@ -154,23 +154,22 @@ class PoseEstimate:
 
     @property
     def off_rad(self) -> float:
-        """How far the pose lies off the pose space, rms."""
+        """How far the pose lies off the pose space, rms over the 21 angles."""
         return float(self.offset.square().mean().sqrt())
 
 
 def shift_particles(found: PoseEstimate, model: FilterModel) -> ParticleSet:
-    """The particles as they follow the estimate."""
+    """The particles, all moved by what moves their mean onto the estimate's particle."""
     filtered, motions = found.filtered, model.backend.motions
     space = model.space_of(filtered.particles)
     change = motions.difference(found.particle, filtered.mean)
     particles = motions.compose(filtered.particles, on_device(change, model.device))
-    latent = bound(particles[:, 6:], space.lower, space.upper, "truncate")
-    particles[:, 6:] = latent
+    particles[:, 6:] = bound(particles[:, 6:], space.lower, space.upper, "truncate")
     return ParticleSet(particles, filtered.weights, found.particle)
 
 
 def update_velocity(track: Track, mean: Tensor, dt_s: float, model: FilterModel) -> Tensor:
-    """(6 + d,) a second, smoothed; 0 in a track's first frame."""
+    """(6 + d,) a second, the smoothed velocity of a track with a new mean; 0 in its first frame."""
     if not track.age.begun:
         return torch.zeros_like(track.velocity)
     moved = model.backend.motions.difference(mean, track.mean)[0]
@@ -179,7 +178,7 @@ def update_velocity(track: Track, mean: Tensor, dt_s: float, model: FilterModel)
 
 
 def new_track(pose: Tensor, model: FilterModel) -> Track:
-    """A track that begins with a pose (1, 27), all particles in one place."""
+    """A track of age 0 at a pose (1, 27), with all particles there; number and side are defaults."""
     particle = model.encode(pose)
     n = model.filter.particles
     particles = on_device(particle, model.device).repeat(n, 1)

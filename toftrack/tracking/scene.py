@@ -1,4 +1,4 @@
-"""A frame as it begins: where the tracks' hands are predicted, and to whom its pixels belong."""
+"""The scene of a frame before detection: the predicted hands, and which one owns which pixels."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ import torch
 from toftrack.frames import DepthImage
 from toftrack.render.model_image import cpu_surface, parted, range_image
 from toftrack.render.segmentation import Expected, Observation, reduce_image
+from toftrack.tracking.candidates import points_at
 from toftrack.tracking.filter import PredictedHand, predict
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
 
 _TOLERANCE_M = 0.02
-"""A pixel that is so near to a hand's surface may be the hand's."""
+"""A pixel whose depth is so near to a predicted surface is that hand's."""
 _EDGE_M = 0.06
-"""Pixels on the outline of a hand mix it with what is behind, up to this."""
+"""Pixels on a hand's outline mix its depth with what is behind, and are up to this farther."""
 _FAR_M = 5.0
-"""So far away is nothing for the detector."""
+"""Depth of removed pixels: the detector sees nothing so far away."""
 _IN_FRONT_M = 0.03
-"""What is so much nearer than a hand's wrist may hide the hand."""
+"""What is nearer than a hand's wrist by more than this may hide the hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An image, and the tracks' hands as they are predicted in it.
+    """An image, and the hands predicted in it.
 
-    depth_m, k: (H, W) and (3, 3), the image as hands are segmented in it.
-    dt_s: since the last frame.
+    depth_m, k: (H, W) and (3, 3), the image reduced to the pixels that hands are segmented in.
+    hands: one a track; a row is an index into them.  dt_s: since the last frame.
     """
 
     image: DepthImage
@@ -53,7 +54,7 @@ class Scene:
 
     @cached_property
     def _surfaces(self) -> np.ndarray:
-        """(B, H, W) Z of the predicted hands' surfaces, 0 = none."""
+        """(B, H, W) m, Z of each predicted hand's surface, 0 = none."""
         height, width = self.depth_m.shape
         each = [
             range_image(
@@ -68,10 +69,10 @@ class Scene:
 
     @cached_property
     def owners(self) -> np.ndarray:
-        """(H, W) int8, the row of the hand that a pixel belongs to; -1 = to none of them.
+        """(H, W) int8, the row of the hand that owns each pixel; -1 = none does.
 
-        It is the one whose surface is nearest. About the pixels of a hand lie the mixed ones of its
-        outline, which are its own as well. A hand that is not reliable owns none.
+        It is the hand whose surface is nearest to the pixel's depth, or whose outline the pixel
+        mixes with what is behind. A track that is not reliable owns no pixels.
         """
         owner = np.full(self.depth_m.shape, -1, np.int8)
         rows, columns = (np.flatnonzero((self._surfaces > 0).any((0, axis))) for axis in (2, 1))
@@ -89,15 +90,15 @@ class Scene:
         for row, hand in enumerate(self.hands):
             if not hand.track.reliable:
                 continue
-            own = sure & (nearest == row)
-            near = cv2.dilate(own.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            around = cv2.dilate(np.where(own, surfaces[row], 0), np.ones((3, 3), np.float32))
+            surface = sure & (nearest == row)
+            near = cv2.dilate(surface.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            around = cv2.dilate(np.where(surface, surfaces[row], 0), np.ones((3, 3), np.float32))
             mixed = near & ~sure & (depth_m > around) & (depth_m < around + _EDGE_M)
-            owner[box][own | mixed] = row
+            owner[box][surface | mixed] = row
         return owner
 
     def owned_by_others(self, row: int) -> np.ndarray | None:
-        """(H, W) bool: pixels of other hands than that of a row; None where none are known."""
+        """(H, W) bool, the pixels that other hands own; None where no other one is reliable."""
         if row not in self._others:
             others = (hand.track.reliable for at, hand in enumerate(self.hands) if at != row)
             mask = (self.owners >= 0) & (self.owners != row) if any(others) else None
@@ -109,9 +110,8 @@ class Scene:
         return {}
 
     def image_for(self, row: int) -> DepthImage:
-        """The image as the pose network is to see it about a hand: with nothing where other hands
-        are, or keypoints lie on their fingers as well. What may hide the hand stays, for the
-        network knows things that hide hands.
+        """The image for the pose network at a hand: without the pixels of other hands, or keypoints
+        lie on their fingers, but for those in front of it: the network knows what hides a hand.
         """
         others = self.owned_by_others(row)
         if others is None:
@@ -120,7 +120,7 @@ class Scene:
         return self._without(others & (self.depth_m > nearest))
 
     def unexplained(self) -> DepthImage:
-        """The image with nothing where the tracks' hands are."""
+        """The image without the pixels that hands own."""
         return self._without(self.owners >= 0) if self.hands else self.image
 
     def _without(self, pixels: np.ndarray) -> DepthImage:
@@ -132,21 +132,19 @@ class Scene:
         return replace(self.image, depth_m=depth_m)
 
     def near(self, centre_m: np.ndarray, radius_m: float) -> np.ndarray:
-        """(P, 3) seen points within a cube about a point (3,)."""
+        """(P, 3) m, the image's points within radius_m along each axis of a point (3,)."""
         row, column = np.nonzero(np.abs(self.depth_m - centre_m[2]) < radius_m)
-        z = self.depth_m[row, column]
-        x, y = (column - self.k[0, 2]) / self.k[0, 0] * z, (row - self.k[1, 2]) / self.k[1, 1] * z
-        points = np.stack((x, y, z), 1)
+        points = points_at(row, column, self.depth_m, self.k)
         inside: np.ndarray = points[np.abs(points - centre_m).max(1) < radius_m]
         return inside
 
     def segment(self, expected: Expected, row: int) -> Observation:
-        """What can be the hand of a row where it is expected; of a hand without a row, -1."""
+        """The observation of the hand of a row, -1 = of a new one, where it is expected."""
         others = self.owned_by_others(row)
         return self.model.segmentation(self.image.depth_m, self.image.k, expected, others)
 
     def others_joints(self, row: int) -> tuple[torch.Tensor, ...]:
-        """(21, 3) each, the joints of the other hands that are reliable."""
+        """The joints (21, 3) m of each reliable hand but the row's."""
         return tuple(
             hand.joints_m for at, hand in enumerate(self.hands) if at != row and hand.track.reliable
         )

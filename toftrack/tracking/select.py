@@ -1,4 +1,4 @@
-"""Which of a frame's hypotheses is the hand: the one with the highest posterior."""
+"""Selection of a frame's pose: the hypothesis with the highest posterior, but for two margins."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 _MARGIN = 0.05
-"""By so much the log posterior of the detector's pose must be better than that of the last frame's
-fingers: neighbouring fingers change places from frame to frame otherwise (swaps +0.6 points)."""
+"""What a pose of the detector loses in log posterior against the other sources: neighbouring
+fingers change places from frame to frame otherwise (swaps +0.6 points)."""
 _SURE_LEAD = 2.0
-"""Likewise of a pose at another place while something hides the hand: without it, a second hand
-that crosses the first one is silently wrong in 5 % of the frames."""
+"""The same of a pose elsewhere while something hides the hand: without it, a second hand that
+crosses the first one is silently wrong in 5 % of the frames."""
 _ELSEWHERE_M = 0.02
-"""Poses whose joints are so far apart, on average, are of different places."""
-_WORST = -1e6
+"""A pose of the detector is elsewhere when its joints are so far from the others', on average."""
+WORST = -1e6
 """Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
 
 
@@ -27,11 +27,11 @@ class Source(IntEnum):
     """Where a hypothesis comes from."""
 
     PREVIOUS = 0
-    """The last frame's fingers where the filter has the hand."""
+    """The last frame's fingers at the filter's wrist; of a covered hand, its last pose."""
     DYNAMICS = 1
     """The filter's estimate."""
     DETECTOR = 2
-    """The detector's likeliest hypothesis, as it is and bent to its keypoints."""
+    """The detector's likeliest hypothesis, raw or bent to the keypoints."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Hypotheses:
 
     @classmethod
     def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
-        """One below the other."""
+        """The rows of all tables, in order."""
         return cls(
             torch.cat([table.pose for table in tables]),
             torch.cat([table.source for table in tables]),
@@ -66,9 +66,9 @@ class Hypotheses:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The pose of a frame.
+    """The chosen pose of a frame.
 
-    pose: (1, 27).  moved: it is of another place, where a new track begins.
+    pose: (1, 27).  moved: the detector sees it elsewhere: the track is to restart there.
     """
 
     pose: Tensor
@@ -76,15 +76,15 @@ class Choice:
 
 
 def select(table: Hypotheses, joints_m: Tensor, hidden: bool) -> Choice:
-    """The pose of one hand in a frame: the best of all, those of the detector with a margin.
+    """The best of a hand's scored hypotheses; one of the detector must be better by a margin.
 
-    table: the hand's hypotheses, scored.  joints_m: (N, 21, 3) of them.
-    hidden: something hides part of the hand. Then a pose of the detector at another place needs a
-        large lead, for it may be of what hides the hand, such as another hand.
+    table: with at least one row that is not the detector's.  joints_m: (N, 21, 3) of its poses.
+    hidden: something hides part of the hand. Then a pose elsewhere needs a large lead, for it may
+        be of what hides the hand, such as another hand.
     """
     # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
     joints, source = joints_m.numpy(), table.source.numpy()
-    values = np.maximum(table.log_posterior.numpy(), _WORST)
+    values = np.maximum(table.log_posterior.numpy(), WORST)
     detectors = source == Source.DETECTOR
     base = int(np.where(detectors, -np.inf, values).argmax())
     away = np.sqrt(np.square(joints - joints[base]).sum(-1)).mean(1)

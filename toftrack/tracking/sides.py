@@ -1,9 +1,9 @@
 """Right or left: evidence for a track's side, summed up over comparisons.
 
 The same image is explained twice, by the pose network's poses of a right hand and by those of a
-left one, each brought onto the seen points; their posteriors are compared. The network's own word
-counts a little beside them: where the image says nothing, as of a fist that does not move, it is
-right more often, but it believes a wrong pose whose crop it sees.
+left one, raw and refined; the best posteriors are compared. The network's own word counts a little
+beside them: where the image says nothing, as of a fist that does not move, it is right more often,
+but it believes a wrong pose whose crop it sees.
 """
 
 from __future__ import annotations
@@ -17,45 +17,43 @@ import numpy as np
 from toftrack.detector.hand_detector import Detection
 from toftrack.frames import DepthImage
 from toftrack.tracking.candidates import View, best_start
+from toftrack.tracking.confidence import log_odds
 from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.select import WORST
 from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 
 _WEIGHT, _LARGEST, _MOST = 2.0, 3.0, 6.0
-"""A comparison counts so many times the difference of the log posteriors, this at most; and the log
-odds that all together are never more than."""
+"""Weight of a comparison's difference of log posteriors; bound of that difference, and of the log
+odds that all comparisons give together."""
 _KEYPOINTS = 0.1
 """Weight of the keypoints in a comparison; little, for the network sees a hand of either side where
 it looks for one."""
 _NETWORK, _LEAST_SIDE = 0.03, 1e-4
-"""Weight of the difference of the network's own log odds; it is never surer of a side than that."""
+"""Weight of the network's own log odds; and the least probability of a side that they count."""
 _SHOULDER, _SHOULDER_MOST, _BODY_COMPARISONS = 10.0, 1.0, 20
 """Log odds for each m that the body is beside the hand, for people face the camera, these at most;
 and comparisons over which the body's place is averaged."""
 _BEHIND_M, _BODY_M2, _BODY_ROWS = (0.12, 0.55), 0.03, 72
-"""The body lies so far behind a hand that is raised before it; its least area that is seen, and
-rows of the image that it is searched in."""
+"""Range of the body's distance behind a raised hand; its least visible area; and rows of the image
+that it is searched in."""
 _PARTNER = 2.0
 """Log odds that two hands which are seen at once are of different sides."""
 _TOLD = 2.0
 """Log odds that a hand which is seen alone is of the side that the user said."""
 _SURE, _FIRST = 3.0, 5
-"""Log odds from which on the sides are compared less often; a new hand's are, so often, before."""
+"""Sides are compared less often beyond these log odds, after so many comparisons."""
 _UNSURE_S, _SURE_S = 0.08, 0.8
-"""Seconds between two comparisons."""
+"""Seconds between two comparisons, before and after that."""
 _SWITCHED, _SWITCHED_TOLD = 0.2, 2.4
-"""Log odds by which the other side must be likelier for a track to change, so that it does not
-flicker; and where the user said a side."""
+"""Log odds by which the other side must be likelier for a track to change, or it would flicker; and
+the same where the user said a side."""
 _LEAST_PRESENT, _LEAST_LOG_ODDS = 0.5, -1.0
 """Where a hand is less probable, or its estimate is less surely right, its sides are not compared:
 neither pose is the hand's, and which one explains more of the image is chance."""
 
 
-_WORST = -1e6
-"""Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
-
-
 def side_log_odds(track: Track, others: Sequence[Track], told: str | None) -> float:
-    """Log odds that a track is a right hand, with what is known beside its own evidence.
+    """Log odds that a track is a right hand, by its evidence, the body, its partner and the user.
 
     others: the other tracks that are confirmed; a person's two hands are not of one side.
     told: the side that the user said, of a hand that is seen alone.
@@ -72,7 +70,7 @@ def side_log_odds(track: Track, others: Sequence[Track], told: str | None) -> fl
 
 
 def comparison_due(track: Track, dt_s: float) -> bool:
-    """Whether both sides of a track's hand are to be compared in a frame, dt_s after the last."""
+    """Whether a track's sides are to be compared in a frame that comes dt_s after its last one."""
     if track.confirmed and track.log_odds < _LEAST_LOG_ODDS:
         return False
     known = abs(track.evidence.fits) > _SURE and track.evidence.comparisons >= _FIRST
@@ -80,10 +78,9 @@ def comparison_due(track: Track, dt_s: float) -> bool:
 
 
 def compare_sides(view: View, mirrored: Detection, image: DepthImage) -> SideEvidence:
-    """A track's evidence after one more comparison.
+    """A track's evidence after one more comparison; as it was where hardly a hand is detected.
 
-    mirrored: what the pose network says of the other side at the hand's place.
-    image: without other hands.
+    mirrored: the detection there as a hand of the other side.  image: without other hands.
     """
     evidence, side = view.track.evidence, view.track.side
     if view.detection.empty or view.detection.present < _LEAST_PRESENT:
@@ -99,32 +96,30 @@ def compare_sides(view: View, mirrored: Detection, image: DepthImage) -> SideEvi
     return SideEvidence(min(max(fits, -_MOST), _MOST), body_m, comparisons, 0.0)
 
 
-def changes_side(track: Track, log_odds: float, told: str | None) -> bool:
-    """Whether a track's hand, a right one with these log odds, is of the other side after all."""
-    own = log_odds if track.side == "right" else -log_odds
-    return own < -(_SWITCHED if told is None else _SWITCHED_TOLD)
+def changes_side(track: Track, right: float, told: str | None) -> bool:
+    """Whether a track is to change its side, by the log odds of a right hand."""
+    agrees = right if track.side == "right" else -right
+    return agrees < -(_SWITCHED if told is None else _SWITCHED_TOLD)
 
 
 def _best_of_side(view: View, detection: Detection, side: str) -> float:
-    """The log posterior of the best pose that the detector has for a side."""
+    """The log posterior of the best pose of a detection as a hand of `side`."""
     fitted = view.model.hand(side, view.track.shape)
     # Very different poses are compared: what explains more of the image counts in full.
     image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
     seen = replace(view, fitted=fitted, detection=detection, image=image)
-    return max(best_start(seen, _KEYPOINTS)[1], _WORST)
+    return max(best_start(seen, _KEYPOINTS)[1], WORST)
 
 
 def _network_lead(
     detection: Detection, mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
 ) -> float:
-    """How much surer the network is of a side than of the other one, log odds.
+    """Log odds by which the network is surer of `side` than of the other one.
 
-    It is asked about the crop of either side's pose, for a crop that is turned as a pose has it
-    makes that pose's side the likelier one.
+    It is the mean over the crops of both sides' poses: a crop that is turned as a pose has it makes
+    that pose's side likelier.
     """
     said = _network_log_odds(detection) - _network_log_odds(mirrored)
-    if mirrored.empty:
-        return said
     centre, up = mirrored.centre_m.numpy()[None], mirrored.up[None]
     own, other = (
         model.detector.detect(image.depth_m, image.k, centre, one, up)[0]
@@ -134,16 +129,15 @@ def _network_lead(
 
 
 def _network_log_odds(detection: Detection) -> float:
-    """That a hand is of the side that was looked for, by the network; 0 where it was not asked.
+    """The network's log odds that a detected hand is of the side that was looked for.
 
     Most hands that it was trained on are of that side, which cancels in the difference of both.
     """
-    p = min(max(detection.right_side, _LEAST_SIDE), 1 - _LEAST_SIDE)
-    return math.log(p / (1 - p))
+    return log_odds(min(max(detection.right_side, _LEAST_SIDE), 1 - _LEAST_SIDE))
 
 
 def body_offset_m(image: DepthImage, centre_m: np.ndarray) -> float:
-    """How far a body behind a hand is to the image's right of it; 0 where none is seen.
+    """How far, m, a body is to the image's right of a hand at centre_m (3,); 0 where none is seen.
 
     Who faces the camera has the right hand to the image's left of the body, as a rule.
     """

@@ -1,4 +1,4 @@
-"""What the tracker carries from frame to frame, and what others may see of it."""
+"""The tracker's state from frame to frame, and what a step says of one frame."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ OTHER_SIDE = {"right": "left", "left": "right"}
 
 @dataclass(frozen=True)
 class SideEvidence:
-    """What comparisons of a hand's two sides have said, log odds of a right hand; see sides.py.
+    """Evidence for a hand's side, from comparisons; see sides.py.
 
-    fits: by how much better a right hand explains the image than a left one, summed up.
+    fits: log odds of a right hand, summed up over the comparisons.
     body_m: how far the body is to the image's right of the hand, on average.
     comparisons: how many there were.  age_s: how long ago the last one was.
     """
@@ -44,18 +44,17 @@ class Track:
 
     particles: (N, 6 + d), after the last observation.  weights: (N,) normalised. Both are on the
         model's device; all else is on the CPU.
-    mean: (1, 6 + d), the last estimate in the pose space.  velocity: (6 + d,) its change a second.
+    mean: (1, 6 + d), of the particles.  velocity: (6 + d,) its smoothed change a second.
     pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
-    number: tells it from all others.  side: right or left, and `evidence` for it.
-    shape: the estimate of the hand's shape.
-    age: how long it has been followed.
-    doubtful: how long its confidence has been below what a track is kept for.
-    log_odds: that the estimate is right, smoothed over time.  whole_odds: that its mean error is
-        below 40 mm, likewise.
+    number: unique.  side: right or left, with the `evidence`.
+    age: since it began or restarted.  doubtful: how long it was below ConfidenceModel.give_up, where
+        frames of a hidden hand count less.
+    log_odds: that every joint of the estimate is within 40 mm, smoothed over time.
+    whole_odds: that its mean error is, likewise.
     confirmed: one of its estimates was believed; until then the track is tentative.
-    believed_s: how long ago one was, or since it began; 0 = the last one is not lost.
-    asked_s: how long ago the pose network was asked about it.
+    believed_s: since the last believed estimate, or since it began; 0 = the last one is not lost.
+    asked_s: since the pose network looked at it.
     features: of the last estimate, see confidence.py.
     nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
         at; 0 while nothing does.
@@ -89,11 +88,12 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """A place of the report: the hand that a user knows by its number.
+    """A place of the report, for one hand.
 
     track: number of the track that is reported here; -1 = none.
-    side, shape: of the hand that was here last.  known: how surely that is its side, log odds.
-    last: the last estimate that was believed, or that there was; lost and NaN before any.
+    side, shape: of the last track here.  known: log odds that its last confirmed one was a right
+        hand; 0 = there was none.
+    last: the last believed estimate, else the last one; lost and NaN before any.
     gesture: smoothed probabilities of the gestures, None where there are none.
     away_s: how long ago a hand was believed here; inf = never.
     joint_features: (21, J) of the last estimate, see confidence.py.
@@ -110,7 +110,7 @@ class Slot:
 
 
 NO_PLACES = Places(np.zeros((0, 3)), np.zeros(0))
-"""Of a frame in which the finder was not asked."""
+"""The places of a frame in which the finder was not asked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +118,10 @@ class TrackerState:
     """All that is carried between frames: from the same state and images, the same estimates.
 
     generator: the state of the random generator, as torch.Generator.get_state() gives it.
-    tracks: the hands that are followed, each a row; the surest of them are reported.
-    slots: as many as hands are asked for.
-    told: the side that the user said of the first one; None = nobody did.
-    places: where the finder has seen hands in the last frame; `found_s` ago.
-    refused: (R, 4) middles of what was taken for a hand and was none, and how long ago that was.
+    tracks: in the order in which they began.  slots: as many as hands are asked for.
+    told: the side of the first slot that the user said; None = nobody did.
+    places: the finder's in the last frame, used in the next.  found_s: since it was last asked.
+    refused: (R, 4) palms of tentative tracks that ended, m, and how long ago that was, s.
     next_track, next_index: numbers of the next track, and of the next frame without one.
     timestamp_s: of the last frame, None before any.
     """
@@ -139,15 +138,15 @@ class TrackerState:
     timestamp_s: float | None = None
 
     def track_of(self, slot: Slot) -> Track | None:
-        """The hand that is reported in a slot."""
+        """The track of a slot; None where it has none."""
         return next((track for track in self.tracks if track.number == slot.track), None)
 
     def elapsed_s(self, image: DepthImage) -> float:
-        """Seconds from the last frame to an image, as motions are reckoned with."""
+        """Seconds from the last frame to an image, bounded: see compute.pace.elapsed_s."""
         return elapsed_s(self.timestamp_s, image.timestamp_s)
 
     def at(self, image: DepthImage) -> TrackerState:
-        """The state as time goes on to an image."""
+        """The state at the time of an image: ages of its slots and places updated, tracks as they were."""
         before = image.timestamp_s if self.timestamp_s is None else self.timestamp_s
         passed = max(0.0, image.timestamp_s - before)
         refused = self.refused + np.array([0.0, 0.0, 0.0, passed])
@@ -161,25 +160,25 @@ class TrackerState:
         )
 
     def random_generator(self) -> torch.Generator:
-        """The random generator, on the CPU."""
+        """A CPU generator that goes on from the state."""
         made = torch.Generator()
         made.set_state(self.generator)
         return made
 
 
 REFUSED_S = 1.5
-"""What was taken for a hand and was none is left alone for so long, if it stays where it is."""
+"""No track begins for so long where a tentative one ended."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepInfo:
-    """What a step saw and believed of one hand; for those who watch it.
+    """What a step saw and believed of one hand, for views and tools.
 
-    particles: (N, 6 + d) before the estimate was refined; none where nothing can be a hand.
+    particles: (N, 6 + d), before refinement; (0, 6 + d) where nothing can be a hand.
     weights: (N,) normalised. Both are on the model's device.
     seconds: wall seconds of each stage.
     features, joint_features: what the confidence was computed from; None where there is no network.
-    detection: what the network said; None in a frame in which it was not asked.
+    detection: None where the pose network did not look.
     """
 
     observation: Observation
@@ -192,9 +191,9 @@ class StepInfo:
 
 
 def generator_on(device: torch.device, generator: torch.Generator) -> torch.Generator:
-    """The generator to draw particles with on a device; on the CPU it is the given one itself.
+    """A generator on a device: on the CPU the given one itself, elsewhere a new one that it seeds.
 
-    Elsewhere the given one seeds it, so that nothing but the CPU's is carried between frames.
+    So only the CPU's generator is carried between frames.
     """
     if device.type == "cpu":
         return generator

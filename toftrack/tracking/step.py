@@ -1,4 +1,4 @@
-"""The tracker's step: a state and an image in, the next state and an estimate of each hand out."""
+"""The tracker's step: from a state and an image to the next state and an estimate per slot."""
 
 from __future__ import annotations
 
@@ -37,36 +37,37 @@ from toftrack.tracking.state import NO_PLACES, StepInfo, Track, TrackerState
 from toftrack.tracking.views import begin_tracks, continue_track, max_new_tracks, predicted_view
 
 StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
-"""The next state, and for each slot what was seen, None where nothing was, and the estimate."""
+"""The next state; per slot what the step saw, None where it has no track; per slot the estimate."""
 
 
 @small_operations()
 def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepResult:
-    """One frame of all hands; a pure function: the state given stays as it is.
+    """The next state, and what each slot reports, after one image. It leaves `state` unchanged.
 
     Tracking by detection (SORT: Bewley et al., ICIP 2016) of hands that are each followed by a
     particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and local
     optimisation of few hypotheses (Gall et al., IJCV 87, 2010):
 
-    1. Predict where the tracks' hands are, and whose the pixels are.
-    2. Detect: a network that votes for joints (A2J: Xiong et al., ICCV 2019) looks at each track's
-       place, and where another one that sees the whole image finds a hand that no track explains.
-    3. Associate detections with tracks; what is left over begins tentative ones.
-    4. Filter: N particles (N, 6 + d) of each track in the pose space, resampled, diffused, weighed
-       by the F-measure of the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
+    1. Predict each track's hand, and which track owns which pixels.
+    2. Detect: the pose network, which votes for joints (A2J: Xiong et al., ICCV 2019), looks at
+       predicted hands, and where the finder, which sees the whole image, finds a hand of no track.
+    3. Associate detections with tracks; the unassigned ones begin tentative tracks.
+    4. Filter: resample, diffuse and weigh each track's particles (N, 6 + d) by the F-measure of the
+       image, in annealed passes (Deutscher and Reid, IJCV 61, 2005). While no hand is to be found
+       anew this runs beside the networks, before 3.
     5. Refine a few hypotheses (M, 27) by Levenberg-Marquardt steps; the best posterior is the pose.
-    6. Judge it, learn the hand's shape, and end what nobody sees any more.
+    6. Judge it, learn the hand's shape, end tracks that stay doubtful or share another one's hand.
     7. Report the tracks in the slots that the user asked for.
     """
     spans, generator, dt_s = Spans(), state.random_generator(), state.elapsed_s(image)
     before = state.at(image)
     with spans("detector"):
         scene = Scene.of(before.tracks, image, dt_s, model)
-        asked = start_detection(scene, before)
+        pending = start_detection(scene, before)
         views = [predicted_view(scene, row) for row in range(len(scene.hands))]
     dice = _dice(generator, len(views) + max_new_tracks(before))
     early = dict[int, ParticleSet]()
-    if not asked.at_once:  # the networks need nothing of it, and it needs little of them
+    if not pending.at_once:  # no track moves elsewhere, so that the filter need not wait
         shown = {slot.track for slot in before.slots}
         early = {
             row: filter_track(view, dt_s, dice[row], spans, view.track.number in shown)
@@ -74,33 +75,35 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
             if view is not None
         }
     with spans("detector"):
-        seen, asked = finish_detection(asked, scene, before)
-        taken = assign(costs(scene.hands, seen, dt_s))
+        detections, pending = finish_detection(pending, scene, before)
+        columns = assign(costs(scene.hands, detections, dt_s))
         views = [
-            continue_track(scene, row, view, seen[column] if column >= 0 else None, before.told)
-            for row, (view, column) in enumerate(zip(views, taken, strict=True))
+            continue_track(
+                scene, row, view, detections[column] if column >= 0 else None, before.told
+            )
+            for row, (view, column) in enumerate(zip(views, columns, strict=True))
         ]
-        views += begin_tracks(scene, unassigned(seen, taken), before)
-    followed = [
+        views += begin_tracks(scene, unassigned(detections, columns), before)
+    results = [
         update_track(view, early.get(row), scene, dice[row], spans)
         for row, view in enumerate(views)
         if view is not None
     ]
     with spans("detector"):
-        places = NO_PLACES if asked.finding is None else asked.finding()
+        places = NO_PLACES if pending.finder is None else pending.finder()
     after = replace(
         before,
         places=places,
-        found_s=0.0 if asked.found else before.found_s,
-        next_track=before.next_track + len(views) - len(taken),
+        found_s=0.0 if pending.finder_asked else before.found_s,
+        next_track=before.next_track + len(views) - len(columns),
         generator=generator.get_state(),
     )
-    after = keep_tracks(after, [one.track for one in followed], model)
-    return report(after, followed, scene, spans)
+    after = keep_tracks(after, [result.track for result in results], model)
+    return report(after, results, scene, spans)
 
 
 def _dice(generator: torch.Generator, count: int) -> list[torch.Generator]:
-    """A generator for each hand: what one draws does not depend on how many there are."""
+    """`count` generators, one a hand: the first hands draw the same however many there are."""
     seeds = torch.randint(2**62, (count - 1,), generator=generator).tolist()
     return [generator, *(torch.Generator().manual_seed(seed) for seed in seeds)]
 
@@ -108,7 +111,7 @@ def _dice(generator: torch.Generator, count: int) -> list[torch.Generator]:
 def filter_track(
     view: View, dt_s: float, generator: torch.Generator, spans: Spans, shown: bool
 ) -> ParticleSet:
-    """The particles of a frame; of a hand that nobody asked for only moved on."""
+    """A track's particles in a frame: filtered where `shown` in a slot, else only predicted."""
     with spans("filter: rest"):
         if not shown:
             return predict_particles(view.track, dt_s, view.model)
@@ -118,9 +121,10 @@ def filter_track(
 def update_track(
     view: View, early: ParticleSet | None, scene: Scene, generator: torch.Generator, spans: Spans
 ) -> TrackResult:
-    """A track after a frame: its particles filtered, its pose chosen and judged.
+    """A track after a frame, with its chosen pose and what is thought of it.
 
-    early: its particles as of this frame, if it goes on where it was predicted.
+    early: its particles in this frame where they are filtered already. A restarted track, of age 0,
+        has new ones, which are filtered here.
     """
     model, track, dt_s = view.model, view.track, scene.dt_s
     if early is None or track.age.seconds == 0:
@@ -164,7 +168,7 @@ def update_track(
 
 
 def learn_shape(view: View, found: PoseEstimate) -> shape_fit.ShapeEstimate:
-    """The estimate of the hand's shape after a believed estimate of its pose."""
+    """The shape estimate of a track, updated by a pose that is believed and unhidden."""
     shape, fitted = view.track.shape, view.fitted
     if view.detection.empty or view.hidden or shape.applied != fitted.applied:
         return shape
@@ -182,13 +186,12 @@ def learn_shape(view: View, found: PoseEstimate) -> shape_fit.ShapeEstimate:
 
 
 def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
-    """The state with the tracks that go on: hands that somebody sees, each of them once."""
-    confirmed = [track.confirmed for track in tracks]
-    beside = [sum(confirmed) > own for own in confirmed]
+    """The state with the tracks that go on, one a hand; tentative ones that end are refused."""
+    confirmed = sum(track.confirmed for track in tracks)
     left = [
         track
-        for track, other in zip(tracks, beside, strict=True)
-        if not track_ends(track, other, model.lost.patience)
+        for track in tracks
+        if not track_ends(track, confirmed > track.confirmed, model.lost.patience)
     ]
     gone = {track.number for track in tracks} - {track.number for track in left}
     for first in sorted(left, key=sureness, reverse=True):
@@ -210,7 +213,7 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
 
 
 def on_same_hand(first: Track, second: Track, model: TrackerModel) -> bool:
-    """Whether two tracks have come onto one hand."""
+    """Whether two tracks follow the same hand."""
     joints = [
         model.hand(track.side, track.shape).refiner.joints(track.pose)[0].cpu()
         for track in (first, second)
@@ -219,5 +222,5 @@ def on_same_hand(first: Track, second: Track, model: TrackerModel) -> bool:
 
 
 def palm_of(track: Track, model: TrackerModel) -> np.ndarray:
-    """(3,) the middle of the palm of a track's last pose."""
+    """(3,) m, the middle of the palm in a track's last pose."""
     return predict(replace(track, velocity=torch.zeros_like(track.velocity)), 0.0, model).palm_m[0]

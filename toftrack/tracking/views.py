@@ -1,4 +1,4 @@
-"""Tracks as they go into a frame: with their detection, of the likelier side, begun."""
+"""Views of tracks in a frame: predicted, continued or restarted with a detection, and begun."""
 
 from __future__ import annotations
 
@@ -24,13 +24,11 @@ from toftrack.tracking.sides import changes_side, compare_sides, side_log_odds
 from toftrack.tracking.state import OTHER_SIDE, Track, TrackerState
 
 _SPARE = 1
-"""So many tracks may be followed beyond those that are asked for, or the two hands of a person."""
+"""So many tracks may exist beyond the slots, or beyond the two hands of a person."""
 
 
 def predicted_view(scene: Scene, row: int) -> View | None:
-    """A track where it is predicted, before anything was detected; None where nothing in the image
-    can be its hand.
-    """
+    """The view of a track where it is predicted, without detection; None where no hand can be."""
     hand = scene.hands[row]
     evidence = replace(hand.track.evidence, age_s=hand.track.evidence.age_s + scene.dt_s)
     track = replace(hand.track, evidence=evidence)
@@ -40,10 +38,9 @@ def predicted_view(scene: Scene, row: int) -> View | None:
 def continue_track(
     scene: Scene, row: int, view: View | None, seen: SideDetection | None, told: str | None
 ) -> View | None:
-    """A track in a frame with its detection; None where nothing in the image can be its hand.
+    """The `view` of a track with its detection, if it has one; None where no hand can be.
 
-    It begins anew where it was seen at another place than where it was predicted, or turns out to
-    be of the other side.
+    The track restarts where the finder's detection is elsewhere, or the other side is likelier.
     """
     if seen is None:
         return view
@@ -66,7 +63,7 @@ def continue_track(
 
 
 def max_new_tracks(state: TrackerState) -> int:
-    """How many tracks may begin: no more are tentative than hands are missing, or one."""
+    """How many tracks may begin: as many may be tentative as confirmed hands are missing, or one."""
     confirmed = sum(track.confirmed for track in state.tracks)
     most = max(len(state.slots), 2)
     tentative = len(state.tracks) - confirmed
@@ -76,7 +73,7 @@ def max_new_tracks(state: TrackerState) -> int:
 def begin_tracks(
     scene: Scene, new: Sequence[SideDetection], state: TrackerState
 ) -> list[View | None]:
-    """Tentative tracks of hands that are no track's, as many as there is room for."""
+    """Views of new tentative tracks, one a detection while there is room; None where no hand can be."""
     model = scene.model
     views: list[View | None] = []
     for one in new[: max_new_tracks(state)]:
@@ -105,7 +102,7 @@ def begin_tracks(
 
 
 def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
-    """The shape of the hand of a side that was last in a slot which now has none."""
+    """The last shape of a slot of `side` whose track has ended; the population's where there is none."""
     numbers = {track.number for track in state.tracks}
     vacant = (slot for slot in state.slots if slot.track not in numbers and slot.side == side)
     return next((slot.shape for slot in vacant), first_shape())
@@ -114,7 +111,7 @@ def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
 def make_view(
     scene: Scene, row: int, track: Track, detection: Detection, expected: Expected
 ) -> View | None:
-    """A track's hand in the image; None where nothing there can be one."""
+    """The view of a track, -1 = one without row, where it is expected; None where no hand can be."""
     model = scene.model
     observation = scene.segment(expected, row)
     if observation.empty:
@@ -133,7 +130,7 @@ def make_view(
 
 
 def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
-    """The view after its sides were compared; begun anew where the other one is likelier."""
+    """The view with its sides compared; restarted as the other side where that one is likelier."""
     image: DepthImage = scene.image_for(row) if row >= 0 else scene.unexplained()
     track = replace(view.track, evidence=compare_sides(view, mirrored, image))
     others = [hand.track for at, hand in enumerate(scene.hands) if at != row]
@@ -149,7 +146,7 @@ def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: s
 
 
 def restart_track(view: View) -> Track:
-    """The track begun anew with the best of the detection's poses; it is the same hand's."""
+    """The track at the best pose of the view's detection, with age 0: still of the same hand."""
     model, seen = view.model, without_things(view.observation, view.detection)
     # Very different poses are compared: what explains more of the image counts in full.
     image = image_term(seen, view.fitted, model, coverage=1.0)
@@ -167,8 +164,8 @@ def restart_track(view: View) -> Track:
 
 
 def update_shape(track: Track, detection: Detection, model: TrackerModel) -> Track:
-    """The track with what a detection says of its hand's shape: the length to begin with, and
-    whether it still is the hand that was fitted.
+    """The track with its shape updated: a new one takes the detection's length, and a fit that
+    detections contradict is forgotten.
     """
     if detection.empty:
         return track
@@ -179,7 +176,7 @@ def update_shape(track: Track, detection: Detection, model: TrackerModel) -> Tra
 
 
 def expected_of(detection: Detection) -> Expected:
-    """Where a hand is to be segmented that is not tracked yet."""
+    """Where a detected hand is to be segmented."""
     joints = detection.joints_m[0]
     nearest, farthest = map(float, joints[:, 2].aminmax())
     return Expected(nearest, farthest, tuple(detection.centre_m.tolist()))
