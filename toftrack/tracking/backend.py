@@ -1,4 +1,4 @@
-"""Which back end computes here: the only place that chooses between torch, numba and triton."""
+"""The back ends: the only place that chooses between torch, numba and triton."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Backend:
     name: "torch", "numba" or "triton", as `renderer=` says it.
     device: where the particles are. A frame's estimate is on the CPU, where its few poses are
         refined and compared, as is all that is said of it.
-    motions: of particles, there and on the CPU.
-    make_scorer: for a hand of some sizes, given on the CPU; it takes states on the device.
-    make_refiner: likewise, on the CPU.
+    motions: of particles, on the device and on the CPU.
+    make_scorer: from a hand on the CPU to its scorer of poses on the device.
+    make_refiner: from a hand to its refiner of poses, both on the CPU.
     """
 
     name: str
@@ -66,7 +66,7 @@ def choose_backend(renderer: str, device: torch.device | str = "cpu") -> Backend
 
 
 def make_scorer(renderer: str, shape: HandShape, device: torch.device | str = "cpu") -> Scorer:
-    """The scorer alone of a back end, see choose_backend."""
+    """The scorer of a hand by one back end, see choose_backend, also for errors."""
     return choose_backend(renderer, device).make_scorer(shape)
 
 
@@ -81,7 +81,7 @@ def _torch(device: torch.device) -> Backend:
 
 
 def _on_cpu_too(device: torch.device, there: Motions) -> Motions:
-    """Motions of particles on a device; on the CPU beside it the compiled ones."""
+    """The motions `there` for tensors on the device, and compiled ones for those on the CPU."""
     if device.type == "cpu":
         return there
     from toftrack.compute.rigid_numba import MOTIONS as HERE
@@ -104,7 +104,7 @@ def _compiled_refiner() -> Callable[[HandShape], Refiner]:
 
 
 def _numba(device: torch.device) -> Backend:
-    """Compiled code on the CPU; particles elsewhere are scored by it, and moved where they are."""
+    """Compiled code on the CPU, which also scores particles elsewhere; torch moves those."""
     from toftrack.compute import rigid_numba
     from toftrack.render.numba.scorer import NumbaScorer
 

@@ -117,8 +117,8 @@ class View:
 
 
 def with_parts(view: View) -> View:
-    """The view with pixels told apart by the pose network: those of a thing in the hand are no more the
-    hand's, and where it is hidden those of its own arm are, instead of its occluder's.
+    """The view with its pixels told apart by the pose network: a thing's in the hand are no more
+    the hand's, and where it is hidden those of its own arm are, instead of its occluder's.
     """
     seen = without_things(view.observation, view.detection)
     if view.hidden and view.detection.present >= _SURELY_PRESENT:

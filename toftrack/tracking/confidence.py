@@ -30,14 +30,14 @@ _FITTED = Path(__file__).parents[1] / "data" / "confidence.json"
 _LEAST = 1e-3
 _LIKELY = 0.03
 _NEAREST_M, _BEHIND_M = 0.05, 0.04
-"""No joint is nearer; and by how much a surface is nearer that hides one."""
+"""Least depth of a joint in projections; and how much nearer than a joint what hides it is."""
 
 
 @dataclass(frozen=True)
 class ConfidenceFeatures:
-    """What speaks for and against an estimate in one frame; each is a number of order 1.
+    """Features for and against an estimate in one frame, each a number of order 1.
 
-    log_score: of the image, per factor e.
+    log_score: natural log of the image's score.
     keypoints_off, farthest_keypoint_off: distance of the joints from the network's keypoints, mean
         and largest, log of centimetres.
     pose_off: mean distance from the hypothesis that is most like it, likewise.
@@ -65,13 +65,13 @@ class ConfidenceFeatures:
     young: float
 
     def values(self) -> list[float]:
-        """In the order of FEATURES."""
+        """The features in the order of FEATURES."""
         return [getattr(self, name) for name in FEATURES]
 
 
 FEATURES = tuple(field.name for field in fields(ConfidenceFeatures))
 NO_FEATURES = ConfidenceFeatures(*[0.0] * len(FEATURES))
-"""Before any frame."""
+"""The features before any frame."""
 
 
 def confidence_features(
@@ -113,7 +113,7 @@ def confidence_features(
 
 
 def log_odds(probability: float) -> float:
-    """Of a probability in 0 .. 1, both excluded."""
+    """The log odds of a probability in 0 .. 1, both excluded."""
     return math.log(probability / (1 - probability))
 
 
@@ -122,7 +122,7 @@ def _log_cm(metres: float) -> float:
 
 
 def _log_cm_of(*columns_m: np.ndarray) -> np.ndarray:
-    """Columns of metres to the logarithm of centimetres, (N, columns)."""
+    """(N, columns) logs of centimetres, of columns (N,) of metres."""
     values: np.ndarray = np.log(np.maximum(100 * np.stack(columns_m, 1), 0.05))
     return values
 
@@ -132,7 +132,7 @@ def _surprise(probability: float) -> float:
 
 
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
-    """Shares of the joints (21, 3) outside of the image (H, W), and of those behind something."""
+    """The shares of joints (21, 3) outside of the image (H, W), and of those behind something."""
     at, z = joints.numpy(), np.maximum(joints[:, 2].numpy(), _NEAREST_M)
     seen = _readings(at[:, 0] / z, at[:, 1] / z, depth_m.cpu().numpy(), k.cpu().numpy())
     behind = (seen > 0) & (seen < z - _BEHIND_M)
@@ -142,10 +142,10 @@ def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, flo
 def seen_around(
     joints_m: np.ndarray, nearest_m: float, step_m: float, depth_m: np.ndarray, k: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) parts of a joint's surroundings outside and without reading, median depth or NaN.
+    """(N, 3) shares of a joint's surroundings outside and without reading; median depth or NaN.
 
     joints_m: (N, 3).  step_m: from one of the 3 x 3 readings about a joint to the next.
-    nearest_m: depth of a joint that is nearer.
+    nearest_m: least depth of a joint in the projection.
     """
     z = np.maximum(joints_m[:, 2:], nearest_m)
     down, right = (side.ravel() * step_m for side in np.mgrid[-1:2, -1:2])
@@ -160,7 +160,7 @@ def seen_around(
 
 
 def _readings(x: np.ndarray, y: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """(N, ...) what an image has at points of the plane z = 1: NaN outside, 0 without reading."""
+    """Depths, shaped as x and y, at points of the plane z = 1: NaN outside, 0 without reading."""
     height, width = depth_m.shape
     column, row = np.rint(k[0, 0] * x + k[0, 2]), np.rint(k[1, 1] * y + k[1, 2])
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -215,7 +215,7 @@ _LEAST_CM, _MOST_CM = 0.1, 30.0
 
 @dataclass(frozen=True)
 class JointConfidence:
-    """What makes a joint's standard deviations and probability; see data/confidence.json.
+    """The model of a joint's standard deviations and probability; see data/confidence.json.
 
     scale: times all standard deviations.  odds: added to all log odds.
     kinds: what each kind of joint begins with, in the order of COLUMNS.
@@ -270,7 +270,7 @@ def joint_features(
     depth_m: np.ndarray,
     k: np.ndarray,
 ) -> np.ndarray:
-    """(21, J) in the order of JOINT_FEATURES.
+    """(21, J) features of the joints, in the order of JOINT_FEATURES.
 
     joints_m: (21, 3).
     last: (21, J) of the frame before; in a frame without a detection, those of its keypoints hold.
@@ -290,7 +290,7 @@ def joint_features(
     deeper = np.where(np.isnan(surface), 0.0, joints[:, 2] - surface - _BELOW_M)
     features[:, 3], features[:, 4] = outside, unread
     features[:, 5], features[:, 6] = deeper.clip(0, 0.05) / 0.02, (-deeper).clip(0, 0.05) / 0.02
-    features[:, 7] = -math.log(max(score, 1e-3))
+    features[:, 7] = -math.log(max(score, _LEAST))
     features[:, 8] = np.log(1e3 * np.maximum(joints[:, 2], _NEAREST_M) / k[0, 0])
     features[:, 9] = np.logaddexp(0.0, -log_odds)
     return features
@@ -299,7 +299,7 @@ def joint_features(
 def propagated_sigma(
     joints_m: np.ndarray, covariance: Tensor, joints_of: Callable[[Tensor], Tensor]
 ) -> np.ndarray:
-    """(21, 3) m along joint_axes: what the particles' covariance means for the joints (21, 3).
+    """(21, 3) m, deviations of joints (21, 3) along joint_axes by the particles' covariance.
 
     covariance: (6 + d, 6 + d) in the tangent space.
     joints_of: joints (N, 21, 3) of the estimate moved by tangents (N, 6 + d).
@@ -335,17 +335,17 @@ class LogOdds:
             check_number(f"weights.{name}", value)
 
     def __call__(self, features: ConfidenceFeatures) -> float:
-        """From one frame."""
+        """The log odds of one frame."""
         return self.intercept + sum(w * getattr(features, n) for n, w in self.weights.items())
 
 
 @dataclass(frozen=True)
 class ConfidenceModel:
-    """When an estimate is not to be used, and when its track is given up; see conf/lost.
+    """When an estimate is lost, and when its track ends; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
     believe: likewise, until a track was believed for the first time.
-    give_up: below this, a frame is bad.  patience: bad frames in a row until a new search.
+    give_up: below this, a frame is bad.  patience: bad frames in a row that end a track; 0 = none.
     whole: estimates whose mean joint error is below 40 mm with a lower probability are flagged lost
         as well: a hand taken for another one, or turned round, is not to be used at all, while one
         of whose joints a hidden thumb is wrong is, but for that joint.

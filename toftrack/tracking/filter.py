@@ -178,7 +178,7 @@ def update_velocity(track: Track, mean: Tensor, dt_s: float, model: FilterModel)
 
 
 def new_track(pose: Tensor, model: FilterModel) -> Track:
-    """A track of age 0 at a pose (1, 27), with all particles there; number and side are defaults."""
+    """A track of age 0 at a pose (1, 27), with all particles there; without number and side."""
     particle = model.encode(pose)
     n = model.filter.particles
     particles = on_device(particle, model.device).repeat(n, 1)

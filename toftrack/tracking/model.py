@@ -1,4 +1,4 @@
-"""What does not change from frame to frame: the parts of a tracker and their settings."""
+"""The parts of a tracker and their settings, which do not change from frame to frame."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
 _HANDS = 32
-"""Hands of some side and shape that are kept made."""
+"""So many hands of different sides and shapes are cached."""
 
 
 @dataclass(frozen=True)
 class Hand:
-    """The hand of a configuration: a shape, and how it is fitted to the user.
+    """The configured hand: a shape, and how it is fitted to the user.
 
-    side_given: the user said its side, which is detected else.
+    side_given: whether the user said its side; otherwise it is detected.
     """
 
     shape: HandShape
@@ -50,8 +50,9 @@ class Hand:
 
 
 def make_hand(shape: str, side: str, length_m: float) -> Hand:
-    """See toftrack.hand.make_hand_shape; only shape="auto" is fitted, and only side="auto"
-    detected: it begins as a right hand.
+    """The configured hand of arguments as in toftrack.hand.make_hand_shape, which says the errors.
+
+    Only shape="auto" is fitted; only side="auto" is detected, and begins as a right hand.
     """
     made = make_hand_shape(shape, "right" if side == "auto" else side, length_m)
     return Hand(made, ShapeFit(fixed=shape != "auto"), side != "auto")
@@ -59,9 +60,9 @@ def make_hand(shape: str, side: str, length_m: float) -> Hand:
 
 @dataclass(frozen=True, eq=False)
 class FittedHand:
-    """A hand of one side and shape, and what was made for it.
+    """A hand of one side and shape, and what computes with it.
 
-    first: the hand whose components `applied` is away from; see hand/shape_space.py.
+    first, applied: `shape` is `first` changed by the components `applied`; see hand/shape_space.py.
     """
 
     shape: HandShape
@@ -72,7 +73,7 @@ class FittedHand:
 
     @cached_property
     def ratio(self) -> float:
-        """How long it is, in lengths of the mean adult's."""
+        """Its length in lengths of the mean adult's."""
         return self.shape.hand_length_m / DEFAULT_HAND_LENGTH_M
 
     @cached_property
@@ -83,9 +84,7 @@ class FittedHand:
 
 @dataclass(frozen=True, eq=False)
 class FilterModel:
-    """What every tracker has: a hand, its pose space, and particles that are compared with images.
-
-    All is on the CPU but for those parts that the back end makes.
+    """The parts of every tracker; on the CPU but for the particles and the back end's scorers.
 
     configured: the hand as the user configured it.
     gestures: None recognises none.
@@ -100,10 +99,9 @@ class FilterModel:
     backend: Backend
 
     def first_state(self, seed: int, hands: int = 1, side: str | None = None) -> TrackerState:
-        """Before any frame.
+        """The state before any frame, with `hands` slots, which alternate between the sides.
 
-        side: of the first hand, right or left; None = as it was configured, "auto" = of either. A
-            second slot is for the other one.
+        side: of the first, right or left; None = as configured, "auto" = detected.
         """
         told = self.configured.shape.side if self.configured.side_given else None
         told = told if side is None else side if side in OTHER_SIDE else None
@@ -126,16 +124,16 @@ class FilterModel:
         return False
 
     def fitted(self, slot: Slot) -> HandShape:
-        """A slot's hand, with how sure the fit is of it if there is one."""
+        """A slot's hand; where its shape is fitted, with the uncertainty."""
         return self.hand(slot.side, slot.shape).shape
 
     @property
     def device(self) -> torch.device:
-        """Where the particles are."""
+        """The particles' device."""
         return self.backend.device
 
     def space_of(self, particles: Tensor) -> PoseSpace:
-        """The pose space where particles are."""
+        """The pose space on the particles' device."""
         return self.space if particles.device.type == "cpu" else self._space_there
 
     @cached_property
@@ -149,34 +147,30 @@ class FilterModel:
 
     @cached_property
     def model_variance(self) -> Tensor:
-        """(6 + d,) of what the particles do not know."""
+        """(6 + d,) variances to be added to the particles' covariance, see _MODEL_ERROR."""
         return _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
 
     def hand(self, side: str, shape: ShapeEstimate) -> FittedHand:
-        """The hand of a side in the shape that is applied."""
-        return self.made_hand(side, shape.applied)
-
-    def made_hand(self, side: str, applied: tuple[float, ...]) -> FittedHand:
-        """The same of the components that are applied; made once."""
-        return self._hands(side, applied)
+        """The hand of a side in the applied shape; cached."""
+        return self._hands(side, shape.applied)
 
     @cached_property
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
         return lru_cache(_HANDS)(partial(_fitted_hand, self.configured.shape, self.backend))
 
     def decode(self, particles: Tensor) -> Tensor:
-        """(N, 6 + d) particles to (N, 27) hand states."""
+        """(N, 27) poses of particles (N, 6 + d), within the joints' limits."""
         angles = clamp_to_joint_limits(self.space_of(particles).decode(particles[:, 6:]))
         return torch.cat((particles[:, :6], angles), 1)
 
     def encode(self, states: Tensor) -> Tensor:
-        """(N, 27) hand states to the nearest particles within the space's bounds, (N, 6 + d)."""
+        """(N, 6 + d) the particles nearest to poses (N, 27) on the CPU, within the bounds."""
         latent = self.space.encode(states[:, 6:])
         latent = bound(latent, self.space.lower, self.space.upper, "truncate")
         return torch.cat((states[:, :6], latent), 1)
 
     def nearest(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """One hand (1, 27) as a particle (1, 6 + d), and how far off that is, (21,) rad."""
+        """The nearest particle (1, 6 + d) to a pose (1, 27), and from there to it, (21,) rad."""
         particle = self.encode(state)
         return particle, state[0, 6:] - self.space.decode(particle[:, 6:])[0]
 
@@ -186,7 +180,7 @@ class TrackerModel(FilterModel):
     """The parts of the tracker with networks.
 
     weights: of the terms of the posterior.
-    lost: when an estimate is not to be used, and its track is given up.
+    lost: when an estimate is lost, and when its track ends.
     """
 
     detector: HandDetector
@@ -213,7 +207,7 @@ class TrackerModel(FilterModel):
         return not self.fit.fixed
 
     def fitted(self, slot: Slot) -> HandShape:
-        """See FilterModel; nothing is said of the fit before anything was fitted."""
+        """See FilterModel; without the uncertainty before any pose was fitted."""
         shape = super().fitted(slot)
         if not (self.fits and slot.shape.poses):
             return shape

@@ -69,7 +69,7 @@ class RoughStart:
     def __call__(
         self, observation: Observation, model: FilterModel, generator: torch.Generator
     ) -> Track:
-        """A track that begins in a frame that is not empty; nothing is scored."""
+        """A track at the rough start; the observation must not be empty."""
         space, n = model.space, model.filter.particles
         reference = torch.zeros(1, 6 + space.dims)
         rows = [label == "palm" for label in space.training_labels]
@@ -92,7 +92,7 @@ class RoughStart:
 
 
 def palm_centre(observation: Observation) -> np.ndarray:
-    """Where the middle of the palm is, roughly, (3,) float32 metres.
+    """(3,) float32 m, roughly the middle of the palm of an observation on the CPU.
 
     It is the centre of the widest and nearest disc that is inscribed in the silhouette cut along
     its depth edges, so that a hand in front of the body stands by itself, and no wider than a palm,
@@ -127,7 +127,7 @@ def palm_centre(observation: Observation) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ScoreThreshold:
-    """A frame whose estimate scores less than `score`, 0 .. 1, is flagged, and changes nothing."""
+    """A frame whose estimate scores less than `score`, 0 .. 1, is lost; tracking goes on."""
 
     score: float
 
@@ -135,7 +135,7 @@ class ScoreThreshold:
         check_number("lost.score", self.score, 0, 1)
 
     def judge(self, track: Track, score: float) -> Status:
-        """What is thought of an estimate with a score."""
+        """The status of an estimate with a score."""
         if score < self.score:
             return Status("recovering", True)
         return Status("tracking" if track.age.begun else "initialising", False)
@@ -151,10 +151,9 @@ class PaperModel(FilterModel):
 
 @small_operations()
 def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> StepResult:
-    """One frame: segment, start if there is no hand yet, filter, take the mean.
+    """The next state and the one slot's report: segment, start without a track, filter, take the mean.
 
-    A pure function: the state given stays as it is, and gives the same again. In an image without
-    anything in it, the particles wait as they were.
+    It leaves `state` unchanged. In an image without a surface, the particles stay as they are.
     """
     spans, generator, dt_s = Spans(), state.random_generator(), state.elapsed_s(image)
     state = state.at(image)
@@ -206,7 +205,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
 def _particles_sigma(
     joints_m: np.ndarray, found: PoseEstimate, track: Track, fitted: FittedHand, model: FilterModel
 ) -> np.ndarray:
-    """(21, 3) standard deviations of joints by the particles alone, as joint_sigma_m has them."""
+    """(21, 3) m, standard deviations of joints by the particles and _MODEL_ERROR alone."""
     motions, filtered = model.backend.motions, found.filtered
 
     def joints_of(tangents: torch.Tensor) -> torch.Tensor:

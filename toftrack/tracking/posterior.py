@@ -1,10 +1,9 @@
-"""The posterior of a hand's pose: one definition for all who compare poses.
+"""The posterior of a hand's pose, by which all but the particle filter compare poses.
 
     log p(pose | frame) = image + keypoints + overlap + other hand  (up to a constant)
 
-A start, the candidates of a frame and the two sides of a hand are compared by it; the particle
-filter weighs its particles by the image alone, sharpened. Each term is a small object, and a term
-of weight 0 is left out.
+A start, the hypotheses of a frame and the two sides of a hand are compared by it; the filter weighs
+its particles by the image alone, sharpened. A term of weight 0 is left out.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer
 
 _FAR_SIGMAS = 3.0
-"""Farther off, a joint is as wrong as it can be."""
+"""Scale, in standard deviations, from which on farther joints hardly cost more."""
 _TOUCH_M = 0.018
 """Joints of two hands come no nearer to each other, as a rule: fingers are so thick."""
 Term = Callable[[Tensor, Tensor], Tensor]
-"""Poses (N, 27) and their joints (N, 21, 3) to log values (N,); everything on the CPU."""
+"""Log values (N,) of poses (N, 27) and their joints (N, 21, 3); everything on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,8 @@ class PosteriorWeights:
 class ImageTerm:
     """The likelihood of the image: the log of the F-measure, and of how much is explained.
 
-    evidence: on the scorer's device.  coverage: see FMeasure.log_score; None = the likelihood's.
+    evidence: on the scorer's device.  coverage: weight of how much is explained; None = the
+        likelihood's own.
     """
 
     likelihood: FMeasure
@@ -56,12 +56,12 @@ class ImageTerm:
     device: torch.device
     coverage: float | None = None
 
-    def __call__(self, poses: Tensor, joints_m: Tensor | None = None) -> Tensor:
-        """(N, 27) hands, on the CPU or the scorer's device, to (N,) there; joints are not used."""
+    def __call__(self, poses: Tensor) -> Tensor:
+        """(N,) log values of poses (N, 27), on the device of the poses: the CPU or the scorer's."""
         return self.likelihood.log_score(self._counts(poses), self.coverage)
 
     def score(self, pose: Tensor) -> float:
-        """(1, 27) to the F-measure, 0 .. 1."""
+        """The F-measure, 0 .. 1, of a pose (1, 27)."""
         return float(self.likelihood.score(self._counts(pose)))
 
     def _counts(self, poses: Tensor) -> Counts:
@@ -73,8 +73,8 @@ class ImageTerm:
 
 @dataclass(frozen=True, eq=False)
 class KeypointsTerm:
-    """Joints away from the detector's keypoints: the mean of their squared deviations in standard
-    deviations, robust (Geman-McClure).
+    """Cost of joints away from the detector's keypoints: the mean of their squared deviations in
+    standard deviations, robust (Geman-McClure).
     """
 
     keypoints: Keypoints
@@ -89,8 +89,8 @@ class KeypointsTerm:
 
 @dataclass(frozen=True, eq=False)
 class OverlapTerm:
-    """Fingers in one another. Else what is no hand, such as an elbow, is one whose fingers lie in
-    each other: without this term a fresh draw is usable in 28 instead of 91 %.
+    """Cost of fingers in one another. Else what is no hand, such as an elbow, looks like one with
+    overlapping fingers: without this term a fresh draw is usable in 28 instead of 91 %.
     """
 
     hand_length_m: float
@@ -103,7 +103,7 @@ class OverlapTerm:
 
 @dataclass(frozen=True, eq=False)
 class OtherHandTerm:
-    """Joints that lie in another hand.  other_m: (J, 3) its joints."""
+    """Cost of joints that lie in another hand.  other_m: (J, 3) its joints."""
 
     other_m: Tensor
     weight: float
@@ -115,9 +115,9 @@ class OtherHandTerm:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The terms of one hand in one frame.
+    """The posterior of one hand in one frame.
 
-    joints: hands (N, 27) to joints (N, 21, 3).
+    joints: from poses (N, 27) to joints (N, 21, 3).  terms: by name, all but the image's.
     """
 
     image: ImageTerm
@@ -125,7 +125,7 @@ class Posterior:
     terms: Mapping[str, Term] = field(default_factory=dict)
 
     def __call__(self, poses: Tensor) -> Tensor:
-        """(N, 27) on the CPU to (N,)."""
+        """(N,) log posteriors of poses (N, 27) on the CPU."""
         joints, total = self.joints(poses), self.image(poses)
         for term in self.terms.values():
             total = total + term(poses, joints)

@@ -1,4 +1,4 @@
-"""What is reported of a frame: which track is in which slot, and the estimate of each.
+"""The report of a frame: which track is in which slot, and the estimate of each.
 
 Only here it matters what the user asked for: how many hands, and of which side.
 """
@@ -33,19 +33,17 @@ from toftrack.tracking.sides import side_log_odds
 from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
 
 _OTHER = 0.4
-"""Where it is less probable than this that a hand is of the given side, the frame is flagged."""
+"""A hand that is less probably of the side that the user said is flagged as another one."""
 _STAYS, _CONFIRMED, _MOST = 4.0, 6.0, 3.0
-"""What a track is worth to a slot, log odds: that it was there before; that it was confirmed; and
-what its estimate is believed, and its side agrees, at most."""
+"""Worth of a track to a slot, log odds: for being there before, for being confirmed, and, at most,
+for its log odds and for its side."""
 _GONE_S = 2.0
-"""Where no side was said, a hand that has been away so long makes way for another one."""
+"""Where no side was said, one of the other side takes the place of a hand away for so long."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """A track after a frame: what it was compared with, what was found, its F-measure, and what is
-    thought of it.
-    """
+    """A track after a frame.  score: the F-measure of its pose, 0 .. 1."""
 
     view: View
     track: Track
@@ -55,15 +53,15 @@ class TrackResult:
 
 
 def report(
-    state: TrackerState, followed: Sequence[TrackResult], scene: Scene, spans: Spans
+    state: TrackerState, results: Sequence[TrackResult], scene: Scene, spans: Spans
 ) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
-    """The state with its slots, and for each slot what was seen and the estimate.
+    """The state with its slots updated; per slot the info, None without a track; the estimates.
 
-    state: with the tracks that go on.
+    state: with the tracks that go on.  results: also of those that ended in this frame.
     """
-    sides = {one.track.number: right_log_odds(one.track, state) for one in followed}
+    sides = {one.track.number: right_log_odds(one.track, state) for one in results}
     slots, infos, estimates = [], list[StepInfo | None](), []
-    for number, one in enumerate(assign_slots(state, followed, sides)):
+    for number, one in enumerate(assign_slots(state, results, sides)):
         slot, info = state.slots[number], None
         if one is None:
             slot, estimate = report_absence(slot, scene.image, scene.model, len(state.slots))
@@ -78,28 +76,31 @@ def report(
 
 
 def right_log_odds(track: Track, state: TrackerState) -> float:
-    """Log odds that a track is a right hand, by all that is known."""
+    """Log odds that a track is a right hand, see side_log_odds."""
     others = [one for one in state.tracks if one.confirmed and one.number != track.number]
     return side_log_odds(track, others, state.told)
 
 
 def assign_slots(
-    state: TrackerState, followed: Sequence[TrackResult], sides: Mapping[int, float]
+    state: TrackerState, results: Sequence[TrackResult], sides: Mapping[int, float]
 ) -> list[TrackResult | None]:
-    """The track of each slot: the sum of what they are worth to their slots is largest."""
-    worth = np.zeros((len(state.slots), len(followed) + len(state.slots)))
+    """The result for each slot, None = none, so that their worth to the slots is largest in sum.
+
+    sides: log odds of a right hand by track number.
+    """
+    worth = np.zeros((len(state.slots), len(results) + len(state.slots)))
     for number, slot in enumerate(state.slots):
-        for column, one in enumerate(followed):
+        for column, one in enumerate(results):
             worth[number, column] = _worth(number, slot, one.track, sides[one.track.number], state)
     columns = linear_sum_assignment(-worth)[1]
     return [
-        followed[column] if column < len(followed) and worth[number, column] > 0 else None
+        results[column] if column < len(results) and worth[number, column] > 0 else None
         for number, column in enumerate(columns)
     ]
 
 
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
-    """What a track is worth to a slot; at most 0 where it is not for it."""
+    """A track's worth to slot `number`; 0 or less where it may not take it.  right: log odds."""
     worth = _CONFIRMED * track.confirmed + min(max(track.log_odds, -_MOST), _MOST) + _MOST
     stays = slot.track == track.number
     # Of hands that are worth the same, the one that was found first comes first.
@@ -122,7 +123,7 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
 def report_track(
     number: int, one: TrackResult, right: float, state: TrackerState, scene: Scene
 ) -> tuple[Slot, StepInfo, Estimate]:
-    """A slot with its track after a frame, what was seen of it, and the estimate.
+    """Slot `number` with a track's result, the info but for its seconds, and the estimate.
 
     right: log odds that it is a right hand.
     """
@@ -184,7 +185,7 @@ def report_track(
 def report_absence(
     slot: Slot, image: DepthImage, model: FilterModel, count: int
 ) -> tuple[Slot, Estimate]:
-    """A slot without a hand, and its estimate; of the only slot the last believed one stands."""
+    """A slot without track, and a lost estimate: NaN, or of the only slot its last one."""
     nothing = no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
     if count > 1:
         return replace(slot, track=-1, gesture=None), nothing
@@ -201,11 +202,13 @@ def make_estimate(
     fitted: FittedHand,
     model: FilterModel,
 ) -> Estimate:
-    """The estimate of a frame, but for its joints' deviations and what `emitted` adds."""
+    """A frame's estimate, without side, joint deviations and what `emitted` adds."""
     particles, motions = found.filtered.particles, model.backend.motions
     mean = on_device(found.filtered.mean, model.device)
     tangents = motions.difference(particles, mean)
-    tangents[:, :3] = particles[:, :3] - mean[:, :3]  # the result speaks of the wrist
+    tangents[:, :3] = (
+        particles[:, :3] - mean[:, :3]
+    )  # the covariance is of the wrist, not of the pivot
     covariance, effective = on_host(
         particle_filter.covariance(tangents, found.filtered.weights),
         particle_filter.effective_sample_size(found.filtered.weights),
@@ -235,8 +238,9 @@ def finish_estimate(
     dt_s: float,
     model: FilterModel,
 ) -> tuple[Slot, Estimate]:
-    """The estimate with its gesture and other programs' conventions; and the slot with what is kept
-    of them.  shape: the hand of the estimate.
+    """The slot with the estimate's gesture, and the estimate with it and in all conventions.
+
+    shape: the hand of the estimate.
     """
     gesture, estimate = tell_gesture(
         model.gestures, slot.gesture, estimate, model.space, dt_s / FRAME_S

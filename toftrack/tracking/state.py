@@ -48,8 +48,8 @@ class Track:
     pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
     number: unique.  side: right or left, with the `evidence`.
-    age: since it began or restarted.  doubtful: how long it was below ConfidenceModel.give_up, where
-        frames of a hidden hand count less.
+    age: since it began or restarted.  doubtful: how long it was below ConfidenceModel.give_up,
+        where frames of a hidden hand count less.
     log_odds: that every joint of the estimate is within 40 mm, smoothed over time.
     whole_odds: that its mean error is, likewise.
     confirmed: one of its estimates was believed; until then the track is tentative.
@@ -146,7 +146,7 @@ class TrackerState:
         return elapsed_s(self.timestamp_s, image.timestamp_s)
 
     def at(self, image: DepthImage) -> TrackerState:
-        """The state at the time of an image: ages of its slots and places updated, tracks as they were."""
+        """The state with its clocks at the time of an image; its tracks as they were."""
         before = image.timestamp_s if self.timestamp_s is None else self.timestamp_s
         passed = max(0.0, image.timestamp_s - before)
         refused = self.refused + np.array([0.0, 0.0, 0.0, passed])

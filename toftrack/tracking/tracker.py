@@ -35,7 +35,7 @@ class HandsTracker:
     """Follows `hands` hands, each in a slot of its own: slot 0 is the first one that was found.
 
     state: all that is carried between frames; one that was kept may be put back.
-    infos: what the last step saw and believed of each; None where it was not searched.
+    infos: what the last step saw and believed of each; None where it has no track.
     time: what frames take, and what may be spent on them.
     """
 
@@ -69,7 +69,7 @@ class HandsTracker:
         timestamp_s: float | None = None,
         began_s: float | None = None,
     ) -> tuple[Estimate, ...]:
-        """One frame; an estimate a slot. One without a hand is lost and NaN.
+        """The estimate of each slot in a frame. A slot without a hand has a lost one.
 
         depth_m: (H, W) rectified Z in metres, 0 = no reading; H and W may change.
         k: (3, 3) intrinsics in pixels.
@@ -108,7 +108,7 @@ class HandsTracker:
 
     @property
     def states(self) -> tuple[Slot, ...]:
-        """Of the slots."""
+        """The slots."""
         return self.state.slots
 
     @property
@@ -123,7 +123,7 @@ class HandsTracker:
 
     @property
     def scorer(self) -> Scorer:
-        """The back end's, for the first hand."""
+        """The back end's scorer of the first hand."""
         return self.model.hand(self.states[0].side, self.states[0].shape).scorer
 
     @property
@@ -133,7 +133,7 @@ class HandsTracker:
 
     @property
     def device(self) -> torch.device:
-        """Where everything is computed."""
+        """The particles' device; all else is on the CPU."""
         return self.model.device
 
     @property
@@ -208,7 +208,7 @@ class Tracker:
 
 
 def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepResult:
-    """One frame, by the tracker that a model is of: see step and paper_step."""
+    """The result of `step` or `paper_step`, as the model is of the one or the other."""
     if isinstance(model, PaperModel):
         return paper_step(state, image, model)
     assert isinstance(model, TrackerModel)
@@ -216,8 +216,9 @@ def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepRes
 
 
 def restart_state(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
-    """A state that has seen nothing, but for its random and frame numbers; of a side if one is
-    given, which is certain from then on, with auto of either. The paper's tracker detects none.
+    """A state before any frame, but with the random and frame numbers of `state`.
+
+    side: see HandsTracker.restart; the paper's tracker detects none, and treats auto as None.
 
     Raises ToftrackError for an unknown side.
     """

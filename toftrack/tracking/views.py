@@ -63,7 +63,7 @@ def continue_track(
 
 
 def max_new_tracks(state: TrackerState) -> int:
-    """How many tracks may begin: as many may be tentative as confirmed hands are missing, or one."""
+    """How many tracks may begin: no more are tentative than hands are missing, or one."""
     confirmed = sum(track.confirmed for track in state.tracks)
     most = max(len(state.slots), 2)
     tentative = len(state.tracks) - confirmed
@@ -73,7 +73,7 @@ def max_new_tracks(state: TrackerState) -> int:
 def begin_tracks(
     scene: Scene, new: Sequence[SideDetection], state: TrackerState
 ) -> list[View | None]:
-    """Views of new tentative tracks, one a detection while there is room; None where no hand can be."""
+    """Views of new tentative tracks, as many as there is room for; None where no hand can be."""
     model = scene.model
     views: list[View | None] = []
     for one in new[: max_new_tracks(state)]:
@@ -102,7 +102,7 @@ def begin_tracks(
 
 
 def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
-    """The last shape of a slot of `side` whose track has ended; the population's where there is none."""
+    """The shape in the first vacant slot of a side; the population's where there is none."""
     numbers = {track.number for track in state.tracks}
     vacant = (slot for slot in state.slots if slot.track not in numbers and slot.side == side)
     return next((slot.shape for slot in vacant), first_shape())
@@ -111,7 +111,7 @@ def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
 def make_view(
     scene: Scene, row: int, track: Track, detection: Detection, expected: Expected
 ) -> View | None:
-    """The view of a track, -1 = one without row, where it is expected; None where no hand can be."""
+    """The view of a track where it is expected, row -1 = a new one; None where no hand can be."""
     model = scene.model
     observation = scene.segment(expected, row)
     if observation.empty:
