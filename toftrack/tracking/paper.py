@@ -151,7 +151,7 @@ class PaperModel(FilterModel):
 
 @small_operations()
 def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> StepResult:
-    """The next state and the one slot's report: segment, start without a track, filter, take the mean.
+    """The next state and its slot's report: segment, start without a track, filter, take the mean.
 
     It leaves `state` unchanged. In an image without a surface, the particles stay as they are.
     """

@@ -202,7 +202,7 @@ def make_estimate(
     fitted: FittedHand,
     model: FilterModel,
 ) -> Estimate:
-    """A frame's estimate, without side, joint deviations and what `emitted` adds."""
+    """A frame's estimate, without side, joint deviations and what `finish_estimate` adds."""
     particles, motions = found.filtered.particles, model.backend.motions
     mean = on_device(found.filtered.mean, model.device)
     tangents = motions.difference(particles, mean)
