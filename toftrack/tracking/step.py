@@ -67,7 +67,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         views = [predicted_view(scene, row) for row in range(len(scene.hands))]
     dice = _dice(generator, len(views) + max_new_tracks(before))
     early = dict[int, ParticleSet]()
-    if not pending.at_once:  # no track moves elsewhere, so that the filter need not wait
+    if not pending.at_once:  # hardly a track restarts now: the filter need not wait
         shown = {slot.track for slot in before.slots}
         early = {
             row: filter_track(view, dt_s, dice[row], spans, view.track.number in shown)
