@@ -80,7 +80,7 @@ def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(
     far = mean.clone()
     far[:, 2] += 0.5
     assert bool(view.posterior()(far).isneginf())
-    monkeypatch.setattr(View, "refined", lambda _, poses: far.repeat(len(poses), 1))
+    monkeypatch.setattr(View, "refine", lambda _, poses: far.repeat(len(poses), 1))
     table = propose(view, mean)
     standing = table.source <= Source.DYNAMICS
     torch.testing.assert_close(table.pose[standing, :3], mean[:, :3].repeat(2, 1))
