@@ -29,10 +29,13 @@ _SPARE = 1
 
 def predicted_view(scene: Scene, row: int) -> View | None:
     """The view of a track where it is predicted, without detection; None where no hand can be."""
-    hand = scene.hands[row]
-    evidence = replace(hand.track.evidence, age_s=hand.track.evidence.age_s + scene.dt_s)
-    track = replace(hand.track, evidence=evidence)
-    return make_view(scene, row, track, NO_DETECTION, hand.depths)
+    return make_view(scene, row, _later(scene, row), NO_DETECTION, scene.hands[row].depths)
+
+
+def _later(scene: Scene, row: int) -> Track:
+    """The track of a row, with the time since its sides were compared as of this frame."""
+    track = scene.hands[row].track
+    return replace(track, evidence=replace(track.evidence, age_s=track.evidence.age_s + scene.dt_s))
 
 
 def continue_track(
@@ -48,7 +51,7 @@ def continue_track(
     away = float(np.linalg.norm(detection.centre_m.numpy() - palm))
     moved = seen.row < 0 and away > SAME_PLACE_M
     if moved:
-        view = make_view(scene, row, scene.hands[row].track, detection, expected_of(detection))
+        view = make_view(scene, row, _later(scene, row), detection, expected_of(detection))
     if view is None:
         return None
     view = replace(
