@@ -26,6 +26,8 @@ from toftrack.errors import ToftrackError
 from toftrack.programs import export_detector
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+NETWORKS = {"pose": 3, "finder": 2}
+"""How many of their convolutions are the first and the last ones."""
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +74,7 @@ def test_a_file_of_weights_is_exported_and_answers_like_torch_at_any_size(weight
     for size in ((1, 2, 16, 16), (2, 2, 80, 48)):
         images = torch.rand(size, generator=draw)
         for one, two in zip(finder(images), finder.reference(images), strict=True):
-            torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-4)
+            assert 0 < (one - two).square().mean().sqrt() < 0.15 * two.std()
 
 
 def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand() -> None:
@@ -90,20 +92,25 @@ def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand
     image, _ = wide(scene.depth_m[0], scene.k)
     with torch.no_grad():
         for one, two in zip(finder(image), finder.reference(image), strict=True):
-            torch.testing.assert_close(one, two, atol=1e-3, rtol=1e-4)
+            assert float((one - two).square().mean().sqrt() / two.std()) < 0.15
 
 
-def test_the_file_is_in_8_bits_and_says_so_and_bad_ones_are_refused(exported: Path) -> None:
-    pose, _ = load_networks(exported)
-    model = onnx.load(onnx_networks.onnx_file(exported, "pose"))
-    assert "int8" in [one.value for one in model.metadata_props if one.key == "precision"]
-    kinds = [part.data_type for part in model.graph.initializer if len(part.dims) == 4]
-    assert kinds.count(onnx.TensorProto.INT8) == len(kinds) - 3, "all but the first and the last"
-    crops = onnx_export.example_crops()[:4]
-    onnx_export.compare(pose.reference, model, crops)
-    other, _ = small_networks()
+def test_the_files_are_in_8_bits_and_say_so_and_bad_ones_are_refused(exported: Path) -> None:
+    pose, finder = load_networks(exported)
+    models = {name: onnx.load(onnx_networks.onnx_file(exported, name)) for name in NETWORKS}
+    for name, ends in NETWORKS.items():
+        model = models[name]
+        assert "int8" in [one.value for one in model.metadata_props if one.key == "precision"]
+        kinds = [part.data_type for part in model.graph.initializer if len(part.dims) == 4]
+        assert kinds.count(onnx.TensorProto.INT8) == len(kinds) - ends, "not the first and the last"
+    crops, other = onnx_export.example_crops()[:4], small_networks()
+    onnx_export.compare(pose.reference, models["pose"], crops)
     with pytest.raises(ToftrackError, match=r"mm away .* give --float"):
-        onnx_export.compare(other, model, crops)
+        onnx_export.compare(other[0], models["pose"], crops)
+    images = torch.rand(4, 2, 32, 48, generator=torch.Generator().manual_seed(0)).numpy()
+    onnx_export.compare_finder(finder.reference, models["finder"], images)
+    with pytest.raises(ToftrackError, match=r"its spread away .* give --float"):
+        onnx_export.compare_finder(other[1], models["finder"], images)
 
 
 @pytest.mark.parametrize("network", ["pose", "finder"])

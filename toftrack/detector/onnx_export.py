@@ -1,8 +1,8 @@
 """From weights to the files that ONNX Runtime runs, see onnx_networks; needs the extra `train`.
 
-The pose network computes in whole numbers of 8 bits, by static quantisation (as Jacob et al.,
+The networks compute in whole numbers of 8 bits, by static quantisation (as Jacob et al.,
 "Quantization and training of neural networks for efficient integer-arithmetic-only inference",
-CVPR 2018): what the layers say is 0 .. 255, in ranges that are measured on the generator's crops;
+CVPR 2018): what the layers say is 0 .. 255, in ranges that are measured on the generator's images;
 weights are -64 .. 64, by channel. They have 7 bits because processors without VNNI add two products
 in 16 bits.
 """
@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from toftrack.detector.crops import CROP, CROP_CHANNELS, WIDE_MULTIPLE
-from toftrack.detector.images import crop_images
-from toftrack.detector.network import Found, PoseNet
+from toftrack.detector.images import crop_images, wide_images
+from toftrack.detector.network import Finder, Found, PoseNet
 from toftrack.detector.onnx_networks import (
     DIGEST,
     FLOAT,
@@ -38,12 +38,13 @@ from toftrack.errors import ToftrackError
 from toftrack.safe_files import whole_file
 
 CALIBRATION, COMPARED = 384, 64
-"""Crops that ranges are measured on, and others that the result is compared on."""
+"""Images that ranges are measured on, and others that the result is compared on."""
 _SHAPES, _SEED, _BATCH = 100, 5, 16
 _WITHIN_M = 0.004
 """How far keypoints may be from torch's, on average; twice what the package's are."""
 _SPREAD = 0.1
-"""How far heads may be from torch's, RMS in parts of their spread; three times the package's."""
+"""How far heads, and what the finder says, may be from torch's, RMS in parts of their spread; three
+times the package's heads, and a fifth more than what its finder says."""
 
 
 def example_crops() -> np.ndarray:
@@ -53,12 +54,21 @@ def example_crops() -> np.ndarray:
     return crop_images(CALIBRATION + COMPARED, bank, generator).image.numpy()
 
 
-def quantised(model: Any, crops: np.ndarray) -> Any:
-    """An onnx.ModelProto of the pose network, whose weights and activations are whole numbers.
+def example_images() -> np.ndarray:
+    """(CALIBRATION + COMPARED, 2, H, W) float32 of what the finder sees, the same every time."""
+    generator = torch.Generator().manual_seed(_SEED)
+    bank, count = shape_bank(_SHAPES, generator), (CALIBRATION + COMPARED) // _BATCH
+    return np.concatenate(
+        [wide_images(_BATCH, bank, generator).image.numpy() for _ in range(count)]
+    )
+
+
+def quantised(model: Any, images: np.ndarray) -> Any:
+    """An onnx.ModelProto of a network, whose weights and activations are whole numbers.
 
     The first and the last layers stay as they are, which decide on depths and places, and of the
     dense layers all but the first, on which the hypotheses depend: they take no time.
-    crops: (N, CROP_CHANNELS, CROP, CROP) that the ranges are measured on.
+    images: (N, ...) that the ranges are measured on.
     """
     import onnx
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
@@ -68,7 +78,7 @@ def quantised(model: Any, crops: np.ndarray) -> Any:
         quantize_static(
             model,
             str(file),
-            _Crops(model.graph.input[0].name, crops),
+            _Images(model.graph.input[0].name, images),
             # Of separate operators, which ONNX Runtime joins as suits the processor.
             quant_format=QuantFormat.QDQ,
             per_channel=True,
@@ -102,25 +112,44 @@ def compare(pose: PoseNet, model: Any, crops: np.ndarray) -> None:
         )
 
 
+def compare_finder(finder: Finder, model: Any, images: np.ndarray) -> None:
+    """Raises ToftrackError where a quantised finder is too far from torch's on (N, ...) images."""
+    session = open_session(model.SerializeToString())
+    each = [session.run(Found._fields, {"images": one[None]}) for one in images]
+    with torch.inference_mode():
+        expected = finder(torch.from_numpy(images))
+    for name, one, *parts in zip(Found._fields, expected, *each, strict=True):
+        found = torch.from_numpy(np.concatenate(parts))
+        apart = float((found - one).square().mean().sqrt() / one.std())
+        if not apart <= _SPREAD:
+            raise ToftrackError(
+                f"in 8 bits the finder's {name} is {100 * apart:.0f} % of its spread away from"
+                f" torch's (at most {100 * _SPREAD:g}), so nothing was written; give --float"
+            )
+
+
 def _kept(model: Any) -> list[str]:
     """Names of the nodes that stay in floating point."""
-    nodes = model.graph.node
-    ends = {value.name for value in (*model.graph.input, *model.graph.output)}
-    flattened = {node.output[0] for node in nodes if node.op_type == "Reshape"}
-    return [
-        node.name
-        for node in nodes
-        if ends.intersection((*node.input, *node.output))
-        or (node.op_type == "Gemm" and node.input[0] not in flattened)
-    ]
+    given = {value.name for value in model.graph.input}
+    said = {value.name for value in model.graph.output}
+    flattened = {node.output[0] for node in model.graph.node if node.op_type == "Reshape"}
+    kept = []
+    for node in reversed(model.graph.node):
+        last = bool(said.intersection(node.output))
+        if last and node.op_type not in ("Conv", "Gemm"):
+            said.update(node.input)  # the layer before says it
+        dense = node.op_type == "Gemm" and node.input[0] not in flattened
+        if last or dense or given.intersection(node.input):
+            kept.append(node.name)
+    return kept
 
 
-class _Crops:
+class _Images:
     """What onnxruntime.quantization reads: a CalibrationDataReader."""
 
-    def __init__(self, name: str, crops: np.ndarray) -> None:
+    def __init__(self, name: str, images: np.ndarray) -> None:
         self._batches = iter(
-            {name: crops[start : start + _BATCH]} for start in range(0, len(crops), _BATCH)
+            {name: images[start : start + _BATCH]} for start in range(0, len(images), _BATCH)
         )
 
     def get_next(self) -> dict[str, np.ndarray] | None:
@@ -150,7 +179,7 @@ def needed(missing: list[str]) -> str:
 def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     """Write the networks of a file of weights beside it; returns the files.
 
-    whole_numbers: the pose network in 8 bits, else in floating point, as the finder is.
+    whole_numbers: in 8 bits, else in floating point.
     Raises ToftrackError when the weights cannot be used, when a package is missing, and when ONNX
     Runtime computes something else than torch.
     """
@@ -179,16 +208,16 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     }
     _compare(_Features(loaded.pose), contents["pose"], "crops", crops.shape[1:])
     _compare(loaded.finder, contents["finder"], "images", (2, 3 * WIDE_MULTIPLE, 4 * WIDE_MULTIPLE))
-    precision = dict.fromkeys(contents, FLOAT)
     if whole_numbers:
-        examples = example_crops()
-        contents["pose"] = quantised(contents["pose"], examples[:-COMPARED])
-        compare(loaded.pose, contents["pose"], examples[-COMPARED:])
-        precision["pose"] = WHOLE
+        examples = {"pose": example_crops(), "finder": example_images()}
+        for network, images in examples.items():
+            contents[network] = quantised(contents[network], images[:-COMPARED])
+        compare(loaded.pose, contents["pose"], examples["pose"][-COMPARED:])
+        compare_finder(loaded.finder, contents["finder"], examples["finder"][-COMPARED:])
     files = []
     for network, content in contents.items():
         facts = {"format": FORMAT, "version": VERSION, "network": network}
-        facts["precision"] = precision[network]
+        facts["precision"] = WHOLE if whole_numbers else FLOAT
         file = onnx_file(weights, network)
         with whole_file(file) as stream:
             stream.write(_signed(content, facts | {"weights_sha256": loaded.sha256}))

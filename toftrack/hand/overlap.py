@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.hand.surface import BONE_RADII_MM
 
-PAIRS = [(a, b) for a in range(5) for b in range(a + 1, 5)]
 SQUEEZED = 0.6
 """Bent fingers, and the thumb, lie so much closer to others than their radii say: flesh gives."""
 STRICT = 4.0
@@ -37,27 +39,55 @@ def finger_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
 
 def overlap_of_each(joints_m: Tensor, hand_length_m: float) -> Tensor:
     """The same for each finger with all others, (N, 21, 3) to (N, 5); both on the CPU."""
-    # In numpy: on a few hands each of torch's operations takes longer than its arithmetic.
-    fingers = joints_m.numpy()[:, 1:].reshape(-1, 5, 4, 3)
-    steps = fingers[:, :, 1:] - fingers[:, :, :-1]
-    chord = np.linalg.norm(steps.sum(2), axis=-1)
-    length = np.maximum(np.linalg.norm(steps, axis=-1).sum(2), 1e-9)
-    straight = ((chord / length - BENT) / (STRAIGHT - BENT)).clip(0, 1)
-    # The thumb crosses the others, straight or not.
-    either = np.maximum(straight[:, _FIRST], straight[:, _SECOND]) * (_FIRST > 0)
-    ends = fingers[:, :, 1:]  # (N, 5, 3, 3)
-    points = np.concatenate((ends, (ends[:, :, 1:] + ends[:, :, :-1]) / 2), 2)  # (N, 5, 5, 3)
-    away = points[:, _FIRST, :, None] - points[:, _SECOND, None]  # (N, pairs, 5, 5, 3)
-    gap = np.sqrt(np.einsum("...a,...a->...", away, away))
-    share = (SQUEEZED + (1 - SQUEEZED) * either) * (hand_length_m / DEFAULT_HAND_LENGTH_M)
-    depth = (1 - gap / (_APART_M * share[:, :, None, None])).clip(0)
-    pairs = (1 + (STRICT - 1) * either) * np.square(depth.max(3)).sum(2)
-    return torch.from_numpy((pairs @ _OF_FINGER).astype(fingers.dtype))
+    joints = np.ascontiguousarray(joints_m.numpy(), np.float32)
+    found = np.zeros((len(joints), 5), np.float32)
+    _add_overlaps(joints, hand_length_m / DEFAULT_HAND_LENGTH_M, found)
+    return torch.from_numpy(found)
 
 
-_FIRST, _SECOND = np.array(PAIRS).T
+@entry_point
+def _add_overlaps(joints, ratio, out):
+    """joints: (N, 21, 3) float32.  ratio: hand's length in mean ones.  out: (N, 5), added to."""
+    straight, points = np.empty(5), np.empty((5, 5, 3))
+    for n in range(len(joints)):
+        for finger in range(5):
+            knuckle = 1 + 4 * finger
+            length = chord = 0.0
+            for bone in range(3):
+                length += _distance(joints[n, knuckle + bone], joints[n, knuckle + bone + 1])
+            chord = _distance(joints[n, knuckle], joints[n, knuckle + 3])
+            part = (chord / max(length, 1e-9) - BENT) / (STRAIGHT - BENT)
+            straight[finger] = min(max(part, 0.0), 1.0)
+            for end in range(3):
+                for i in range(3):
+                    points[finger, end, i] = joints[n, knuckle + 1 + end, i]
+            for bone in range(2):
+                for i in range(3):
+                    both = points[finger, bone, i] + points[finger, bone + 1, i]
+                    points[finger, 3 + bone, i] = both / 2
+        for first in range(5):
+            for second in range(first + 1, 5):
+                # The thumb crosses the others, straight or not.
+                either = max(straight[first], straight[second]) if first > 0 else 0.0
+                share = (SQUEEZED + (1 - SQUEEZED) * either) * ratio
+                found = 0.0
+                for a in range(5):
+                    depth = 0.0
+                    for b in range(5):
+                        apart = (_RADII_M[first, a] + _RADII_M[second, b]) * share
+                        gap = _distance(points[first, a], points[second, b])
+                        depth = max(depth, 1 - gap / apart)
+                    found += depth * depth
+                found *= 1 + (STRICT - 1) * either
+                out[n, first] += found
+                out[n, second] += found
+
+
+@compiled
+def _distance(a, b):
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
 _RADII_M = np.array(RADII_MM) / 1e3
-_APART_M = _RADII_M[_FIRST][:, :, None] + _RADII_M[_SECOND][:, None]
-"""(10, 5, 5) how far apart the points of fingers that touch are, of the mean adult."""
-_OF_FINGER = (np.eye(5)[_FIRST] + np.eye(5)[_SECOND]).astype(np.float64)
-"""(10, 5) whether a finger is one of a pair."""
+"""(5, 5) radii of the points that are compared, of the mean adult."""

@@ -2,7 +2,7 @@
 
 python -m toftrack.programs.export_detector FILE
 
-train_detector does so at its end. The pose network computes in whole numbers of 8 bits, or, with
+train_detector does so at its end. The networks compute in whole numbers of 8 bits, or, with
 --float, in floating point, which is slower. Without FILE: those of the package. It needs
 `pip install 'toftrack[train]'`; tracking does not.
 """
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "weights", nargs="?", type=Path, metavar="FILE", help="of train_detector (the package's)"
     )
     parser.add_argument(
-        "--float", action="store_true", help="the pose network in floating point, not in 8 bits"
+        "--float", action="store_true", help="in floating point, not in 8 bits"
     )
     options = parser.parse_args(arguments)
 
