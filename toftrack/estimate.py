@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self, overload
 
 import numpy as np
 
@@ -23,11 +25,39 @@ STATES = {
 """What the tracker does, Estimate.state_name, and how it is said to people."""
 
 
+class OnDemand:
+    """A field of a dataclass that may be given as a function without arguments: it is called when
+    the field is first read. What few programs read then costs the others nothing."""
+
+    def __init__(self, *shape: int) -> None:
+        """shape: of the default, an array of NaN."""
+        self._shape, self._name = shape, ""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Callable[[], np.ndarray]: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> np.ndarray: ...
+
+    def __get__(self, instance: object | None, owner: type) -> Any:
+        if instance is None:  # the dataclass asks for the default
+            return lambda: np.full(self._shape, np.nan)
+        value = vars(instance)[self._name]
+        if callable(value):
+            value = vars(instance)[self._name] = value()
+        return value
+
+    def __set__(self, instance: object, value: np.ndarray | Callable[[], np.ndarray]) -> None:
+        vars(instance)[self._name] = value
+
+
 @fields_in_help
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The hand in one frame, on the host. Arrays are NaN where there never was an estimate, nor
-    the guess of a hand that the border of the image cuts off, which is lost."""
+    """The hand in one frame, on the host. Arrays are NaN where there never was an estimate."""
 
     index: int
     """Number of the input frame."""
@@ -47,11 +77,11 @@ class Estimate:
     """(d,) float32 pose-space coordinates."""
     score: float
     """The likelihood head's score, 0..1."""
-    covariance: np.ndarray
+    covariance: OnDemand = OnDemand(10, 10)
     """(6 + d, 6 + d) float32 over translation, rotation (tangent space) and latent."""
-    effective_sample_size: float
+    effective_sample_size: float = math.nan
     """Of the weights, before resampling."""
-    compute_s: float
+    compute_s: float = math.nan
     """Wall seconds from the raw frame to the estimate, rectification included, drawing excluded."""
     confidence: float = math.nan
     """Probability that every joint is within 40 mm; NaN where nothing says."""
@@ -85,15 +115,28 @@ class Estimate:
     the thumb stretched away, else NaN."""
     pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 unit vector from there to the finger's tip, else NaN."""
-    landmarks: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan))
+    landmarks: OnDemand = OnDemand(21, 3)
     """(21, 3) the joints as MediaPipe's landmarks: x, y in parts of the image's width and height, z
     the depth beyond the wrist's in parts of the width; see hand/conventions.py."""
-    openxr_position_m: np.ndarray = field(default_factory=lambda: np.full((26, 3), np.nan))
+    openxr_position_m: OnDemand = OnDemand(26, 3)
     """(26, 3) metres, the joints of XR_EXT_hand_tracking; x right, y up, -z forward."""
-    openxr_orientation: np.ndarray = field(default_factory=lambda: np.full((26, 4), np.nan))
+    openxr_orientation: OnDemand = OnDemand(26, 4)
     """(26, 4) unit quaternions x y z w of these joints; see hand/openxr.py for their axes."""
-    openxr_radius_m: np.ndarray = field(default_factory=lambda: np.full(26, np.nan))
+    openxr_radius_m: OnDemand = OnDemand(26)
     """(26,) metres from these joints to the skin."""
+
+    def updated(self, **changes: Any) -> Self:
+        """With other values of some fields, as dataclasses.replace; what is on demand stays so."""
+        made = object.__new__(type(self))
+        vars(made).update(vars(self) | changes)
+        return made
+
+    def values(self) -> dict[str, Any]:
+        """All fields by name."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.values()  # pickles and copies take no functions
 
 
 def no_estimate(

@@ -268,7 +268,7 @@ def test_only_a_pointing_hand_that_is_followed_has_a_ray() -> None:
         estimate(pose("gun"), "lost", True),
         estimate(pose("gun"), "recovering", True),
         # As for a frame without a hand: the last estimate repeated.
-        Estimate(**{**vars(pointing), "state_name": "lost", "lost": True}),
+        pointing.updated(state_name="lost", lost=True),
         no_estimate(0, 0.0, "lost", 4, 0.0),
     ):
         state, reported = tell_gesture(GESTURES, state, lost, SPACE)

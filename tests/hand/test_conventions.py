@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import copy
+import pickle
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from helpers.hands import SIZE_PX, K, hand_estimate, lost_hand
 from helpers.tracking import follow, make_tracker, sample
 
+from toftrack.estimate import Estimate
 from toftrack.hand.conventions import image_landmarks, in_all_conventions
 from toftrack.hand.shape import default_hand_shape
 
@@ -41,3 +44,20 @@ def test_the_tracker_s_estimates_have_them_and_keep_them_while_the_hand_is_gone(
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(gone, name), getattr(found, name))
     assert replace(found).landmarks.shape == (21, 3)
+
+
+def test_they_are_computed_when_they_are_read_and_go_along_into_copies_and_pickles() -> None:
+    asked = []
+
+    def landmarks() -> np.ndarray:
+        asked.append(1)
+        return np.ones((21, 3))
+
+    estimate = hand_estimate(0).updated(landmarks=landmarks)
+    later = estimate.updated(compute_s=1.0)
+    assert later.compute_s == 1.0 and not asked
+    for copied in (copy.deepcopy(later), pickle.loads(pickle.dumps(later)), replace(later)):
+        assert (copied.landmarks == 1).all()
+        assert copied.values().keys() == {field.name for field in fields(Estimate)}
+    assert later.landmarks is later.landmarks
+    assert len(asked) == 1

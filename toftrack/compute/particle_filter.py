@@ -8,7 +8,7 @@ weights sum to 1. Every function that draws takes an explicit generator on the p
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -101,7 +101,7 @@ def widened(sigmas: Tensor, frames: float, movement: Tensor, rest: float, gain: 
 
 
 def normalise(log_weights: Tensor) -> Tensor:
-    """(N,) log weights to weights that sum to 1, float64.
+    """(..., N) log weights to weights that sum to 1 along N, float64.
 
     NaN counts as impossible. When no particle is possible, all are equally likely: the filter then
     diffuses on without evidence instead of failing.
@@ -109,18 +109,18 @@ def normalise(log_weights: Tensor) -> Tensor:
     if log_weights.device.type == "cpu":
         return torch.from_numpy(_normalised(log_weights.numpy()))
     w = log_weights.double().nan_to_num(nan=-math.inf, neginf=-math.inf, posinf=1e300)
-    top = w.max()
+    top = w.amax(-1, keepdim=True)
     w = torch.where(top.isfinite(), (w - top).exp(), torch.ones_like(w))
-    return w / w.sum()
+    return w / w.sum(-1, keepdim=True)
 
 
 def _normalised(log_weights: np.ndarray) -> np.ndarray:
     """The same on the CPU, where each of torch's operations takes longer than its arithmetic."""
     w = np.where(np.isnan(log_weights), -np.inf, log_weights.astype(np.float64))
     w = np.minimum(w, 1e300)
-    top = w.max()
-    w = np.exp(w - top) if math.isfinite(top) else np.ones_like(w)
-    found: np.ndarray = w / w.sum()
+    top = w.max(-1, keepdims=True)
+    w = np.exp(w - np.where(np.isfinite(top), top, np.inf)) + ~np.isfinite(top)
+    found: np.ndarray = w / w.sum(-1, keepdims=True)
     return found
 
 
@@ -162,23 +162,28 @@ def annealed(
     upper: Tensor,
     settings: FilterSettings,
     redraw: Redraw,
-    generator: torch.Generator,
+    generators: Sequence[torch.Generator],
 ) -> tuple[Tensor, Tensor]:
     """Resample - diffuse - observe, in passes of shrinking diffusion and sharper weights.
 
-    particles, weights: (M, 6 + d) predicted and (M,) normalised.
-    sigmas: (6 + d,) of the first pass's diffusion.
-    log_scores: of the image, (N, 6 + d) to (N,); their exponent grows.
-    Returns (N, 6 + d) and (N,).
+    B hands at once, each with particles of its own.
+
+    particles, weights: (B, M, 6 + d) predicted and (B, M) normalised.
+    sigmas: (B, 6 + d) of the first pass's diffusion.
+    log_scores: of the image, (B, N, 6 + d) to (B, N); their exponent grows.
+    generators: B of them, so that what is drawn for a hand does not depend on others.
+    Returns (B, N, 6 + d) and (B, N).
     """
-    n, device = settings.particles, particles.device
+    n, size, device = settings.particles, particles.shape[2], particles.device
     for number in range(settings.passes):
-        positions = RESAMPLERS[settings.resampling](n, generator)
-        size = n, particles.shape[1]
-        noise = torch.randn(size, generator=generator, device=device, dtype=particles.dtype)
-        tangents = noise * (sigmas * settings.shrink**number)
-        bounds = lower, upper, settings.bounds
-        particles = redraw(particles, weights, positions, tangents, *bounds)
+        drawn = []
+        for row, generator in enumerate(generators):
+            positions = RESAMPLERS[settings.resampling](n, generator)
+            noise = torch.randn((n, size), generator=generator, device=device)
+            tangents = noise * (sigmas[row] * settings.shrink**number)
+            bounds = lower, upper, settings.bounds
+            drawn.append(redraw(particles[row], weights[row], positions, tangents, *bounds))
+        particles = torch.stack(drawn)
         log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
         weights = normalise(log_weights)
     return particles, weights

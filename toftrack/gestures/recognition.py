@@ -272,8 +272,7 @@ def pointing_ray(joints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def without_gesture(estimate: Estimate) -> Estimate:
     """The same without a gesture, a pinch and a pointing ray, as of a hand that is lost."""
     nowhere = np.full(3, np.nan, np.float32)
-    return replace(
-        estimate,
+    return estimate.updated(
         gesture="",
         gesture_probability=math.nan,
         pinch=math.nan,
@@ -319,8 +318,7 @@ def tell_gesture(
     nothing = label == FIST and not state.pinch.pinching
     pinched = update_pinch(state.pinch, 0.0 if nothing else pinch, gestures.settings.pinch, frames)
     state = replace(state, pinch=pinched)
-    estimate = replace(
-        estimate,
+    estimate = estimate.updated(
         gesture=label,
         gesture_probability=probability,
         pinch=pinch,
@@ -328,5 +326,5 @@ def tell_gesture(
     )
     if label in RAY_GESTURES:
         origin, direction = pointing_ray(estimate.joints_m)
-        estimate = replace(estimate, pointing_origin_m=origin, pointing_direction=direction)
+        estimate = estimate.updated(pointing_origin_m=origin, pointing_direction=direction)
     return state, estimate

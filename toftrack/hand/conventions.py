@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import functools
 
 import numpy as np
 
 from toftrack.estimate import Estimate
-from toftrack.hand.openxr import openxr_hand, openxr_rig
+from toftrack.hand.openxr import OpenXRHand, openxr_hand, openxr_rig
 from toftrack.hand.shape import HandShape
 
 _DECIMALS = 6
@@ -21,13 +21,17 @@ def in_all_conventions(
 
     shape: the hand of the estimate.  k: (3, 3) intrinsics, pixels.  size_px: width, height.
     """
-    hand = openxr_hand(estimate.joints_m, estimate.state, openxr_rig(shape))
-    return replace(
-        estimate,
-        landmarks=np.round(image_landmarks(estimate.joints_m, k, size_px), _DECIMALS),
-        openxr_position_m=np.round(hand.position_m, _DECIMALS),
-        openxr_orientation=np.round(hand.orientation, _DECIMALS),
-        openxr_radius_m=np.round(hand.radius_m, _DECIMALS),
+    joints, state, rig, k = estimate.joints_m, estimate.state, openxr_rig(shape), k.copy()
+
+    @functools.cache
+    def hand() -> OpenXRHand:
+        return openxr_hand(joints, state, rig)
+
+    return estimate.updated(
+        landmarks=lambda: np.round(image_landmarks(joints, k, size_px), _DECIMALS),
+        openxr_position_m=lambda: np.round(hand().position_m, _DECIMALS),
+        openxr_orientation=lambda: np.round(hand().orientation, _DECIMALS),
+        openxr_radius_m=lambda: np.round(hand().radius_m, _DECIMALS),
     )
 
 

@@ -79,7 +79,7 @@ class Records:
             count = sum(1 for _ in stream)
         last = 1
         try:
-            like = like or vars(no_estimate(0, 0, "", latent_size, 0))
+            like = like or no_estimate(0, 0, "", latent_size, 0).values()
             _check(like, set(FROM_THE_START) - set(FRAME_FIELDS if slots > 1 else ()))
             records = cls(lines.parent, like, slots)
             try:
@@ -99,14 +99,14 @@ class Records:
     def append(self, estimates: Sequence[Estimate]) -> None:
         """Keep a frame, of which there is an estimate for each slot."""
         if self.slots == 1:
-            self._keep([vars(estimates[0])])
+            self._keep([estimates[0].values()])
             return
         hands = [
-            {"slot": slot} | vars(estimate)
+            {"slot": slot} | estimate.values()
             for slot, estimate in enumerate(estimates)
             if not is_vacant(estimate)
         ]
-        self._keep([vars(estimates[0]) | {"hands": hands}])
+        self._keep([estimates[0].values() | {"hands": hands}])
 
     def close(self) -> None:
         """The records are gone; a second call does nothing."""

@@ -14,7 +14,7 @@ joints follow by forward kinematics, so bones keep their lengths and angles thei
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -129,10 +129,10 @@ def _with_state(estimate: Estimate, state: np.ndarray, shape: HandShape) -> Esti
     """The estimate with another hand state, (27,), and what follows from it."""
     hand = torch.from_numpy(state)[None]
     joints = forward_kinematics(hand, shape.to("cpu", torch.float32)).joints_m[0].numpy()
-    estimate = replace(estimate, state=state, joints_m=joints)
+    estimate = estimate.updated(state=state, joints_m=joints)
     if np.isfinite(estimate.pointing_origin_m).all():
         origin, direction = pointing_ray(joints)
-        estimate = replace(estimate, pointing_origin_m=origin, pointing_direction=direction)
+        estimate = estimate.updated(pointing_origin_m=origin, pointing_direction=direction)
     return estimate
 
 

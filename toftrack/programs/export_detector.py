@@ -26,9 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "weights", nargs="?", type=Path, metavar="FILE", help="of train_detector (the package's)"
     )
-    parser.add_argument(
-        "--float", action="store_true", help="in floating point, not in 8 bits"
-    )
+    parser.add_argument("--float", action="store_true", help="in floating point, not in 8 bits")
     options = parser.parse_args(arguments)
 
     from toftrack.detector.onnx_export import export_networks

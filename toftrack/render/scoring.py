@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -82,6 +83,16 @@ class Scorer(Protocol):
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """states: (N, 27) on the evidence's device. Pixels outside the image count as nothing."""
+
+
+ScoreRows = Callable[[Sequence[Scorer], Tensor, Sequence[Evidence]], Counts]
+"""See score_rows."""
+
+
+def score_rows(scorers: Sequence[Scorer], states: Tensor, evidences: Sequence[Evidence]) -> Counts:
+    """Counts (B, N) of states (B, N, 27) of B hands, each with its own scorer and evidence."""
+    rows = [score(*row) for score, *row in zip(scorers, states, evidences, strict=True)]
+    return Counts(*map(torch.stack, zip(*rows, strict=True)))
 
 
 def disc_square(radius_px: float, height: int, width: int) -> int:

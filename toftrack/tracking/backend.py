@@ -15,7 +15,7 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
 from toftrack.refinement.gauss_newton import Refiner, TorchRefiner
-from toftrack.render.scoring import Scorer
+from toftrack.render.scoring import Scorer, ScoreRows, score_rows
 from toftrack.render.torch_scorer import TorchScorer
 
 
@@ -29,6 +29,7 @@ class Backend:
     motions: of particles, on the device and on the CPU.
     make_scorer: from a hand on the CPU to its scorer of poses on the device.
     make_refiner: from a hand to its refiner of poses, both on the CPU.
+    score_rows: poses of several hands, see render.scoring.score_rows.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Backend:
     motions: Motions
     make_scorer: Callable[[HandShape], Scorer]
     make_refiner: Callable[[HandShape], Refiner]
+    score_rows: ScoreRows = score_rows
 
 
 BACK_ENDS = ("torch", "numba", "triton")
@@ -106,11 +108,11 @@ def _compiled_refiner() -> Callable[[HandShape], Refiner]:
 def _numba(device: torch.device) -> Backend:
     """Compiled code on the CPU, which also scores particles elsewhere; torch moves those."""
     from toftrack.compute import rigid_numba
-    from toftrack.render.numba.scorer import NumbaScorer
+    from toftrack.render.numba.scorer import NumbaScorer, score_rows
 
     there = rigid_numba.MOTIONS if device.type == "cpu" else rigid.MOTIONS
     motions = _on_cpu_too(device, there)
-    return Backend("numba", device, motions, NumbaScorer, _compiled_refiner())
+    return Backend("numba", device, motions, NumbaScorer, _compiled_refiner(), score_rows)
 
 
 def _triton(device: torch.device) -> Backend:

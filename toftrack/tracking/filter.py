@@ -6,6 +6,7 @@ The filter itself is compute/particle_filter.py.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,48 +82,65 @@ def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
 
 
 def run_filter(
-    track: Track,
+    tracks: Sequence[Track],
     dt_s: float,
-    image: ImageTerm,
+    images: Sequence[ImageTerm],
     model: FilterModel,
-    generator: torch.Generator,
+    generators: Sequence[torch.Generator],
     spans: Spans,
-) -> ParticleSet:
-    """A track's particles after dt_s: predicted, then diffused, weighed by the image, resampled.
+) -> list[ParticleSet]:
+    """The particles of B tracks after dt_s: predicted, then diffused, weighed by each track's image
+    and resampled, all of them in each call.
 
     Nothing within waits for the device, so that it is not held up between passes.
     """
-    space, motions = model.space_of(track.particles), model.backend.motions
+    if not tracks:
+        return []
+    space, motions = model.space_of(tracks[0].particles), model.backend.motions
+    scorers, evidences = [image.scorer for image in images], [image.evidence for image in images]
 
     def log_scores(particles: Tensor) -> Tensor:
-        states = model.decode(particles)
+        poses = model.decode(particles.flatten(0, 1)).unflatten(0, particles.shape[:2])
         with spans("filter: scoring"):
-            return image(states)
+            return model.likelihood.log_score(model.backend.score_rows(scorers, poses, evidences))
 
-    moved = predicted_motion(track, dt_s, model.filter)
-    particles = motions.compose(track.particles, on_device(moved[None], model.device))
-    sigmas = particle_filter.widened(
-        model.sigmas, dt_s / FRAME_S, moved, model.filter.rest, model.filter.speed_gain
-    )
+    moves = [predicted_motion(track, dt_s, model.filter) for track in tracks]
+    sigmas = [
+        particle_filter.widened(
+            model.sigmas, dt_s / FRAME_S, moved, model.filter.rest, model.filter.speed_gain
+        )
+        for moved in moves
+    ]
     particles, weights = particle_filter.annealed(
-        particles,
-        track.weights,
-        on_device(sigmas, model.device),
+        torch.stack(
+            [
+                _moved(track.particles, moved, model)
+                for track, moved in zip(tracks, moves, strict=True)
+            ]
+        ),
+        torch.stack([track.weights for track in tracks]),
+        on_device(torch.stack(sigmas), model.device),
         log_scores,
         space.lower,
         space.upper,
         model.filter,
         motions.redraw,
-        generator_on(model.device, generator),
+        [generator_on(model.device, generator) for generator in generators],
     )
-    return ParticleSet(particles, weights, motions.mean(particles, weights))
+    rows = zip(particles, weights, strict=True)
+    return [ParticleSet(*row, motions.mean(*row)) for row in rows]
+
+
+def _moved(particles: Tensor, tangent: Tensor, model: FilterModel) -> Tensor:
+    """(N, 6 + d) particles, each moved by the same tangent (6 + d,)."""
+    return model.backend.motions.compose(particles, on_device(tangent[None], model.device))
 
 
 def predict_particles(track: Track, dt_s: float, model: FilterModel) -> ParticleSet:
     """A track's particles dt_s later, moved as predicted; weights and spread stay."""
-    motions, moved = model.backend.motions, predicted_motion(track, dt_s, model.filter)[None]
-    particles = motions.compose(track.particles, on_device(moved, model.device))
-    return ParticleSet(particles, track.weights, motions.compose(track.mean, moved))
+    moved = predicted_motion(track, dt_s, model.filter)
+    mean = model.backend.motions.compose(track.mean, moved[None])
+    return ParticleSet(_moved(track.particles, moved, model), track.weights, mean)
 
 
 @dataclass(frozen=True, eq=False)

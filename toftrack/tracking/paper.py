@@ -164,7 +164,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         observation = model.segmentation(image.depth_m, image.k, expected)
         if observation.empty:
             slot, estimate = report_absence(slot, image, model, 1)
-            estimate = replace(estimate, side=slot.side, side_probability=sure)
+            estimate = estimate.updated(side=slot.side, side_probability=sure)
             none = torch.zeros(0, 6 + model.space.dims, device=model.device)
             info = StepInfo(observation, none, none[:, 0], spans.seconds())
             return replace(state, slots=(slot,)), (info,), (estimate,)
@@ -172,7 +172,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     with spans("start"):
         track = model.start(observation, model, generator) if track is None else track
     with spans("filter: rest"):
-        filtered = run_filter(track, dt_s, likelihood, model, generator, spans)
+        (filtered,) = run_filter([track], dt_s, [likelihood], model, [generator], spans)
         pose = model.decode(filtered.mean)
     score = likelihood.score(pose)
     status = model.lost.judge(track, score)
@@ -193,8 +193,8 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         nearest_m=expected.nearest_m if expected is not None and hidden else 0.0,
     )
     ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
-    estimate = replace(estimate, joint_sigma_m=sigma_m, joint_ok=ok)
-    estimate = replace(estimate, side=slot.side, side_probability=sure)
+    estimate = estimate.updated(joint_sigma_m=sigma_m, joint_ok=ok)
+    estimate = estimate.updated(side=slot.side, side_probability=sure)
     slot, estimate = finish_estimate(slot, image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
     slot = replace(slot, track=track.number)

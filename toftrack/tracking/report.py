@@ -26,7 +26,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.tracking.belief import Status, probability
 from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import joint_features
-from toftrack.tracking.filter import PoseEstimate
+from toftrack.tracking.filter import ParticleSet, PoseEstimate
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import side_log_odds
@@ -144,14 +144,13 @@ def report_track(
     sigma, confidence = model.lost.joints.judge(rows)
     sure = probability(right if track.side == "right" else -right)
     if state.told is None:
-        estimate = replace(estimate, confidence=estimate.confidence * sure)
+        estimate = estimate.updated(confidence=estimate.confidence * sure)
     else:
         wanted = OTHER_SIDE[state.told] if number else state.told
         sure = 1.0 if track.side == wanted else sure
         if len(state.slots) < 3 and probability(right if wanted == "right" else -right) < _OTHER:
-            estimate = replace(estimate, lost=True, state_name="other hand")
-    estimate = replace(
-        estimate,
+            estimate = estimate.updated(lost=True, state_name="other hand")
+    estimate = estimate.updated(
         side=track.side,
         side_probability=sure,
         joint_sigma_m=sigma,
@@ -203,16 +202,7 @@ def make_estimate(
     model: FilterModel,
 ) -> Estimate:
     """A frame's estimate, without side, joint deviations and what `finish_estimate` adds."""
-    particles, motions = found.filtered.particles, model.backend.motions
-    mean = on_device(found.filtered.mean, model.device)
-    tangents = motions.difference(particles, mean)
-    tangents[:, :3] = (
-        particles[:, :3] - mean[:, :3]
-    )  # the covariance is of the wrist, not of the pivot
-    covariance, effective = on_host(
-        particle_filter.covariance(tangents, found.filtered.weights),
-        particle_filter.effective_sample_size(found.filtered.weights),
-    )
+    (effective,) = on_host(particle_filter.effective_sample_size(found.filtered.weights))
     return Estimate(
         index=image.index,
         timestamp_s=image.timestamp_s,
@@ -224,10 +214,19 @@ def make_estimate(
         state=_host(found.pose[0]),
         latent=_host(model.space.encode(found.pose[:, 6:])[0]),
         score=score,
-        covariance=_host(covariance + torch.diag(model.model_variance)),
+        covariance=lambda: covariance_of(found.filtered, model),
         effective_sample_size=float(effective),
         compute_s=math.nan,
     )
+
+
+def covariance_of(filtered: ParticleSet, model: FilterModel) -> np.ndarray:
+    """(6 + d, 6 + d) of particles and the hand model's own error, of the wrist, not the pivot."""
+    mean = on_device(filtered.mean, model.device)
+    tangents = model.backend.motions.difference(filtered.particles, mean)
+    tangents[:, :3] = filtered.particles[:, :3] - mean[:, :3]
+    (covariance,) = on_host(particle_filter.covariance(tangents, filtered.weights))
+    return _host(covariance + torch.diag(model.model_variance))
 
 
 def finish_estimate(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.select import select
 from toftrack.tracking.state import NO_PLACES, StepInfo, Track, TrackerState
-from toftrack.tracking.views import begin_tracks, continue_track, max_new_tracks, predicted_view
+from toftrack.tracking.views import begin_tracks, continue_track, predicted_view
 
 StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state; per slot what the step saw, None where it has no track; per slot the estimate."""
@@ -52,9 +53,8 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     2. Detect: the pose network, which votes for joints (A2J: Xiong et al., ICCV 2019), looks at
        predicted hands, and where the finder, which sees the whole image, finds a hand of no track.
     3. Associate detections with tracks; the unassigned ones begin tentative tracks.
-    4. Filter: resample, diffuse and weigh each track's particles (N, 6 + d) by the F-measure of the
-       image, in annealed passes (Deutscher and Reid, IJCV 61, 2005). While no hand is to be found
-       anew this runs beside the networks, before 3.
+    4. Filter: resample, diffuse and weigh all tracks' particles (B, N, 6 + d) by the F-measure of
+       the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
     5. Refine a few hypotheses (M, 27) by Levenberg-Marquardt steps; the best posterior is the pose.
     6. Judge it, learn the hand's shape, end tracks that stay doubtful or share another one's hand.
     7. Report the tracks in the slots that the user asked for.
@@ -64,30 +64,22 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     with spans("detector"):
         scene = Scene.of(before.tracks, image, dt_s, model)
         pending = start_detection(scene, before)
-        views = [predicted_view(scene, row) for row in range(len(scene.hands))]
-    dice = _dice(generator, len(views) + max_new_tracks(before))
-    early = dict[int, ParticleSet]()
-    if not pending.at_once:  # hardly a track restarts now: the filter need not wait
-        shown = {slot.track for slot in before.slots}
-        early = {
-            row: filter_track(view, dt_s, dice[row], spans, view.track.number in shown)
-            for row, view in enumerate(views)
-            if view is not None
-        }
-    with spans("detector"):
+        predicted = [predicted_view(scene, row) for row in range(len(scene.hands))]
         detections, pending = finish_detection(pending, scene, before)
         columns = assign(costs(scene.hands, detections, dt_s))
         views = [
             continue_track(
                 scene, row, view, detections[column] if column >= 0 else None, before.told
             )
-            for row, (view, column) in enumerate(zip(views, columns, strict=True))
+            for row, (view, column) in enumerate(zip(predicted, columns, strict=True))
         ]
         views += begin_tracks(scene, unassigned(detections, columns), before)
+        there = [view for view in views if view is not None]
+    with spans("filter: rest"):
+        particles = filter_tracks(there, before, dt_s, model, generator, spans)
     results = [
-        update_track(view, early.get(row), scene, dice[row], spans)
-        for row, view in enumerate(views)
-        if view is not None
+        update_track(view, filtered, scene, spans)
+        for view, filtered in zip(there, particles, strict=True)
     ]
     with spans("detector"):
         places = NO_PLACES if pending.finder is None else pending.finder()
@@ -102,35 +94,46 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     return report(after, results, scene, spans)
 
 
-def _dice(generator: torch.Generator, count: int) -> list[torch.Generator]:
-    """`count` generators, one a hand: the first hands draw the same however many there are."""
-    seeds = torch.randint(2**62, (count - 1,), generator=generator).tolist()
-    return [generator, *(torch.Generator().manual_seed(seed) for seed in seeds)]
+def filter_tracks(
+    views: Sequence[View],
+    state: TrackerState,
+    dt_s: float,
+    model: TrackerModel,
+    generator: torch.Generator,
+    spans: Spans,
+) -> list[ParticleSet]:
+    """The particles of tracks: filtered where a slot shows them or they restart, else predicted.
+
+    What is drawn for a track depends on its number, not on which others there are.
+    """
+    seed = int(torch.randint(2**62, (1,), generator=generator))
+    shown = {slot.track for slot in state.slots}
+    chosen = [view.track.number in shown or not view.track.age.begun for view in views]
+    filtered = list(compress(views, chosen))
+    found = iter(
+        run_filter(
+            [view.track for view in filtered],
+            dt_s,
+            [view.image for view in filtered],
+            model,
+            [torch.Generator().manual_seed(seed + view.track.number) for view in filtered],
+            spans,
+        )
+    )
+    return [
+        next(found) if one else predict_particles(view.track, dt_s, model)
+        for view, one in zip(views, chosen, strict=True)
+    ]
 
 
-def filter_track(
-    view: View, dt_s: float, generator: torch.Generator, spans: Spans, shown: bool
-) -> ParticleSet:
-    """A track's particles in a frame: filtered where `shown` in a slot, else only predicted."""
-    with spans("filter: rest"):
-        if not shown:
-            return predict_particles(view.track, dt_s, view.model)
-        return run_filter(view.track, dt_s, view.image, view.model, generator, spans)
-
-
-def update_track(
-    view: View, early: ParticleSet | None, scene: Scene, generator: torch.Generator, spans: Spans
-) -> TrackResult:
+def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) -> TrackResult:
     """A track after a frame, with its chosen pose and what is thought of it.
 
-    early: its particles in this frame where they are filtered already. A restarted track, of age 0,
-        has new ones, which are filtered here.
+    filtered: its particles in this frame.
     """
     model, track, dt_s = view.model, view.track, scene.dt_s
-    if early is None or track.age.seconds == 0:
-        early = filter_track(view, dt_s, generator, spans, shown=True)
     with spans("refinement"):
-        table = propose(view, model.decode(early.mean))
+        table = propose(view, model.decode(filtered.mean))
         choice = select(table, view.fitted.refiner.joints(table.pose), view.hidden)
     pose, trend = choice.pose, track.trend
     if choice.moved:
@@ -138,13 +141,13 @@ def update_track(
         track, trend = replace(track, age=fresh.age, doubtful=fresh.doubtful), fresh.trend
     elif model.refinement.iterations:
         pose, trend = steadied(pose, track.pose, trend, dt_s, model.backend.motions)
-    found = PoseEstimate(early, pose, trend, *model.nearest(pose))
+    found = PoseEstimate(filtered, pose, trend, *model.nearest(pose))
     score, joints = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
     age_s, last, seen = track.age.seconds, track.features, view.observation
     features = confidence_features(joints, score, age_s, view.detection, last, seen.depth_m, seen.k)
     status = judge(track, features, dt_s, model.lost)
     # Without refinement the particles stay where they are.
-    drawn = shift_particles(found, model) if model.refinement.iterations else early
+    drawn = shift_particles(found, model) if model.refinement.iterations else filtered
     track = replace(
         track,
         particles=drawn.particles,

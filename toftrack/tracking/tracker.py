@@ -89,7 +89,7 @@ class HandsTracker:
             model = self.model.at_quality(quality)
             self.state, self.infos, estimates = _step(self.state, image, model)
         took_s = self.time.took_s()
-        return tuple(replace(estimate, compute_s=took_s) for estimate in estimates)
+        return tuple(estimate.updated(compute_s=took_s) for estimate in estimates)
 
     @small_operations()
     def prepare(self) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,15 +48,15 @@ class NumbaScorer:
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""
-        x = _array(states, np.float32)
-        counts = np.empty((4, len(x)), np.float32)
-        tasks = np.zeros(1, np.int64)
-        given = x, self._packed(evidence), self._hand, tasks, counts
-        # A second thread is not worth waking for less than a task of its own.
-        run_shared(functools.partial(score_hands, *given), len(x) // LANES)
-        if states.device.type == "cpu":
-            return Counts(*map(torch.from_numpy, counts))
-        return Counts(*torch.from_numpy(counts).to(states.device).unbind())
+        counts = score_rows([self], states[None], [evidence])
+        return Counts(*(one[0] for one in counts))
+
+    def task(
+        self, states: np.ndarray, evidence: Evidence, counts: np.ndarray
+    ) -> Callable[[], None]:
+        """What scores states (N, 27) float32 into counts (4, N), in one thread or several."""
+        given = states, self._packed(evidence), self._hand, np.zeros(1, np.int64), counts
+        return functools.partial(score_hands, *given)
 
     def _packed(self, evidence: Evidence) -> tuple:
         """The evidence as the kernel wants it, once for all calls of a frame."""
@@ -80,6 +82,23 @@ class NumbaScorer:
             )
             self._frame = evidence, packed
         return packed
+
+
+def score_rows(scorers: Sequence[Any], states: Tensor, evidences: Sequence[Evidence]) -> Counts:
+    """See scoring.score_rows, of NumbaScorers; threads share the particles of all hands."""
+    x = _array(states, np.float32)
+    counts = np.empty((len(x), 4, x.shape[1]), np.float32)
+    rows = zip(scorers, x, evidences, counts, strict=True)
+    tasks = [scorer.task(*row) for scorer, *row in rows]
+
+    def all_of_them() -> None:
+        for task in tasks:
+            task()
+
+    # A second thread is not worth waking for less than a task of its own.
+    run_shared(all_of_them, x.shape[0] * x.shape[1] // LANES)
+    found = torch.from_numpy(counts).to(states.device)
+    return Counts(*found.unbind(1))
 
 
 def _array(tensor: Tensor, dtype: type) -> np.ndarray:
