@@ -65,6 +65,8 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         scene = Scene.of(before.tracks, image, dt_s, model)
         pending = start_detection(scene, before)
         predicted = [predicted_view(scene, row) for row in range(len(scene.hands))]
+        for view in predicted:
+            _ = view and view.seen  # while the networks look
         detections, pending = finish_detection(pending, scene, before)
         columns = assign(costs(scene.hands, detections, dt_s))
         views = [
