@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,16 +23,24 @@ from helpers.rendered import (
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.compute.spans import Spans
 from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import LogOdds
-from toftrack.tracking.filter import predict_particles
+from toftrack.tracking.filter import ParticleSet, predict_particles
 from toftrack.tracking.report import TrackResult
 from toftrack.tracking.state import REFUSED_S, Track, TrackerState
-from toftrack.tracking.step import filter_track, keep_tracks, step, update_track
+from toftrack.tracking.step import filter_tracks, keep_tracks, step, update_track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 HERE, THERE = hand_at(0.0), hand_at(SAME_PLACE_M + 0.05)
 IMAGE = image_of(HERE, THERE)
+
+
+def filtered(view: View, **changes: Any) -> ParticleSet:
+    """The particles of the only track, which the slot shows."""
+    state, dice = replace(state_of(view.track), **changes), torch.Generator().manual_seed(0)
+    (found,) = filter_tracks([view], state, FRAME_S, view.model, dice, Spans())
+    return found
 
 
 def followed(track: Track, odds: float, at: torch.Tensor = HERE) -> TrackResult:
@@ -41,7 +50,7 @@ def followed(track: Track, odds: float, at: torch.Tensor = HERE) -> TrackResult:
     model = replace(right_hand_model(), lost=plain)
     view = view_of(IMAGE, track, detection_of(at), model=model)
     scene = scene_of(track, image=IMAGE, model=model)
-    return update_track(view, None, scene, torch.Generator().manual_seed(0), Spans())
+    return update_track(view, filtered(view), scene, Spans())
 
 
 @pytest.mark.parametrize(("odds", "lost"), [(2.0, False), (-4.0, True)])
@@ -74,14 +83,15 @@ def test_a_pose_of_another_place_begins_the_track_anew_there() -> None:
 
 def test_it_is_kept_what_was_asked_and_what_hides_the_hand() -> None:
     track = track_of(HERE, asked_s=0.1, nearest_m=0.3)
-    scene, dice = scene_of(track, image=IMAGE), torch.Generator().manual_seed(0)
+    scene = scene_of(track, image=IMAGE)
     plain, seen = view_of(IMAGE, track), view_of(IMAGE, track, detection_of(HERE))
     hand = plain.observation.hand
     before = torch.zeros_like(hand)
     before[int(hand.nonzero()[:, 0].float().mean()) :] = True
     part = replace(plain.observation, occluder=hand & before, hand=hand & ~before)
     hidden = replace(plain, observation=part)
-    after = [update_track(view, None, scene, dice, Spans()).track for view in (plain, seen, hidden)]
+    views = plain, seen, hidden
+    after = [update_track(view, filtered(view), scene, Spans()).track for view in views]
     assert [one.asked_s for one in after[:2]] == pytest.approx([0.1 + FRAME_S, 0.0])
     assert [one.nearest_m for one in after] == pytest.approx([0.0, 0.0, hidden.expected_m])
 
@@ -90,8 +100,7 @@ def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> No
     track = track_of(HERE)
     track = replace(track, velocity=torch.full_like(track.velocity, 0.1))
     view = view_of(IMAGE, track)
-    dice, spans = torch.Generator().manual_seed(0), Spans()
-    shown, other = (filter_track(view, FRAME_S, dice, spans, asked) for asked in (True, False))
+    shown, other = filtered(view), filtered(view, slots=())
     assert shown.particles.std(0).any() and not other.particles.std(0).any()
     torch.testing.assert_close(
         other.mean, predict_particles(track, FRAME_S, right_hand_model()).mean
@@ -100,18 +109,20 @@ def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> No
     assert 0.0 < float(other.mean[0, 0]) < 0.1 * FRAME_S
 
 
-@pytest.mark.parametrize("age_s", [0.0, 1.0])
-def test_particles_that_were_filtered_before_are_not_those_of_a_track_that_begins_anew(
-    age_s: float,
+@pytest.mark.parametrize(
+    ("odds", "asked_s", "rests"), [(3.0, 0.0, True), (3.0, 0.04, False), (0.0, 0.0, False)]
+)
+def test_a_sure_hand_that_nobody_asked_for_is_looked_at_in_every_second_frame(
+    odds: float, asked_s: float, rests: bool
 ) -> None:
-    track = track_of(HERE, age=Duration(age_s))
-    early, scene = (
-        predict_particles(track, FRAME_S, right_hand_model()),
-        scene_of(track, image=IMAGE),
-    )
-    dice = torch.Generator().manual_seed(0)
-    after = update_track(view_of(IMAGE, track), early, scene, dice, Spans())
-    assert (after.found.filtered is early) == (age_s > 0)
+    other = replace(track_of(THERE), log_odds=odds, asked_s=asked_s)
+    state = state_of(track_of(HERE), other)
+    after, _, _ = step(state, replace(IMAGE, timestamp_s=FRAME_S), right_hand_model())
+    assert after.tracks[0].asked_s == 0
+    moved = next(track for track in after.tracks if track.number == 1)
+    assert (moved.asked_s > asked_s) == rests
+    assert moved.age.seconds == pytest.approx(other.age.seconds + FRAME_S)
+    torch.testing.assert_close(moved.pose[:, :3], THERE[:, :3], atol=0.01, rtol=0.0)
 
 
 @pytest.mark.parametrize("sure", [True, False])

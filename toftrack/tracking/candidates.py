@@ -83,6 +83,8 @@ class View:
     @property
     def covered(self) -> bool:
         """Whether so much of the hand's last pose is behind something that the pose is kept."""
+        if not self.hidden:
+            return False
         seen, joints = self.observation, self.fitted.refiner.joints(self.track.pose)[0]
         hiding_m = seen.depth_m * seen.occluder  # not another hand: the networks know both apart
         return out_of_sight(joints, hiding_m, seen.k)[1] > _COVERED

@@ -68,10 +68,7 @@ def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
     tangent = torch.cat((moved[:6], moved.new_zeros(21)))[None]
     pose = model.backend.motions.compose(track.pose, tangent)
     joints = fitted.refiner.joints(pose)[0]
-    wrist = pose[:, :6].numpy()
-    up = np.float32(fitted.ratio) * pivot_offset(wrist[:, 3:6])
-    palm = wrist[:, :3] + up
-    palm[:, 2] = np.maximum(palm[:, 2], _NEAREST_M)
+    palm, up = palm_of(pose, fitted)
     nearest, farthest = map(float, joints[:, 2].aminmax())
     # A hidden finger is free to move in front of what hides it, which would then be taken for the
     # hand: while something hides the hand, it comes nearer only as its middle does.
@@ -79,6 +76,15 @@ def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
     nearest = max(nearest, track.nearest_m - approach)
     depths = Expected(nearest, farthest, tuple(joints.mean(0).tolist()))
     return PredictedHand(track, fitted, pose, joints, palm, up, depths)
+
+
+def palm_of(pose: Tensor, fitted: FittedHand) -> tuple[np.ndarray, np.ndarray]:
+    """(1, 3) m, the middle of the palm in a pose (1, 27); and from the wrist to it."""
+    wrist = pose[:, :6].numpy()
+    up = np.float32(fitted.ratio) * pivot_offset(wrist[:, 3:6])
+    palm = wrist[:, :3] + up
+    palm[:, 2] = np.maximum(palm[:, 2], _NEAREST_M)
+    return palm, up
 
 
 def run_filter(

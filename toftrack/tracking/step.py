@@ -19,12 +19,13 @@ from toftrack.tracking.association import assign, costs, same_hand, sureness, tr
 from toftrack.tracking.belief import judge
 from toftrack.tracking.candidates import View, keypoints_of, propose
 from toftrack.tracking.confidence import confidence_features
-from toftrack.tracking.detect import finish_detection, start_detection
+from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
     ParticleSet,
     PoseEstimate,
+    PredictedHand,
     new_track,
-    predict,
+    palm_of,
     predict_particles,
     run_filter,
     shift_particles,
@@ -64,7 +65,10 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     with spans("detector"):
         scene = Scene.of(before.tracks, image, dt_s, model)
         pending = start_detection(scene, before)
-        predicted = [predicted_view(scene, row) for row in range(len(scene.hands))]
+        resting = [rests(scene, row, before) for row in range(len(scene.hands))]
+        predicted = [
+            None if rest else predicted_view(scene, row) for row, rest in enumerate(resting)
+        ]
         for view in predicted:
             _ = view and view.seen  # while the networks look
         detections, pending = finish_detection(pending, scene, before)
@@ -92,8 +96,23 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         next_track=before.next_track + len(views) - len(columns),
         generator=generator.get_state(),
     )
-    after = keep_tracks(after, [result.track for result in results], model)
+    rested = [rest_track(hand, dt_s, model) for hand in compress(scene.hands, resting)]
+    after = keep_tracks(after, [*rested, *(result.track for result in results)], model)
     return report(after, results, scene, spans)
+
+
+def rest_track(hand: PredictedHand, dt_s: float, model: TrackerModel) -> Track:
+    """A track after a frame in which it is only moved on."""
+    moved, track = predict_particles(hand.track, dt_s, model), hand.track
+    return replace(
+        track,
+        particles=moved.particles,
+        mean=moved.mean,
+        pose=hand.pose,
+        age=track.age.extended(dt_s),
+        asked_s=track.asked_s + dt_s,
+        evidence=replace(track.evidence, age_s=track.evidence.age_s + dt_s),
+    )
 
 
 def filter_tracks(
@@ -104,13 +123,13 @@ def filter_tracks(
     generator: torch.Generator,
     spans: Spans,
 ) -> list[ParticleSet]:
-    """The particles of tracks: filtered where a slot shows them or they restart, else predicted.
+    """The particles of tracks: filtered where a slot shows them or they are doubtful, else moved on.
 
     What is drawn for a track depends on its number, not on which others there are.
     """
     seed = int(torch.randint(2**62, (1,), generator=generator))
     shown = {slot.track for slot in state.slots}
-    chosen = [view.track.number in shown or not view.track.age.begun for view in views]
+    chosen = [view.track.number in shown or not view.track.reliable for view in views]
     filtered = list(compress(views, chosen))
     found = iter(
         run_filter(
@@ -206,7 +225,7 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
             if on_same_hand(first, second, model):
                 gone.add(min(first, second, key=sureness).number)
     refused = [
-        [*palm_of(track, model), 0.0]
+        [*palm_of(track.pose, model.hand(track.side, track.shape))[0][0], 0.0]
         for track in tracks
         if track.number in gone and not track.confirmed
     ]
@@ -219,13 +238,8 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
 
 def on_same_hand(first: Track, second: Track, model: TrackerModel) -> bool:
     """Whether two tracks follow the same hand."""
-    joints = [
-        model.hand(track.side, track.shape).refiner.joints(track.pose)[0].cpu()
-        for track in (first, second)
-    ]
-    return same_hand(palm_of(first, model), palm_of(second, model), *joints)
-
-
-def palm_of(track: Track, model: TrackerModel) -> np.ndarray:
-    """(3,) m, the middle of the palm in a track's last pose."""
-    return predict(replace(track, velocity=torch.zeros_like(track.velocity)), 0.0, model).palm_m[0]
+    hands = [model.hand(track.side, track.shape) for track in (first, second)]
+    poses = [track.pose for track in (first, second)]
+    palms = [palm_of(*each)[0][0] for each in zip(poses, hands, strict=True)]
+    joints = [hand.refiner.joints(pose)[0] for hand, pose in zip(hands, poses, strict=True)]
+    return same_hand(*palms, *joints)
