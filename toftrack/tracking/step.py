@@ -96,8 +96,9 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         next_track=before.next_track + len(views) - len(columns),
         generator=generator.get_state(),
     )
-    rested = [rest_track(hand, dt_s, model) for hand in compress(scene.hands, resting)]
-    after = keep_tracks(after, [*rested, *(result.track for result in results)], model)
+    tracks = [rest_track(hand, dt_s, model) for hand in compress(scene.hands, resting)]
+    tracks += [result.track for result in results]
+    after = keep_tracks(after, sorted(tracks, key=lambda track: track.number), model)
     return report(after, results, scene, spans)
 
 
@@ -123,7 +124,7 @@ def filter_tracks(
     generator: torch.Generator,
     spans: Spans,
 ) -> list[ParticleSet]:
-    """The particles of tracks: filtered where a slot shows them or they are doubtful, else moved on.
+    """The particles of tracks: filtered if a slot shows them or they are doubtful, else moved on.
 
     What is drawn for a track depends on its number, not on which others there are.
     """
