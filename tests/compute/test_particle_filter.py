@@ -122,3 +122,45 @@ def test_mean_and_covariance_of_particles_are_the_weighted_ones() -> None:
     torch.testing.assert_close(
         sir.covariance(tangents, weights).double(), expected, atol=1e-5, rtol=1e-4
     )
+
+
+def test_importance_weights_make_draws_about_a_detection_speak_of_the_prediction() -> None:
+    """Means under the prediction, by draws from elsewhere, within five standard deviations."""
+    n, sigmas = 20_000, torch.full((10,), 0.5)
+    predicted = 0.3 * torch.randn(4, 10, generator=generator(1))
+    weights = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    tangents = sigmas * torch.randn(n, 10, generator=generator(2))
+    ratio = sir.importance(tangents, predicted, weights, sigmas).exp()
+    share = ratio / ratio.sum()
+    expected = weights.float() @ predicted
+    found = share @ tangents
+    error = ((tangents - found).square() * share.square()[:, None]).sum(0).sqrt()
+    assert ((found - expected).abs() < 5 * error).all()
+    assert float(ratio.mean()) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_a_share_of_the_particles_is_drawn_about_the_detection(share: float) -> None:
+    """The prediction is elsewhere, and the image says nothing."""
+    spread = sir.Spread(0.01, 0.01, 0.01, 0.01)
+    settings = sir.FilterSettings(
+        *(40, 1, 1.0, 1.0, 1.0, spread, 1.0, 0.0, 0.0, 0.0, "systematic", "reflect", share)
+    )
+    here, there = torch.zeros(1, 10), torch.zeros(1, 10)
+    there[:, 0] = 0.2
+    found, weights = sir.annealed(
+        here.expand(1, 40, 10),
+        torch.full((1, 40), 1 / 40, dtype=torch.float64),
+        [there],
+        torch.full((1, 10), 0.01),
+        lambda particles: torch.zeros(particles.shape[:2]),
+        LOWER,
+        UPPER,
+        settings,
+        MOTIONS,
+        [generator()],
+    )
+    at_detection = found[0, :, 0] > 0.1
+    assert int(at_detection.sum()) == 40 * share
+    assert float(weights[0, at_detection].sum()) < 1e-6, "where the prediction says no hand can be"
+    assert float(weights.sum()) == pytest.approx(1.0)

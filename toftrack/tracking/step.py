@@ -135,6 +135,7 @@ def filter_tracks(
     found = iter(
         run_filter(
             [view.track for view in filtered],
+            [view.likeliest for view in filtered],
             dt_s,
             [view.image for view in filtered],
             model,
