@@ -101,7 +101,7 @@ def test_a_hand_that_is_believed_comes_before_one_that_is_not() -> None:
 
 @pytest.mark.parametrize("hands", [1, 2, 4])
 def test_a_hand_keeps_its_slot(hands: int) -> None:
-    state = before(hands, track=1, known=5.0)
+    state = before(hands, track=1, known=True)
     assert numbers(state, hand(0), hand(1))[0] == 1
     while_lost = numbers(state, hand(0), hand(1, lost=True))
     assert while_lost[:2] == [1, 0][:hands]
@@ -154,7 +154,7 @@ def test_of_more_hands_than_slots_the_first_ones_are_reported() -> None:
 def test_where_no_side_was_said_a_hand_that_comes_may_be_the_first_one_again(
     side: str, away_s: float, taken: bool
 ) -> None:
-    state = before(known=5.0, away_s=away_s)
+    state = before(known=True, away_s=away_s)
     assert numbers(state, hand(1, side)) == [1 if taken else -1]
 
 

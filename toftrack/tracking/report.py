@@ -105,11 +105,10 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
     stays = slot.track == track.number
     # Of hands that are worth the same, the one that was found first comes first.
     worth += _STAYS * stays + 0.1 / ((1 + track.number) * (1 + number))
-    several = len(state.slots)
+    several, wanted = len(state.slots), side_of_slot(number, state)
     if several > 2:
         return worth
-    if state.told is not None:
-        wanted = state.told if number == 0 else OTHER_SIDE[state.told]
+    if wanted is not None:
         agrees = right if wanted == "right" else -right
         return worth + min(max(agrees, -_MOST), _MOST) + (0 if several == 1 else _MOST)
     if not slot.known or stays:
@@ -142,17 +141,8 @@ def report_track(
         image.k,
     )
     sigma, confidence = model.lost.joints.judge(rows)
-    sure = probability(right if track.side == "right" else -right)
-    if state.told is None:
-        estimate = estimate.updated(confidence=estimate.confidence * sure)
-    else:
-        wanted = OTHER_SIDE[state.told] if number else state.told
-        sure = 1.0 if track.side == wanted else sure
-        if len(state.slots) < 3 and probability(right if wanted == "right" else -right) < _OTHER:
-            estimate = estimate.updated(lost=True, state_name="other hand")
+    estimate = with_side(estimate, track.side, right, side_of_slot(number, state))
     estimate = estimate.updated(
-        side=track.side,
-        side_probability=sure,
         joint_sigma_m=sigma,
         joint_confidence=confidence,
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
@@ -174,11 +164,32 @@ def report_track(
         track=track.number,
         side=track.side,
         shape=track.shape,
-        known=right if track.confirmed else slot.known,
+        known=slot.known or track.confirmed,
         away_s=slot.away_s if estimate.lost else 0.0,
         joint_features=rows,
     )
     return slot, info, estimate
+
+
+def side_of_slot(number: int, state: TrackerState) -> str | None:
+    """The side that the user said of a slot; None where nobody did, or there are several persons."""
+    if state.told is None or len(state.slots) > 2:
+        return None
+    return OTHER_SIDE[state.told] if number else state.told
+
+
+def with_side(estimate: Estimate, side: str, right: float, wanted: str | None) -> Estimate:
+    """The estimate of a hand of a track's `side`; lost where it is not the `wanted` one.
+
+    right: log odds that it is a right hand.  wanted: see side_of_slot.
+    """
+    sure = probability(right if side == "right" else -right)
+    if wanted is None:
+        confidence = estimate.confidence * sure
+        return estimate.updated(side=side, side_probability=sure, confidence=confidence)
+    if probability(right if wanted == "right" else -right) < _OTHER:
+        estimate = estimate.updated(lost=True, state_name="other hand")
+    return estimate.updated(side=side, side_probability=1.0 if side == wanted else sure)
 
 
 def report_absence(

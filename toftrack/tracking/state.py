@@ -91,8 +91,7 @@ class Slot:
     """A place of the report, for one hand.
 
     track: number of the track that is reported here; -1 = none.
-    side, shape: of the last track here.  known: log odds that its last confirmed one was a right
-        hand; 0 = there was none.
+    side, shape: of the last track here.  known: whether one of them was ever confirmed.
     last: the last believed estimate, else the last one; lost and NaN before any.
     gesture: smoothed probabilities of the gestures, None where there are none.
     away_s: how long ago a hand was believed here; inf = never.
@@ -103,7 +102,7 @@ class Slot:
     shape: ShapeEstimate
     last: Estimate
     track: int = -1
-    known: float = 0.0
+    known: bool = False
     gesture: GestureState | None = None
     away_s: float = math.inf
     joint_features: np.ndarray = field(default_factory=lambda: np.zeros((21, len(JOINT_FEATURES))))

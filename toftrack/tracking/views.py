@@ -99,8 +99,8 @@ def begin_tracks(
             continue
         at = detection.centre_m.numpy()[None], OTHER_SIDE[one.side], detection.up[None]
         mirrored = model.detector.detect(image.depth_m, image.k, *at)[0]
-        view = choose_side(scene, -1, view, mirrored, state.told)
-        views.append(with_parts(replace(view, track=restart_track(view))))
+        view = with_parts(replace(view, track=restart_track(view)))
+        views.append(choose_side(scene, -1, view, mirrored, state.told))
     return views
 
 
