@@ -114,25 +114,15 @@ def run_filter(
             return model.likelihood.log_score(model.backend.score_rows(scorers, poses, evidences))
 
     moves = [predicted_motion(track, dt_s, model.filter) for track in tracks]
-    sigmas = [
-        particle_filter.widened(
-            model.sigmas, dt_s / FRAME_S, moved, model.filter.rest, model.filter.speed_gain
-        )
-        for moved in moves
-    ]
+    given = zip(tracks, moves, strict=True)
     particles, weights = particle_filter.annealed(
-        torch.stack(
-            [
-                _moved(track.particles, moved, model)
-                for track, moved in zip(tracks, moves, strict=True)
-            ]
-        ),
+        torch.stack([_moved(track.particles, moved, model) for track, moved in given]),
         torch.stack([track.weights for track in tracks]),
         [
             None if pose is None else on_device(model.encode(pose), model.device)
             for pose in detected
         ],
-        on_device(torch.stack(sigmas), model.device),
+        on_device(torch.stack([_sigmas(moved, dt_s, model) for moved in moves]), model.device),
         log_scores,
         space.lower,
         space.upper,
@@ -142,6 +132,13 @@ def run_filter(
     )
     rows = zip(particles, weights, strict=True)
     return [ParticleSet(*row, motions.mean(*row)) for row in rows]
+
+
+def _sigmas(moved: Tensor, dt_s: float, model: FilterModel) -> Tensor:
+    """(6 + d,) of the first diffusion of a hand that is expected to move by a tangent (6 + d,)."""
+    settings = model.filter
+    frames = dt_s / FRAME_S
+    return particle_filter.widened(model.sigmas, frames, moved, settings.rest, settings.speed_gain)
 
 
 def _moved(particles: Tensor, tangent: Tensor, model: FilterModel) -> Tensor:

@@ -96,7 +96,11 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         next_track=before.next_track + len(views) - len(columns),
         generator=generator.get_state(),
     )
-    tracks = [rest_track(hand, dt_s, model) for hand in compress(scene.hands, resting)]
+    tracks = [
+        rest_track(hand, dt_s, model)
+        for hand, rest, view in zip(scene.hands, resting, views, strict=False)
+        if rest and view is None
+    ]
     tracks += [result.track for result in results]
     after = keep_tracks(after, sorted(tracks, key=lambda track: track.number), model)
     return report(after, results, scene, spans)
