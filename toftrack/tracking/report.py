@@ -172,7 +172,7 @@ def report_track(
 
 
 def side_of_slot(number: int, state: TrackerState) -> str | None:
-    """The side that the user said of a slot; None where nobody did, or there are several persons."""
+    """The side that the user said of a slot; None where nobody did, or of several persons."""
     if state.told is None or len(state.slots) > 2:
         return None
     return OTHER_SIDE[state.told] if number else state.told
