@@ -180,22 +180,21 @@ def annealed(
     Returns (B, N, 6 + d) and (B, N).
     """
     n, size, device = settings.particles, particles.shape[2], particles.device
-    about = round(settings.detected * n)
     for number in range(settings.passes):
         drawn, log_ratios = [], particles.new_zeros(len(particles), n)
         for row, (generator, seen) in enumerate(zip(generators, detected, strict=True)):
-            positions = RESAMPLERS[settings.resampling](n, generator)
+            about = 0 if number or seen is None else round(settings.detected * n)
+            positions = RESAMPLERS[settings.resampling](n - about, generator)
             noise = torch.randn((n, size), generator=generator, device=device)
             tangents = noise * (sigmas[row] * settings.shrink**number)
-            given = particles[row], weights[row], positions, tangents
+            given = particles[row], weights[row], positions, tangents[about:]
             moved = motions.redraw(*given, lower, upper, settings.bounds)
-            if number == 0 and about and seen is not None:
+            if about and seen is not None:
                 proposed = motions.compose(seen.expand(about, -1), tangents[:about])
                 proposed[:, 6:] = bound(proposed[:, 6:], lower, upper, settings.bounds)
-                moved[:about] = proposed
                 offsets = motions.difference(particles[row], seen)
                 ratios = importance(tangents[:about], offsets, weights[row], sigmas[row])
-                log_ratios[row, :about] = ratios
+                moved, log_ratios[row, :about] = torch.cat((proposed, moved)), ratios
             drawn.append(moved)
         particles = torch.stack(drawn)
         log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
