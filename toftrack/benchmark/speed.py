@@ -54,7 +54,7 @@ PARTS = (
     "refinement",
     "rest",
 )
-"""What a frame's time is spent on. Of the networks, which look beside the filter where there is a
+"""What a frame's time is spent on. Of the networks, which look in another thread where there is a
 second core, only what is waited for counts."""
 _SLOW_PARTICLES = 300
 """The baselines are not timed with more particles than this."""
