@@ -23,13 +23,14 @@ def table_of(*rows: tuple[float, float, Source, float]) -> Hypotheses:
     poses = torch.zeros(len(rows), 27)
     poses[:, 0] = torch.tensor([place for place, _, _, _ in rows])
     poses[:, 6] = torch.tensor([finger for _, finger, _, _ in rows])
-    sources = torch.tensor([int(source) for _, _, source, _ in rows])
-    return Hypotheses(poses, sources, torch.tensor([value for _, _, _, value in rows]))
+    sources = [source for _, _, source, _ in rows]
+    values = torch.tensor([value for _, _, _, value in rows])
+    return Hypotheses(poses, joints_of(poses), sources, values)
 
 
 def chosen(table: Hypotheses, hidden: bool = False) -> tuple[int, bool]:
     """The row, and whether it is of another place."""
-    choice = select(table, joints_of(table.pose), hidden)
+    choice = select(table, hidden)
     (row,) = (table.pose == choice.pose).all(1).nonzero()[:1].tolist()
     return row[0], choice.moved
 
@@ -43,7 +44,7 @@ def test_the_choice_is_that_of_a_plain_reference() -> None:
         sources = [Source(int(draw.integers(3))) for _ in range(n)]
         sources[0] = Source(int(draw.integers(2)))
         table = table_of(*zip(places, fingers, sources, draw.normal(0, 0.05, n), strict=True))
-        value, joints = table.log_posterior.tolist(), joints_of(table.pose).double().numpy()
+        value, joints = table.log_posterior.tolist(), table.joints_m.double().numpy()
         filters = [i for i in range(n) if sources[i] != Source.DETECTOR]
         base = max(filters, key=lambda i: value[i])
         margins = [_MARGIN if source == Source.DETECTOR else 0.0 for source in sources]

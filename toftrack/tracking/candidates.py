@@ -7,6 +7,7 @@ Gall et al., "Optimization and filtering for human motion capture" (IJCV 87, 201
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -209,24 +210,26 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
     explains nothing once refined stays as proposed: the few points that are left of a hand that
     leaves the image may draw it anywhere.
     """
-    model, posterior = view.model, view.posterior()
-    if not model.refinement.iterations:
-        return replace(Hypotheses.of(mean, Source.DYNAMICS), log_posterior=posterior(mean))
+    if not view.model.refinement.iterations:
+        return scored(view, mean, (Source.DYNAMICS,))
     if view.covered:
-        held = Hypotheses.of(view.track.pose, Source.PREVIOUS)
-        return replace(held, log_posterior=posterior(view.track.pose))
-    detected = detector_poses(view.detection, view.observation, view.fitted, model, 1)
+        return scored(view, view.track.pose, (Source.PREVIOUS,))
+    detected = detector_poses(view.detection, view.observation, view.fitted, view.model, 1)
     previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
-    tables = [
-        Hypotheses.of(previous, Source.PREVIOUS),
-        Hypotheses.of(mean, Source.DYNAMICS),
-        Hypotheses.of(detected, Source.DETECTOR),
-    ]
-    table = Hypotheses.joined(tables)
-    pose = view.refine(table.pose)
-    values = posterior(pose)
-    pose = torch.where(values.isneginf()[:, None], table.pose, pose)
-    return replace(table, pose=pose, log_posterior=values)
+    poses = torch.cat((previous, mean, detected))
+    sources = (Source.PREVIOUS, Source.DYNAMICS, *[Source.DETECTOR] * len(detected))
+    table = scored(view, view.refine(poses), sources)
+    nothing = table.log_posterior.isneginf()
+    if not nothing.any():
+        return table
+    pose = torch.where(nothing[:, None], poses, table.pose)
+    return replace(table, pose=pose, joints_m=view.fitted.refiner.joints(pose))
+
+
+def scored(view: View, poses: Tensor, sources: Sequence[Source]) -> Hypotheses:
+    """Poses (N, 27) of these sources as they are, scored."""
+    joints = view.fitted.refiner.joints(poses)
+    return Hypotheses(poses, joints, sources, view.posterior().value(poses, joints))
 
 
 def without_things(observation: Observation, detection: Detection) -> Observation:

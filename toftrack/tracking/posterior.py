@@ -128,7 +128,11 @@ class Posterior:
 
     def __call__(self, poses: Tensor) -> Tensor:
         """(N,) log posteriors of poses (N, 27) on the CPU."""
-        joints, total = self.joints(poses), self.image(poses)
+        return self.value(poses, self.joints(poses))
+
+    def value(self, poses: Tensor, joints: Tensor) -> Tensor:
+        """The same of poses whose joints (N, 21, 3) are known."""
+        total = self.image(poses)
         for term in self.terms.values():
             total = total + term(poses, joints)
         return total

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-import torch
 from torch import Tensor
 
 _MARGIN = 0.05
@@ -38,27 +36,13 @@ class Source(IntEnum):
 class Hypotheses:
     """A table of poses of one hand, a row each.
 
-    pose: (N, 27).  source: (N,) see Source.  log_posterior: (N,), NaN before they are scored.
+    pose: (N, 27).  joints_m: (N, 21, 3).  source: of each.  log_posterior: (N,).
     """
 
     pose: Tensor
-    source: Tensor
+    joints_m: Tensor
+    source: Sequence[Source]
     log_posterior: Tensor
-
-    @classmethod
-    def of(cls, pose: Tensor, source: Source) -> Hypotheses:
-        """Poses (N, 27) of one source, not scored."""
-        n = len(pose)
-        return cls(pose, torch.full((n,), int(source)), torch.full((n,), math.nan))
-
-    @classmethod
-    def joined(cls, tables: Sequence[Hypotheses]) -> Hypotheses:
-        """The rows of all tables, in order."""
-        return cls(
-            torch.cat([table.pose for table in tables]),
-            torch.cat([table.source for table in tables]),
-            torch.cat([table.log_posterior for table in tables]),
-        )
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -75,15 +59,15 @@ class Choice:
     moved: bool
 
 
-def select(table: Hypotheses, joints_m: Tensor, hidden: bool) -> Choice:
+def select(table: Hypotheses, hidden: bool) -> Choice:
     """The best of a hand's scored hypotheses; one of the detector must be better by a margin.
 
-    table: with at least one row that is not the detector's.  joints_m: (N, 21, 3) of its poses.
+    table: with at least one row that is not the detector's.
     hidden: something hides part of the hand. Then a pose elsewhere needs a large lead, for it may
         be of what hides the hand, such as another hand.
     """
     # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
-    joints, source = joints_m.numpy(), table.source.numpy()
+    joints, source = table.joints_m.numpy(), np.array(table.source)
     values = np.maximum(table.log_posterior.numpy(), WORST)
     detectors = source == Source.DETECTOR
     base = int(np.where(detectors, -np.inf, values).argmax())

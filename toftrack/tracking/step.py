@@ -160,8 +160,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
     """
     model, track, dt_s = view.model, view.track, scene.dt_s
     with spans("refinement"):
-        table = propose(view, model.decode(filtered.mean))
-        choice = select(table, view.fitted.refiner.joints(table.pose), view.hidden)
+        choice = select(propose(view, model.decode(filtered.mean)), view.hidden)
     pose, trend = choice.pose, track.trend
     if choice.moved:
         fresh = new_track(pose, model)
