@@ -26,6 +26,8 @@ _AGAIN = 3.0
 """The first look may be so much worse than what a hand needs: the second one is more exact."""
 _DOUBT_M = 0.06
 """How far off a finger's outer joints may be that lies in another one, by the keypoints."""
+_OUTER = np.array([0, 1, 1, 1], np.float32)
+"""Of a finger's joints, those that may be another one's."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
@@ -226,7 +228,7 @@ def doubt_m(detection: Detection) -> float:
 
 def _detection(seen: NetworkOutput, row: int) -> Detection:
     points_m = seen.keypoints_m[row]
-    length_m = DEFAULT_HAND_LENGTH_M * float(seen.log_size[row, 0].exp())
+    length_m = DEFAULT_HAND_LENGTH_M * math.exp(float(seen.log_size[row, 0]))
     return Detection(
         **{name: getattr(seen, name)[row] for name in _OF_HYPOTHESES},
         keypoints=Keypoints(points_m, doubted_sigma_m(points_m, seen.sigma_m[row], length_m)),
@@ -242,9 +244,12 @@ def doubted_sigma_m(points_m: Tensor, sigma_m: Tensor, hand_length_m: float) -> 
     Of a single finger that is seen the cells do not know which one it is, and say surely that it is
     either; what is no hand, such as an elbow, has its fingers in one another.
     """
-    doubt_m = _DOUBT_M * overlap_of_each(points_m[None], hand_length_m)[0].clamp(max=1)
-    outer = doubt_m[:, None] * torch.tensor([0.0, 1.0, 1.0, 1.0])
-    return torch.hypot(sigma_m, torch.cat((torch.zeros(1), outer.flatten())))
+    # In numpy: on a few numbers each of torch's operations takes longer than its arithmetic.
+    overlap = overlap_of_each(points_m[None], hand_length_m)[0].numpy()
+    doubt_m = _DOUBT_M * np.minimum(overlap, 1)[:, None] * _OUTER
+    sigma = sigma_m.numpy().copy()
+    sigma[1:] = np.hypot(sigma[1:], doubt_m.ravel())
+    return torch.from_numpy(sigma)
 
 
 def make_detector(weights: str | None = None, **settings: Any) -> HandDetector:

@@ -183,7 +183,7 @@ class PoseEstimate:
     @property
     def off_rad(self) -> float:
         """How far the pose lies off the pose space, rms over the 21 angles."""
-        return float(self.offset.square().mean().sqrt())
+        return float(np.sqrt(np.square(self.offset.numpy()).mean()))
 
 
 def shift_particles(found: PoseEstimate, model: FilterModel) -> ParticleSet:
