@@ -109,32 +109,6 @@ def compose_rows(reference, tangent, pivot, out):
 
 
 @entry_point
-def redraw_rows(particles, weights, positions, tangents, lower, upper, reflect, pivot, out):
-    """See redraw.redraw_with; weights, positions, pivot: float64, the others float32."""
-    last, total = 0, 0.0
-    for i in range(len(weights)):
-        total += weights[i]
-        if weights[i] > 0:
-            last = i
-    at, reached = 0, weights[0]
-    for n in range(len(out)):
-        while at < last and reached <= positions[n] * total:
-            at += 1
-            reached += weights[at]
-        compose_row(particles[at], tangents[n], pivot, out[n])
-        for j in range(len(lower)):
-            value = out[n, 6 + j]
-            if reflect:
-                # As numpy's remainder, which is never below 0.
-                wide = upper[j] - lower[j]
-                folded = (value - lower[j]) % (2 * wide)
-                value = lower[j] + min(folded, 2 * wide - folded)
-            else:
-                value = min(max(value, lower[j]), upper[j])
-            out[n, 6 + j] = value
-
-
-@entry_point
 def difference_rows(particles, reference, pivot, out):
     """See rigid.difference; particles, out: (N, 6 + d), reference: (1, 6 + d), float32."""
     r = reference[0]
@@ -255,18 +229,19 @@ def redraw(
     mode: str,
 ) -> Tensor:
     """See redraw.redraw_with; on the CPU, in float32."""
+    total = weights.double().numpy().cumsum()
+    chosen = np.searchsorted(total, positions.numpy() * total[-1], side="right")
+    # The last particle that has weight: one past the end is only ever a rounding.
+    chosen = np.minimum(chosen, np.searchsorted(total, total[-1]))
     out = np.empty(tangents.shape, np.float32)
-    redraw_rows(
-        _rows(particles),
-        np.ascontiguousarray(weights.numpy(), np.float64),
-        np.ascontiguousarray(positions.numpy(), np.float64),
-        _rows(tangents),
-        _rows(lower),
-        _rows(upper),
-        mode == "reflect",
-        _PIVOT,
-        out,
-    )
+    compose_rows(_rows(particles)[chosen], _rows(tangents), _PIVOT, out)
+    low, high = lower.numpy(), upper.numpy()
+    if mode == "reflect":
+        wide = high - low
+        folded = np.remainder(out[:, 6:] - low, 2 * wide)
+        out[:, 6:] = low + np.minimum(folded, 2 * wide - folded)
+    else:
+        out[:, 6:] = out[:, 6:].clip(low, high)
     return torch.from_numpy(out)
 
 
