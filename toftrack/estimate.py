@@ -25,7 +25,7 @@ STATES = {
 """What the tracker does, Estimate.state_name, and how it is said to people."""
 
 
-class OnDemand:
+class ArrayOnDemand:
     """A field of a dataclass that may be given as a function without arguments: it is called when
     the field is first read. What few programs read then costs the others nothing."""
 
@@ -77,7 +77,7 @@ class Estimate:
     """(d,) float32 pose-space coordinates."""
     score: float
     """The likelihood head's score, 0..1."""
-    covariance: OnDemand = OnDemand(10, 10)
+    covariance: ArrayOnDemand = ArrayOnDemand(10, 10)
     """(6 + d, 6 + d) float32 over translation, rotation (tangent space) and latent."""
     effective_sample_size: float = math.nan
     """Of the weights, before resampling."""
@@ -115,14 +115,14 @@ class Estimate:
     the thumb stretched away, else NaN."""
     pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 unit vector from there to the finger's tip, else NaN."""
-    landmarks: OnDemand = OnDemand(21, 3)
+    landmarks: ArrayOnDemand = ArrayOnDemand(21, 3)
     """(21, 3) the joints as MediaPipe's landmarks: x, y in parts of the image's width and height, z
     the depth beyond the wrist's in parts of the width; see hand/conventions.py."""
-    openxr_position_m: OnDemand = OnDemand(26, 3)
+    openxr_position_m: ArrayOnDemand = ArrayOnDemand(26, 3)
     """(26, 3) metres, the joints of XR_EXT_hand_tracking; x right, y up, -z forward."""
-    openxr_orientation: OnDemand = OnDemand(26, 4)
+    openxr_orientation: ArrayOnDemand = ArrayOnDemand(26, 4)
     """(26, 4) unit quaternions x y z w of these joints; see hand/openxr.py for their axes."""
-    openxr_radius_m: OnDemand = OnDemand(26)
+    openxr_radius_m: ArrayOnDemand = ArrayOnDemand(26)
     """(26,) metres from these joints to the skin."""
 
     def updated(self, **changes: Any) -> Self:

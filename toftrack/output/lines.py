@@ -15,7 +15,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, OnDemand, is_vacant
+from toftrack.estimate import ArrayOnDemand, Estimate, is_vacant
 from toftrack.json_text import parse_json
 from toftrack.safe_files import open_to_read
 
@@ -25,7 +25,7 @@ _KINDS: dict[type, type] = {
     float: np.float32,
     str: np.str_,
     np.ndarray: np.float32,
-    OnDemand: np.float32,
+    ArrayOnDemand: np.float32,
 }
 _EXACT: dict[str, type] = {"timestamp_s": np.float64, "joint_ok": np.bool_}
 """Fields of another type than their kind's."""
@@ -34,7 +34,9 @@ KINDS: dict[str, type] = {
     field.name: _EXACT.get(field.name, _KINDS[_HINTS[field.name]]) for field in fields(Estimate)
 }
 """Of what type each field is in track.npz; arrays have their shape behind the frames' axis."""
-NUMBERS = frozenset(name for name, hint in _HINTS.items() if hint not in (np.ndarray, OnDemand))
+NUMBERS = frozenset(
+    name for name, hint in _HINTS.items() if hint not in (np.ndarray, ArrayOnDemand)
+)
 """The fields that are one number or text."""
 
 _FIRST = (
