@@ -54,7 +54,8 @@ def test_a_hand_that_is_seen_alone_is_rather_of_the_side_that_the_user_said() ->
     right, none, left = (side_log_odds(known(), [], told) for told in ("right", None, "left"))
     assert right == pytest.approx(-left) and right > 1 and none == pytest.approx(0.0)
     for others in ([known()], [known(), known()]):
-        assert side_log_odds(known(), others, "left") == pytest.approx(0.0), "not beside another"
+        beside = side_log_odds(known(), others, "left")
+            assert beside == pytest.approx(0.0, abs=0.02), "not beside another"
     assert side_log_odds(known(-6.0), [], "right") < 0, "but what is seen may say otherwise"
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from toftrack.detector.hand_detector import Detection
 from toftrack.frames import DepthImage
+from toftrack.tracking.belief import probability
 from toftrack.tracking.candidates import View, best_start
 from toftrack.tracking.confidence import log_odds
 from toftrack.tracking.model import TrackerModel
@@ -57,16 +58,20 @@ def side_log_odds(track: Track, others: Sequence[Track], told: str | None) -> fl
 
     others: the other tracks that are confirmed; a person's two hands are not of one side.
     told: the side that the user said, of a hand that is seen alone.
+
+    A partner counts by how probable it is that it is a hand, and what was said by the rest.
     """
     evidence, total = track.evidence, track.evidence.fits
     if told is None:
         shoulder = _SHOULDER * evidence.body_m
         total += min(max(shoulder, -_SHOULDER_MOST), _SHOULDER_MOST)
-    if len(others) == 1:
-        return total - _PARTNER * math.tanh(0.5 * others[0].evidence.fits)
-    if told is not None and not others:
-        total += _TOLD if told == "right" else -_TOLD
-    return total
+    if len(others) > 1:
+        return total
+    alone = 1.0 - sum(probability(other.log_odds) for other in others)
+    if told is not None:
+        total += alone * (_TOLD if told == "right" else -_TOLD)
+    partner = sum(math.tanh(0.5 * other.evidence.fits) for other in others)
+    return total - (1.0 - alone) * _PARTNER * partner
 
 
 def comparison_due(track: Track, dt_s: float) -> bool:
