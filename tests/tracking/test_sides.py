@@ -50,6 +50,12 @@ def test_two_hands_are_of_different_sides_the_more_surely_the_surer_the_other_on
     assert -3.0 < odds[3] < -1.0
 
 
+def test_a_partner_that_is_hardly_a_hand_says_little_and_what_the_user_said_counts() -> None:
+    ghost, partner = known(6.0, log_odds=-2.0), known(6.0, log_odds=3.0)
+    said = [side_log_odds(known(), [one], "right") for one in (ghost, partner)]
+    assert said[0] > 1.0 > -1.0 > said[1]
+
+
 def test_a_hand_that_is_seen_alone_is_rather_of_the_side_that_the_user_said() -> None:
     right, none, left = (side_log_odds(known(), [], told) for told in ("right", None, "left"))
     assert right == pytest.approx(-left) and right > 1 and none == pytest.approx(0.0)
