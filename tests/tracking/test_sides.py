@@ -61,7 +61,7 @@ def test_a_hand_that_is_seen_alone_is_rather_of_the_side_that_the_user_said() ->
     assert right == pytest.approx(-left) and right > 1 and none == pytest.approx(0.0)
     for others in ([known()], [known(), known()]):
         beside = side_log_odds(known(), others, "left")
-            assert beside == pytest.approx(0.0, abs=0.02), "not beside another"
+        assert beside == pytest.approx(0.0, abs=0.02), "not beside another"
     assert side_log_odds(known(-6.0), [], "right") < 0, "but what is seen may say otherwise"
 
 
