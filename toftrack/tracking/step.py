@@ -96,13 +96,12 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         next_track=before.next_track + len(views) - len(columns),
         generator=generator.get_state(),
     )
-    tracks = [
+    rested = [
         rest_track(hand, dt_s, model)
         for hand, rest, view in zip(scene.hands, resting, views, strict=False)
         if rest and view is None
     ]
-    tracks += [result.track for result in results]
-    after = keep_tracks(after, sorted(tracks, key=lambda track: track.number), model)
+    after = keep_tracks(after, [*rested, *(result.track for result in results)], model)
     return report(after, results, scene, spans)
 
 
@@ -234,9 +233,10 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
         for track in tracks
         if track.number in gone and not track.confirmed
     ]
+    kept = [track for track in tracks if track.number not in gone]
     return replace(
         state,
-        tracks=tuple(track for track in tracks if track.number not in gone),
+        tracks=tuple(sorted(kept, key=lambda track: track.number)),
         refused=np.concatenate((state.refused, np.reshape(refused, (-1, 4)))),
     )
 
