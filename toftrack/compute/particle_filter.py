@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.redraw import BOUNDS, Motions, bound
+from toftrack.compute.redraw import BOUNDS, Redraw
 from toftrack.errors import ToftrackError
 
 
@@ -60,7 +60,6 @@ class FilterSettings:
     velocity_smoothing: float
     resampling: str
     bounds: str
-    detected: float = 0.0
 
     def __post_init__(self) -> None:
         if self.resampling not in RESAMPLERS:
@@ -76,7 +75,6 @@ class FilterSettings:
             check_number(f"filter.{name}", getattr(self, name), 1, whole=True)
         for name in ("exponent", "exponent_growth", "shrink"):
             check_number(f"filter.{name}", getattr(self, name), 0, above=True)
-        check_number("filter.detected", self.detected, 0, 1)
         for name in ("rest", "speed_gain", "velocity"):
             check_number(f"filter.{name}", getattr(self, name), 0)
         check_number("filter.velocity_smoothing", self.velocity_smoothing, 0, 1)
@@ -158,22 +156,19 @@ RESAMPLERS: dict[str, Callable[[int, torch.Generator], Tensor]] = {
 def annealed(
     particles: Tensor,
     weights: Tensor,
-    detected: Sequence[Tensor | None],
     sigmas: Tensor,
     log_scores: Callable[[Tensor], Tensor],
     lower: Tensor,
     upper: Tensor,
     settings: FilterSettings,
-    motions: Motions,
+    redraw: Redraw,
     generators: Sequence[torch.Generator],
 ) -> tuple[Tensor, Tensor]:
     """Resample - diffuse - observe, in passes of shrinking diffusion and sharper weights.
 
-    B hands at once, each with particles of its own. In the first pass a share of a hand's particles
-    is drawn about where it was detected (ICONDENSATION: Isard and Blake, ECCV 1998).
+    B hands at once, each with particles of its own.
 
     particles, weights: (B, M, 6 + d) predicted and (B, M) normalised.
-    detected: of each hand the particle (1, 6 + d) that a detector proposes, if there is any.
     sigmas: (B, 6 + d) of the first pass's diffusion.
     log_scores: of the image, (B, N, 6 + d) to (B, N); their exponent grows.
     generators: B of them, so that what is drawn for a hand does not depend on others.
@@ -181,39 +176,17 @@ def annealed(
     """
     n, size, device = settings.particles, particles.shape[2], particles.device
     for number in range(settings.passes):
-        drawn, log_ratios = [], particles.new_zeros(len(particles), n)
-        for row, (generator, seen) in enumerate(zip(generators, detected, strict=True)):
-            about = 0 if number or seen is None else round(settings.detected * n)
-            positions = RESAMPLERS[settings.resampling](n - about, generator)
+        drawn = []
+        for row, generator in enumerate(generators):
+            positions = RESAMPLERS[settings.resampling](n, generator)
             noise = torch.randn((n, size), generator=generator, device=device)
             tangents = noise * (sigmas[row] * settings.shrink**number)
-            given = particles[row], weights[row], positions, tangents[about:]
-            moved = motions.redraw(*given, lower, upper, settings.bounds)
-            if about and seen is not None:
-                proposed = motions.compose(seen.expand(about, -1), tangents[:about])
-                proposed[:, 6:] = bound(proposed[:, 6:], lower, upper, settings.bounds)
-                offsets = motions.difference(particles[row], seen)
-                ratios = importance(tangents[:about], offsets, weights[row], sigmas[row])
-                moved, log_ratios[row, :about] = torch.cat((proposed, moved)), ratios
-            drawn.append(moved)
+            given = particles[row], weights[row], positions, tangents
+            drawn.append(redraw(*given, lower, upper, settings.bounds))
         particles = torch.stack(drawn)
         log_weights = settings.exponent * settings.exponent_growth**number * log_scores(particles)
-        weights = normalise(log_weights + log_ratios)
+        weights = normalise(log_weights)
     return particles, weights
-
-
-def importance(tangents: Tensor, offsets: Tensor, weights: Tensor, sigmas: Tensor) -> Tensor:
-    """(n,) log f(x) / g(x) of particles x that were drawn about a detection, instead of the
-    prediction: f is the density of the prediction, a normal about each of the predicted particles,
-    and g that of the draw, the same normal about the detection (Isard and Blake, eq. 2).
-
-    In the tangent space at the detection, to first order in rotations: tangents (n, 6 + d) of x,
-    offsets (M, 6 + d) and weights (M,) of the predicted particles, sigmas (6 + d,) of the normal.
-    """
-    drawn, predicted = tangents / sigmas, offsets / sigmas
-    away = (drawn[:, None] - predicted).square().sum(2)
-    log_f = torch.logsumexp(weights.to(away.dtype).log() - 0.5 * away, 1)
-    return log_f + 0.5 * drawn.square().sum(1)
 
 
 def covariance(tangents: Tensor, weights: Tensor) -> Tensor:

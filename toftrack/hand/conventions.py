@@ -21,11 +21,11 @@ def in_all_conventions(
 
     shape: the hand of the estimate.  k: (3, 3) intrinsics, pixels.  size_px: width, height.
     """
-    joints, state, rig, k = estimate.joints_m, estimate.state, openxr_rig(shape), k.copy()
+    joints, state, k = estimate.joints_m, estimate.state, k.copy()
 
     @functools.cache
     def hand() -> OpenXRHand:
-        return openxr_hand(joints, state, rig)
+        return openxr_hand(joints, state, openxr_rig(shape))
 
     return estimate.updated(
         landmarks=lambda: np.round(image_landmarks(joints, k, size_px), _DECIMALS),

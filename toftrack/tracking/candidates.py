@@ -90,12 +90,6 @@ class View:
         hiding_m = seen.depth_m * seen.occluder  # not another hand: the networks know both apart
         return out_of_sight(joints, hiding_m, seen.k)[1] > _COVERED
 
-    @property
-    def likeliest(self) -> Tensor | None:
-        """(1, 27) the likeliest pose of the detection; None where it is empty."""
-        seen = self.detection
-        return None if seen.empty else seen.first(1).states(self.fitted.ratio)
-
     @cached_property
     def keypoints(self) -> Keypoints:
         """The detection's keypoints, see keypoints_of."""

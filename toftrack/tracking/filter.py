@@ -89,7 +89,6 @@ def palm_of(pose: Tensor, fitted: FittedHand) -> tuple[np.ndarray, np.ndarray]:
 
 def run_filter(
     tracks: Sequence[Track],
-    detected: Sequence[Tensor | None],
     dt_s: float,
     images: Sequence[ImageTerm],
     model: FilterModel,
@@ -98,8 +97,6 @@ def run_filter(
 ) -> list[ParticleSet]:
     """The particles of B tracks after dt_s: predicted, then diffused, weighed by each track's image
     and resampled, all of them in each call.
-
-    detected: of each the pose (1, 27) that the pose network takes for the likeliest, if it looked.
 
     Nothing within waits for the device, so that it is not held up between passes.
     """
@@ -118,16 +115,12 @@ def run_filter(
     particles, weights = particle_filter.annealed(
         torch.stack([_moved(track.particles, moved, model) for track, moved in given]),
         torch.stack([track.weights for track in tracks]),
-        [
-            None if pose is None else on_device(model.encode(pose), model.device)
-            for pose in detected
-        ],
         on_device(torch.stack([_sigmas(moved, dt_s, model) for moved in moves]), model.device),
         log_scores,
         space.lower,
         space.upper,
         model.filter,
-        motions,
+        motions.redraw,
         [generator_on(model.device, generator) for generator in generators],
     )
     rows = zip(particles, weights, strict=True)

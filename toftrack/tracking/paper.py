@@ -172,7 +172,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     with spans("start"):
         track = model.start(observation, model, generator) if track is None else track
     with spans("filter: rest"):
-        (filtered,) = run_filter([track], [None], dt_s, [likelihood], model, [generator], spans)
+        (filtered,) = run_filter([track], dt_s, [likelihood], model, [generator], spans)
         pose = model.decode(filtered.mean)
     score = likelihood.score(pose)
     status = model.lost.judge(track, score)

@@ -69,8 +69,6 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         predicted = [
             None if rest else predicted_view(scene, row) for row, rest in enumerate(resting)
         ]
-        for view in predicted:
-            _ = view and view.seen  # while the networks look
         detections, pending = finish_detection(pending, scene, before)
         columns = assign(costs(scene.hands, detections, dt_s))
         views = [
@@ -138,7 +136,6 @@ def filter_tracks(
     found = iter(
         run_filter(
             [view.track for view in filtered],
-            [view.likeliest for view in filtered],
             dt_s,
             [view.image for view in filtered],
             model,
