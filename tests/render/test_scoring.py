@@ -20,7 +20,7 @@ from toftrack.render.closed_form import pixel_rays, project, render_range_images
 from toftrack.render.reference import ReferenceScorer, dilate_disc, step_range_images
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.torch_scorer import count_bits, dilate_bits, pack_bits
-from toftrack.tracking.backend import make_scorer
+from toftrack.tracking.backend import choose_backend, make_scorer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -129,6 +129,19 @@ def test_threads_share_the_particles():
         calls = [pool.submit(scorer, states, evidence) for _ in range(12)]
     for call in calls:
         assert all(torch.equal(a, b) for a, b in zip(call.result(), alone, strict=True))
+
+
+def test_several_hands_at_once_count_as_each_alone(back_end):
+    """Of different shapes and images, as two hands in a frame are."""
+    shapes = [default_hand_shape(**SHAPES[kind]) for kind in ("default", "left and thick")]
+    back = choose_backend(back_end, CPU)
+    scorers = [back.make_scorer(shape) for shape in shapes]
+    seen = [random_evidence(shape, 48, 64, 5.0, 0.4, 7 + i) for i, shape in enumerate(shapes)]
+    states = torch.stack([random_states(20, (0.3, 0.5), 7 + i) for i in range(2)])
+    together = back.score_rows(scorers, states, seen)
+    for row, scorer in enumerate(scorers):
+        for one, alone in zip(together, scorer(states[row], seen[row]), strict=True):
+            torch.testing.assert_close(one[row], alone, atol=0, rtol=0)
 
 
 def test_hands_outside_and_behind_and_at_the_camera(back_end):

@@ -43,6 +43,19 @@ def filtered(view: View, **changes: Any) -> ParticleSet:
     return found
 
 
+def test_what_is_drawn_for_a_hand_does_not_depend_on_others() -> None:
+    views = [view_of(IMAGE, replace(track_of(at), number=n)) for n, at in enumerate((HERE, THERE))]
+    state, model = state_of(*(view.track for view in views), hands=2), right_hand_model()
+
+    def drawn(some: list[View]) -> list[ParticleSet]:
+        dice = torch.Generator().manual_seed(3)
+        return filter_tracks(some, state, FRAME_S, model, dice, Spans())
+
+    both, (alone,) = drawn(views), drawn(views[1:])
+    torch.testing.assert_close(both[1].particles, alone.particles, atol=0, rtol=0)
+    torch.testing.assert_close(both[1].weights, alone.weights, atol=0, rtol=0)
+
+
 def followed(track: Track, odds: float, at: torch.Tensor = HERE) -> TrackResult:
     """After a frame in which the network sees the hand somewhere, with these log odds."""
     plain = confidence_model(memory=0.0, whole=0.0)
