@@ -67,7 +67,7 @@ def test_thumb_and_outer_fingers() -> None:
 
 def test_derivatives_are_those_of_the_shape() -> None:
     at = torch.tensor([0.05, 0.03, -0.02, 0.04, 0.01, 0.02])
-    base, bones = shape_derivatives(default_hand_shape(), at)
+    base, bones = map(torch.from_numpy, shape_derivatives(default_hand_shape(), at))
     step = 0.004 * torch.tensor([1.0, -2.0, 1.5, 0.5, 1.0, -1.0])
     here, there = (shaped(default_hand_shape(), c) for c in (at, at + step))
     off = (there.base_m - here.base_m) - torch.einsum("k,kij->ij", step, base)

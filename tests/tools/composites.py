@@ -8,8 +8,8 @@ four: two recordings of two hands each, of one camera, laid over one another: of
 mirrored: a recording, turned aside, laid over its own mirror image: two hands that move alike.
 leaving: a recording whose camera turns away from the hand and back.
 
-Prints for each, per cent: how often all hands are usable (every joint within 40 mm, and not lost) of
-the frames in which all are visible, the same of each hand, how often one was silently wrong (not
+Prints for each, per cent: how often all hands are usable (every joint within 40 mm, and not lost)
+of the frames in which all are visible, the same of each hand, how often one was silently wrong (not
 lost, but the mean error beyond 40 mm or no hand there), and at another hand than its own.
 """
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,12 +58,14 @@ def shaped(first: HandShape, components: Tensor) -> HandShape:
     )
 
 
-def shape_derivatives(first: HandShape, components: Tensor) -> tuple[Tensor, Tensor]:
-    """How the roots (6, 5, 3) and the bones (6, 5, 3) change with each component, metres."""
+def shape_derivatives(first: HandShape, components: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """How the roots (6, 5, 3) and the bones (6, 5, 3) of a hand on the CPU change with each
+    component, metres.
+    """
     steps = _STEP * torch.eye(len(COMPONENTS))
     up = [shaped(first, components + step) for step in steps]
     down = [shaped(first, components - step) for step in steps]
     pairs = list(zip(up, down, strict=True))
-    base = torch.stack([a.base_m - b.base_m for a, b in pairs])
-    bones = torch.stack([a.bone_lengths_m - b.bone_lengths_m for a, b in pairs])
+    base = np.stack([(a.base_m - b.base_m).numpy() for a, b in pairs])
+    bones = np.stack([(a.bone_lengths_m - b.bone_lengths_m).numpy() for a, b in pairs])
     return base / (2 * _STEP), bones / (2 * _STEP)

@@ -38,18 +38,19 @@ _JOINTS = [
     for bone, abduction in ((0, True), (0, False), (1, True), (1, False), (2, False))
     if finger == 0 or (bone, abduction) != (1, True)
 ]
-# Rows of the table of axes that `point_jacobian` builds: the x axes of the 15 bones (flexion), the
-# z axes of the 5 base frames (abduction of the first joint), the z axis of the thumb's first bone.
-_AXIS_ROW = tuple(
+AXIS_ROW = tuple(
     3 * finger + bone if not abduction else 15 + finger if bone == 0 else 20
     for finger, bone, abduction in _JOINTS
 )
-_ORIGIN_ROW = tuple(1 + 3 * finger + bone for finger, bone, _ in _JOINTS)
-# (16, 21) which angles move a point that is attached to a frame.
-_MOVES = tuple(
+"""Rows of the table of axes that `point_jacobian` builds: the x axes of the 15 bones (flexion), the
+z axes of the 5 base frames (abduction of the first joint), the z axis of the thumb's first bone."""
+ORIGIN_ROW = tuple(1 + 3 * finger + bone for finger, bone, _ in _JOINTS)
+"""The frames in whose origins these axes lie."""
+MOVES = tuple(
     tuple(f > 0 and finger == (f - 1) // 3 and bone <= (f - 1) % 3 for finger, bone, _ in _JOINTS)
     for f in range(16)
 )
+"""(16, 21) which angles move a point that is attached to a frame."""
 JOINT_FRAME = (
     0,
     *(0 if bone == 0 else 3 * finger + bone for finger in range(5) for bone in range(4)),
@@ -180,7 +181,7 @@ def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame
     Returns (N, P, 27): translation, small rotation about the wrist in the camera frame, angles.
     """
     frames, origins = pose.frames, pose.origins_m
-    axis_row, origin_row = table((_AXIS_ROW, _ORIGIN_ROW), torch.int64, x.device)
+    axis_row, origin_row = table((AXIS_ROW, ORIGIN_ROW), torch.int64, x.device)
     base = (frames[:, 0] @ shape.base_frames[:, :, 2].mT).mT
     axes = torch.cat((frames[:, 1:, :, 0], base, frames[:, 1:2, :, 2]), 1)[:, axis_row]
     if shape.side == "left":  # a mirror turns the sense of rotation round
@@ -188,7 +189,7 @@ def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame
     # n.(a x (X - o)) = (n x a).(o - X) = a.((X - o) x n)
     arm_moment = torch.linalg.cross(x, n)
     turning = arm_moment @ axes.mT - n @ torch.linalg.cross(axes, origins[:, origin_row]).mT
-    by_angle = turning * table(_MOVES, torch.bool, x.device)[frame]
+    by_angle = turning * table(MOVES, torch.bool, x.device)[frame]
     by_rotation = torch.linalg.cross(x - origins[:, :1], n)
     return torch.cat((n, by_rotation, by_angle), -1)
 

@@ -23,18 +23,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from toftrack.compute.rotations import rotation_matrix, rotvec_to_rotmat
+from toftrack.compute.rotations import rotation_matrix
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
 from toftrack.hand.skeleton import HandPose, forward_kinematics
-from toftrack.refinement.gauss_newton import Keypoints, keypoint_residuals
+from toftrack.refinement.gauss_newton import (
+    AXIS_ROW,
+    JOINT_FRAME,
+    KEYPOINT_SIGMAS,
+    MOVES,
+    ORIGIN_ROW,
+    Keypoints,
+)
 
 _COUNT = len(COMPONENTS)
 _ANGLE_RAD = 0.25
@@ -51,6 +57,8 @@ which on only frames that count so many times as much are: an update costs a mil
 _KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
 """By how much the keypoints put the components wrong: means of uncertain places shorten fingers.
 Of rendered sequences of other hands, like what is said above."""
+_JOINT_MOVES = np.array(MOVES)[list(JOINT_FRAME)]
+"""(21, 21) which angles move each joint."""
 _LEAST = 0.02
 """Weight below which a frame says nothing."""
 _STEP, _STEP_SIGMAS = 0.01, 0.5
@@ -108,22 +116,21 @@ class KeyPoses:
     and precision times the components.
     """
 
-    angles: Tensor
-    rotations: Tensor
-    frames: Tensor
-    weight: Tensor
-    square: Tensor
-    information: Tensor
-    vector: Tensor
+    angles: np.ndarray
+    rotations: np.ndarray
+    frames: np.ndarray
+    weight: np.ndarray
+    square: np.ndarray
+    information: np.ndarray
+    vector: np.ndarray
 
     def nearest(self, state: Tensor) -> tuple[int, float]:
         """The most similar key pose to a hand (1, 27), and how far it is, 1 where they differ."""
         if not len(self.weight):
             return -1, math.inf
-        # In numpy: on a few numbers each of torch's operations takes longer than its arithmetic.
         angles, rotation = state[0, 6:].numpy(), rotation_matrix(state[0, 3:6].numpy())
-        bent = np.sqrt(np.square(self.angles.numpy() - angles).mean(1)) / _KEY_RAD
-        cosine = 0.5 * ((self.rotations.numpy() * rotation).sum((1, 2)) - 1)
+        bent = np.sqrt(np.square(self.angles - angles).mean(1)) / _KEY_RAD
+        cosine = 0.5 * ((self.rotations * rotation).sum((1, 2)) - 1)
         far = np.hypot(bent, np.arccos(cosine.clip(-1, 1)) / _KEY_TURN_RAD)
         row = int(far.argmin())
         return row, float(far[row])
@@ -134,24 +141,24 @@ class KeyPoses:
         often = frames >= _ENOUGH_FRAMES and weight < _SURER * total / frames
         return total > _ENOUGH or often
 
-    def summed(self) -> tuple[float, Tensor, Tensor]:
+    def summed(self) -> tuple[float, np.ndarray, np.ndarray]:
         """How many sure poses this amounts to, and their evidence (6, 6) and (6,)."""
-        each = self.weight.clamp(min=1e-9)
+        each = np.maximum(self.weight, 1e-9)
         information = (self.information / each[:, None, None]).sum(0)
         vector = (self.vector / each[:, None]).sum(0)
         return float((self.square / each).sum()), information, vector
 
 
 def _no_poses() -> KeyPoses:
-    none = torch.zeros(0)
+    none = np.zeros(0)
     return KeyPoses(
-        torch.zeros(0, 21),
-        torch.zeros(0, 3, 3),
+        np.zeros((0, 21)),
+        np.zeros((0, 3, 3)),
         none,
         none,
         none,
-        torch.zeros(0, _COUNT, _COUNT),
-        torch.zeros(0, _COUNT),
+        np.zeros((0, _COUNT, _COUNT)),
+        np.zeros((0, _COUNT)),
     )
 
 
@@ -167,8 +174,8 @@ class ShapeEstimate:
     frames: how many were seen, used or not.
     """
 
-    mean: Tensor
-    covariance: Tensor
+    mean: np.ndarray
+    covariance: np.ndarray
     keys: KeyPoses
     applied: tuple[float, ...]
     poses: float = 0.0
@@ -189,8 +196,8 @@ class ShapeEstimate:
 
 def first_shape() -> ShapeEstimate:
     """Before any frame was seen: the population."""
-    population = torch.tensor(POPULATION_SIGMA).square().diag()
-    return ShapeEstimate(torch.zeros(_COUNT), population, _no_poses(), (0.0,) * _COUNT)
+    population = np.diag(np.square(POPULATION_SIGMA))
+    return ShapeEstimate(np.zeros(_COUNT), population, _no_poses(), (0.0,) * _COUNT)
 
 
 def with_network_length(
@@ -205,7 +212,7 @@ def with_network_length(
     sigma = POPULATION_SIGMA[0]
     log_length = math.log(length_m / first.hand_length_m)
     applied = min(max(log_length, -3 * sigma), 3 * sigma)
-    mean = estimate.mean.clone()
+    mean = estimate.mean.copy()
     mean[0] = applied
     return replace(estimate, mean=mean, applied=(applied, *estimate.applied[1:]))
 
@@ -241,7 +248,7 @@ def learned(
     estimate: ShapeEstimate,
     state: Tensor,
     shape: HandShape,
-    derivatives: tuple[Tensor, Tensor],
+    derivatives: tuple[np.ndarray, np.ndarray],
     detection: SeenHand,
     keypoints: Keypoints,
     fit: ShapeFit,
@@ -270,7 +277,7 @@ def learned(
             return estimate
     pose = posed(state) if posed is not None else forward_kinematics(state, shape)
     information, vector = keypoints_system(pose, shape, derivatives, keypoints)
-    reported_here = torch.tensor(estimate.applied) - torch.tensor(_KEYPOINTS_OFF)
+    reported_here = np.subtract(estimate.applied, _KEYPOINTS_OFF)
     # The network's length and its keypoints rest on the same image: each counts half.
     vector = 0.5 * fit.keypoints * (information @ reported_here + vector)
     information = 0.5 * fit.keypoints * information
@@ -282,35 +289,61 @@ def learned(
 
 
 def keypoints_system(
-    pose: HandPose, shape: HandShape, derivatives: tuple[Tensor, Tensor], keypoints: Keypoints
-) -> tuple[Tensor, Tensor]:
+    pose: HandPose,
+    shape: HandShape,
+    derivatives: tuple[np.ndarray, np.ndarray],
+    keypoints: Keypoints,
+) -> tuple[np.ndarray, np.ndarray]:
     """What keypoints say of the components, the pose of one hand marginalised.
 
     Returns the precision (6, 6) and the precision times the change of the components (6,).
     """
+    # In numpy: on a few numbers each of torch's operations takes longer than its arithmetic.
     keypoints = keypoints.of_each(1)
-    found = keypoint_residuals(pose, keypoints, shape)
-    by_shape = _joint_derivatives(pose.frames[0], derivatives)  # (63, 6)
-    # The same robust weights as the pose's rows have: a translation's derivative is the weight.
-    weight = found.rows[0, :, :3].abs().sum(1)
-    rows = torch.cat((found.rows[0], by_shape * weight[:, None]), 1)
-    normal, gradient = rows.mT @ rows, rows.mT @ found.values[0]
-    angles = torch.arange(6, 27)
+    gap = (pose.joints_m - keypoints.points_m)[0].numpy()
+    sigma = keypoints.sigma_m[0].numpy()
+    away = np.square(np.linalg.norm(gap, axis=1) / (KEYPOINT_SIGMAS * sigma))
+    weight = (1 / ((1 + away) * sigma)).repeat(3)[:, None]
+    by_shape = _joint_derivatives(pose.frames[0].numpy(), *derivatives)
+    rows = np.concatenate((_joint_jacobian(pose, shape), by_shape), 1) * weight
+    normal, gradient = rows.T @ rows, rows.T @ (gap.ravel() * weight[:, 0])
+    angles = np.arange(6, 27)
     normal[angles, angles] += _ANGLE_RAD**-2
-    pose_part = normal[:27, :27] + 1e-4 * normal[:27, :27].diagonal().diag()
-    solved = torch.linalg.solve(pose_part, torch.cat((normal[:27, 27:], gradient[:27, None]), 1))
+    pose_part = normal[:27, :27] + 1e-4 * np.diag(normal[:27, :27].diagonal())
+    solved = np.linalg.solve(pose_part, np.column_stack((normal[:27, 27:], gradient[:27])))
     left = normal[27:, :27] @ solved
     return normal[27:, 27:] - left[:, :-1], -(gradient[27:] - left[:, -1])
 
 
-def _joint_derivatives(frames: Tensor, derivatives: tuple[Tensor, Tensor]) -> Tensor:
-    """(63, 6) how the joints' coordinates change with the components; frames: (16, 3, 3)."""
-    base, bones = derivatives
-    roots = base @ frames[0].mT  # (6, 5, 3)
-    along = -bones[..., None] * frames[1:, :, 1].unflatten(0, (5, 3))  # (6, 5, 3 bones, 3)
-    points = torch.cat((roots[:, :, None], roots[:, :, None] + along.cumsum(2)), 2)
-    joints = torch.cat((points.new_zeros(len(base), 1, 3), points.flatten(1, 2)), 1)
-    return joints.flatten(1).mT
+def _joint_jacobian(pose: HandPose, shape: HandShape) -> np.ndarray:
+    """(63, 27) how the joints' coordinates change with translation, rotation and angles; as
+    gauss_newton.point_jacobian, of all joints of one hand.
+    """
+    frames, origins = pose.frames[0].numpy(), pose.origins_m[0].numpy()
+    joints = pose.joints_m[0].numpy().astype(np.float64)
+    base = shape.base_frames[:, :, 2].numpy() @ frames[0].T
+    axes = np.concatenate((frames[1:, :, 0], base, frames[1:2, :, 2]))[list(AXIS_ROW)]
+    if shape.side == "left":  # a mirror turns the sense of rotation round
+        axes = -axes
+    rows = np.zeros((21, 3, 27))
+    rows[:, :, :3] = np.eye(3)
+    rows[:, :, 3:6] = np.cross(np.eye(3), (joints - origins[0])[:, None]).swapaxes(1, 2)
+    turned = np.cross(axes, joints[:, None] - origins[list(ORIGIN_ROW)])
+    rows[:, :, 6:] = (turned * _JOINT_MOVES[..., None]).swapaxes(1, 2)
+    return rows.reshape(63, 27)
+
+
+def _joint_derivatives(frames: np.ndarray, base: np.ndarray, bones: np.ndarray) -> np.ndarray:
+    """(63, 6) how the joints' coordinates change with the components; frames: (16, 3, 3).
+
+    base, bones: (6, 5, 3), see shape_derivatives.
+    """
+    roots = base @ frames[0].T  # (6, 5, 3)
+    along = -bones[..., None] * frames[1:, :, 1].reshape(5, 3, 3)  # (6, 5, 3 bones, 3)
+    tips = roots[:, :, None] + along.cumsum(2)
+    points = np.concatenate((roots[:, :, None], tips), 2).reshape(_COUNT, 20, 3)
+    joints = np.concatenate((np.zeros((_COUNT, 1, 3)), points), 1)
+    return joints.reshape(_COUNT, 63).T
 
 
 def _kept(
@@ -319,47 +352,39 @@ def _kept(
     known: bool,
     state: Tensor,
     weight: float,
-    information: Tensor,
-    vector: Tensor,
+    information: np.ndarray,
+    vector: np.ndarray,
 ) -> KeyPoses:
     """The key poses with one more frame, which belongs to one of them or takes a row's place."""
     new = (
-        state[0, 6:].clone(),
-        rotvec_to_rotmat(state[0, 3:6]),
-        torch.tensor(1.0),
-        torch.tensor(weight),
-        torch.tensor(weight**2),
+        state[0, 6:].numpy(),
+        rotation_matrix(state[0, 3:6].numpy()),
+        np.array(1.0),
+        np.array(weight),
+        np.array(weight**2),
         weight**2 * information,
         weight**2 * vector,
     )
-    old = (
-        keys.angles,
-        keys.rotations,
-        keys.frames,
-        keys.weight,
-        keys.square,
-        keys.information,
-        keys.vector,
-    )
+    old = [getattr(keys, field.name) for field in fields(keys)]
     if not known and len(keys.weight) < _KEYS:
-        return KeyPoses(*(torch.cat((a, b[None])) for a, b in zip(old, new, strict=True)))
-    fields = [a.clone() for a in old]
-    for place, (field, value) in enumerate(zip(fields, new, strict=True)):
+        return KeyPoses(*(np.concatenate((a, b[None])) for a, b in zip(old, new, strict=True)))
+    kept = [a.copy() for a in old]
+    for place, (field, value) in enumerate(zip(kept, new, strict=True)):
         if not known:
             field[row] = value
         elif place > 1:  # the pose of a key stays that of its first frame
             field[row] += value
-    return KeyPoses(*fields)
+    return KeyPoses(*kept)
 
 
 def _posterior(estimate: ShapeEstimate, fit: ShapeFit) -> ShapeEstimate:
     """Mean, covariance and the hand in use by the key poses that there are."""
     poses, information, vector = estimate.keys.summed()
     shared = 1 / (1 + fit.alike * max(poses - 1, 0.0))
-    precision = torch.tensor(POPULATION_SIGMA).square().reciprocal().diag() + shared * information
-    covariance = torch.linalg.inv(precision)
+    precision = np.diag(np.square(POPULATION_SIGMA) ** -1) + shared * information
+    covariance = np.linalg.inv(precision)
     mean = covariance @ (shared * vector)
-    off = (mean - torch.tensor(estimate.applied)).abs()
-    least = (_STEP_SIGMAS * covariance.diagonal().sqrt()).clamp(min=_STEP)
-    applied = tuple(mean.tolist()) if bool((off > least).any()) else estimate.applied
+    off = np.abs(mean - estimate.applied)
+    least = np.maximum(_STEP_SIGMAS * np.sqrt(covariance.diagonal()), _STEP)
+    applied = tuple(mean.tolist()) if (off > least).any() else estimate.applied
     return replace(estimate, mean=mean, covariance=covariance, poses=poses, applied=applied)

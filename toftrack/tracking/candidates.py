@@ -236,6 +236,8 @@ def without_things(observation: Observation, detection: Detection) -> Observatio
         return observation
     row, column = np.nonzero(observation.hand.cpu().numpy())
     of = detection.parts.at(_points_of(row, column, observation)) == THING_PART
+    if not of.any():
+        return observation
     mask = np.zeros(observation.hand.shape, bool)
     mask[row[of], column[of]] = True
     thing = torch.from_numpy(mask).to(observation.hand.device)
@@ -255,7 +257,10 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     of = surface[row, column]
     known = np.bincount(of[kind != _UNKNOWN], minlength=count)
     mine = np.bincount(of[kind == FOREARM_PART], minlength=count)
-    arm = torch.from_numpy((mine > _MOSTLY * known)[surface] & occluder).to(observation.hand.device)
+    of_arm = (mine > _MOSTLY * known)[surface] & occluder
+    if not of_arm.any():
+        return observation
+    arm = torch.from_numpy(of_arm).to(observation.hand.device)
     return replace(observation, hand=observation.hand | arm, occluder=observation.occluder & ~arm)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -77,8 +78,8 @@ class FittedHand:
         return self.shape.hand_length_m / DEFAULT_HAND_LENGTH_M
 
     @cached_property
-    def derivatives(self) -> tuple[Tensor, Tensor]:
-        """How roots and bones change with the components, on the CPU, see shape_derivatives."""
+    def derivatives(self) -> tuple[np.ndarray, np.ndarray]:
+        """How roots and bones change with the components, see shape_derivatives."""
         return shape_derivatives(self.first.to("cpu"), torch.tensor(self.applied))
 
 

@@ -19,7 +19,6 @@ from toftrack.frames import DepthImage
 from toftrack.tracking.belief import probability
 from toftrack.tracking.candidates import View, best_start
 from toftrack.tracking.confidence import log_odds
-from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.select import WORST
 from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 
@@ -92,7 +91,7 @@ def compare_sides(view: View, mirrored: Detection, image: DepthImage) -> SideEvi
         return evidence
     gain = _best_of_side(view, view.detection, side)
     gain -= _best_of_side(view, mirrored, OTHER_SIDE[side])
-    gain += _NETWORK * _network_lead(view.detection, mirrored, side, image, view.model)
+    gain += _NETWORK * (_network_log_odds(view.detection) - _network_log_odds(mirrored))
     gain = gain if side == "right" else -gain
     comparisons = evidence.comparisons + 1
     fits = evidence.fits + _WEIGHT * min(max(gain, -_LARGEST), _LARGEST)
@@ -114,23 +113,6 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
     seen = replace(view, fitted=fitted, detection=detection, image=image)
     return max(best_start(seen, _KEYPOINTS)[1], WORST)
-
-
-def _network_lead(
-    detection: Detection, mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
-) -> float:
-    """Log odds by which the network is surer of `side` than of the other one.
-
-    It is the mean over the crops of both sides' poses: a crop that is turned as a pose has it makes
-    that pose's side likelier.
-    """
-    said = _network_log_odds(detection) - _network_log_odds(mirrored)
-    centre, up = mirrored.centre_m.numpy()[None], mirrored.up[None]
-    own, other = (
-        model.detector.detect(image.depth_m, image.k, centre, one, up)[0]
-        for one in (side, OTHER_SIDE[side])
-    )
-    return 0.5 * (said + _network_log_odds(own) - _network_log_odds(other))
 
 
 def _network_log_odds(detection: Detection) -> float:
