@@ -25,6 +25,7 @@ from toftrack.tracking.detect import (
     PendingDetections,
     finish_detection,
     held_out_first,
+    no_places,
     start_detection,
 )
 from toftrack.tracking.scene import Scene
@@ -159,13 +160,13 @@ def test_what_the_finder_sees_is_looked_at_at_once_but_a_frame_later_while_all_h
     third = [detection_of(hand_at(-0.3))]
     detector, seen, asked = looked(*tracks, found=third, dt_s=dt_s)
     assert asked.finder_asked and detector.known == [len(tracks)]
-    assert bool(elsewhere(seen)) == at_once == (asked.finder is None)
+    assert bool(elsewhere(seen)) == at_once == (asked.finder is no_places)
 
 
 def test_what_the_finder_saw_a_frame_ago_is_looked_at() -> None:
     _, _, asked = looked(known(), found=FOUND)
     again, seen, asked = looked(known(), found=FOUND, found_s=FRAME_S, places=asked.finder())
-    assert not asked.finder_asked and asked.finder is None
+    assert not asked.finder_asked and asked.finder is no_places
     assert elsewhere(seen) == [("left", 0.3)] and again.looked == ["left"], "the other hand"
 
 
@@ -273,7 +274,7 @@ def left_of(seen: Detection, dt_s: float = FRAME_S) -> set[torch.Tensor]:
     depth[105:112, 90:150] = 0.5  # a forearm to the right
     state = state_of(known(), model=model, places=places_of(*others.values()))
     scene = scene_of(*state.tracks, image=replace(IMAGE, depth_m=depth), model=model)
-    asked = PendingDetections([lambda: SideDetection(seen, "right", 0)], None, False, False)
+    asked = PendingDetections([lambda: SideDetection(seen, "right", 0)], no_places, False, False)
     found, _ = finish_detection(asked, replace(scene, dt_s=dt_s), state)
     return {pose for pose, one in others.items() if any(one is each.detection for each in found)}
 

@@ -16,7 +16,7 @@ from toftrack.tracking.association import SideDetection
 from toftrack.tracking.confidence import log_odds
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import comparison_due
-from toftrack.tracking.state import OTHER_SIDE, TrackerState
+from toftrack.tracking.state import NO_PLACES, OTHER_SIDE, TrackerState
 
 _RARE_S = 0.1
 """Frames farther apart are rare: predictions say little, so that the finder looks first."""
@@ -35,13 +35,13 @@ class PendingDetections:
     """The networks at work on a frame.
 
     at_tracks: each waits for the detection at a predicted hand.
-    finder: waits for the finder's places; None where it is not asked, or was waited for.
+    finder: waits for the finder's places; there are none where it is not asked, or was waited for.
     at_once: the finder's places are used in this frame, to find a hand anew; else in the next one.
     finder_asked: whether the finder looks at this frame.
     """
 
     at_tracks: Sequence[Callable[[], SideDetection]]
-    finder: Callable[[], Places] | None
+    finder: Callable[[], Places]
     at_once: bool
     finder_asked: bool
 
@@ -52,17 +52,24 @@ def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     several = len(state.slots) > 2 and scene.dt_s <= _RARE_S
     image = scene.unexplained() if several else scene.image
     followed = bool(scene.hands) and all(hand.track.reliable for hand in scene.hands)
-    at_once = not followed or scene.dt_s > _RARE_S
-    frames = detector.settings.search * (1 if at_once else _FOLLOWED)
+    urgent = not followed or scene.dt_s > _RARE_S
+    frames = detector.settings.search * (1 if urgent else _FOLLOWED)
     due = frames == 1 or Duration(state.found_s).reached(frames)
     whole = image.depth_m, image.k, len(scene.hands)
-    finder = detector.start_search(*whole) if due and at_once else None
+    finder: Callable[[], Places] = no_places
+    if due and urgent:
+        finder = detector.start_search(*whole)
     at_tracks = [
         _start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row, state)
     ]
-    if due and not at_once:
+    if due and not urgent:
         finder = detector.start_search(*whole)
-    return PendingDetections(at_tracks, finder, at_once, due)
+    return PendingDetections(at_tracks, finder, due and urgent, due)
+
+
+def no_places() -> Places:
+    """The places of a finder that is not asked, or was waited for."""
+    return NO_PLACES
 
 
 def finish_detection(
@@ -70,8 +77,8 @@ def finish_detection(
 ) -> tuple[list[SideDetection], PendingDetections]:
     """All detections of a frame, those at tracks first; and what is still pending."""
     places = state.places
-    if pending.at_once and pending.finder is not None:
-        places, pending = pending.finder(), replace(pending, finder=None)
+    if pending.at_once:
+        places, pending = pending.finder(), replace(pending, finder=no_places)
     seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]

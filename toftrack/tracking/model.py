@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
+from typing import Self
 
 import numpy as np
 import torch
@@ -115,9 +116,14 @@ class FilterModel:
         generator = torch.Generator().manual_seed(seed)
         return TrackerState(generator.get_state(), slots, told)
 
-    def at_quality(self, quality: Quality) -> FilterModel:
+    def at_quality(self, quality: Quality) -> Self:
         """The same tracker with less effort; itself where nothing is left out."""
         return self
+
+    @property
+    def detects(self) -> bool:
+        """Whether networks detect hands: they tell several apart, and a hand's side."""
+        return False
 
     @property
     def fits(self) -> bool:
@@ -192,6 +198,11 @@ class TrackerModel(FilterModel):
     def at_quality(self, quality: Quality) -> TrackerModel:
         """See FilterModel."""
         return self._at_quality(quality)
+
+    @property
+    def detects(self) -> bool:
+        """See FilterModel."""
+        return True
 
     @cached_property
     def _at_quality(self) -> Callable[[Quality], TrackerModel]:

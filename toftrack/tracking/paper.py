@@ -160,7 +160,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     (slot,), track = state.slots, state.tracks[0] if state.tracks else None
     fitted, sure = model.hand(slot.side, slot.shape), 1.0 if state.told else 0.5
     with spans("segmentation and evidence"):
-        expected = None if track is None else predict(track, dt_s, model).depths
+        expected = predict(track, dt_s, model).depths if track else None
         observation = model.segmentation(image.depth_m, image.k, expected)
         if observation.empty:
             slot, estimate = report_absence(slot, image, model, 1)
@@ -170,7 +170,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
             return replace(state, slots=(slot,)), (info,), (estimate,)
         likelihood = image_term(observation, fitted, model)
     with spans("start"):
-        track = model.start(observation, model, generator) if track is None else track
+        track = track or model.start(observation, model, generator)
     with spans("filter: rest"):
         (filtered,) = run_filter([track], dt_s, [likelihood], model, [generator], spans)
         pose = model.decode(filtered.mean)
@@ -179,7 +179,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     found = PoseEstimate(filtered, pose, track.trend, *model.nearest(pose))
     estimate = make_estimate(image, found, score, status, fitted, model)
     sigma_m = _particles_sigma(estimate.joints_m, found, track, fitted, model)
-    hidden = expected is not None and bool(observation.occluder.any())
+    hidden = bool(observation.occluder.any())
     track = replace(
         track,
         particles=filtered.particles,
@@ -190,7 +190,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         age=track.age.extended(dt_s),
         confirmed=track.confirmed or not status.lost,
         believed_s=track.believed_s + dt_s if status.lost else 0.0,
-        nearest_m=expected.nearest_m if expected is not None and hidden else 0.0,
+        nearest_m=expected.nearest_m if expected and hidden else 0.0,
     )
     ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
     estimate = estimate.updated(joint_sigma_m=sigma_m, joint_ok=ok)

@@ -35,7 +35,7 @@ from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.select import select
-from toftrack.tracking.state import NO_PLACES, StepInfo, Track, TrackerState
+from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.views import begin_tracks, continue_track, predicted_view
 
 StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
@@ -86,7 +86,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         for view, filtered in zip(there, particles, strict=True)
     ]
     with spans("detector"):
-        places = NO_PLACES if pending.finder is None else pending.finder()
+        places = pending.finder()
     after = replace(
         before,
         places=places,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -52,7 +53,7 @@ class HandsTracker:
         Raises ToftrackError when `hands` is no number of hands, or several without a detector.
         """
         check_number("hands", hands, 1, MOST_HANDS, whole=True)
-        if hands > 1 and isinstance(model, PaperModel):
+        if hands > 1 and not model.detects:
             raise ToftrackError(
                 f"hands={hands} tells hands apart by the networks, but experiment=paper has none;"
                 " give hands=1, or leave experiment=paper out"
@@ -211,8 +212,7 @@ def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepRes
     """The result of `step` or `paper_step`, as the model is of the one or the other."""
     if isinstance(model, PaperModel):
         return paper_step(state, image, model)
-    assert isinstance(model, TrackerModel)
-    return step(state, image, model)
+    return step(state, image, cast(TrackerModel, model))
 
 
 def restart_state(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
@@ -224,8 +224,8 @@ def restart_state(state: TrackerState, model: FilterModel, side: str | None = No
     """
     if side is not None and side not in (AUTO, *OTHER_SIDE):
         model.configured.shape.of_side(side)  # which says what it may be
-    if side is None or (side == AUTO and isinstance(model, PaperModel)):
-        side = state.told or (None if isinstance(model, PaperModel) else AUTO)
+    if side is None or (side == AUTO and not model.detects):
+        side = state.told or (AUTO if model.detects else None)
     fresh = model.first_state(0, len(state.slots), side)
     return replace(fresh, generator=state.generator, next_index=state.next_index)
 
