@@ -114,13 +114,12 @@ def test_two_hands_are_one_where_they_could_not_be_both(
     apart_m: float, behind_m: float, one: bool
 ) -> None:
     first, second = (detection_of(hand) for hand in (hand_at(), hand_at(apart_m, 0.5 + behind_m)))
-    palms = first.centre_m.numpy(), second.centre_m.numpy()
-    assert same_hand(*palms, first.joints_m[0], second.joints_m[0]) == one
+    apart = float((first.centre_m - second.centre_m).norm())
+    assert same_hand(apart, first.joints_m[0], second.joints_m[0]) == one
 
 
 def test_palms_near_each_other_are_one_hand_s_where_much_of_one_lies_in_the_other() -> None:
-    joints, palm = torch.rand(21, 3, generator=torch.Generator().manual_seed(0)), np.zeros(3)
-    beside = palm + [0.03, 0.0, 0.0]
-    assert same_hand(palm, beside, joints, joints)
-    assert not same_hand(palm, beside, joints, joints + 1.0)
-    assert not same_hand(palm, palm + [0.1, 0.0, 0.0], joints, joints)
+    joints = torch.rand(21, 3, generator=torch.Generator().manual_seed(0))
+    assert same_hand(0.03, joints, joints)
+    assert not same_hand(0.03, joints, joints + 1.0)
+    assert not same_hand(0.1, joints, joints)

@@ -20,6 +20,8 @@ from toftrack.detector.parts import BACKGROUND_PART, FOREARM_PART, HAND_PART, TH
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import (
+    Hypotheses,
+    Source,
     View,
     best_start,
     hypotheses_of,
@@ -29,7 +31,6 @@ from toftrack.tracking.candidates import (
     without_things,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.select import Hypotheses, Source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -23,12 +23,13 @@ from helpers.rendered import (
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.compute.spans import Spans
 from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.tracking.association import keep_tracks
 from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import LogOdds
 from toftrack.tracking.filter import ParticleSet, predict_particles
 from toftrack.tracking.report import TrackResult
 from toftrack.tracking.state import REFUSED_S, Track, TrackerState
-from toftrack.tracking.step import filter_tracks, keep_tracks, step, update_track
+from toftrack.tracking.step import filter_tracks, step, update_track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from toftrack.tracking.select import _ELSEWHERE_M, _MARGIN, Hypotheses, Source, select
+from toftrack.tracking.candidates import _ELSEWHERE_M, _MARGIN, Hypotheses, Source, select
 
 
 def joints_of(poses: torch.Tensor) -> torch.Tensor:

@@ -7,19 +7,21 @@ begin tentative tracks, and tracks that stay doubtful end.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.optimize import linear_sum_assignment
+from torch import Tensor
 
 from toftrack.detector.hand_detector import Detection, merit
 from toftrack.detector.proposals import SAME_PLACE_M
-from toftrack.tracking.filter import PredictedHand
+from toftrack.tracking.filter import PredictedHand, palm_of
+from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.posterior import touching
-from toftrack.tracking.state import Track
+from toftrack.tracking.state import Track, TrackerState
 
 _STEP_M, _SPEED_M_S = 0.04, 0.25
 """Standard deviation of a predicted palm, and its growth from the last believed frame on."""
@@ -75,16 +77,6 @@ def assign(cost: np.ndarray) -> list[int]:
     return [int(column) if column < columns else -1 for column in found]
 
 
-def same_hand(
-    first_m: np.ndarray, second_m: np.ndarray, first: torch.Tensor, second: torch.Tensor
-) -> bool:
-    """Whether palms (3,) and joints (21, 3), all in metres, are of the same hand."""
-    apart = float(np.linalg.norm(first_m - second_m))
-    if apart > _SAME_HAND_M:
-        return False
-    return apart < _SAME_PALM_M or float(touching(first[None], second)) > _SAME_JOINTS
-
-
 def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[SideDetection]:
     """The finder's detections that are of no track's hand, each hand once.  taken: see assign."""
     explained = [seen[column] for column in taken if column >= 0]
@@ -99,10 +91,17 @@ def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[Side
 def _same(first: SideDetection, second: SideDetection) -> bool:
     """Whether two detections are of the same hand, as all of one side at one place are."""
     palms = [one.detection.centre_m.numpy() for one in (first, second)]
-    if first.side == second.side and np.linalg.norm(palms[0] - palms[1]) < SAME_PLACE_M:
+    apart = float(np.linalg.norm(palms[0] - palms[1]))
+    if first.side == second.side and apart < SAME_PLACE_M:
         return True
-    joints = [one.detection.keypoints.points_m for one in (first, second)]
-    return same_hand(palms[0], palms[1], joints[0], joints[1])
+    return same_hand(apart, *(one.detection.keypoints.points_m for one in (first, second)))
+
+
+def same_hand(apart_m: float, first: Tensor, second: Tensor) -> bool:
+    """Whether joints (21, 3) are of the same hand, whose palms are so far apart."""
+    if apart_m > _SAME_HAND_M:
+        return False
+    return apart_m < _SAME_PALM_M or float(touching(first[None], second)) > _SAME_JOINTS
 
 
 def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
@@ -115,3 +114,35 @@ def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
 def sureness(track: Track) -> float:
     """A track's log odds, raised so that any confirmed track is surer than any tentative one."""
     return track.log_odds + 20.0 * track.confirmed
+
+
+def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
+    """The state with the tracks that go on, one a hand; tentative ones that end are refused."""
+    confirmed = sum(track.confirmed for track in tracks)
+    ended = {
+        track.number
+        for track in tracks
+        if track_ends(track, confirmed > track.confirmed, model.lost.patience)
+    }
+    hands = [model.hand(track.side, track.shape) for track in tracks]
+    palms = [palm_of(track.pose, hand)[0][0] for track, hand in zip(tracks, hands, strict=True)]
+    surest = sorted(range(len(tracks)), key=lambda row: sureness(tracks[row]), reverse=True)
+    for first, second in itertools.combinations(surest, 2):
+        if ended & {tracks[first].number, tracks[second].number}:
+            continue
+        apart = float(np.linalg.norm(palms[first] - palms[second]))
+        if apart < _SAME_HAND_M:
+            joints = (hands[row].refiner.joints(tracks[row].pose)[0] for row in (first, second))
+            if same_hand(apart, *joints):
+                ended.add(tracks[second].number)
+    refused = [
+        [*palm, 0.0]
+        for track, palm in zip(tracks, palms, strict=True)
+        if track.number in ended and not track.confirmed
+    ]
+    kept = [track for track in tracks if track.number not in ended]
+    return replace(
+        state,
+        tracks=tuple(sorted(kept, key=lambda track: track.number)),
+        refused=np.concatenate((state.refused, np.reshape(refused, (-1, 4)))),
+    )

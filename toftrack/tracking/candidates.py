@@ -1,4 +1,4 @@
-"""The hypotheses of a frame: proposed by the filter and the detector, refined, scored.
+"""The hypotheses of a frame: proposed by the filter and the detector, refined, scored, selected.
 
 Data-driven proposals are as in ICONDENSATION (Isard and Blake, ECCV 1998), local optimisation as in
 Gall et al., "Optimization and filtering for human motion capture" (IJCV 87, 2010).
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import cached_property
 
 import cv2
@@ -31,7 +32,6 @@ from toftrack.tracking.posterior import (
     Posterior,
     Term,
 )
-from toftrack.tracking.select import Hypotheses, Source
 from toftrack.tracking.state import Track
 
 _SURELY_PRESENT = 0.97
@@ -54,6 +54,16 @@ _LEAST_PARTS = 4
 _MOSTLY, _UNKNOWN = 0.5, 255
 """A surface in front is the hand's arm when more than this share of it is, where the network sees
 it; and the class of what it does not see."""
+_MARGIN = 0.05
+"""What a pose of the detector loses in log posterior against the other sources: neighbouring
+fingers change places from frame to frame otherwise (swaps +0.6 points)."""
+_SURE_LEAD = 2.0
+"""The same of a pose elsewhere while something hides the hand: without it, a second hand that
+crosses the first one is silently wrong in 5 % of the frames."""
+_ELSEWHERE_M = 0.02
+"""A pose of the detector is elsewhere when its joints are so far from the others', on average."""
+WORST = -1e6
+"""Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +206,33 @@ def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, floa
     return poses[best][None], float(values[best])
 
 
+class Source(IntEnum):
+    """Where a hypothesis comes from."""
+
+    PREVIOUS = 0
+    """The last frame's fingers at the filter's wrist; of a covered hand, its last pose."""
+    DYNAMICS = 1
+    """The filter's estimate."""
+    DETECTOR = 2
+    """The detector's likeliest hypothesis, raw or bent to the keypoints."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """A table of poses of one hand, a row each.
+
+    pose: (N, 27).  joints_m: (N, 21, 3).  source: of each.  log_posterior: (N,).
+    """
+
+    pose: Tensor
+    joints_m: Tensor
+    source: Sequence[Source]
+    log_posterior: Tensor
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
 def propose(view: View, mean: Tensor) -> Hypotheses:
     """Refined and scored hypotheses of a frame: the filter's `mean` (1, 27), its wrist with the
     last frame's fingers, and the detector's likeliest pose, raw and bent.
@@ -224,6 +261,36 @@ def scored(view: View, poses: Tensor, sources: Sequence[Source]) -> Hypotheses:
     """Poses (N, 27) of these sources as they are, scored."""
     joints = view.fitted.refiner.joints(poses)
     return Hypotheses(poses, joints, sources, view.posterior().value(poses, joints))
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The chosen pose of a frame.
+
+    pose: (1, 27).  moved: the detector sees it elsewhere: the track is to restart there.
+    """
+
+    pose: Tensor
+    moved: bool
+
+
+def select(table: Hypotheses, hidden: bool) -> Choice:
+    """The best of a hand's scored hypotheses; one of the detector must be better by a margin.
+
+    table: with at least one row that is not the detector's.
+    hidden: something hides part of the hand. Then a pose elsewhere needs a large lead, for it may
+        be of what hides the hand, such as another hand.
+    """
+    # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
+    joints, source = table.joints_m.numpy(), np.array(table.source)
+    values = np.maximum(table.log_posterior.numpy(), WORST)
+    detectors = source == Source.DETECTOR
+    base = int(np.where(detectors, -np.inf, values).argmax())
+    away = np.sqrt(np.square(joints - joints[base]).sum(-1)).mean(1)
+    elsewhere = detectors & (away >= _ELSEWHERE_M)
+    values = values - np.where(elsewhere & hidden, _SURE_LEAD, _MARGIN * detectors)
+    best = int(values.argmax())
+    return Choice(table.pose[best][None], bool(elsewhere[best]))
 
 
 def without_things(observation: Observation, detection: Detection) -> Observation:

@@ -17,9 +17,8 @@ import numpy as np
 from toftrack.detector.hand_detector import Detection
 from toftrack.frames import DepthImage
 from toftrack.tracking.belief import probability
-from toftrack.tracking.candidates import View, best_start
+from toftrack.tracking.candidates import WORST, View, best_start
 from toftrack.tracking.confidence import log_odds
-from toftrack.tracking.select import WORST
 from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 
 _WEIGHT, _LARGEST, _MOST = 2.0, 3.0, 6.0

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
 
-import numpy as np
 import torch
 
 from toftrack.compute.spans import Spans
@@ -15,9 +14,9 @@ from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.association import assign, costs, same_hand, sureness, track_ends, unassigned
+from toftrack.tracking.association import assign, costs, keep_tracks, unassigned
 from toftrack.tracking.belief import judge
-from toftrack.tracking.candidates import View, keypoints_of, propose
+from toftrack.tracking.candidates import View, keypoints_of, propose, select
 from toftrack.tracking.confidence import confidence_features
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
@@ -25,7 +24,6 @@ from toftrack.tracking.filter import (
     PoseEstimate,
     PredictedHand,
     new_track,
-    palm_of,
     predict_particles,
     run_filter,
     shift_particles,
@@ -34,7 +32,6 @@ from toftrack.tracking.filter import (
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.select import select
 from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.views import begin_tracks, continue_track, predicted_view
 
@@ -208,40 +205,3 @@ def learn_shape(view: View, found: PoseEstimate) -> shape_fit.ShapeEstimate:
         fitted.first,
         fitted.refiner.pose,
     )
-
-
-def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
-    """The state with the tracks that go on, one a hand; tentative ones that end are refused."""
-    confirmed = sum(track.confirmed for track in tracks)
-    left = [
-        track
-        for track in tracks
-        if not track_ends(track, confirmed > track.confirmed, model.lost.patience)
-    ]
-    gone = {track.number for track in tracks} - {track.number for track in left}
-    for first in sorted(left, key=sureness, reverse=True):
-        for second in left:
-            if first.number in gone or second.number in gone or first.number == second.number:
-                continue
-            if on_same_hand(first, second, model):
-                gone.add(min(first, second, key=sureness).number)
-    refused = [
-        [*palm_of(track.pose, model.hand(track.side, track.shape))[0][0], 0.0]
-        for track in tracks
-        if track.number in gone and not track.confirmed
-    ]
-    kept = [track for track in tracks if track.number not in gone]
-    return replace(
-        state,
-        tracks=tuple(sorted(kept, key=lambda track: track.number)),
-        refused=np.concatenate((state.refused, np.reshape(refused, (-1, 4)))),
-    )
-
-
-def on_same_hand(first: Track, second: Track, model: TrackerModel) -> bool:
-    """Whether two tracks follow the same hand."""
-    hands = [model.hand(track.side, track.shape) for track in (first, second)]
-    poses = [track.pose for track in (first, second)]
-    palms = [palm_of(*each)[0][0] for each in zip(poses, hands, strict=True)]
-    joints = [hand.refiner.joints(pose)[0] for hand, pose in zip(hands, poses, strict=True)]
-    return same_hand(*palms, *joints)
