@@ -11,6 +11,7 @@ import roma
 import torch
 from helpers.configured import nearest_surface, refinement
 from helpers.tracking import sample
+from reference.refinement import TorchRefiner, point_jacobian, points_around, refine
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
@@ -20,14 +21,7 @@ from toftrack.hand.surface import hand_surface
 from toftrack.output.evaluation import TIPS
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
-from toftrack.refinement.gauss_newton import (
-    JOINT_FRAME,
-    Keypoints,
-    Refinement,
-    TorchRefiner,
-    point_jacobian,
-    refine,
-)
+from toftrack.refinement.gauss_newton import JOINT_FRAME, Keypoints, Refinement
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -204,7 +198,7 @@ def test_points_of_nothing_near_are_left_alone() -> None:
     state, shape = true_states()[:1], default_hand_shape()
     seen = beside(state, 0.14)
     middle = forward_kinematics(state, shape).joints_m.mean(1)
-    assert seen.around(middle, 500)[1].any()
+    assert points_around(seen, middle, 500)[1].any()
     settings = refinement(reach_m=1e-3)
     found = refine(state, state[:, 6:], seen, shape, hand_surface(shape), settings)
     torch.testing.assert_close(found, state, atol=1e-6, rtol=0)

@@ -10,12 +10,13 @@ import pytest
 import torch
 from helpers.configured import nearest_surface, refinement
 from helpers.tracking import sample
+from reference.refinement import TorchRefiner
 from torch import Tensor
 
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.refinement.gauss_newton import Keypoints, Refiner, TorchRefiner
+from toftrack.refinement.gauss_newton import Keypoints, Refiner
 from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.closed_form import render_range_images

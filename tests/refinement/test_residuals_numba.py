@@ -8,6 +8,15 @@ import numpy as np
 import pytest
 import torch
 from helpers.configured import refinement
+from reference.refinement import (
+    Residuals,
+    keypoint_residuals,
+    nearest_ellipsoids,
+    point_jacobian,
+    point_residuals,
+    points_around,
+    silhouette_residuals,
+)
 from torch import Tensor
 
 from toftrack.compute.compiling import entry_point
@@ -16,15 +25,7 @@ from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement import residuals_numba as compiled
-from toftrack.refinement.gauss_newton import (
-    Keypoints,
-    Residuals,
-    keypoint_residuals,
-    nearest_ellipsoids,
-    point_jacobian,
-    point_residuals,
-    silhouette_residuals,
-)
+from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.gauss_newton_numba import CompiledRefiner, solve
 from toftrack.refinement.seen_points import SeenPoints
 
@@ -117,7 +118,7 @@ def test_points_are_chosen_as_by_the_reference(count: int) -> None:
     points = 0.1 * torch.randn(400, 3, generator=g) + posed.pose.joints_m[0].mean(0).float()
     seen = SeenPoints(points, torch.zeros(0, 0, 2), torch.eye(3), (1, 1))
     middle = posed.pose.joints_m.mean(1).float()
-    expected, there = seen.around(middle, count)
+    expected, there = points_around(seen, middle, count)
     chosen = np.zeros((3, min(count, 400)), np.float32)
     found = _choose(points.numpy(), posed.hand[1], count, np.empty(401, np.int32), chosen)
     assert found == int(there.sum())

@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers.configured import nearest_surface
 from helpers.tracking import sample
+from reference.refinement import points_around
 from torch import Tensor
 
 from toftrack.refinement import seen_points as seen_points_of
@@ -91,7 +92,7 @@ def test_each_hypothesis_has_the_points_around_itself(count: int) -> None:
     middles[1] += 0.15
     middles[2] += 1.0
     middles[3] = torch.nan
-    points, there = seen.around(middles, count)
+    points, there = points_around(seen, middles, count)
     assert points.shape[:2] == there.shape and there.shape[1] <= count
     for i, middle in enumerate(middles):
         assert torch.equal(points[i, there[i]], by_a_loop(seen.points_m, middle, count))
@@ -104,9 +105,9 @@ def no_points(seen: SeenPoints) -> SeenPoints:
 
 def test_without_points_or_hypotheses_there_are_none() -> None:
     seen = seen_points(observed(0))
-    points, there = no_points(seen).around(torch.zeros(4, 3), COUNT)
+    points, there = points_around(no_points(seen), torch.zeros(4, 3), COUNT)
     assert points.shape == (4, 0, 3) and there.shape == (4, 0)
-    assert seen.around(torch.zeros(0, 3), COUNT)[0].shape[0] == 0
+    assert points_around(seen, torch.zeros(0, 3), COUNT)[0].shape[0] == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (40, 30)])

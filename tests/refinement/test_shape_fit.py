@@ -9,13 +9,14 @@ import pytest
 import torch
 from helpers.detection import detection_of
 from helpers.tracking import make_tracker
+from reference.refinement import keypoint_residuals
 
 from toftrack.detector.hand_detector import Detection
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.shape_space import POPULATION_SIGMA, shape_derivatives, shaped
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement import shape_fit
-from toftrack.refinement.gauss_newton import Keypoints, keypoint_residuals
+from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.shape_fit import ShapeEstimate, ShapeFit, first_shape, keypoints_system
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -40,25 +40,6 @@ class SeenPoints:
     size: tuple[int, int]
     corner: tuple[int, int] = (0, 0)
 
-    def around(self, middle_m: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """The points of each of N hypotheses: those within its reach, thinned out evenly.
-
-        middle_m: (N, 3) mean of a hypothesis' joints.  count: points of a hypothesis at most.
-        Returns the points (N, C, 3), and which of them there are, (N, C) bool.
-        """
-        total = len(self.points_m)
-        near = (self.points_m - middle_m[:, None]).square().sum(-1) < REACH_M**2
-        stride = (near.sum(1, keepdim=True) + count - 1).div(count, rounding_mode="floor")
-        rank = near.cumsum(1) - 1
-        kept = near & (rank % stride.clamp(min=1) == 0)
-        # What is not kept goes to one place past the end.
-        slots = min(count, total)
-        to = torch.where(kept, rank // stride.clamp(min=1), slots)
-        index = to.new_zeros(len(near), slots + 1)
-        index.scatter_(1, to, torch.arange(total, device=to.device).expand_as(to))
-        there = torch.arange(slots, device=to.device) < kept.sum(1, keepdim=True)
-        return self.points_m[index[:, :slots]], there
-
 
 @lru_cache(maxsize=_KEPT)
 def seen_points(observation: Observation) -> SeenPoints:

@@ -14,7 +14,7 @@ from toftrack.compute.redraw import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.refinement.gauss_newton import Refiner, TorchRefiner
+from toftrack.refinement.gauss_newton import Refiner
 from toftrack.render.scoring import Scorer, ScoreRows, score_rows
 from toftrack.render.torch_scorer import TorchScorer
 
@@ -78,7 +78,7 @@ def _torch(device: torch.device) -> Backend:
         device,
         _on_cpu_too(device, rigid.MOTIONS),
         lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
-        TorchRefiner if device.type == "cpu" else _compiled_refiner(),
+        _compiled_refiner(),
     )
 
 
