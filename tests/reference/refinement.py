@@ -49,11 +49,11 @@ class TorchRefiner:
         return refine(states, prior_angles, seen, self.shape, self.surface, settings, keypoints)
 
     def joints(self, states: Tensor) -> Tensor:
-        """See Refiner."""
+        """See gauss_newton_numba.Refiner."""
         return self.pose(states).joints_m
 
     def pose(self, states: Tensor) -> HandPose:
-        """See Refiner."""
+        """See gauss_newton_numba.Refiner."""
         return forward_kinematics(states, self.shape)
 
 

@@ -16,8 +16,8 @@ from torch import Tensor
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.refinement.gauss_newton import Keypoints, Refiner
-from toftrack.refinement.gauss_newton_numba import CompiledRefiner
+from toftrack.refinement.gauss_newton import Keypoints
+from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.segmentation import Observation
@@ -44,7 +44,7 @@ def seen_hand(
     return state, seen_points(observation), starts
 
 
-def error_m(refiner: Refiner, states: Tensor, truth: Tensor) -> Tensor:
+def error_m(refiner: TorchRefiner | Refiner, states: Tensor, truth: Tensor) -> Tensor:
     return (refiner.joints(states) - refiner.joints(truth)).norm(dim=-1).mean(-1)
 
 
@@ -58,7 +58,7 @@ def check_joints(shape: HandShape, found: Tensor, expected: Tensor, atol_m: floa
 @pytest.mark.parametrize("iterations", [1, 5])
 def test_it_agrees_with_the_reference(side: str, iterations: int) -> None:
     shape, settings = default_hand_shape(side=side), refinement(iterations=iterations)
-    reference, compiled = TorchRefiner(shape), CompiledRefiner(shape)
+    reference, compiled = TorchRefiner(shape), Refiner(shape)
     generator = torch.Generator().manual_seed(1)
     for _ in range(2):
         _, seen, starts = seen_hand(shape, generator, n=5)
@@ -75,7 +75,7 @@ def test_it_agrees_with_the_reference(side: str, iterations: int) -> None:
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_it_agrees_with_the_reference_on_a_recording(side: str) -> None:
     shape = default_hand_shape(side=side)
-    reference, compiled = TorchRefiner(shape), CompiledRefiner(shape)
+    reference, compiled = TorchRefiner(shape), Refiner(shape)
     for frame in (0, 36, 72):
         scene = sample().cut(frame)
         if side == "left":
@@ -91,7 +91,7 @@ def test_it_agrees_with_the_reference_on_a_recording(side: str) -> None:
 @pytest.mark.parametrize("own", [False, True])
 def test_it_agrees_with_the_reference_about_landmarks(own: bool) -> None:
     shape = default_hand_shape()
-    reference, compiled = TorchRefiner(shape), CompiledRefiner(shape)
+    reference, compiled = TorchRefiner(shape), Refiner(shape)
     generator = torch.Generator().manual_seed(5)
     truth, seen, starts = seen_hand(shape, generator, n=3)
     points = reference.joints(truth)[0] + 0.004 * torch.randn(21, 3, generator=generator)
@@ -109,7 +109,7 @@ def test_it_agrees_with_the_reference_about_landmarks(own: bool) -> None:
 
 
 def test_it_draws_hands_onto_the_points() -> None:
-    refiner = CompiledRefiner(default_hand_shape())
+    refiner = Refiner(default_hand_shape())
     generator = torch.Generator().manual_seed(2)
     before, after = 0.0, 0.0
     for _ in range(4):
@@ -122,7 +122,7 @@ def test_it_draws_hands_onto_the_points() -> None:
 
 def test_hypotheses_do_not_know_of_each_other() -> None:
     """Together, alone, in threads and in calls at the same time: the same to the last bit."""
-    refiner = CompiledRefiner(default_hand_shape())
+    refiner = Refiner(default_hand_shape())
     _, seen, starts = seen_hand(default_hand_shape(), torch.Generator().manual_seed(3), n=12)
     starts[1], starts[4, 3] = math.nan, math.inf
     starts[7, 0] += 1.0
@@ -137,7 +137,7 @@ def test_hypotheses_do_not_know_of_each_other() -> None:
 
 
 def test_nothing_seen_leaves_the_states_as_they_are() -> None:
-    refiner = CompiledRefiner(default_hand_shape())
+    refiner = Refiner(default_hand_shape())
     _, seen, starts = seen_hand(default_hand_shape(), torch.Generator().manual_seed(4), n=3)
     nothing = replace(seen, points_m=torch.zeros(0, 3), nearest_px=torch.zeros(0, 0, 2))
     assert torch.equal(refiner(starts, 0 * starts[:, 6:], nothing, SETTINGS), starts)
@@ -155,7 +155,7 @@ def test_images_of_a_pixel_s_width_do_no_harm(size: tuple[int, int]) -> None:
     start[0, 1:3] = torch.tensor([0.08, 0.46])
     found = [
         refiner(start, start[:, 6:], seen, SETTINGS)
-        for refiner in (TorchRefiner(shape), CompiledRefiner(shape))
+        for refiner in (TorchRefiner(shape), Refiner(shape))
     ]
     check_joints(shape, *found)
 
@@ -168,7 +168,7 @@ def test_hands_at_and_behind_the_camera_agree_too(z: float) -> None:
     moved = replace(seen, points_m=seen.points_m + torch.tensor([0.0, 0.0, z - 0.45]))
     found = [
         refiner(start, start[:, 6:], moved, refinement(iterations=1))
-        for refiner in (TorchRefiner(shape), CompiledRefiner(shape))
+        for refiner in (TorchRefiner(shape), Refiner(shape))
     ]
     assert found[0].isfinite().all()
     check_joints(shape, *found)

@@ -26,7 +26,7 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement import residuals_numba as compiled
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.refinement.gauss_newton_numba import CompiledRefiner, solve
+from toftrack.refinement.gauss_newton_numba import Refiner, solve
 from toftrack.refinement.seen_points import SeenPoints
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -61,7 +61,7 @@ class Posed:
     shape: HandShape
     surface: HandSurface
     pose: HandPose
-    refiner: CompiledRefiner
+    refiner: Refiner
     hand: tuple[np.ndarray, ...]
     ellipsoids: np.ndarray
 
@@ -75,7 +75,7 @@ def posed_hand(side: str, seed: int, z: float = 0.45) -> Posed:
     state[6:] = low + (high - low) * torch.rand(21, generator=g, dtype=torch.float64)
     single = default_hand_shape(side=side)
     shape, surface = single.to(torch.float64), hand_surface(single).to(torch.float64)
-    refiner = CompiledRefiner(single)
+    refiner = Refiner(single)
     hand = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty((21, 3))
     ellipsoids = np.empty((len(surface), 12), np.float32)
     _pose(state.numpy(), refiner._shape, refiner._surface, hand, ellipsoids)

@@ -8,7 +8,6 @@ import torch
 from toftrack.compute import rigid, rigid_numba
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
-from toftrack.refinement.gauss_newton_numba import CompiledRefiner
 from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.scoring import disc_square
 from toftrack.render.torch_scorer import TorchScorer
@@ -26,7 +25,6 @@ def test_a_back_end_is_of_one_kind() -> None:
         backend = choose_backend(name, "cpu")
         assert backend.name == name and backend.device == torch.device("cpu")
         assert isinstance(backend.make_scorer(SHAPE), scorer)
-        assert isinstance(backend.make_refiner(SHAPE), CompiledRefiner)
         assert backend.motions.compose is compose
 
 

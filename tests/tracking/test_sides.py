@@ -101,7 +101,7 @@ def compared(side: str, image_side: str, **evidence: float) -> SideEvidence:
     image, here = image_of(hand_at(), side=image_side), hand_at()
     track = known(side=side, **evidence)
     view = view_of(image, track, detection_of(here, side=side), model=model)
-    return compare_sides(view, detection_of(here, side=OTHER_SIDE[side]), image)
+    return compare_sides(view, detection_of(here, side=OTHER_SIDE[side]), image, None)
 
 
 @pytest.mark.parametrize("image_side", ["right", "left"])
@@ -125,7 +125,7 @@ def test_without_a_hand_that_is_surely_there_nothing_is_learned() -> None:
     unsure = replace(detection_of(hand_at()), present=0.3)
     for detection in (unsure, NO_DETECTION):
         view = view_of(image_of(hand_at()), track, detection, model=any_hand_model())
-        assert compare_sides(view, unsure, image_of()) == track.evidence
+        assert compare_sides(view, unsure, image_of(), None) == track.evidence
 
 
 def test_a_body_is_seen_beside_the_hand_only_where_it_is_large_and_near_enough() -> None:

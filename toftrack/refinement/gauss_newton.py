@@ -19,14 +19,11 @@ tests/reference/refinement.py.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.hand.skeleton import HandPose
-from toftrack.refinement.seen_points import SeenPoints
 
 # The joints of the 21 angles: (finger, bone that moves first, is it an abduction).
 _JOINTS = [
@@ -110,23 +107,3 @@ class Keypoints:
         known = points.isfinite().all(-1) & (self.sigma_m > 0)
         sigma = torch.where(known, self.sigma_m, torch.inf)
         return Keypoints(torch.where(known[..., None], points, 0.0), sigma)
-
-
-class Refiner(Protocol):
-    """Brings hands of one shape onto the seen points."""
-
-    def __call__(
-        self,
-        states: Tensor,
-        prior_angles: Tensor,
-        seen: SeenPoints,
-        settings: Refinement,
-        keypoints: Keypoints | None = None,
-    ) -> Tensor:
-        """See refine."""
-
-    def joints(self, states: Tensor) -> Tensor:
-        """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
-
-    def pose(self, states: Tensor) -> HandPose:
-        """(N, 27) to joints and frames, see skeleton.forward_kinematics."""

@@ -1,4 +1,4 @@
-"""Refinement in compiled code: all of gauss_newton.refine's iterations in one call on the CPU.
+"""Refinement in compiled code: all iterations of gauss_newton.py in one call on the CPU.
 
 Threads share the hypotheses. What is seen of each is added up in residuals_numba.py.
 """
@@ -156,8 +156,8 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings, coun
             _move(state, priors[i], settings, sums)
 
 
-class CompiledRefiner:
-    """Refines hands of one shape on the CPU; see gauss_newton.Refiner."""
+class Refiner:
+    """Brings hands of one shape onto what is seen, on the CPU."""
 
     def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
         """surface: instead of the shape's own."""
@@ -182,7 +182,7 @@ class CompiledRefiner:
         return torch.from_numpy(joints)
 
     def pose(self, states: Tensor) -> HandPose:
-        """See gauss_newton.Refiner."""
+        """(N, 27) to joints and frames, see skeleton.forward_kinematics."""
         joints, frames = torch.empty(len(states), 21, 3), torch.empty(len(states), 16, 3, 3)
         states_read = np.ascontiguousarray(states.numpy(), np.float32)
         joints_of(states_read, *self._shape, joints.numpy(), frames.numpy())
@@ -196,7 +196,13 @@ class CompiledRefiner:
         settings: Refinement,
         keypoints: Keypoints | None = None,
     ) -> Tensor:
-        """See gauss_newton.refine."""
+        """(N, 27) the hands `states`, each refined by itself, see gauss_newton.py.
+
+        prior_angles: (N, 21) the poses that the filter believes in.
+        keypoints: joints that are known besides.
+
+        A hand within whose reach nothing is seen, and of which no keypoint is known, stays.
+        """
         names = ("reach_m", "point_m", "silhouette_px", "angle_rad", "damping")
         numbers = tuple(float(getattr(settings, name)) for name in names)
         counts = int(settings.iterations), int(settings.points)

@@ -14,7 +14,6 @@ from toftrack.compute.redraw import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.refinement.gauss_newton import Refiner
 from toftrack.render.scoring import Scorer, ScoreRows, score_rows
 from toftrack.render.torch_scorer import TorchScorer
 
@@ -28,7 +27,6 @@ class Backend:
         refined and compared, as is all that is said of it.
     motions: of particles, on the device and on the CPU.
     make_scorer: from a hand on the CPU to its scorer of poses on the device.
-    make_refiner: from a hand to its refiner of poses, both on the CPU.
     score_rows: poses of several hands, see render.scoring.score_rows.
     """
 
@@ -36,7 +34,6 @@ class Backend:
     device: torch.device
     motions: Motions
     make_scorer: Callable[[HandShape], Scorer]
-    make_refiner: Callable[[HandShape], Refiner]
     score_rows: ScoreRows = score_rows
 
 
@@ -78,7 +75,6 @@ def _torch(device: torch.device) -> Backend:
         device,
         _on_cpu_too(device, rigid.MOTIONS),
         lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
-        _compiled_refiner(),
     )
 
 
@@ -99,12 +95,6 @@ def _on_cpu_too(device: torch.device, there: Motions) -> Motions:
     )
 
 
-def _compiled_refiner() -> Callable[[HandShape], Refiner]:
-    from toftrack.refinement.gauss_newton_numba import CompiledRefiner
-
-    return CompiledRefiner
-
-
 def _numba(device: torch.device) -> Backend:
     """Compiled code on the CPU, which also scores particles elsewhere; torch moves those."""
     from toftrack.compute import rigid_numba
@@ -112,7 +102,7 @@ def _numba(device: torch.device) -> Backend:
 
     there = rigid_numba.MOTIONS if device.type == "cpu" else rigid.MOTIONS
     motions = _on_cpu_too(device, there)
-    return Backend("numba", device, motions, NumbaScorer, _compiled_refiner(), score_rows)
+    return Backend("numba", device, motions, NumbaScorer, score_rows)
 
 
 def _triton(device: torch.device) -> Backend:
@@ -122,7 +112,7 @@ def _triton(device: torch.device) -> Backend:
     require_device()
     motions = _on_cpu_too(device, rigid_triton.MOTIONS)
     scorer = partial(TritonScorer, device=device)
-    return Backend("triton", device, motions, scorer, _compiled_refiner())
+    return Backend("triton", device, motions, scorer)
 
 
 _MAKERS: dict[str, Callable[[torch.device], Backend]] = {

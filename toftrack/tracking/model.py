@@ -22,7 +22,8 @@ from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
-from toftrack.refinement.gauss_newton import Refinement, Refiner
+from toftrack.refinement.gauss_newton import Refinement
+from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.shape_fit import ShapeEstimate, ShapeFit, first_shape
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Scorer
@@ -250,4 +251,4 @@ def _fitted_hand(
 ) -> FittedHand:
     first = shape.of_side(side)
     made = shaped(first, torch.tensor(applied))
-    return FittedHand(made, backend.make_scorer(made), backend.make_refiner(made), first, applied)
+    return FittedHand(made, backend.make_scorer(made), Refiner(made), first, applied)

@@ -139,7 +139,7 @@ def make_view(
 def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
     """The view with its sides compared; restarted as the other side where that one is likelier."""
     image: DepthImage = scene.image_for(row) if row >= 0 else scene.unexplained()
-    track = replace(view.track, evidence=compare_sides(view, mirrored, image))
+    track = replace(view.track, evidence=compare_sides(view, mirrored, image, told))
     others = [hand.track for at, hand in enumerate(scene.hands) if at != row]
     others = [other for other in others if other.confirmed]
     if not changes_side(track, side_log_odds(track, others, told), told):
