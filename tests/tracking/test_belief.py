@@ -24,7 +24,6 @@ PLAIN = replace(
     whole_odds=LogOdds(0.0, {}),
 )
 """Log odds are just the feature log_score."""
-HIDDEN = {"hidden": 0.5}
 
 
 def followed(**changes: object) -> Track:
@@ -42,37 +41,19 @@ def judged(
     return judge(track, replace(NO_FEATURES, log_score=log_odds, **features), dt_s, model)
 
 
-def frames_until_end(
-    patience: int, dt_s: float = FRAME_S, track: Track | None = None, **features: float
-) -> int | None:
+def frames_until_end(patience: int, dt_s: float = FRAME_S) -> int | None:
     """After so many doubtful frames a track ends; None = it does not."""
-    track = track or followed()
+    track = followed()
     for number in range(1, 500):
-        track = replace(track, doubtful=judged(track, 0.05, dt_s, **features).doubtful)
+        track = replace(track, doubtful=judged(track, 0.05, dt_s).doubtful)
         if track_ends(track, False, patience):
             return number
     return None
 
 
-@pytest.mark.parametrize(
-    ("patience", "features", "frames"),
-    [(1, {}, 1), (5, {}, 5), (8, {}, 8), (5, HIDDEN, 45), (0, {}, None)],
-)
-def test_a_doubtful_track_ends_after_its_patience_and_a_hidden_one_much_later(
-    patience: int, features: dict[str, float], frames: int | None
-) -> None:
-    found = frames_until_end(patience, **features)
-    assert found == (frames if frames is None else pytest.approx(frames, abs=1))
-
-
-def test_what_was_never_believed_is_not_waited_for_when_it_is_hidden() -> None:
-    assert frames_until_end(5, track=followed(confirmed=False), **HIDDEN) == 5
-
-
-def test_of_a_hand_that_was_doubtful_before_it_was_hidden_little_patience_is_left() -> None:
-    before = judged(followed(doubtful=Duration(3 * FRAME_S)), 0.05)
-    frames = frames_until_end(5, track=followed(doubtful=before.doubtful), **HIDDEN)
-    assert frames is not None and frames <= 10, "one frame is left of five"
+@pytest.mark.parametrize(("patience", "frames"), [(1, 1), (5, 5), (8, 8), (0, None)])
+def test_a_doubtful_track_ends_after_its_patience(patience: int, frames: int | None) -> None:
+    assert frames_until_end(patience) == frames
 
 
 def test_patience_is_a_time_but_what_was_dropped_was_not_doubtful() -> None:
@@ -98,12 +79,6 @@ def test_a_new_hand_is_asked_for_more_confidence_than_one_that_was_believed(
     status = judged(followed(confirmed=confirmed), chance)
     assert status.lost == lost and status.confidence == pytest.approx(chance)
     assert (status.state_name == "tracking") == (not lost)
-
-
-def test_a_new_hand_is_believed_that_is_right_as_a_whole_whatever_its_fingers() -> None:
-    for odds, lost in ((3.0, False), (1.0, True)):
-        model = replace(PLAIN, whole_odds=LogOdds(odds, {}))
-        assert judged(followed(confirmed=False), 0.4, model=model).lost == lost
 
 
 def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:

@@ -13,11 +13,6 @@ _HIDDEN = 0.3
 """A hand is hidden where more than this share of its joints is behind something."""
 _OUT_OF_VIEW = 0.4
 """A hand is out of view where more than this share of its joints is outside of the image."""
-_WHOLE_HAND = 0.9
-"""A tentative track is confirmed from this probability of the whole hand on, whatever its
-confidence: of a hand that holds a thing or lies beside another one a joint is often far off."""
-_PATIENT = 10
-"""A frame in which a confirmed hand is hidden makes its track so much less doubtful."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +43,9 @@ def judge(
     confidence, probable = probability(smooth), probability(whole)
     # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
     passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
-    # What was never believed may be no hand, and may hide behind anything.
-    waits = track.confirmed and features.hidden > _HIDDEN
-    doubtful = Duration(track.doubtful.seconds + passed / (_PATIENT if waits else 1))
+    doubtful = Duration(track.doubtful.seconds + passed)
     doubtful = doubtful if confidence < model.give_up else Duration()
-    confirmed = track.confirmed or confidence >= model.believe or probable >= _WHOLE_HAND
+    confirmed = track.confirmed or confidence >= model.believe
     lost = not confirmed or confidence < model.confidence or probable < model.whole
     name = _state_name(features) if lost else "tracking"
     return Status(name, lost, confidence, smooth, whole, doubtful)

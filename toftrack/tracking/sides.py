@@ -87,19 +87,21 @@ def compare_sides(
     """A track's evidence after one more comparison; as it was where hardly a hand is detected.
 
     mirrored: the detection there as a hand of the other side.  image: without other hands.
-    told: the side that the user said, beside which the network's word and the body, which is
-        searched for in the image, count for nothing.
+    told: the side that the user said; where nobody did, the network looks twice more, and a body
+        is searched for in the image.
     """
     evidence, side = view.track.evidence, view.track.side
     if view.detection.empty or view.detection.present < _LEAST_PRESENT:
         return evidence
     gain = _best_of_side(view, view.detection, side)
     gain -= _best_of_side(view, mirrored, OTHER_SIDE[side])
+    lead = _network_log_odds(view.detection) - _network_log_odds(mirrored)
     comparisons, body_m = evidence.comparisons + 1, evidence.body_m
     if told is None:
-        gain += _NETWORK * _network_lead(view.detection, mirrored, side, image, view.model)
+        lead = 0.5 * (lead + _turned_lead(mirrored, side, image, view.model))
         offset = body_offset_m(image, view.detection.centre_m.numpy())
         body_m += (offset - body_m) / min(comparisons, _BODY_COMPARISONS)
+    gain += _NETWORK * lead
     gain = gain if side == "right" else -gain
     fits = evidence.fits + _WEIGHT * min(max(gain, -_LARGEST), _LARGEST)
     return SideEvidence(min(max(fits, -_MOST), _MOST), body_m, comparisons, 0.0)
@@ -120,21 +122,16 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     return max(best_start(seen, _KEYPOINTS)[1], WORST)
 
 
-def _network_lead(
-    detection: Detection, mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
-) -> float:
-    """Log odds by which the network is surer of `side` than of the other one.
-
-    It is the mean over the crops of both sides' poses: a crop that is turned as a pose has it makes
-    that pose's side likelier.
+def _turned_lead(mirrored: Detection, side: str, image: DepthImage, model: TrackerModel) -> float:
+    """Log odds by which the network is surer of `side` in the crops of the other side's pose: a
+    crop that is turned as a pose has it makes that pose's side likelier.
     """
-    said = _network_log_odds(detection) - _network_log_odds(mirrored)
     centre, up = mirrored.centre_m.numpy()[None], mirrored.up[None]
     own, other = (
         model.detector.detect(image.depth_m, image.k, centre, one, up)[0]
         for one in (side, OTHER_SIDE[side])
     )
-    return 0.5 * (said + _network_log_odds(own) - _network_log_odds(other))
+    return _network_log_odds(own) - _network_log_odds(other)
 
 
 def _network_log_odds(detection: Detection) -> float:

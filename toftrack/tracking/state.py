@@ -48,8 +48,7 @@ class Track:
     pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
     number: unique.  side: right or left, with the `evidence`.
-    age: since it began or restarted.  doubtful: how long it was below ConfidenceModel.give_up,
-        where frames of a hidden hand count less.
+    age: since it began or restarted.  doubtful: how long it was below ConfidenceModel.give_up.
     log_odds: that every joint of the estimate is within 40 mm, smoothed over time.
     whole_odds: that its mean error is, likewise.
     confirmed: one of its estimates was believed; until then the track is tentative.
