@@ -95,7 +95,7 @@ def laid_over(first: Recording, second: Recording) -> Recording:
 
 def turned(one: Recording, angle_rad: np.ndarray) -> Recording:
     """A recording as a camera sees it that is turned by (T,) angles about its y axis, so that all
-    moves to the left. Beyond its edges, the recording goes on as it is there.
+    moves to the left. Beyond its edges there are no readings.
     """
     (_, rows, columns), k = one.depth_m.shape, one.k
     v, u = np.mgrid[:rows, :columns]
@@ -108,7 +108,7 @@ def turned(one: Recording, angle_rad: np.ndarray) -> Recording:
         source = rays @ turn  # by the inverse, as rows
         x, y = (source[..., n] / source[..., 2] * k[n, n] + k[n, 2] for n in (0, 1))
         maps = x.astype(np.float32), y.astype(np.float32)
-        seen = cv2.remap(image, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        seen = cv2.remap(image, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
         depth.append(seen / source[..., 2])
     joints = np.einsum("tij,thnj->thni", turns, one.joints_m)
     return Recording(np.array(depth, np.float32), k, joints, one.visible).checked()
