@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from toftrack.programs import command_line
 from toftrack.programs.applications import start
+from toftrack.programs.command_line import plain_parser, run
 
 _PROGRAM = "python -m toftrack.training"
-_HELP = ("-h", "--help")
 _TRAIN = f"""Trains the networks that find hands and propose poses, from nothing.
 
   {_PROGRAM} train                     hours on two cores, minutes on a GPU
@@ -26,14 +26,18 @@ conf/train_detector.yaml has the settings, each with what it does."""
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command line, by default this process's. Raises ToftrackError."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    if given[:1] == ["train"] and not set(given).intersection(_HELP):
+    if given[:1] == ["train"] and not {"-h", "--help"}.intersection(given):
         from toftrack.training.train import train
 
         start(train, f"{_PROGRAM} train", "train_detector", given[1:])
         return
     asked = _parser().parse_args(given)
     if asked.command == "export":
-        _export(asked)
+        from toftrack.detector.weights import DEFAULT_FILE
+        from toftrack.training.onnx_export import export_networks
+
+        for file in export_networks(asked.weights or DEFAULT_FILE, not asked.float):
+            print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
     elif asked.command == "fit-confidence":
         from toftrack.training.fit_confidence import fit_confidence
 
@@ -44,71 +48,41 @@ def main(arguments: Sequence[str] | None = None) -> None:
         fit_joint_flags(asked)
 
 
-def _export(asked: argparse.Namespace) -> None:
-    from toftrack.detector.weights import DEFAULT_FILE
-    from toftrack.training.onnx_export import export_networks
-
-    for file in export_networks(asked.weights or DEFAULT_FILE, not asked.float):
-        print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_PROGRAM, description="Train the detector's networks, export them, fit the confidence."
-    )
+    parser = plain_parser(_PROGRAM, "Train the detector's networks, export them, fit confidences.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    commands.add_parser(
+
+    def command(name: str, about: str, **more: Any) -> Callable[..., Any]:
+        """Adds arguments to a new command."""
+        return commands.add_parser(name, help=about, **{"description": about} | more).add_argument
+
+    command(
         "train",
-        help="train the networks from nothing",
-        usage=f"{_PROGRAM} train [KEY=VALUE ...]",
+        "train the networks from nothing",
         description=_TRAIN,
+        usage=f"{_PROGRAM} train [KEY=VALUE ...]",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-
-    about = "make of weights the files that ONNX Runtime runs, beside them"
-    export = commands.add_parser("export", help=about, description=f"{about}; training does so.")
-    export.add_argument(
-        "weights", nargs="?", type=Path, metavar="FILE", help="of weights (the package's)"
-    )
-    export.add_argument("--float", action="store_true", help="in floating point, not in 8 bits")
-
-    about = "fit lost=calibrated on rendered sequences: writes the file of lost.fitted"
-    confidence = commands.add_parser("fit-confidence", help=about, description=about)
-    confidence.add_argument(
-        "overrides", nargs="*", default=[], help="of the tracker, as for track.py"
-    )
-    confidence.add_argument(
-        "--sequences", type=int, default=200, help="how many are rendered (200)"
-    )
-    confidence.add_argument("--frames", type=int, default=50, help="of each (50)")
-    confidence.add_argument("--seed", type=int, default=1, help="of everything random (1)")
-    confidence.add_argument(
-        "--output", type=Path, default=Path("confidence"), help="folder (confidence)"
-    )
-    confidence.add_argument(
-        "--sequences-from",
-        type=Path,
-        metavar="FOLDER",
-        help="track the sequences that an earlier run kept here, or render and keep them",
-    )
-
-    flags = commands.add_parser(
-        "fit-joint-flags",
-        help="choose lost.joint_ok on recordings with truth",
-        description="Choose lost.joint_ok on every second recording of each folder, show it on the"
-        " others, and print it.",
-    )
-    flags.add_argument("recordings", nargs="+", help=".npz files or folders of them, with truth")
-    flags.add_argument(
-        "--labels", action="append", default=[], metavar="FILE", help="of images without truth"
-    )
-    flags.add_argument("--seeds", type=int, default=1, help="how many runs of each (1)")
-    flags.add_argument(
-        "--right", type=float, default=4.0, help="per cent of the right tips to be flagged (4)"
-    )
-    flags.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings")
+    add = command("export", "make of weights the files that ONNX Runtime runs, beside them")
+    add("weights", nargs="?", type=Path, metavar="FILE", help="of `train` (the package's)")
+    add("--float", action="store_true", help="in floating point, not in 8 bits")
+    add = command("fit-confidence", "fit lost=calibrated: writes the file of lost.fitted")
+    add("overrides", nargs="*", help="of the tracker, as for track.py")
+    add("--sequences", type=int, default=200, help="how many are rendered (200)")
+    add("--frames", type=int, default=50, help="of each (50)")
+    add("--seed", type=int, default=1, help="of everything random (1)")
+    add("--output", type=Path, default=Path("confidence"), help="folder (confidence)")
+    kept = "track the sequences that an earlier run kept here, or render and keep them"
+    add("--sequences-from", type=Path, metavar="FOLDER", help=kept)
+    about = "choose lost.joint_ok on every second recording of each folder, show it on the others"
+    add = command("fit-joint-flags", about)
+    add("recordings", nargs="+", help=".npz files or folders of them, with truth")
+    add("--labels", action="append", default=[], metavar="FILE", help="of images without truth")
+    add("--seeds", type=int, default=1, help="how many runs of each (1)")
+    add("--right", type=float, default=4.0, help="per cent of the right tips to be flagged (4)")
+    add("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings")
     return parser
 
 
 if __name__ == "__main__":
-    sys.exit(command_line.run(main))
+    sys.exit(run(main))
