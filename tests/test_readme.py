@@ -80,7 +80,7 @@ def with_track_py(words: list[str]) -> tuple[str, ...]:
 COMMANDS = sorted(set(commands()))
 TRACK = [words for words in COMMANDS if words[:2] == ("python", "track.py")]
 TRAIN = [words for words in COMMANDS if words[:2] == ("python", "train_pose_space.py")]
-DETECTOR = ("python", "-m", "toftrack.programs.train_detector")
+DETECTOR = ("python", "-m", "toftrack.training", "train")
 """The one command of a module that takes overrides."""
 OTHERS = (DETECTOR, ("python", "-m", "venv", ".venv"))
 MODULES = [words for words in COMMANDS if words[:2] == ("python", "-m") and words not in OTHERS]
@@ -153,7 +153,7 @@ def test_a_command_parses(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatc
         if words in TOFTRACK:
             main(words[1:])
         else:
-            importlib.import_module(words[2]).main(list(words[3:]))
+            importlib.import_module(f"{words[2]}.__main__").main(list(words[3:]))
 
 
 def test_the_readme_is_short() -> None:

@@ -15,7 +15,7 @@ from helpers.configured import detector_settings
 from helpers.detection import small_networks
 from helpers.tracking import sample
 
-from toftrack.detector import onnx_export, onnx_networks, proposals
+from toftrack.detector import onnx_networks, proposals
 from toftrack.detector.crops import CROP, CROP_CHANNELS, wide
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import Finder, PoseNet
@@ -23,7 +23,8 @@ from toftrack.detector.onnx_networks import DIGEST, OnnxFinder, OnnxPoseNet, dig
 from toftrack.detector.proposals_numba import run_pose_network
 from toftrack.detector.weights import DEFAULT_FILE, save_weights
 from toftrack.errors import ToftrackError
-from toftrack.programs import export_detector
+from toftrack.training import onnx_export
+from toftrack.training.__main__ import main
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NETWORKS = {"pose": 3, "finder": 2}
@@ -38,7 +39,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_weights(path, PoseNet(4), Finder(8), {})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_export, "CALIBRATION", 32)
-        export_detector.main([str(path)])
+        main(["export", str(path)])
     return path
 
 
@@ -56,7 +57,7 @@ def torch_runs(path: Path, caplog: pytest.LogCaptureFixture) -> str:
         load_networks(path)
     assert isinstance(pose, PoseNet) and isinstance(finder, Finder)
     [record] = caplog.records  # once
-    assert f"python -m toftrack.programs.export_detector {path}" in record.message
+    assert f"python -m toftrack.training export {path}" in record.message
     return record.message
 
 
@@ -202,7 +203,7 @@ def test_on_another_device_torch_runs_them() -> None:
 def test_without_what_an_export_needs_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_export.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ToftrackError, match=r"onnx and onnxscript: pip install 'toftrack\[train\]"):
-        export_detector.main([str(DEFAULT_FILE)])
+        main(["export", str(DEFAULT_FILE)])
 
 
 def test_an_export_that_does_not_agree_with_torch_is_an_error(exported: Path) -> None:

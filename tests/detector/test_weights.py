@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.detection import used
 from helpers.tracking import configuration
 from torch import nn
 
@@ -15,7 +16,7 @@ from toftrack.api import build_tracker
 from toftrack.detector import weights as module
 from toftrack.detector.crops import CROP_CHANNELS
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.weights import DEFAULT_FILE, go_on_from, load_weights, save_weights
+from toftrack.detector.weights import DEFAULT_FILE, load_weights, save_weights
 from toftrack.errors import ToftrackError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -23,18 +24,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 CROPS = 2 * torch.rand(2, CROP_CHANNELS, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
 WHOLE = torch.rand(1, 2, 32, 48, generator=torch.Generator().manual_seed(0))
 ABOUT = {"seed": 3, "images": 12}
-
-
-def used(network: nn.Module, image: torch.Tensor) -> nn.Module:
-    """A network whose statistics have seen images, in numbers of half precision."""
-    network.train()
-    with torch.no_grad():
-        for _ in range(3):
-            network(image)
-        for value in network.state_dict().values():
-            if value.is_floating_point():
-                value.copy_(value.half().float())
-    return network.eval()
 
 
 @pytest.fixture(scope="module")
@@ -181,27 +170,3 @@ def test_without_networks_their_weights_are_not_read(
     build_tracker(configuration("experiment=paper"))
     with pytest.raises(Exception, match="no file of the detector's weights"):
         build_tracker(configuration())
-
-
-def test_training_goes_on_from_the_weights_of_a_file(
-    networks: tuple[nn.Module, nn.Module], file: Path
-) -> None:
-    going_on = PoseNet(4)
-    go_on_from(file, "pose", going_on, 4)
-    for name, value in networks[0].state_dict().items():
-        torch.testing.assert_close(going_on.state_dict()[name], value)
-    with pytest.raises(ToftrackError, match="width of 8, and the width to train is 6"):
-        go_on_from(file, "finder", Finder(6), 6)
-
-
-@torch.no_grad()
-def test_training_of_a_wider_network_begins_with_what_the_narrower_one_says(
-    networks: tuple[nn.Module, nn.Module], file: Path
-) -> None:
-    wider = PoseNet(7).train()
-    go_on_from(file, "pose", wider, 7)
-    narrow, *_ = load_weights(file)
-    for one, two in zip(narrow.features(CROPS), wider.eval().features(CROPS), strict=True):
-        torch.testing.assert_close(two, one, atol=1e-4, rtol=1e-4)
-    seeing = wider.fine.first.weight[8:]
-    assert (seeing[:, :4] != 0).all()  # the new channels see the old ones

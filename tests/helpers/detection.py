@@ -9,21 +9,22 @@ from functools import cache
 import numpy as np
 import torch
 from helpers.configured import detector_settings
+from torch import nn
 
 from toftrack.compute.rigid import rotated_pivot
-from toftrack.detector.dice import Dice
 from toftrack.detector.hand_detector import Detection
-from toftrack.detector.hands import HAND, Hands, posed_hands
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
 from toftrack.detector.proposals import Places
-from toftrack.detector.scenes import Scenes
-from toftrack.detector.shapes import ShapeBank, shape_bank
-from toftrack.detector.things_numba import PART
 from toftrack.detector.weights import make_ready
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement.gauss_newton import Keypoints
+from toftrack.training.dice import Dice
+from toftrack.training.hands import HAND, Hands, posed_hands
+from toftrack.training.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
+from toftrack.training.scenes import Scenes
+from toftrack.training.shapes import ShapeBank, shape_bank
+from toftrack.training.things_numba import PART
 
 FARTHEST_M = 7.9
 """Nothing is drawn beyond 8 m."""
@@ -46,6 +47,18 @@ def small_networks() -> tuple[PoseNet, Finder]:
     make_ready(pose)
     make_ready(finder)
     return pose, finder
+
+
+def used(network: nn.Module, image: torch.Tensor) -> nn.Module:
+    """A network whose statistics have seen images, in numbers of half precision."""
+    network.train()
+    with torch.no_grad():
+        for _ in range(3):
+            network(image)
+        for value in network.state_dict().values():
+            if value.is_floating_point():
+                value.copy_(value.half().float())
+    return network.eval()
 
 
 def one_hand(seed: int, pivot_m: tuple[float, float, float], left: bool = False) -> Hands:

@@ -255,7 +255,7 @@ def doubted_sigma_m(points_m: Tensor, sigma_m: Tensor, hand_length_m: float) -> 
 def make_detector(weights: str | None = None, **settings: Any) -> HandDetector:
     """The detector of a configuration.
 
-    weights: a file of train_detector; None = the package's.
+    weights: a file of `toftrack.training`; None = the package's.
     Raises ToftrackError when they cannot be used.
     """
     return HandDetector(*load_networks(weights), DetectorSettings(**settings))

@@ -1,4 +1,4 @@
-"""The detector's networks on the CPU by ONNX Runtime, from the files that export_detector derives.
+"""The detector's networks on the CPU by ONNX Runtime, from the files that are derived from weights.
 
 Beside the weights NAME.npz lie NAME.pose.onnx and NAME.finder.onnx. Each says of which weights it
 was made, and ends with its own checksum. Weights without them, or with those of other weights, are
@@ -7,13 +7,9 @@ for torch, which is the reference, and slower on the CPU.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
-import io
 import logging
-import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
@@ -34,7 +30,7 @@ DIGEST = 64
 """Last bytes of such a file, the SHA-256 in hexadecimal of all before: a property's value."""
 FLOAT, WHOLE = "float32", "int8"
 """Precisions that such a file says it is in; one that says nothing is of before there were two."""
-COMMAND = "python -m toftrack.programs.export_detector"
+COMMAND = "python -m toftrack.training export"
 _LARGEST_BYTES = 1 << 28
 _log = logging.getLogger(__name__)
 Network = TypeVar("Network", PoseNet, Finder)
@@ -154,22 +150,6 @@ def _runtime() -> Any:
     onnxruntime.set_default_logger_severity(4)
     onnxruntime.disable_telemetry_events()
     return onnxruntime
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Within, nothing is said of how an export or a quantisation goes, nor of other packages."""
-    loggers = logging.getLogger(), logging.getLogger("torch.onnx")
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
 
 
 def _made_of(session: Any) -> tuple[str | None, ...]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +25,7 @@ DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
 _LARGEST_BYTES = 64 << 20
 _WIDEST = 256
 """Channels; ten times those of the package's networks."""
-_AGAIN = "train them anew with python -m toftrack.programs.train_detector, or install again"
+_AGAIN = "train them anew with python -m toftrack.training train, or install again"
 
 
 def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any]) -> None:
@@ -62,59 +64,27 @@ def load_weights(path: str | Path | None = None) -> Weights:
     Raises ToftrackError when the file is missing, damaged, not weights or of another version.
     """
     path = DEFAULT_FILE if path is None else Path(path)
-    arrays, metadata = _read(path)
-    try:
-        pose = PoseNet(_width(metadata, "pose"))
-        finder = Finder(_width(metadata, "finder"))
+    arrays, metadata = read_arrays(path)
+    with other_networks_refused(path):
+        pose = PoseNet(network_width(metadata, "pose"))
+        finder = Finder(network_width(metadata, "finder"))
         for name, network in (("pose", pose), ("finder", finder)):
-            network.load_state_dict(_tensors(arrays, name))
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
-        raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
+            network.load_state_dict(network_tensors(arrays, name))
     make_ready(pose)
     make_ready(finder)
     return Weights(pose, finder, metadata.get("about", {}), path, metadata["sha256"])
 
 
-def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> str:
-    """Give a new network, "pose" or "finder" of a width, the weights of a file to train on from.
-
-    A wider network's further channels begin without effect on what is there (as Chen et al.,
-    "Net2Net: accelerating learning via knowledge transfer", ICLR 2016, with new channels instead
-    of copies).
-    Returns the checksum of the file's arrays. Raises ToftrackError as load_weights does, and for a
-    narrower network.
-    """
-    arrays, metadata = _read(Path(path))
+@contextmanager
+def other_networks_refused(path: Path) -> Iterator[None]:
+    """Within, what does not fit the networks is a ToftrackError about the file."""
     try:
-        before = _width(metadata, name)
-        tensors = _tensors(arrays, name)
-        if before > width:
-            raise ToftrackError(
-                f"{path} holds weights for a width of {before}, and the width to train is {width};"
-                " give that width or more"
-            )
-        network.load_state_dict(_widened(tensors, network.state_dict()))
+        yield
     except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
         raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
-    return str(metadata["sha256"])
 
 
-def _widened(tensors: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of a network in one that has more channels, whose own are `fresh`.
-
-    The new channels see all others, and none of those that were there sees them, at first.
-    """
-    widened = {}
-    for key, new in fresh.items():
-        old, out = tensors[key], new.clone()
-        if old.ndim > 1 and old.is_floating_point():
-            out[: len(old)] = 0
-        out[tuple(slice(size) for size in old.shape)] = old
-        widened[key] = out
-    return widened
-
-
-def _width(metadata: dict[str, Any], name: str) -> int:
+def network_width(metadata: dict[str, Any], name: str) -> int:
     """Of a network; ValueError for one that would take all memory before its weights are seen."""
     width = metadata[f"{name}_width"]
     if type(width) is not int or not 1 <= width <= _WIDEST:
@@ -122,7 +92,7 @@ def _width(metadata: dict[str, Any], name: str) -> int:
     return width
 
 
-def _tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
+def network_tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
     """One network's arrays as it takes them."""
     return {
         key.split(".", 1)[1]: torch.from_numpy(array).float()
@@ -133,7 +103,7 @@ def _tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
     }
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and metadata of a file that is whole."""
     try:
         if path.stat().st_size > _LARGEST_BYTES:

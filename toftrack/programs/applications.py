@@ -34,22 +34,22 @@ def train_job(config: DictConfig) -> float:
 def track(arguments: Sequence[str]) -> None:
     """Track as a command line says, which may name a recording."""
     words = with_recording(arguments, setting_names(), devices_of_files())
-    _start(track_job, "track", "config", words)
+    start(track_job, "toftrack track", "config", words)
 
 
 def train(arguments: Sequence[str]) -> None:
     """Train as a command line says."""
-    _start(train_job, "train", "train_pose_space", arguments)
+    start(train_job, "toftrack train", "train_pose_space", arguments)
 
 
-def _start(
-    job: Callable[[DictConfig], float], name: str, config: str, arguments: Sequence[str]
+def start(
+    job: Callable[[DictConfig], float], program: str, config: str, arguments: Sequence[str]
 ) -> None:
     """Run a Hydra application; it reads the command line of the process."""
     folder = str(configuration_folder())
     application = hydra.main(version_base="1.3", config_path=folder, config_name=config)(job)
     before = sys.argv
-    sys.argv = [f"toftrack {name}", *options_first(arguments)]
+    sys.argv = [program, *options_first(arguments)]
     try:
         application()
     finally:

@@ -1,9 +1,9 @@
 """How likely an estimate, and each of its joints, is right: calibrated probabilities.
 
 Logistic models of a few features of a frame, and a log-linear one of the joints' standard
-deviations, all fitted by toftrack.programs.fit_confidence on rendered sequences of other hands,
-persons and sensors than any recording that the tracker is judged on. hand/regions.py says along
-which axes the deviations are, and what they mean.
+deviations, all fitted by `toftrack.training` on rendered sequences of other hands, persons and
+sensors than any recording that the tracker is judged on. hand/regions.py says along which axes the
+deviations are, and what they mean.
 """
 
 from __future__ import annotations
@@ -391,6 +391,6 @@ def make_confidence(fitted: str | None = None, **thresholds: Any) -> ConfidenceM
     except (OSError, ValueError, TypeError, KeyError, AttributeError, ToftrackError) as error:
         raise ToftrackError(
             f"lost.fitted='{path}' is no confidence that was fitted ({error}); give a file of"
-            " python -m toftrack.programs.fit_confidence, or leave it out"
+            " python -m toftrack.training fit-confidence, or leave it out"
         ) from None
     return ConfidenceModel(**thresholds, log_odds=log_odds, whole_odds=whole_odds, joints=joints)

@@ -1,0 +1,278 @@
+"""Training from nothing: the same from a seed, and by one command."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import multiprocessing
+import subprocess
+import sys
+import threading
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import programs
+from helpers.detection import small_bank
+from helpers.tracking import ROOT
+
+from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
+from toftrack.detector.weights import load_weights, save_weights
+from toftrack.errors import ToftrackError
+from toftrack.training import batches, checkpoints, descent, images
+from toftrack.training.batches import tensors_of
+from toftrack.training.checkpoints import Checkpoints, Progress
+from toftrack.training.descent import Schedule, train_finder, train_poses
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("train", [train_poses, train_finder])
+def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many processes make the images."""
+    one, other = (train(TINY, 6, seed) for seed in (0, 1))
+    monkeypatch.setattr(batches, "threads", lambda: 2)
+    two = train(TINY, 6, 0)
+    for key, value in one[0].state_dict().items():
+        assert torch.equal(value, two[0].state_dict()[key]), key
+    weights = [network.state_dict()["heads.weight"] for network, _ in (one, other)]
+    assert not torch.equal(*weights)
+    assert one[1][-1]["images"] == 24 and len(one[1]) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"images": 0}, "images of a network must be a whole number above 0"),
+        ({"rate": 1.5}, "rate of a network must be between 0 and 1"),
+        ({"start": "w.npz", "start_share": 1.0}, "start_share of a network must be at least 0"),
+        ({"start_share": 0.5}, "start_share of a network needs weights to start from"),
+    ],
+)
+def test_a_schedule_that_cannot_be_is_refused(change: dict, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        Schedule(**{"images": 8, "batch": 8, "rate": 0.002, "width": 4, **change})
+
+
+def test_no_images_leave_the_weights_of_a_start_as_they_are(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    finder = Finder(8)
+    save_weights(tmp_path / "w.npz", PoseNet(4), finder, {})
+    start = str(tmp_path / "w.npz")
+    nothing = Schedule(0, 8, 0.002, 8, start, restart_images=24)
+    same, course = train_finder(nothing, shapes=6, seed=0)
+    assert course == []
+    for key, value in finder.state_dict().items():
+        torch.testing.assert_close(same.state_dict()[key], value, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_share_of_the_start_makes_the_mean_of_both(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    begun = Finder(4)
+    save_weights(tmp_path / "w.npz", PoseNet(4), begun, {})
+    schedule = Schedule(24, 8, 0.002, 4, str(tmp_path / "w.npz"))
+    trained, _ = train_finder(schedule, shapes=6, seed=0)
+    mean, _ = train_finder(replace(schedule, start_share=0.25), shapes=6, seed=0)
+    start, end = begun.state_dict(), trained.state_dict()
+    for key, value in mean.state_dict().items():
+        if value.is_floating_point():
+            torch.testing.assert_close(
+                value, 0.25 * start[key] + 0.75 * end[key], atol=1e-3, rtol=1e-3
+            )
+
+
+@pytest.mark.slow
+def test_a_restart_ends_with_the_mean_of_both_ends(tmp_path: Path) -> None:
+    """As two trainings do, of which the second begins from the first one's weights."""
+    first, before = train_finder(TINY, 6, 0)
+    save_weights(tmp_path / "w.npz", PoseNet(4), first, {})
+    begun = {"start": str(tmp_path / "w.npz"), "start_share": 0.5}
+    second, _ = train_finder(replace(TINY, rate=0.001, **begun), 6, descent._RESTART_SEED)
+    schedule = replace(TINY, restart_images=24, restart_rate=0.001)
+    both, course = train_finder(schedule, 6, 0)
+    moved = 0.0
+    for key, value in both.state_dict().items():
+        if value.is_floating_point():
+            end = second.state_dict()[key]
+            torch.testing.assert_close(value, end, atol=1e-3, rtol=1e-3)
+            moved = max(moved, float((value - first.state_dict()[key]).abs().max()))
+    assert moved > 0.002
+    assert [row["images"] for row in course] == [24, 48]
+    assert course[0]["loss"] == before[0]["loss"] and course[1]["seconds"] > course[0]["seconds"]
+
+
+@pytest.mark.slow
+def test_a_restart_that_was_interrupted_ends_with_the_same_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("whole", "first", "part", "rest"):
+        (tmp_path / name).mkdir()
+    schedule = replace(TINY, restart_images=24)
+    whole, course = train_finder(schedule, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
+    train_finder(TINY, 6, 0, Checkpoints(tmp_path / "first", 1.0))
+    resumed = Checkpoints(tmp_path / "part", 1e-9, resume=tmp_path / "first")
+    interrupted(train_finder, resumed, monkeypatch, after=2, schedule=schedule)
+    resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "part")
+    rest, other = train_finder(schedule, 6, 0, resumed)
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, rest.state_dict()[key]), key
+    assert [row["loss"] for row in course] == [row["loss"] for row in other]
+
+
+def test_batches_come_in_order_from_a_thread_that_ends_with_whoever_asks() -> None:
+    def numbers() -> Generator[int]:
+        try:
+            yield from range(100)
+        finally:
+            ended.set()
+
+    for asked in (3, 100):
+        ended = threading.Event()
+        with batches.prefetched(numbers(), lambda number: 2 * number) as ready:
+            found = list(itertools.islice(ready, asked))
+        assert found == list(range(0, 2 * asked, 2))
+        assert ended.wait(5), "what makes the batches is told to end"
+
+
+def test_what_goes_wrong_while_batches_are_made_reaches_whoever_asks() -> None:
+    def numbers() -> Generator[int]:
+        yield 1
+        raise ToftrackError("no memory")
+
+    with batches.prefetched(numbers(), None) as ready:
+        assert next(ready) == 1
+        with pytest.raises(ToftrackError, match="no memory"):
+            next(ready)
+
+
+def through_a_queue(batch: Any) -> Any:
+    """As it comes from a process that makes it."""
+    queue = multiprocessing.get_context("spawn").Queue()
+    queue.put(batches.arrays(batch))
+    return batches.tensors(queue.get(timeout=60))
+
+
+def test_scenes_that_were_sent_to_another_process_give_the_same_crops() -> None:
+    """On a CUDA device processes make scenes, and their pictures are taken beside the training."""
+    crops = images.crop_images(8, small_bank(), torch.Generator().manual_seed(0))
+    scenes = images.crop_scenes(8, small_bank(), torch.Generator().manual_seed(0))
+    sent = through_a_queue(scenes)
+    for one, other in zip(tensors_of(crops), tensors_of(images.crops_of(sent)), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_the_rate_rises_stays_and_falls_to_nothing() -> None:
+    schedule = Schedule(images=30_000, batch=10, rate=0.002, width=4)
+    rates = [schedule.rate_at(step) for step in range(schedule.steps)]
+    assert rates[0] < 0.01 * 0.002 and rates == sorted(rates[:300]) + rates[300:]
+    assert set(rates[300:2000]) == {0.002}
+    falling = rates[2000:]
+    assert falling == sorted(falling, reverse=True) and 0 < falling[-1] < 0.002 * 0.002
+
+
+def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "toftrack.training", "train"]
+    return subprocess.run(
+        [*line, f"hydra.run.dir={folder}", *overrides], cwd=ROOT, capture_output=True, text=True
+    )
+
+
+@pytest.mark.slow
+def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> None:
+    sizes = ["poses.images=256", "finder.images=256", "poses.batch=32", "finder.batch=32"]
+    sizes += ["poses.restart_images=64", "finder.restart_images=32"]
+    done = command(tmp_path, *sizes, "shapes=6", "poses.width=4", "finder.width=8")
+    assert done.returncode == 0, done.stderr
+    derived = ("detector.pose.onnx", "detector.finder.onnx")
+    for name in ("detector.npz", *derived, "images.png", "course.png", "summary.json"):
+        assert (tmp_path / name).stat().st_size > 0
+        assert name in done.stdout
+    about = load_weights(tmp_path / "detector.npz").about
+    pose, finder = load_networks(tmp_path / "detector.npz")
+    assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
+    assert (about["pose_images"], about["finder_images"], about["shapes"]) == (256, 256, 6)
+    assert (about["pose_restart_images"], about["finder_restart_images"]) == (64, 32)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert [summary[name][-1]["images"] for name in ("poses", "finder")] == [320, 288]
+    assert "poses" in done.stderr and "finder" in done.stderr, "progress bars"
+
+
+def test_the_program_refuses_what_cannot_be(tmp_path: Path) -> None:
+    program = str(ROOT / "toftrack" / "training" / "__main__.py")
+    given = ("train", "shapes=0", "hydra.run.dir=out")
+    status, _, err = programs.call(*given, folder=tmp_path, program=program)
+    assert status == 1
+    assert err.splitlines()[-1].startswith("error: shapes")
+
+
+class SwitchedOffError(Exception):
+    """As if the machine were switched off."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("train", [train_poses, train_finder])
+def test_an_interrupted_training_ends_with_the_same_weights(
+    train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("whole", "part", "rest", "end"):
+        (tmp_path / name).mkdir()
+    whole, course = train(TINY, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
+    interrupted(train, Checkpoints(tmp_path / "part", 1e-9), monkeypatch, after=2)
+    again = Checkpoints(tmp_path / "rest", 1e-9, resume=tmp_path / "part")
+    rest, other = train(TINY, 6, 0, again)
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, rest.state_dict()[key]), key
+    errors = [{k: v for k, v in row.items() if k != "seconds"} for row in (course[-1], other[-1])]
+    assert errors[0] == errors[1]
+    done, _ = train(TINY, 6, 0, Checkpoints(tmp_path / "end", 1e-9, resume=tmp_path / "rest"))
+    assert torch.equal(done.state_dict()["heads.weight"], rest.state_dict()["heads.weight"])
+
+
+def interrupted(
+    train,
+    kept_in: Checkpoints,
+    monkeypatch: pytest.MonkeyPatch,
+    after: int,
+    schedule: Schedule = TINY,
+) -> None:
+    """A training that ends after some batches, with a checkpoint."""
+    kept = checkpoints.save
+
+    def save(path: Path, progress: Progress, settings: dict) -> None:
+        kept(path, progress, settings)
+        if progress.step == after:
+            raise SwitchedOffError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoints, "save", save)
+        with pytest.raises(SwitchedOffError):
+            train(schedule, 6, 0, kept_in)
+
+
+@pytest.mark.slow
+def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(descent, "_WARM", 1)
+    for name in ("whole", "early", "late", "rest"):
+        (tmp_path / name).mkdir()
+    more_images = replace(TINY, images=48)
+    whole, _ = train_finder(more_images, 6, 0, Checkpoints(tmp_path / "whole", 1.0))
+    interrupted(train_finder, Checkpoints(tmp_path / "early", 1e-9), monkeypatch, after=1)
+    resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "early")
+    rest, course = train_finder(more_images, 6, 0, resumed)
+    assert course[-1]["images"] == 48
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, rest.state_dict()[key]), key
+    interrupted(train_finder, Checkpoints(tmp_path / "late", 1e-9), monkeypatch, after=3)
+    late = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "late")
+    with pytest.raises(ToftrackError, match="finder.images cannot become 48 any more; give 24"):
+        train_finder(more_images, 6, 0, late)

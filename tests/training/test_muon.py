@@ -1,0 +1,86 @@
+"""The optimiser: orthogonal steps for matrices, AdamW's for all else."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from toftrack.training.muon import Muon, orthogonal
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.mark.parametrize("size", [(24, 24), (8, 200), (200, 8)])
+def test_a_step_has_the_gradient_s_directions_and_even_sizes(size: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    u, _, v = torch.linalg.svd(torch.randn(size, generator=generator), full_matrices=False)
+    sizes = torch.logspace(0, -1.5, len(v))
+    stepped = orthogonal(u @ torch.diag(sizes) @ v)
+    assert stepped.shape == size
+    found = torch.linalg.svdvals(stepped)
+    assert found.max() < 1.35 and found.min() > 0.4 and sizes.max() / sizes.min() > 30
+    # The same singular vectors: what lies between them is nearly diagonal.
+    inner = u.mT @ stepped @ v.mT
+    assert (inner - torch.diag(inner.diagonal())).abs().max() < 0.05
+
+
+def network_of(seed: int) -> nn.Sequential:
+    torch.manual_seed(seed)
+    return nn.Sequential(
+        nn.Linear(6, 16), nn.ReLU(), nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 3)
+    )
+
+
+def test_the_ends_and_vectors_are_stepped_as_by_adamw() -> None:
+    one, two = network_of(0), network_of(0)
+    ends = [one[0].weight, one[4].weight]
+    mine = Muon(one, ends, 0.01, 0.1)
+    torchs = torch.optim.AdamW(two.parameters(), 0.01, weight_decay=0.1)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(4):
+        inner = one[2].weight.detach().clone()
+        for a, b in zip(one.parameters(), two.parameters(), strict=True):
+            a.grad = torch.randn(a.shape, generator=generator)
+            b.grad = a.grad.clone()
+        mine.step()
+        torchs.step()
+        # The inner matrix moves as far as Adam would move it.
+        step = (one[2].weight - (1 - 0.01 * 0.1) * inner).square().mean().sqrt()
+        assert 0.1 * 0.01 < step < 0.4 * 0.01
+    others = [name for name, _ in one.named_parameters() if name != "2.weight"]
+    for name in others:
+        a, b = one.get_parameter(name), two.get_parameter(name)
+        assert torch.allclose(a, b, atol=1e-6), name
+    assert not torch.allclose(one[2].weight, two[2].weight, atol=1e-3)
+
+
+def test_it_learns_a_function_faster_than_it_began() -> None:
+    network = network_of(2)
+    optimiser = Muon(network, [network[0].weight, network[4].weight], 0.02, 0.0)
+    x = torch.randn(256, 6, generator=torch.Generator().manual_seed(3))
+    wanted = torch.stack((x[:, 0] * x[:, 1], x[:, 2].abs(), x.sum(1)), 1)
+    losses = []
+    for _ in range(150):
+        loss = (network(x) - wanted).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_a_step_asks_its_closure_for_gradients_and_returns_the_loss() -> None:
+    network = network_of(0)
+    optimiser = Muon(network, [network[0].weight, network[4].weight], 0.01, 0.1)
+    before = network[2].weight.clone()
+
+    def closure() -> torch.Tensor:
+        optimiser.zero_grad()
+        loss = network(torch.ones(2, 6)).square().mean()
+        loss.backward()
+        return loss
+
+    first, second = optimiser.step(closure), optimiser.step(closure)
+    assert second < first and not torch.equal(network[2].weight, before)
+    assert optimiser.step() is None

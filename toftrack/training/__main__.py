@@ -1,0 +1,88 @@
+"""`python -m toftrack.training COMMAND`: trains, exports and fits; see docs/detector.md."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from toftrack.programs.applications import start
+from toftrack.programs.command_line import plain_parser, run
+
+_PROGRAM = "python -m toftrack.training"
+_TRAIN = f"""Trains the networks that find hands and propose poses, from nothing.
+
+  {_PROGRAM} train                     hours on two cores, minutes on a GPU
+  {_PROGRAM} train seed=1              settings are KEY=VALUE
+  {_PROGRAM} train resume=FOLDER       an interrupted training, by its output folder
+  {_PROGRAM} train --cfg job           all settings, composed
+  {_PROGRAM} train --hydra-help        further options
+
+conf/train_detector.yaml has the settings, each with what it does."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command line, by default this process's. Raises ToftrackError."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given[:1] == ["train"] and not {"-h", "--help"}.intersection(given):
+        from toftrack.training.train import train
+
+        start(train, f"{_PROGRAM} train", "train_detector", given[1:])
+        return
+    asked = _parser().parse_args(given)
+    if asked.command == "export":
+        from toftrack.detector.weights import DEFAULT_FILE
+        from toftrack.training.onnx_export import export_networks
+
+        for file in export_networks(asked.weights or DEFAULT_FILE, not asked.float):
+            print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
+    elif asked.command == "fit-confidence":
+        from toftrack.training.fit_confidence import fit_confidence
+
+        fit_confidence(asked)
+    else:
+        from toftrack.training.fit_joint_flags import fit_joint_flags
+
+        fit_joint_flags(asked)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = plain_parser(_PROGRAM, "Train the detector's networks, export them, fit confidences.")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, about: str, **more: Any) -> Callable[..., Any]:
+        """Adds arguments to a new command."""
+        return commands.add_parser(name, help=about, **{"description": about} | more).add_argument
+
+    command(
+        "train",
+        "train the networks from nothing",
+        description=_TRAIN,
+        usage=f"{_PROGRAM} train [KEY=VALUE ...]",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = command("export", "make of weights the files that ONNX Runtime runs, beside them")
+    add("weights", nargs="?", type=Path, metavar="FILE", help="of `train` (the package's)")
+    add("--float", action="store_true", help="in floating point, not in 8 bits")
+    add = command("fit-confidence", "fit lost=calibrated: writes the file of lost.fitted")
+    add("overrides", nargs="*", help="of the tracker, as for track.py")
+    add("--sequences", type=int, default=200, help="how many are rendered (200)")
+    add("--frames", type=int, default=50, help="of each (50)")
+    add("--seed", type=int, default=1, help="of everything random (1)")
+    add("--output", type=Path, default=Path("confidence"), help="folder (confidence)")
+    kept = "track the sequences that an earlier run kept here, or render and keep them"
+    add("--sequences-from", type=Path, metavar="FOLDER", help=kept)
+    about = "choose lost.joint_ok on every second recording of each folder, show it on the others"
+    add = command("fit-joint-flags", about)
+    add("recordings", nargs="+", help=".npz files or folders of them, with truth")
+    add("--labels", action="append", default=[], metavar="FILE", help="of images without truth")
+    add("--seeds", type=int, default=1, help="how many runs of each (1)")
+    add("--right", type=float, default=4.0, help="per cent of the right tips to be flagged (4)")
+    add("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,397 @@
+"""Training of the detector: processes make images, one trains; everything from a seed.
+
+The rate stays where it is for two thirds of the images and then falls to nothing along a line
+(Hägele et al., "Scaling laws and compute-optimal training beyond fixed training durations",
+NeurIPS 2024), so that a training can still be made longer or shorter while the rate has not begun
+to fall. Then, where the schedule says so, the rate rises once more, to less, and falls again, a
+warm restart (Loshchilov and Hutter, "SGDR: stochastic gradient descent with warm restarts", ICLR
+2017), and the result is the mean of both ends, weight by weight (Izmailov et al., "Averaging
+weights leads to wider optima and better generalization", UAI 2018). On a GPU the processes that
+make images set the pace, one on each core.
+
+An interrupted training goes on with the batches that it would have seen (batches.py,
+checkpoints.py).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import sys
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from toftrack.compute.transfer import on_device
+from toftrack.detector.network import Finder, PoseNet
+from toftrack.detector.weights import checksum
+from toftrack.errors import ToftrackError
+from toftrack.training.batches import (
+    keep_memory,
+    made_batches,
+    makers,
+    mapped,
+    prefetched,
+    tensors_of,
+)
+from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from
+from toftrack.training.images import (
+    Crops,
+    CropScenes,
+    WideImages,
+    crop_images,
+    crop_scenes,
+    crops_on_device,
+    wide_images,
+)
+from toftrack.training.losses import finder_loss, pose_losses
+from toftrack.training.muon import Muon
+
+_WARM = 300
+"""Steps in which the rate rises."""
+_STEADY = 2 / 3
+"""Share of the images after which it falls."""
+_CPU = torch.device("cpu")
+_DECAY = 0.02
+"""Of the weights, times the learning rate, in each step."""
+_RESTART_SHARE = 0.5
+"""Of the weights that a restart begins from, in the result."""
+_RESTART_SEED = 100
+"""What is added to the seed for a restart, so that its images and hands are others."""
+Network = TypeVar("Network", PoseNet, Finder)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How a network is trained; see conf/train_detector.yaml.
+
+    images: before a restart; 0 leaves the weights of `start` as they are.
+    batch: images of a step.  rate: the highest learning rate, see rate_at.
+    width: channels of the network's first layer.
+    start: a file of weights to go on from; None begins from nothing.
+    start_share: of these weights in the result, which is the mean of both, weight by weight: what
+        the start knew of images unlike those it now learns from is kept so (Wortsman et al.,
+        "Robust fine-tuning of zero-shot models", CVPR 2022).
+    restart_images: seen after `images`, while the rate rises again and falls; the result is the
+        mean of both ends; 0 = no restart.  restart_rate: the highest learning rate meanwhile.
+    """
+
+    images: int
+    batch: int
+    rate: float
+    width: int
+    start: str | None = None
+    start_share: float = 0.0
+    restart_images: int = 0
+    restart_rate: float = 0.0012
+
+    def __post_init__(self) -> None:
+        for name in ("images", "batch", "width"):
+            least = 0 if name == "images" and self.start is not None else 1
+            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= least):
+                more = "" if name != "images" else ", or 0 with weights to start from"
+                raise ToftrackError(f"{name} of a network must be a whole number above 0{more}")
+        if not (isinstance(self.restart_images, int) and self.restart_images >= 0):
+            raise ToftrackError("restart_images of a network must be a whole number, 0 or more")
+        for name in ("rate", "restart_rate"):
+            if not 0 < getattr(self, name) < 1:
+                raise ToftrackError(f"{name} of a network must be between 0 and 1")
+        if not 0 <= self.start_share < 1:
+            raise ToftrackError("start_share of a network must be at least 0 and less than 1")
+        if self.start_share > 0 and self.start is None:
+            raise ToftrackError(
+                "start_share of a network needs weights to start from: give start, too, or 0"
+            )
+
+    @property
+    def steps(self) -> int:
+        """Batches in all."""
+        return math.ceil(self.images / self.batch)
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step, 0, 1, ..."""
+        left = (self.steps - step) / ((1 - _STEADY) * self.steps)
+        return self.rate * min(1.0, (step + 1) / _WARM, left)
+
+
+Course = list[dict[str, Any]]
+"""How training went: a row every few thousand images, with running means of the errors."""
+
+
+def train_poses(
+    schedule: Schedule,
+    shapes: int,
+    seed: int,
+    checkpoints: Checkpoints | None = None,
+    device: torch.device = _CPU,
+) -> tuple[PoseNet, Course]:
+    """Train the pose network on a device; returns the average of its weights, on the CPU, and the
+    course.
+
+    On a CUDA device the pictures are taken there, and each step is a replay of the first one.
+    """
+    torch.manual_seed(seed)
+    network = PoseNet(schedule.width)
+
+    def losses(crops: Crops) -> tuple[Tensor, dict[str, Tensor]]:
+        image = _image(crops.image, device)
+        with torch.autocast(device.type, torch.bfloat16, cache_enabled=False):
+            outputs = network.features(image)
+        return pose_losses(network.decode(image, *outputs), crops, network.anchors)
+
+    task = Task("poses", crop_images, losses)
+    if device.type != "cpu":
+        task = Task("poses", crop_scenes, losses, _taker(device, seed), replayed=True)
+    return _train(network, task, schedule, shapes, seed, checkpoints, device)
+
+
+def train_finder(
+    schedule: Schedule,
+    shapes: int,
+    seed: int,
+    checkpoints: Checkpoints | None = None,
+    device: torch.device = _CPU,
+) -> tuple[Finder, Course]:
+    """Train the finder on a device; returns the average of its weights, on the CPU, and the
+    course.
+    """
+    torch.manual_seed(seed)
+    network = Finder(schedule.width)
+
+    def losses(images: WideImages) -> tuple[Tensor, dict[str, Tensor]]:
+        image = _image(images.image, device)
+        with torch.autocast(device.type, torch.bfloat16):
+            found = network(image)
+        loss = finder_loss(found, images)
+        return loss, {"loss": loss.detach()}
+
+    task = Task("finder", wide_images, losses)
+    return _train(network, task, schedule, shapes, seed + 1, checkpoints, device)
+
+
+def _image(image: Tensor, device: torch.device) -> Tensor:
+    """A batch's images as a network takes them."""
+    return on_device(image, device).to(torch.float32, memory_format=torch.channels_last)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a network is trained on.
+
+    name: of its checkpoint.  make: what processes make of (batch, shapes, generator).
+    losses: of a batch, and what is reported; () tensors.  taken: what becomes of a batch here.
+    replayed: on a CUDA device, a step is recorded once and replayed, as all its sizes are the same
+    each time.
+    """
+
+    name: str
+    make: Callable[..., Any]
+    losses: Callable[[Any], tuple[Tensor, dict[str, Tensor]]]
+    taken: Callable[[Any], Any] | None = None
+    replayed: bool = False
+
+    @property
+    def counted(self) -> str:
+        """The setting that says how many images it sees."""
+        network, _, restart = self.name.partition("_")
+        return f"{network}.{restart and 'restart_'}images"
+
+
+def _taker(device: torch.device, seed: int) -> Callable[[CropScenes], Crops]:
+    """Makes crops of scenes on a CUDA device, beside the training there."""
+    stream: torch.cuda.Stream | None = None
+    seeds = itertools.count(seed + 1)
+
+    def take(scenes: CropScenes) -> Crops:
+        nonlocal stream
+        stream = stream or torch.cuda.Stream(device)
+        with torch.cuda.stream(stream):
+            there = mapped(scenes, lambda one: on_device(one, device))
+            crops = crops_on_device(there, next(seeds))
+        # Whoever trains waits for nothing: these are ready before they are asked for.
+        stream.synchronize()
+        return crops
+
+    return take
+
+
+class _Step:
+    """One step of a training: losses, gradients, new weights and their average."""
+
+    def __init__(
+        self,
+        task: Task,
+        network: nn.Module,
+        averaged: nn.Module,
+        optimiser: Muon,
+        device: torch.device,
+    ) -> None:
+        self._task, self._network, self._averaged = task, network, averaged
+        self._optimiser = optimiser
+        self._rate, self._share = torch.zeros((), device=device), torch.ones((), device=device)
+        for group in optimiser.param_groups:
+            group["lr"] = self._rate
+        self._graph: Any = None
+
+    def __call__(self, batch: Any, rate: float, share: float) -> dict[str, Tensor]:
+        """share: of the new weights in the average. Returns what is reported."""
+        if not self._task.replayed:
+            self._rate.fill_(rate)
+            self._share.fill_(share)
+            return self._eager(batch)
+        if self._graph is None:
+            self._record(batch)
+        self._rate.fill_(rate)
+        self._share.fill_(share)
+        for kept, new in zip(tensors_of(self._batch), tensors_of(batch), strict=True):
+            new.record_stream(torch.cuda.current_stream())
+            kept.copy_(new)
+        self._graph.replay()
+        return self._reported
+
+    def _eager(self, batch: Any) -> dict[str, Tensor]:
+        loss, reported = self._task.losses(batch)
+        self._optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self._network.parameters(), 5.0)
+        self._optimiser.step()
+        _average(self._averaged, self._network, self._share)
+        return reported
+
+    def _record(self, batch: Any) -> None:
+        """As torch.cuda.graph wants it: some steps, here at a rate of 0, then the one to replay."""
+        self._batch = mapped(batch, Tensor.clone)
+        self._share.fill_(0)
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(3):
+                self._eager(self._batch)
+        torch.cuda.current_stream().wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+            self._reported = self._eager(self._batch)
+
+
+def _train(
+    network: Network,
+    task: Task,
+    schedule: Schedule,
+    shapes: int,
+    seed: int,
+    checkpoints: Checkpoints | None,
+    device: torch.device,
+) -> tuple[Network, Course]:
+    keep_memory()
+    start = None
+    if schedule.start is not None:
+        kind = "pose" if isinstance(network, PoseNet) else "finder"
+        start = go_on_from(schedule.start, kind, network, schedule.width)
+    where = (shapes, checkpoints, device)
+    course = _descend(network, task, schedule, seed, start, schedule.start_share, *where)
+    if schedule.restart_images > 0 and schedule.images > 0:
+        before = course[-1]
+        restart = replace(
+            schedule, images=schedule.restart_images, rate=schedule.restart_rate, restart_images=0
+        )
+        task = replace(task, name=f"{task.name}_restart")
+        begun = checksum({k: v.cpu().numpy() for k, v in network.state_dict().items()})
+        seed += _RESTART_SEED
+        for row in _descend(network, task, restart, seed, begun, _RESTART_SHARE, *where):
+            images = before["images"] + row["images"]
+            seconds = round(before["seconds"] + row["seconds"], 1)
+            course.append(row | {"images": images, "seconds": seconds})
+    return network.cpu(), course
+
+
+def _descend(
+    network: PoseNet | Finder,
+    task: Task,
+    schedule: Schedule,
+    seed: int,
+    start: str | None,
+    start_share: float,
+    shapes: int,
+    checkpoints: Checkpoints | None,
+    device: torch.device,
+) -> Course:
+    """Train a network until the rate has fallen to nothing; it is left with the average of its
+    weights.
+
+    start: the checksum of the weights that it comes with; None = they are random.
+    start_share: of these weights in the result.
+    """
+    steps = schedule.steps
+    network.train().to(device, memory_format=torch.channels_last)
+    begun = deepcopy(network) if start_share > 0 else None
+    optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
+    averaged = deepcopy(network)
+    progress = Progress(network, averaged, optimiser, schedule.images)
+    settings: dict[str, Any] = {"batch": schedule.batch, "rate": schedule.rate}
+    settings |= {"width": schedule.width, "shapes": shapes, "seed": seed, "start": start}
+    writing: Any = contextlib.nullcontext(lambda: None)
+    if checkpoints is not None:
+        checkpoints.restore(task.name, progress, settings)
+        _check_length(task.counted, progress, schedule)
+        writing = checkpoints.writing(task.name, progress, settings)
+    course = progress.course
+    before, began = progress.seconds, time.perf_counter()
+    done = progress.step * schedule.batch
+    bar = tqdm(
+        total=steps * schedule.batch, initial=done, unit=" images", desc=task.name, file=sys.stderr
+    )
+    numbers = range(progress.step, steps)
+    made = made_batches(task.make, schedule.batch, numbers, shapes, seed, makers(device))
+    step = _Step(task, network, averaged, optimiser, device)
+    with bar, writing as stepped, prefetched(made, task.taken) as batches:
+        for batch in batches:
+            number = progress.step
+            share = 1 - min(0.998, (number + 1) / (number + 10))
+            progress.recent.add(step(batch, schedule.rate_at(number), share))
+            bar.update(schedule.batch)
+            progress.step = number + 1
+            progress.seconds = before + time.perf_counter() - began
+            if (number + 1) % 100 == 0 or number + 1 == steps:
+                recent = progress.recent.numbers()
+                bar.set_postfix({k: f"{v:.3g}" for k, v in recent.items()}, refresh=False)
+                images = (number + 1) * schedule.batch
+                seconds = round(progress.seconds, 1)
+                course.append({"images": images, "seconds": seconds} | recent)
+            stepped()
+    if begun is not None:
+        _average(averaged, begun, torch.tensor(start_share, device=device))
+    network.load_state_dict(averaged.state_dict())
+    return course
+
+
+def _check_length(counted: str, progress: Progress, schedule: Schedule) -> None:
+    """A training that goes on may end elsewhere than was meant, if neither would have begun to end.
+
+    counted: the setting that says how many images it sees. Raises ToftrackError.
+    """
+    meant = replace(schedule, images=progress.images)
+    if meant.steps != schedule.steps and progress.step > _STEADY * min(meant.steps, schedule.steps):
+        raise ToftrackError(
+            f"of the {progress.images} images of {counted} {progress.step * schedule.batch} have"
+            f" been seen: the rate falls, or would have to already, so that {counted} cannot become"
+            f" {schedule.images} any more; give {progress.images}"
+        )
+    progress.images = schedule.images
+
+
+@torch.no_grad()
+def _average(averaged: nn.Module, network: nn.Module, share: Tensor) -> None:
+    """Move all weights and statistics towards another network's by a () share of the way."""
+    pairs = zip(averaged.state_dict().values(), network.state_dict().values(), strict=True)
+    for old, new in pairs:
+        if old.is_floating_point():
+            old.lerp_(new, share)
+        else:
+            old.copy_(new)

@@ -1,0 +1,286 @@
+"""Fingers that close on a thing: each joint bends until a bone beyond it meets the thing's surface.
+
+Bones are capsules, the thing is a signed distance, everything in the frame of a right hand whose
+wrist is the origin. The thumb closes last, on the thing or on the fingers, and begins anew
+elsewhere until its pad touches the thing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.rigid_numba import mix_columns
+from toftrack.training.things_numba import part_distance
+
+CLOSE, YIELD = range(2)
+"""What a finger does: it closes on the thing, or gives way where it is in it."""
+_STEP, _BACK = math.radians(6.0), math.radians(9.0)
+_HALVINGS = 4
+_LEAST, _STRAIGHT, _WIDEST = math.radians(-20.0), math.radians(-10.0), math.radians(40.0)
+_TOUCH_M = 0.0025
+_PRESSED_M = 0.003
+"""How deep the thumb may lie in the flesh of the fingers."""
+_PAD_M, _FACING = 0.003, 0.6
+"""How far a thing is looked for where a pad faces, and the cosine within which the pad faces it."""
+_CAPSULE = 7
+"""Numbers of a capsule: its ends and its radius."""
+_BEFORE_THUMB = 9
+"""Capsules that a thumb may meet: the bones of index, middle and ring finger."""
+_PALM = np.array([0.55, 0.72, 0.88, 1.0])
+"""Where along the metacarpals a thing may touch the palm."""
+
+
+@compiled
+def _thing_distance(parts, x, y, z):
+    nearest = 1.0
+    for part in parts:
+        if part[0] >= 0:
+            nearest = min(nearest, part_distance(part, x, y, z))
+    return nearest
+
+
+@compiled
+def _place_in_palm(parts, base, flesh):
+    """Move a thing that lies far before the palm along the hand's z axis until it touches it."""
+    total = -0.25
+    for part in parts:
+        part[3] -= 0.25
+    for _ in range(24):
+        gap = 1.0
+        for finger in range(1, 5):
+            for share in _PALM:
+                x, y, z = share * base[finger, 0], share * base[finger, 1], share * base[finger, 2]
+                gap = min(gap, _thing_distance(parts, x, y, z) - flesh)
+        if gap < 0.0002 or total > 0.2:
+            break
+        total += gap
+        for part in parts:
+            part[3] += gap
+
+
+@compiled
+def _to_capsules(capsules, x, y, z):
+    """From a point to the nearest surface of capsules (N, _CAPSULE); below 0 inside."""
+    nearest = 1.0
+    for c in capsules:
+        ax, ay, az = c[3] - c[0], c[4] - c[1], c[5] - c[2]
+        px, py, pz = x - c[0], y - c[1], z - c[2]
+        along = (ax * px + ay * py + az * pz) / (ax * ax + ay * ay + az * az)
+        along = min(max(along, 0.0), 1.0)
+        px, py, pz = px - along * ax, py - along * ay, pz - along * az
+        nearest = min(nearest, math.sqrt(px * px + py * py + pz * pz) - c[6])
+    return nearest
+
+
+@compiled
+def _capsules_of(finger, angles, base_frames, base, lengths, radii, shifts, capsules):
+    """A finger's three bones into capsules (3, _CAPSULE)."""
+    frame = base_frames[finger].copy()
+    x, y, z = base[finger, 0], base[finger, 1], base[finger, 2]
+    angle = 1 + 4 * finger
+    for bone in range(3):
+        for column in range(0 if bone == 0 else 1, 2):
+            mix_columns(frame, column, angles[angle])
+            angle += 1
+        length, shift = lengths[finger, bone], shifts[finger, bone]
+        end = length - radii[finger, bone] if bone == 2 else length
+        for k, along in enumerate((0.0, end)):
+            capsules[bone, 3 * k] = x - along * frame[0, 1] - shift * frame[0, 2]
+            capsules[bone, 3 * k + 1] = y - along * frame[1, 1] - shift * frame[1, 2]
+            capsules[bone, 3 * k + 2] = z - along * frame[2, 1] - shift * frame[2, 2]
+        capsules[bone, 6] = radii[finger, bone]
+        x -= length * frame[0, 1]
+        y -= length * frame[1, 1]
+        z -= length * frame[2, 1]
+
+
+@compiled
+def _gap(finger, first, angles, base_frames, base, lengths, radii, shifts, parts, frame, others):
+    """How far the bones of a finger, from number `first` on, are from the thing, and from the
+    capsules of other fingers (N, _CAPSULE).
+    """
+    start = 0 if finger == 0 else 1 + 4 * finger
+    for i in range(3):
+        for j in range(3):
+            frame[i, j] = base_frames[finger, i, j]
+    x, y, z = base[finger, 0], base[finger, 1], base[finger, 2]
+    angle = start
+    gap = 1.0
+    for bone in range(3):
+        for column in range(0 if bone == 0 or (bone == 1 and finger == 0) else 1, 2):
+            mix_columns(frame, column, angles[angle])
+            angle += 1
+        length, radius = lengths[finger, bone], radii[finger, bone]
+        shift = shifts[finger, bone]
+        if bone >= first:
+            end = length - radius if bone == 2 else length
+            for sample in range(4):
+                along = end * (0.16 + 0.28 * sample)
+                px = x - along * frame[0, 1] - shift * frame[0, 2]
+                py = y - along * frame[1, 1] - shift * frame[1, 2]
+                pz = z - along * frame[2, 1] - shift * frame[2, 2]
+                gap = min(gap, _thing_distance(parts, px, py, pz) - radius)
+                if len(others) > 0:
+                    gap = min(gap, _to_capsules(others, px, py, pz) - radius + _PRESSED_M)
+        x -= length * frame[0, 1]
+        y -= length * frame[1, 1]
+        z -= length * frame[2, 1]
+    return gap
+
+
+@compiled
+def _opposition(angles, base_frames, base, lengths, radii, shifts, parts, frame):
+    """How far before the palm the thumb's tip is, less half of how far it is beside the middle
+    between index and middle finger, metres; -1 where its pad does not touch the thing.
+    """
+    for i in range(3):
+        for j in range(3):
+            frame[i, j] = base_frames[0, i, j]
+    x, y, z = base[0, 0], base[0, 1], base[0, 2]
+    angle = 0
+    for bone in range(3):
+        for column in range(0 if bone < 2 else 1, 2):
+            mix_columns(frame, column, angles[angle])
+            angle += 1
+        length, shift = lengths[0, bone], shifts[0, bone]
+        if bone < 2:
+            x, y, z = x - length * frame[0, 1], y - length * frame[1, 1], z - length * frame[2, 1]
+    radius = radii[0, 2]
+    nearest, way = 1.0, 0.0
+    for sample in range(4):
+        along = (length - radius) * (0.16 + 0.28 * sample)
+        px = x - along * frame[0, 1] - shift * frame[0, 2]
+        py = y - along * frame[1, 1] - shift * frame[1, 2]
+        pz = z - along * frame[2, 1] - shift * frame[2, 2]
+        gap = _thing_distance(parts, px, py, pz)
+        if gap < nearest:
+            step = _PAD_M
+            onward = _thing_distance(
+                parts, px - step * frame[0, 2], py - step * frame[1, 2], pz - step * frame[2, 2]
+            )
+            nearest, way = gap, (gap - onward) / step
+    if nearest - radius > _TOUCH_M or way < _FACING:
+        return -1.0
+    beside = x - length * frame[0, 1] - 0.5 * (base[1, 0] + base[2, 0])
+    return length * frame[2, 1] - z - 0.5 * abs(beside)
+
+
+@compiled
+def _bending(finger, bone):
+    """Which angle bends a bone of a finger."""
+    if finger == 0:
+        return 1 if bone == 0 else 2 + bone
+    return 2 + 4 * finger + bone
+
+
+@compiled
+def _close(finger, most, angles, hand):
+    """Bend a finger about the thing; hand: what _gap needs besides."""
+    for bone in range(3):
+        angle = _bending(finger, bone)
+        free = angles[angle]
+        while True:
+            angles[angle] = min(free + _STEP, most[angle])
+            if _gap(finger, bone, angles, *hand) < 0:
+                meets = angles[angle]
+                for _ in range(_HALVINGS):
+                    angles[angle] = 0.5 * (free + meets)
+                    if _gap(finger, bone, angles, *hand) < 0:
+                        meets = angles[angle]
+                    else:
+                        free = angles[angle]
+                angles[angle] = free
+                break
+            free = angles[angle]
+            if free >= most[angle]:
+                break
+
+
+@compiled
+def _yield(finger, angles, hand):
+    """Stretch a finger until it is not in the thing; hand: what _gap needs besides."""
+    for _ in range(14):
+        if _gap(finger, 0, angles, *hand) >= 0:
+            break
+        if finger == 0:  # away from the palm first, then straight; as long as it can, opposed
+            if angles[0] < _WIDEST:
+                angles[0] = min(angles[0] + _BACK, _WIDEST)
+                continue
+            if max(angles[3], angles[4]) > _STRAIGHT:
+                for angle in (3, 4):
+                    angles[angle] = min(angles[angle], max(angles[angle] - _BACK, _STRAIGHT))
+                continue
+        for bone in range(3):
+            angle = _bending(finger, bone)
+            angles[angle] = max(angles[angle] - _BACK, min(_LEAST, angles[angle]))
+
+
+@entry_point
+def grasp(
+    angles,
+    thumbs,
+    opposed,
+    most,
+    tasks,
+    in_palm,
+    flesh,
+    base_frames,
+    base,
+    lengths,
+    radii,
+    shifts,
+    parts,
+    said,
+):
+    """N hands on N things.
+
+    angles: (N, 21), bent in place.  thumbs: (N, K, 5) where the thumbs of power grasps begin, tried
+    one after another.  opposed: (N,) whether the thumb is taken that is the most opposed, not the
+    first one whose pad touches the thing.  most: (N, 21) beyond which nothing bends.
+    tasks: (N, 5) CLOSE or YIELD.  in_palm: (N,) the thing is to touch the palm; its parts
+    (N, Q, PART) are moved.  flesh: (N,) how thick the palm is before its bones.
+    base_frames (N, 5, 3, 3), base (N, 5, 3), lengths (N, 5, 3): of HandShape.
+    radii, shifts: (N, 5, 3) of the bones' capsules, and how far palmward they lie.
+    said: (N, 2) fingers that touch, and the deepest that any lies in the thing, metres.
+    """
+    frame, thumb, none = np.empty((3, 3)), np.empty(5), np.empty((0, _CAPSULE))
+    before = np.empty((_BEFORE_THUMB, _CAPSULE))
+    for n in range(len(angles)):
+        bones = (base_frames[n], base[n], lengths[n], radii[n], shifts[n])
+        hand = (*bones, parts[n], frame, none)
+        if in_palm[n]:
+            _place_in_palm(parts[n], base[n], flesh[n])
+        for finger in (1, 2, 3, 4):
+            _yield(finger, angles[n], hand)
+            if tasks[n, finger] == CLOSE:
+                _close(finger, most[n], angles[n], hand)
+        # The thumb last: the fingers hold the thing already.
+        if in_palm[n]:
+            for finger in (1, 2, 3):
+                _capsules_of(finger, angles[n], *bones, before[3 * (finger - 1) : 3 * finger])
+            about = (*bones, parts[n], frame, before)
+            best = -2.0
+            for start in range(thumbs.shape[1]):
+                angles[n, :5] = thumbs[n, start]
+                _yield(0, angles[n], about)
+                _close(0, most[n], angles[n], about)
+                opposition = _opposition(angles[n], *bones, parts[n], frame)
+                if opposition > best:
+                    best = opposition
+                    thumb[:] = angles[n, :5]
+                if best > -1 and not opposed[n]:
+                    break
+            angles[n, :5] = thumb
+        else:
+            _yield(0, angles[n], hand)
+            if tasks[n, 0] == CLOSE:
+                _close(0, most[n], angles[n], hand)
+        touching, deepest = 0, 0.0
+        for finger in range(5):
+            gap = _gap(finger, 0, angles[n], *hand)
+            touching += gap < _TOUCH_M
+            deepest = max(deepest, -gap)
+        said[n, 0], said[n, 1] = touching, deepest

@@ -1,0 +1,416 @@
+"""Depth pictures of scenes, as sensors take them; compiled, one picture after another.
+
+An ellipsoid {c + F u : |u| <= 1} is met by the ray z (x, y, 1) where |z W d - W c| = 1, W = F^-1: a
+quadratic in z. For skin and things see skin_numba and things_numba. Then the sensor: noise that
+grows with the square of the distance, pixels on depth edges that mix both depths, readings that are
+missing, steps, shadows beside near things, hollows that seem deeper than they are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.compute.compiling import compiled, entry_point
+from toftrack.training.dice import Dice
+from toftrack.training.hands import FOREARM, THING
+from toftrack.training.scenes import Scenes
+from toftrack.training.skin import PRIMITIVE
+from toftrack.training.skin_numba import draw_skin
+from toftrack.training.things_numba import TILE, draw_part
+
+(
+    NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE, HOLLOW,
+) = range(13)  # fmt: skip
+SENSOR_TERMS = 13
+ONE_SURFACE_M = np.float32(0.03)
+"""A camera's filter smooths over steps of less than this."""
+HOLLOW_M, HOLLOW_DEPTH_M = np.float32(0.05), np.float32(0.06)
+"""Hollows are at most so wide and so deep; what lies farther back is another surface."""
+_LATEST = 1.2
+"""By what part of its depth a hollow seems deeper, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Pinholes of a batch: f_px, cx, cy (N,), width, height (N,) of what each sees, in pixels."""
+
+    f_px: Tensor
+    cx: Tensor
+    cy: Tensor
+    width: Tensor
+    height: Tensor
+
+
+def random_sensors(n: int, dice: Dice) -> Tensor:
+    """(N, SENSOR_TERMS) of Time-of-Flight and structured-light cameras; lengths in metres.
+
+    NOISE: standard deviation at 0.5 m.  FLYING: share of edge pixels that mix.  BIAS: added.
+    HOLES: share of missing pixels.  STEP: of the readings at 0.5 m.  SHADOW: pixels without
+    readings beside near edges.  RANGE: nothing is read beyond.  PATCHES: how many patches miss.
+    BLUR: 1 mixes with neighbours on one surface.  DARK: 1 = the forearm is not read.
+    SMOOTH: pixels to each side over which the camera's own filter averages one surface; the folds
+    of a fist are lost in it.  COARSE: step of the readings at any distance, as of images that were
+    kept with 8 bits.  HOLLOW: by what part of their depth hollows seem deeper, as light that goes
+    from one of their walls to the other comes late (Fuchs, Multipath interference compensation in
+    time-of-flight camera images, ICPR 2010).
+    """
+    light = dice.chance(0.25, n)
+    terms = torch.zeros(n, SENSOR_TERMS)
+    log_noise = dice.uniform(n, low=math.log(0.0008), high=math.log(0.007))
+    terms[:, NOISE] = torch.where(light, 0.3, 1.0) * log_noise.exp()
+    terms[:, FLYING] = torch.where(light, 0.0, dice.uniform(n, high=0.8))
+    terms[:, BIAS] = 0.003 * dice.normal(n)
+    few = dice.uniform(n, high=0.01)
+    terms[:, HOLES] = torch.where(dice.chance(0.15, n), 0.15 * dice.uniform(n), few)
+    terms[:, STEP] = torch.where(light, dice.uniform(n, high=0.004), 0.0005)
+    terms[:, SHADOW] = torch.where(light, dice.uniform(n, high=10.0), 0.0)
+    terms[:, RANGE] = torch.where(dice.chance(0.3, n), dice.uniform(n, low=0.9, high=1.6), 9.0)
+    terms[:, PATCHES] = torch.where(dice.chance(0.15, n), dice.uniform(n, low=1, high=4), 0.0)
+    terms[:, BLUR] = dice.chance(0.3, n).float()
+    terms[:, DARK] = dice.chance(0.06, n).float()
+    wide = dice.uniform(n, low=1.0, high=3.5).floor()
+    terms[:, SMOOTH] = torch.where(dice.chance(0.3, n), wide, 0.0)
+    terms[:, COARSE] = torch.where(dice.chance(0.1, n), dice.uniform(n, low=0.003, high=0.012), 0.0)
+    late = ~light & dice.chance(0.4, n)
+    terms[:, HOLLOW] = torch.where(late, dice.uniform(n, high=_LATEST), 0.0)
+    return terms
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """All that pictures of N scenes are made of, as float32 but for what is said.
+
+    centres: (N, M, 3).  axes: (N, M, 3, 3).  whiten: their inverses.  which: (N, M) int8 labels of
+    ellipsoids, -1 = not drawn.  planes: (N, P, 4).
+    primitives: (N, S, K, PRIMITIVE) of S hands' skins.  whose: (N, S, K) int8 labels.
+    widths: (N, S, 2) how far a skin blends and lies outside.  parts: (N, Q, PART).
+    lens: (N, 5), see Lens.  sensors: (N, SENSOR_TERMS).  seeds: (N,) int64, of the sensors' noise.
+    """
+
+    centres: Tensor
+    axes: Tensor
+    whiten: Tensor
+    which: Tensor
+    planes: Tensor
+    primitives: Tensor
+    whose: Tensor
+    widths: Tensor
+    parts: Tensor
+    lens: Tensor
+    sensors: Tensor
+    seeds: Tensor
+
+
+def shots(scenes: Scenes, lens: Lens, sensors: Tensor, dice: Dice) -> Shots:
+    """Pictures to take of scenes, on the CPU by `take`, or on a device by pictures_triton."""
+    n = len(sensors)
+    primitives, whose, widths = _skins(scenes)
+    return Shots(
+        _plain(scenes.centres_m),
+        _plain(scenes.axes_m),
+        _plain(torch.linalg.inv(scenes.axes_m)),
+        torch.where(scenes.skinned, -1, scenes.labels).to(torch.int8),
+        _plain(scenes.planes),
+        primitives,
+        whose,
+        widths,
+        _plain(scenes.parts),
+        _plain(torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)),
+        _plain(sensors),
+        torch.randint(1, 2**31 - 1, (n,), generator=dice.generator),
+    )
+
+
+def take_pictures(
+    scenes: Scenes, lens: Lens, sensors: Tensor, size: tuple[int, int], dice: Dice
+) -> tuple[np.ndarray, np.ndarray]:
+    """`take` of `shots`."""
+    return take(shots(scenes, lens, sensors, dice), size)
+
+
+def take(shots: Shots, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (N, H, W) float32, 0 = no reading, and labels (N, H, W) int8, -1 = not seen.
+
+    size: H, W of the arrays; each picture fills its own width and height of them.
+    """
+    n = len(shots.sensors)
+    depth = np.zeros((n, *size), np.float32)
+    labels = np.full((n, *size), -1, np.int8)
+    arrays = {field.name: getattr(shots, field.name).numpy() for field in fields(shots)}
+    seeds = arrays.pop("seeds").astype(np.uint32)
+    _take(*arrays.values(), seeds, depth, labels)
+    return depth, labels
+
+
+def _skins(scenes: Scenes) -> tuple[Tensor, Tensor, Tensor]:
+    """Primitives, labels and widths of the hands' skins, see Shots."""
+    n, skins = len(scenes.labels), scenes.skins
+    if not skins:
+        none = torch.zeros(n, 0, 1, PRIMITIVE), torch.zeros(n, 0, 1, dtype=torch.int8)
+        return *none, torch.zeros(n, 0, 2)
+    widths = [torch.stack((skin.blend_m, skin.outside_m), 1) for skin, _ in skins]
+    return (
+        _plain(torch.stack([skin.primitives for skin, _ in skins], 1)),
+        torch.stack([labels for _, labels in skins], 1).to(torch.int8).contiguous(),
+        _plain(torch.stack(widths, 1)),
+    )
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.detach().to(torch.float32).contiguous()
+
+
+@compiled
+def _random(state):
+    """Uniform in [0, 1) by xorshift; state: (1,) uint32."""
+    x = state[0]
+    x ^= np.uint32((x << np.uint32(13)) & np.uint32(0xFFFFFFFF))
+    x ^= np.uint32(x >> np.uint32(17))
+    x ^= np.uint32((x << np.uint32(5)) & np.uint32(0xFFFFFFFF))
+    state[0] = x
+    return np.float32(np.float64(x) * 2.3283064365386963e-10)
+
+
+@compiled
+def _normal(state):
+    """Nearly normal: the sum of four uniforms."""
+    total = _random(state) + _random(state) + _random(state) + _random(state)
+    return (total - np.float32(2.0)) * np.float32(1.7320508)
+
+
+@compiled
+def _draw(centre, axes, whiten, label, lens, depth, labels):
+    """One ellipsoid into the depth buffer."""
+    cx, cy, cz = centre
+    xx = axes[0, 0] ** 2 + axes[0, 1] ** 2 + axes[0, 2] ** 2
+    yy = axes[1, 0] ** 2 + axes[1, 1] ** 2 + axes[1, 2] ** 2
+    zz = axes[2, 0] ** 2 + axes[2, 1] ** 2 + axes[2, 2] ** 2
+    xz = axes[0, 0] * axes[2, 0] + axes[0, 1] * axes[2, 1] + axes[0, 2] * axes[2, 2]
+    yz = axes[1, 0] * axes[2, 0] + axes[1, 1] * axes[2, 1] + axes[1, 2] * axes[2, 2]
+    if cz - math.sqrt(zz) < 0.05:
+        return
+    w = 1 / (cz * cz - zz)
+    f, px, py = lens[0], lens[1], lens[2]
+    x0, y0 = (cx * cz - xz) * w, (cy * cz - yz) * w
+    hx = math.sqrt(max(x0 * x0 - (cx * cx - xx) * w, 0.0))
+    hy = math.sqrt(max(y0 * y0 - (cy * cy - yy) * w, 0.0))
+    left = max(0, math.ceil((x0 - hx) * f + px))
+    right = min(int(lens[3]) - 1, math.floor((x0 + hx) * f + px))
+    top = max(0, math.ceil((y0 - hy) * f + py))
+    bottom = min(int(lens[4]) - 1, math.floor((y0 + hy) * f + py))
+    p0 = whiten[0, 0] * cx + whiten[0, 1] * cy + whiten[0, 2] * cz
+    p1 = whiten[1, 0] * cx + whiten[1, 1] * cy + whiten[1, 2] * cz
+    p2 = whiten[2, 0] * cx + whiten[2, 1] * cy + whiten[2, 2] * cz
+    outside = p0 * p0 + p1 * p1 + p2 * p2 - np.float32(1.0)
+    step = np.float32(1.0) / f
+    for v in range(top, bottom + 1):
+        y = (np.float32(v) - py) * step
+        r0 = whiten[0, 1] * y + whiten[0, 2]
+        r1 = whiten[1, 1] * y + whiten[1, 2]
+        r2 = whiten[2, 1] * y + whiten[2, 2]
+        for u in range(left, right + 1):
+            x = (np.float32(u) - px) * step
+            q0, q1, q2 = whiten[0, 0] * x + r0, whiten[1, 0] * x + r1, whiten[2, 0] * x + r2
+            a = q0 * q0 + q1 * q1 + q2 * q2
+            b = q0 * p0 + q1 * p1 + q2 * p2
+            disc = b * b - a * outside
+            if disc > 0:
+                z = (b - math.sqrt(disc)) / a
+                if z < depth[v, u]:
+                    depth[v, u] = z
+                    labels[v, u] = label
+
+
+@compiled
+def _smooth(reach, width, height, depth, scratch, total, count):
+    """Each reading becomes the mean of those about it that lie on the same surface.
+
+    scratch: (H, W), total and count: (W,), to work in. It goes along rows, so that the arithmetic
+    is vectorised.
+    """
+    for v in range(height):
+        for u in range(width):
+            scratch[v, u] = depth[v, u]
+    for v in range(height):
+        for u in range(width):
+            total[u] = np.float32(0)
+            count[u] = np.float32(0)
+        for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
+            for shift in range(-reach, reach + 1):
+                for u in range(max(-shift, 0), width - max(shift, 0)):
+                    other = scratch[v2, u + shift]
+                    near = (other > 0) & (abs(other - scratch[v, u]) < ONE_SURFACE_M)
+                    total[u] += other if near else np.float32(0)
+                    count[u] += np.float32(1) if near else np.float32(0)
+        for u in range(width):
+            if scratch[v, u] > 0:
+                depth[v, u] = total[u] / count[u]
+
+
+@compiled
+def _deepen(part, lens, depth, around, scratch):
+    """Hollows of `depth` become deeper by a part of their depth.
+
+    around, scratch: (H, W) to work in. A hollow lies behind the opening of the depths: the farthest
+    of the nearest ones about each pixel.
+    """
+    width, height = int(lens[3]), int(lens[4])
+    nearest = np.float32(8.0)
+    for v in range(height):
+        for u in range(width):
+            nearest = min(nearest, depth[v, u])
+    reach = int(np.float32(0.5) * HOLLOW_M * lens[0] / (nearest + HOLLOW_DEPTH_M))
+    for v in range(height):
+        for u in range(width):
+            around[v, u] = depth[v, u]
+    for sign in (np.float32(1.0), np.float32(-1.0)):
+        for v in range(height):
+            for u in range(width):
+                scratch[v, u] = around[v, u]
+            for shift in range(-reach, reach + 1):
+                for u in range(max(-shift, 0), width - max(shift, 0)):
+                    other = around[v, u + shift]
+                    closer = sign * other < sign * scratch[v, u]
+                    scratch[v, u] = other if closer else scratch[v, u]
+        for v in range(height):
+            for u in range(width):
+                around[v, u] = scratch[v, u]
+            for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
+                for u in range(width):
+                    closer = sign * scratch[v2, u] < sign * around[v, u]
+                    around[v, u] = scratch[v2, u] if closer else around[v, u]
+    for v in range(height):
+        for u in range(width):
+            hollow = depth[v, u] - around[v, u]
+            if hollow < HOLLOW_DEPTH_M:
+                depth[v, u] += part * hollow
+
+
+@compiled
+def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
+    """What a sensor makes of a picture: `depth` in place, from `clean`; rows: (2, W) to work in."""
+    width, height = int(lens[3]), int(lens[4])
+    blur, flying = sensor[BLUR] > 0, sensor[FLYING]
+    shadow = int(sensor[SHADOW])
+    for v in range(height):
+        for u in range(width):
+            z = clean[v, u]
+            v2 = min(max(v + int(_random(state) * 3) - 1, 0), height - 1)
+            u2 = min(max(u + int(_random(state) * 3) - 1, 0), width - 1)
+            other = clean[v2, u2]
+            gap = abs(other - z)
+            if gap > 0.02:
+                if _random(state) < flying:
+                    z += _random(state) * (min(other, z + 2.0) - z)
+            elif blur:
+                z = 0.5 * (z + other)
+            if sensor[DARK] > 0 and labels[v, u] == FOREARM:
+                depth[v, u] = 0.0
+                continue
+            if z > sensor[RANGE] or _random(state) < sensor[HOLES]:
+                depth[v, u] = 0.0
+                continue
+            ratio = min(z * z * 4.0, 20.0)
+            z += sensor[BIAS] + sensor[NOISE] * ratio * _normal(state)
+            step = sensor[STEP] * ratio
+            if step > 0:
+                z = math.floor(z / step + 0.5) * step
+            depth[v, u] = max(z, 0.0)
+    if sensor[SMOOTH] > 0:
+        _smooth(int(sensor[SMOOTH]), width, height, depth, scratch, rows[0], rows[1])
+    if sensor[COARSE] > 0:
+        for v in range(height):
+            for u in range(width):
+                depth[v, u] = math.floor(depth[v, u] / sensor[COARSE] + 0.5) * sensor[COARSE]
+    if shadow > 0:
+        for v in range(height):
+            for u in range(width - 1):
+                if clean[v, u] - clean[v, u + 1] > 0.03:
+                    reach = int(shadow * min((clean[v, u] - clean[v, u + 1]) * 3.0, 1.0))
+                    for back in range(reach + 1):
+                        if u - back >= 0 and clean[v, u - back] > clean[v, u + 1] + 0.02:
+                            depth[v, u - back] = 0.0
+    for _ in range(int(sensor[PATCHES])):
+        radius = 2.0 + _random(state) * 0.08 * width
+        v0, u0 = int(_random(state) * height), int(_random(state) * width)
+        for v in range(max(0, int(v0 - radius)), min(height, int(v0 + radius) + 1)):
+            for u in range(max(0, int(u0 - radius)), min(width, int(u0 + radius) + 1)):
+                if (v - v0) ** 2 + (u - u0) ** 2 < radius * radius * (0.6 + 0.6 * _random(state)):
+                    depth[v, u] = 0.0
+
+
+@entry_point
+def _take(
+    centres,
+    axes,
+    whiten,
+    which,
+    planes,
+    skins,
+    whose,
+    widths,
+    parts,
+    lenses,
+    sensors,
+    seeds,
+    depth,
+    labels,
+):
+    """All pictures of a batch, see Shots."""
+    state = np.zeros(1, np.uint32)
+    tiles = (depth.shape[1] // TILE + 1) * (depth.shape[2] // TILE + 1)
+    count = skins.shape[2]
+    balls, lists = np.empty((count, 4), np.float32), np.empty((tiles, count), np.int64)
+    counts, on = np.empty(tiles, np.int64), np.empty(count, np.int64)
+    near = np.empty(count, np.float32)
+    six = np.empty((6, TILE * TILE), np.float32)
+    rays = six[0], six[1], six[2], six[3], six[4], six[5]
+    clean, scratch = np.zeros(depth.shape[1:], np.float32), np.empty(depth.shape[1:], np.float32)
+    around = np.empty(depth.shape[1:], np.float32)
+    rows = np.empty((2, depth.shape[2]), np.float32)
+    for n in range(len(depth)):
+        lens = lenses[n]
+        state[0] = seeds[n]
+        width, height = int(lens[3]), int(lens[4])
+        for v in range(height):
+            y = (np.float32(v) - lens[2]) / lens[0]
+            for u in range(width):
+                x = (np.float32(u) - lens[1]) / lens[0]
+                nearest = np.float32(8.0)
+                for p in range(planes.shape[1]):
+                    across = planes[n, p, 0] * x + planes[n, p, 1] * y + planes[n, p, 2]
+                    z = planes[n, p, 3] / across
+                    if 0.1 < z < nearest:
+                        nearest = z
+                clean[v, u] = nearest
+                labels[n, v, u] = 0
+        for e in range(centres.shape[1]):
+            if which[n, e] >= 0:
+                _draw(centres[n, e], axes[n, e], whiten[n, e], which[n, e], lens, clean, labels[n])
+        for q in range(parts.shape[1]):
+            if parts[n, q, 0] >= 0:
+                draw_part(parts[n, q], THING, lens, clean, labels[n])
+        for s in range(skins.shape[1]):
+            draw_skin(
+                skins[n, s],
+                whose[n, s],
+                widths[n, s, 0],
+                widths[n, s, 1],
+                lens,
+                clean,
+                labels[n],
+                balls,
+                lists,
+                counts,
+                on,
+                near,
+                rays,
+            )
+        if sensors[n, HOLLOW] > 0:
+            _deepen(sensors[n, HOLLOW], lens, clean, around, scratch)
+        _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch, rows)

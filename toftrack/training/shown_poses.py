@@ -1,0 +1,307 @@
+"""Poses that people show a camera or pass through, to train the detector on.
+
+KINDS and SHOWN say how often each is drawn; docs/detector.md has them as a table. Poses of
+hands that hold things follow from the things: hands.py.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
+from toftrack.pose_space.base import clamp_to_joint_limits
+from toftrack.pose_space.data.pose_data import recorded_poses
+
+KINDS = {
+    "shown": 0.42,  # SHOWN
+    "pinch": 0.16,  # the thumb's tip on that of any finger, the other fingers as shown
+    "moving": 0.19,  # between two that are shown, or one of them and any fingers
+    "any": 0.08,  # each finger straight, half bent, hooked or curled
+    "recorded": 0.09,
+    "crossed": 0.06,  # fingers of two recorded poses
+}
+"""How often poses of each kind are drawn."""
+
+# Degrees (knuckle, middle joint, last joint) and their standard deviations.
+_STATES = {
+    "straight": ((0, 3, 2), (8, 6, 5)),
+    "back": ((-14, 4, 0), (8, 5, 5)),  # bent backwards a little, as of a hand stretched out
+    "tight": ((86, 105, 65), (5, 6, 8)),  # as a fist closes: the tip is 26 to 37 mm off the knuckle
+    "loose": ((74, 92, 45), (11, 12, 14)),
+    "folded": ((38, 115, 72), (18, 5, 9)),  # as tight, over knuckles that are bent half or less
+    "hooked": ((5, 92, 55), (12, 14, 16)),
+    "claw": ((-8, 52, 38), (9, 14, 13)),
+    "half": ((35, 40, 20), (18, 20, 13)),
+    "curved": ((38, 38, 24), (9, 10, 9)),  # around a jar
+    "round": ((58, 52, 34), (8, 9, 9)),  # towards the thumb's tip
+    "bent": ((75, 7, 4), (13, 8, 6)),  # straight, bent at the knuckle
+    "over": ((70, 75, 25), (9, 12, 10)),  # over the thumb
+}
+_THUMBS = {
+    "out": (4, 2, 5, -8, -8),
+    "up": (35, -8, 5, -10, -5),
+    "beside": (-30, 5, -8, 10, 10),
+    "across": (0, 42, -20, 30, 28),
+    "tucked": (-12, 35, -15, 55, 60),
+    "hooked": (4, 2, 5, 25, 60),
+    "opposed": (10, 20, 0, 15, 20),
+    "folded": (-20, 38, -10, 25, 40),
+}
+# What any finger may do: straight, curled, hooked, half bent, bent at the knuckle.
+_ANY_MEANS = torch.tensor(
+    [(0.0, 3.0, 2.0), (85.0, 98.0, 50.0), (5.0, 90.0, 50.0), (35.0, 40.0, 20.0), (72.0, 8.0, 4.0)]
+)
+_ANY_DEVIATIONS = torch.tensor(
+    [(8.0, 6.0, 5.0), (10.0, 12.0, 14.0), (12.0, 18.0, 18.0), (22.0, 25.0, 14.0), (15.0, 10.0, 6.0)]
+)
+_FINGER_OF_ANGLE = torch.tensor([0] * 5 + [f for f in range(1, 5) for _ in range(4)])
+"""(21,) the finger, thumb 0, that each angle bends."""
+_APART, _TOGETHER, _ANY, _CROSSED = range(4)
+_SPREAD = (12.0, 2.0, -8.0, -16.0)
+"""Degrees of abduction of fingers that are spread; about -1 times it, they touch."""
+_BENT_SPREAD = (-1.5, 1.0)
+"""What bent fingers have of it: the tips of hooked ones lie side by side, those of a fist converge
+on one place of the palm, so that their knuckles' axes do not."""
+_BENT_DEG = 70.0
+
+
+class Shown(NamedTuple):
+    """What people show. thumbs: any of these.  fingers: states, index finger first."""
+
+    name: str
+    thumbs: tuple[str, ...]
+    fingers: tuple[str, str, str, str]
+    spread: int
+    weight: float
+
+
+def _four(state: str) -> tuple[str, str, str, str]:
+    return (state, state, state, state)
+
+
+_CLOSED = ("across", "tucked", "hooked", "folded")
+SHOWN = (
+    Shown("palm", ("out", "up", "beside"), _four("straight"), _APART, 6),
+    Shown("stretched palm", ("out", "up"), _four("back"), _APART, 5),
+    Shown("flat", ("beside", "beside", "beside", "out"), _four("straight"), _TOGETHER, 11),
+    Shown("flat, thumb away", ("up", "out"), _four("straight"), _TOGETHER, 4),
+    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 18),
+    Shown("fist about the thumb", ("tucked", "folded"), _four("over"), _TOGETHER, 2),
+    Shown("loose fist", _CLOSED, _four("loose"), _ANY, 3),
+    Shown("thumb up", ("up", "out", "up"), _four("tight"), _TOGETHER, 15),
+    Shown("thumb up, loose", ("up", "out"), _four("loose"), _ANY, 2),
+    Shown("point", _CLOSED, ("straight", "tight", "tight", "tight"), _ANY, 7),
+    Shown("point, loose", _CLOSED, ("straight", "loose", "loose", "loose"), _ANY, 3),
+    Shown("point with thumb", ("out", "up"), ("straight", "tight", "tight", "tight"), _ANY, 7),
+    Shown(
+        "point with thumb, loose", ("out", "up"), ("straight", "loose", "loose", "loose"), _ANY, 3
+    ),
+    Shown("bent index", _CLOSED, ("hooked", "tight", "tight", "tight"), _ANY, 2),
+    Shown("victory", _CLOSED, ("straight", "straight", "tight", "tight"), _APART, 6),
+    Shown("victory with thumb", ("out", "up"), ("straight", "straight", "tight", "tight"), _ANY, 3),
+    Shown("two together", _CLOSED, ("straight", "straight", "tight", "tight"), _TOGETHER, 3),
+    Shown("crossed fingers", _CLOSED, ("straight", "half", "tight", "tight"), _CROSSED, 1),
+    Shown("three", _CLOSED, ("straight", "straight", "straight", "tight"), _ANY, 5),
+    Shown("four", ("tucked", "folded", "across"), _four("straight"), _ANY, 5),
+    Shown("flat, thumb folded", ("folded", "across", "tucked"), _four("straight"), _TOGETHER, 3),
+    Shown("index and little", _CLOSED, ("straight", "tight", "tight", "straight"), _ANY, 4),
+    Shown(
+        "thumb, index and little",
+        ("out", "up"),
+        ("straight", "tight", "tight", "straight"),
+        _ANY,
+        3,
+    ),
+    Shown("little", _CLOSED, ("tight", "tight", "tight", "straight"), _ANY, 6),
+    Shown("thumb and little", ("out", "up"), ("tight", "tight", "tight", "straight"), _ANY, 3),
+    Shown("middle", _CLOSED, ("tight", "straight", "tight", "tight"), _ANY, 1),
+    Shown("bent knuckles", ("beside", "opposed", "out"), _four("bent"), _ANY, 6),
+    Shown("flat beak", ("opposed", "across"), _four("bent"), _TOGETHER, 2),
+    Shown("hook", ("out", "beside", "up", "across"), _four("hooked"), _ANY, 6),
+    Shown("claw", ("out", "up", "opposed"), _four("claw"), _APART, 4),
+    Shown("curved", ("opposed", "out"), _four("curved"), _TOGETHER, 3),
+    Shown("all tips together", ("opposed", "across"), _four("round"), _TOGETHER, 2),
+    Shown(
+        "one up, the others round", ("opposed",), ("straight", "round", "round", "round"), _ANY, 2
+    ),
+    Shown("relaxed", ("out", "opposed", "beside"), _four("half"), _ANY, 6),
+)
+_FLAT_KNUCKLES = 0.4
+"""How many of those who close fingers hardly bend their knuckles: tight ones are folded."""
+_TOUCHING_M = 0.020
+_ONE_BY_ONE = 0.25
+"""Standard deviation of how much further than its neighbour a finger is on its way."""
+
+
+def shown_poses(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) joint angles, radians, within the joint limits, of KINDS."""
+    shown, second = shown_only(n, generator), shown_only(n, generator)
+    fingers = any_fingers(n, generator)
+    other = torch.where(_uniform(generator, n, 1) < 0.3, fingers, second)
+    moving = on_the_way(shown, other, generator)
+    poses = {
+        "shown": shown,
+        "pinch": pinched(torch.where(_uniform(generator, n, 1) < 0.3, fingers, second), generator),
+        "moving": moving,
+        "any": fingers,
+        "recorded": near_recorded(n, generator),
+        "crossed": fingers_of_two_recorded(n, generator),
+    }
+    kind = torch.multinomial(torch.tensor(list(KINDS.values())), n, True, generator=generator)
+    angles = torch.stack([poses[name] for name in KINDS])[kind, torch.arange(n)]
+    return clamp_to_joint_limits(angles)
+
+
+def on_the_way(first: Tensor, last: Tensor, generator: torch.Generator) -> Tensor:
+    """(n, 21) between poses (n, 21) and others: each finger ahead or behind, and in half of them
+    one after another, as a hand opens or closes from one side on.
+    """
+    n = len(first)
+    one_by_one = _ONE_BY_ONE * _normal(generator, n, 1) * (torch.arange(5.0) - 2.0)
+    part = _uniform(generator, n, 1) + 0.15 * _normal(generator, n, 5)
+    some = _uniform(generator, n, 1) < 0.5
+    part = (part + torch.where(some, one_by_one, 0.0)).clamp(0, 1)
+    return torch.lerp(first, last, part[:, _FINGER_OF_ANGLE])
+
+
+def near_recorded(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, recorded poses, each a little changed; not yet within the limits."""
+    recorded = recorded_poses()
+    rows = torch.randint(len(recorded), (n,), generator=generator)
+    return recorded[rows] + math.radians(3.0) * _normal(generator, n, 21)
+
+
+def fingers_of_two_recorded(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, each finger of one of two recorded poses; not yet within the limits."""
+    first, second = near_recorded(n, generator), near_recorded(n, generator)
+    chosen = _uniform(generator, n, 5)[:, _FINGER_OF_ANGLE] < 0.5
+    return torch.where(chosen, first, second)
+
+
+def any_fingers(n: int, generator: torch.Generator) -> Tensor:
+    """(n, 21) radians, each finger straight or curled, or in any state, or all closing together;
+    not yet within the limits.
+    """
+    counting = (_uniform(generator, n, 4) < 0.5).long()
+    anything = torch.randint(len(_ANY_MEANS), (n, 4), generator=generator)
+    kind = _uniform(generator, n, 1)
+    state = torch.where(kind < 0.55, counting, anything)
+    flexion = _ANY_MEANS[state] + _ANY_DEVIATIONS[state] * _normal(generator, n, 4, 3)
+    # All four together: from straight to curled, the middle joints ahead of the knuckles.
+    closing = _uniform(generator, n, 1, 1) * 1.2 - 0.1 + 0.08 * _normal(generator, n, 4, 1)
+    exponent = torch.exp(0.35 * _normal(generator, n, 1, 3))
+    straight, curled = _ANY_MEANS[:2]
+    together = straight + (curled - straight) * closing.clamp(0, 1) ** exponent
+    together = together + 5.0 * _normal(generator, n, 4, 3)
+    flexion = torch.where(kind[..., None] > 0.75, together, flexion)
+    thumbs = torch.tensor(list(_THUMBS.values()), dtype=torch.float32)
+    first, last = torch.randint(len(thumbs), (2, n), generator=generator)
+    part = (_uniform(generator, n, 1) * 1.6 - 0.3).clamp(0, 1)
+    thumb = torch.lerp(thumbs[first], thumbs[last], part)
+    spread = torch.tensor(_SPREAD) * (_uniform(generator, n, 1) * 1.6 - 0.4)
+    abduction = spread + 4.0 * _normal(generator, n, 4)
+    fingers = torch.cat((abduction[..., None], flexion), 2).flatten(1)
+    thumb = thumb + 8.0 * _normal(generator, n, 5)
+    return torch.deg2rad(torch.cat((thumb, fingers), 1))
+
+
+def shown_only(n: int, generator: torch.Generator, rows: Tensor | None = None) -> Tensor:
+    """(n, 21) of SHOWN, by its weights or of these rows, each in an own way."""
+    if rows is None:
+        weights = torch.tensor([float(shown.weight) for shown in SHOWN])
+        rows = torch.multinomial(weights, n, True, generator=generator)
+    names = list(_STATES)
+    state = torch.tensor([[names.index(f) for f in shown.fingers] for shown in SHOWN])[rows]
+    flat = (_uniform(generator, n, 1) < _FLAT_KNUCKLES) & (state == names.index("tight"))
+    state = torch.where(flat, names.index("folded"), state)
+    means = torch.tensor([mean for mean, _ in _STATES.values()], dtype=torch.float32)
+    deviations = torch.tensor([deviation for _, deviation in _STATES.values()], dtype=torch.float32)
+    # One way of bending for all fingers of a person, and a little of each finger's own.
+    noise = 0.6 * _normal(generator, n, 1, 3) + 0.6 * _normal(generator, n, 4, 3)
+    flexion = means[state] + deviations[state] * noise
+    spread = torch.tensor([shown.spread for shown in SHOWN])[rows]
+    return torch.cat((_thumbs(rows, generator), _fingers(flexion, spread, generator)), 1)
+
+
+def _thumbs(rows: Tensor, generator: torch.Generator) -> Tensor:
+    """(n, 5) radians, one that goes with what is shown, or between two."""
+    n = len(rows)
+    names = list(_THUMBS)
+    most = max(len(shown.thumbs) for shown in SHOWN)
+    allowed = [[names.index(name) for name in (shown.thumbs * most)[:most]] for shown in SHOWN]
+    which = torch.randint(most, (2, n), generator=generator)
+    first, second = (torch.tensor(allowed)[rows].gather(1, w[:, None])[:, 0] for w in which)
+    thumbs = torch.tensor(list(_THUMBS.values()), dtype=torch.float32)
+    thumb = torch.lerp(thumbs[first], thumbs[second], 0.5 * _uniform(generator, n, 1))
+    return torch.deg2rad(thumb + 7.0 * _normal(generator, n, 5))
+
+
+def _fingers(flexion: Tensor, spread: Tensor, generator: torch.Generator) -> Tensor:
+    """(n, 16) radians from flexions (n, 4, 3) in degrees and how fingers are spread (n,)."""
+    n = len(spread)
+    kinds = torch.stack(
+        (
+            _uniform(generator, n) * 1.3 + 0.3,
+            _uniform(generator, n) * 0.35 - 1.2,
+            _uniform(generator, n) * 1.6 - 0.6,
+            _uniform(generator, n) * 0.5 - 0.2,
+        ),
+        1,
+    )
+    part = kinds.gather(1, spread[:, None])
+    own = torch.where(spread == _TOGETHER, 1.2, 4.0)[:, None]
+    bent_part = _BENT_SPREAD[0] + (_BENT_SPREAD[1] - _BENT_SPREAD[0]) * _uniform(generator, n, 1)
+    bent = (flexion[..., :2].amax(2) / _BENT_DEG).clamp(0, 1)
+    part = torch.lerp(part.expand(n, 4), bent_part.expand(n, 4), bent)
+    abduction = torch.tensor(_SPREAD) * part + own * _normal(generator, n, 4)
+    across = torch.tensor([-14.0, 10.0, 0.0, 0.0])
+    abduction = torch.where((spread == _CROSSED)[:, None], abduction + across, abduction)
+    return torch.deg2rad(torch.cat((abduction[..., None], flexion), 2).flatten(1))
+
+
+def pinched(poses: Tensor, generator: torch.Generator) -> Tensor:
+    """The same poses (N, 21), the thumb's tip touching that of one finger, each as often."""
+    pairs = touching_pairs()
+    finger = torch.randint(4, (len(poses),), generator=generator)
+    part = _uniform(generator, len(poses))
+    row = torch.stack([(part * len(thumbs)).long() for thumbs, _ in pairs], 1)
+    result = poses.clone()
+    for number, (thumbs, fingers) in enumerate(pairs):
+        use = (finger == number).nonzero()[:, 0]
+        rows = row[use, number]
+        result[use, :5] = thumbs[rows]
+        result[use, 5 + 4 * number : 9 + 4 * number] = fingers[rows]
+    return result
+
+
+@functools.cache
+def touching_pairs(most_m: float = _TOUCHING_M) -> tuple[tuple[Tensor, Tensor], ...]:
+    """Thumbs (P, 5) and fingers (P, 4), for each finger, whose tips are so near to each other."""
+    generator = torch.Generator().manual_seed(0)
+    n = 60_000
+    low, high = torch.tensor(ANGLE_LIMITS)[:5].unbind(1)
+    thumb = low + (high - low) * torch.rand(n, 5, generator=generator)
+    thumb[:, 3:] = thumb[:, 3:].clamp(min=-0.1)
+    bent = torch.tensor([75.0, 80.0, 50.0]) * torch.rand(n, 3, generator=generator)
+    fingers = torch.cat((8.0 * torch.randn(n, 1, generator=generator), bent), 1).deg2rad()
+    state = torch.cat((torch.zeros(n, 6), thumb, fingers.repeat(1, 4)), 1)
+    joints = forward_kinematics(state, default_hand_shape()).joints_m
+    found = []
+    for finger in range(4):
+        rows = ((joints[:, 8 + 4 * finger] - joints[:, 4]).norm(dim=1) < most_m).nonzero()[:, 0]
+        found.append((thumb[rows], fingers[rows]))
+    return tuple(found)
+
+
+def _uniform(generator: torch.Generator, *size: int) -> Tensor:
+    return torch.rand(*size, generator=generator)
+
+
+def _normal(generator: torch.Generator, *size: int) -> Tensor:
+    return torch.randn(*size, generator=generator)

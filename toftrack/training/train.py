@@ -1,0 +1,105 @@
+"""What `python -m toftrack.training train` does: train both networks, write weights and figures."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import os
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import to_absolute_path
+from omegaconf import DictConfig
+
+from toftrack.checks import check_number
+from toftrack.programs.command_line import sweep_job
+from toftrack.safe_files import write_whole
+from toftrack.views.pictures import write_picture
+
+
+@sweep_job
+def train(config: DictConfig) -> float:
+    """Train, write weights, their ONNX files and figures into Hydra's output folder.
+
+    Returns the mean joint error of the pose network's last images, mm; NaN if it saw none.
+    """
+    # Threads that wait must not keep the processes that make images from working.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    import torch
+
+    from toftrack.api import compute_device
+    from toftrack.detector.onnx_networks import COMMAND
+    from toftrack.detector.weights import load_weights, save_weights
+    from toftrack.errors import ToftrackError
+    from toftrack.training.checkpoints import Checkpoints
+    from toftrack.training.descent import train_finder, train_poses
+    from toftrack.training.figures import course_figure, images_figure
+    from toftrack.training.onnx_export import export_networks, missing_packages, needed
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    path = folder / config.output
+    missing = missing_packages()
+    if missing:
+        print(
+            f"{needed(missing)}; otherwise training ends with {config.output} alone, and they are"
+            f" made later by {COMMAND} {path}"
+        )
+    drawable = importlib.util.find_spec("triton") is not None
+    found = "cuda" if torch.cuda.is_available() and drawable else "cpu"
+    device = compute_device(found if config.compute == "auto" else config.compute)
+    if device.type == "cuda" and not drawable:
+        raise ToftrackError(
+            "compute=cuda draws the training images with triton, which is not installed; install"
+            " it, or give compute=cpu"
+        )
+    poses = hydra.utils.instantiate(config.poses)
+    finder = hydra.utils.instantiate(config.finder)
+    if not (isinstance(config.shapes, int) and config.shapes > 0):
+        raise ToftrackError("shapes must be a whole number above 0: how many hands are drawn from")
+    check_number("checkpoint_minutes", config.checkpoint_minutes, 0, above=True)
+    resume = None if config.resume is None else Path(to_absolute_path(config.resume))
+    checkpoints = Checkpoints(folder, config.checkpoint_minutes, resume)
+    write_picture(folder / "images.png", images_figure(config.seed))
+    each = (config.shapes, config.seed, checkpoints, device)
+    finder_network, finder_course = train_finder(finder, *each)
+    pose_network, pose_course = train_poses(poses, *each)
+    courses = [course for course in (finder_course, pose_course) if course]
+    minutes = round(sum(course[-1]["seconds"] for course in courses) / 60, 1)
+    about = {
+        "seed": config.seed,
+        "shapes": config.shapes,
+        "pose_images": poses.images,
+        "finder_images": finder.images,
+        "torch": torch.__version__,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "minutes": minutes,
+    }
+    for name, schedule in (("pose", poses), ("finder", finder)):
+        if schedule.start is not None:
+            about[f"{name}_start"] = load_weights(schedule.start).about
+            about[f"{name}_start_share"] = schedule.start_share
+        if schedule.restart_images > 0 and schedule.images > 0:
+            about[f"{name}_restart_images"] = schedule.restart_images
+    save_weights(path, pose_network, finder_network, about)
+    pictures = ["images.png"]
+    if pose_course:
+        write_picture(folder / "course.png", course_figure(pose_course))
+        pictures.append("course.png")
+    summary = about | {"poses": pose_course, "finder": finder_course}
+    write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
+    derived = [] if missing else [file.name for file in export_networks(path)]
+    error_mm, learned = math.nan, ""
+    if pose_course:
+        last = pose_course[-1]
+        error_mm = float(last["keypoints_mm"])
+        learned = (
+            f"; on the last training images: joints {error_mm:.1f} mm by keypoints,"
+            f" {last['joints_mm']:.1f} mm by the likeliest hypothesis"
+        )
+    print(f"trained in {minutes} minutes{learned}")
+    for name in (config.output, *derived, *pictures, "summary.json"):
+        print(f"  {folder / name}")
+    print(f"use it: toftrack track detector.weights={path}")
+    return error_mm
