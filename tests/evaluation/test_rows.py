@@ -31,7 +31,7 @@ def tracked(seed: int, name: str = "set/a", frames: int = 60) -> dict:
     truth = Truth(true, visible, np.ones(frames, bool), pose_name=np.array(["palm"] * frames))
     found = measured(Estimates(joints, lost), truth)
     row = {"recording": name, "seed": seed, **row_figures(found, np.full(frames, 0.01))}
-    row["groups"] = group_counts(found.first, truth, None, "tof", 170.0)
+    row["groups"] = group_counts(found.first, truth, "tof", 170.0)
     return row | {"expected": by_hand(joints, lost, true, visible)}
 
 

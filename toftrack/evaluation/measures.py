@@ -92,12 +92,15 @@ class Measured:
     """What was measured of one hand.
 
     trust: its figures.  frames: what each frame is.  figures: see the head of this module;
-    JSON-able, unrounded.
+    JSON-able, unrounded.  named: (T,) bool, frames whose pose has a name.  called: those of them
+    that are called so.
     """
 
     trust: Trust
     frames: Judged
     figures: dict[str, Any]
+    named: np.ndarray
+    called: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +152,14 @@ def _of_hand(estimates: Estimates, truth: Truth) -> Measured:
         visible = good[:, None] & truth.joint_visible[:, TIPS]
         flagged = ~np.asarray(estimates.joint_ok, bool)[:, TIPS]
         figures |= flag_counts(of.error_mm[:, TIPS][visible], flagged[visible])
+    poses = np.full(len(of.seen), "") if truth.pose_name is None else truth.pose_name
+    names = np.array([POSE_GESTURES.get(str(pose), "") for pose in poses], str)
+    named, called = of.seen & (names != ""), of.seen & False
     if estimates.gesture is not None:
-        named, right = gestures_right(estimates.gesture, of, truth)
-        figures["gesture_pct"] = share_pct(right, named)
+        called = named & of.said & (np.asarray(estimates.gesture, str) == names)
+        figures["gesture_pct"] = share_pct(called, named)
     figures |= _side_figures(estimates, of, truth)
-    return Measured(trust(of), of, figures)
+    return Measured(trust(of), of, figures, named, called)
 
 
 def coverage(
@@ -178,16 +184,6 @@ def flag_counts(off_mm: np.ndarray, flagged: np.ndarray) -> dict[str, int]:
     wrong = np.asarray(off_mm) > OK_MM
     counted = (wrong, wrong & flagged, ~wrong, ~wrong & flagged)
     return {name: int(rows.sum()) for name, rows in zip(FLAG_COUNTS, counted, strict=True)}
-
-
-def gestures_right(gesture: np.ndarray, of: Judged, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
-    """(T,) bool: the frames whose pose has a name, and those of them that are called so."""
-    none = np.zeros(len(of.seen), bool)
-    if truth.pose_name is None:
-        return none, none
-    names = np.array([POSE_GESTURES.get(str(pose), "") for pose in truth.pose_name])
-    named = of.seen & (names != "")
-    return named, named & of.said & (np.asarray(gesture, str) == names)
 
 
 def _swapped(joints_m: np.ndarray, true_m: np.ndarray) -> np.ndarray:

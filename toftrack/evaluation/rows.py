@@ -22,12 +22,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.evaluation.image_labels import IMAGE_MEANS, tip_figures
-from toftrack.evaluation.measures import (
-    FLAG_COUNTS,
-    Measured,
-    MeasuredRecording,
-    gestures_right,
-)
+from toftrack.evaluation.measures import FLAG_COUNTS, Measured, MeasuredRecording
 from toftrack.evaluation.statistics import interval, mean_of, rounded
 from toftrack.frames import Truth
 
@@ -113,24 +108,21 @@ def _figures_of_hand(of: Measured) -> Row:
 
 
 def group_counts(
-    of: Measured, truth: Truth, gesture: np.ndarray | None, sensor: str, length_mm: float | None
+    of: Measured, truth: Truth, sensor: str, length_mm: float | None
 ) -> dict[str, dict[str, dict[str, float]]]:
     """By kind of group and group: the visible frames of a row, and what they are.
 
     Args:
-        gesture: (T,) what the poses are called; None: nothing is said.
         sensor: what camera it was.
         length_mm: of the hand, wrist to middle fingertip; None: by the truth.
     """
-    silence = np.zeros(len(of.frames.seen), "U1")
-    named, right = gestures_right(silence if gesture is None else gesture, of.frames, truth)
     flags = {
         "usable": of.frames.usable,
         "partly": of.frames.partly,
         "silent": of.frames.silent,
         "false_alarm": of.frames.false_alarm,
-        "named": named,
-        "called_right": right,
+        "named": of.named,
+        "called_right": of.called,
         "said": of.frames.seen & of.frames.said,
     }
     distance = np.asarray(truth.joints_m, np.float64)[:, :, 2].mean(1)

@@ -230,9 +230,6 @@ def _row(
     track = estimates_of(reported, (*fields, *(_SIDE_FIELDS if job.side == "auto" else ())))
     compute_s = np.array([frame[0].compute_s for frame in reported])
     found = measured(track, truth)
-    gesture = track.gesture
-    if gesture is not None and found.slots is not None:
-        gesture = gesture[:, found.slots[0]]
     about = device.metadata
     camera = about.get("camera")
     kind = camera.get("kind") if isinstance(camera, dict) else None
@@ -244,7 +241,7 @@ def _row(
         "recording": job.source.name,
         "seed": job.seed,
         **row_figures(found, compute_s),
-        "groups": group_counts(found.first, truth, gesture, sensor, length_mm),
+        "groups": group_counts(found.first, truth, sensor, length_mm),
     }
 
 
