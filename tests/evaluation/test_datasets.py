@@ -15,7 +15,6 @@ from toftrack.errors import ToftrackError
 from toftrack.evaluation.datasets import DATA_SETS, nyu, open_data_set
 from toftrack.evaluation.datasets.base import INTEL_CREATIVE
 from toftrack.evaluation.datasets.nyu import read_numbers
-from toftrack.evaluation.public import compared_joints
 
 FRAMES = 3
 
@@ -151,15 +150,6 @@ def test_readings_beyond_reason_are_none(tmp_path: Path) -> None:
     write_msra(tmp_path / "Subject1", seen, boxed=False)
     _, (read,) = open_data_set("MSRA14", tmp_path)
     np.testing.assert_array_equal(read.frame(0)[0, :3], 0)
-
-
-def test_fingertips_are_moved_along_the_last_bone() -> None:
-    joints = np.zeros((1, 21, 3))
-    joints[0, 4] = (0, 0.03, 0)
-    joints[0, 7], joints[0, 8] = (0.1, 0, 0), (0.1, 0, 0.02)
-    moved = compared_joints(joints, (4, 8, 7, 20), 0.005)
-    np.testing.assert_allclose(moved[0], [(0, 0.025, 0), (0.1, 0, 0.015), (0.1, 0, 0), (0, 0, 0)])
-    assert joints[0, 4, 1] == 0.03
 
 
 def cut(path: Path) -> None:

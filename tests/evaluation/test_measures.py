@@ -117,11 +117,6 @@ def test_of_two_slots_each_hand_has_its_own() -> None:
     assert alone.second is None and alone.ghost_pct == 100
 
 
-def test_other_shapes_are_refused_in_one_sentence() -> None:
-    with pytest.raises(ToftrackError, match="compare the same joints of the same frames"):
-        measured(estimates(truth(5)), truth(6))
-
-
 def test_poses_sides_and_rests_are_read_from_a_recording(tmp_path) -> None:
     file = tmp_path / "a.npz"
     arrays = {

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toftrack.errors import ToftrackError
 from toftrack.evaluation.metrics import evaluate
 from toftrack.frames import Truth
 
@@ -39,9 +38,7 @@ def random_case(seed: int) -> tuple[np.ndarray, np.ndarray, Truth]:
     return joints, lost, truth
 
 
-def by_loops(
-    joints: np.ndarray, lost: np.ndarray, truth: Truth, skip: int, ok: float, near: float, hold: int
-) -> dict[str, Any]:
+def by_loops(joints: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, Any]:
     """The definitions, spelled out a frame and a joint at a time."""
     count = len(truth.joints_m)
     errors: dict[int, list[float]] = {}
@@ -57,7 +54,7 @@ def by_loops(
             if j > 0:
                 aligned[t].append(1000 * math.sqrt(sum((away - shift) ** 2)))
     present = [bool(truth.visible[t] and truth.in_space[t]) for t in range(count)]
-    used = [t for t in range(skip, count) if present[t]]
+    used = [t for t in range(5, count) if present[t]]
     there = [t for t in used if t in errors]
 
     def mean(values: list[float]) -> float | None:
@@ -81,20 +78,20 @@ def by_loops(
         "visible_joints_mm": mean(
             [errors[t][j] for t in there for j in range(21) if in_view(t, j)]
         ),
-        f"frames_max_below_{ok:g}mm_pct": 100
-        * sum(max(errors[t]) < ok for t in there)
+        "frames_max_below_40mm_pct": 100
+        * sum(max(errors[t]) < 40 for t in there)
         / max(1, len(used)),
         "mean_not_lost_mm": mean(of([t for t in there if not lost[t]], range(21))),
     }
 
     def tracked(t: int) -> bool:
-        return t in errors and sum(errors[t]) / 21 < near and not lost[t]
+        return t in errors and sum(errors[t]) / 21 < 25 and not lost[t]
 
     def delay(start: int) -> int | None:
         for t in range(start, count):
             if not present[t]:
                 return None
-            if all(tracked(s) for s in range(t, min(t + hold, count))):
+            if all(tracked(s) for s in range(t, min(t + 3, count))):
                 return t - start
         return None
 
@@ -122,12 +119,12 @@ def by_loops(
 
 
 def lost_by_loops(
-    lost: np.ndarray, truth: Truth, skip: int, tolerance: int
+    lost: np.ndarray, truth: Truth, tolerance: int
 ) -> tuple[float | None, float | None]:
     count = len(lost)
     absent = [not (truth.visible[t] and truth.in_space[t]) for t in range(count)]
     hits = flagged = positive = 0
-    for t in range(skip, count):
+    for t in range(5, count):
         # A change lies between two frames, half a frame from each.
         if any(
             absent[c] != absent[c - 1] and abs(t - (c - 0.5)) <= tolerance for c in range(1, count)
@@ -143,11 +140,11 @@ def lost_by_loops(
 def test_agrees_with_a_second_implementation(seed: int) -> None:
     joints, lost, truth = random_case(seed)
     found = evaluate(joints, lost, truth)
-    expected = by_loops(joints, lost, truth, skip=5, ok=40.0, near=25.0, hold=3)
+    expected = by_loops(joints, lost, truth)
     events = sorted((e["frame"], e["event"], e["delay"]) for e in found.pop("reacquisition"))
     assert events == expected.pop("reacquisition")
     for tolerance, suffix in ((3, ""), (-1, "_strict")):
-        pair = lost_by_loops(lost, truth, 5, tolerance)
+        pair = lost_by_loops(lost, truth, tolerance)
         expected[f"lost_precision{suffix}"], expected[f"lost_recall{suffix}"] = pair
     assert found.keys() == expected.keys()
     for name, value in expected.items():
@@ -169,9 +166,3 @@ def test_flagging_cannot_improve_the_error() -> None:
     assert flagged["mean_mm"] == honest["mean_mm"]
     assert flagged["frames_max_below_40mm_pct"] == honest["frames_max_below_40mm_pct"]
     assert flagged["mean_not_lost_mm"] == pytest.approx(0)
-
-
-@pytest.mark.parametrize("shape", [(9, 21, 3), (10, 20, 3), (10, 63)])
-def test_other_shapes_than_the_truth_are_reported(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ToftrackError, match="shape"):
-        evaluate(np.zeros(shape), np.zeros(10, bool), still_hand(10))

@@ -16,6 +16,7 @@ from toftrack.evaluation.trust import (
     longest_run,
     runs,
     slots_of_hands,
+    tips_inset,
     trust,
     until,
 )
@@ -123,12 +124,13 @@ def test_two_hands_get_the_slots_that_fit_for_the_whole_recording() -> None:
     assert slots_of_hands(joints, lost, [right]) == (1,)
 
 
-def test_shapes_must_fit() -> None:
+@pytest.mark.parametrize("shape", [(3, J, 3), (4, J - 1, 3), (4, 3 * J)])
+def test_other_shapes_than_the_truth_are_reported(shape) -> None:
     true = hand([True] * 4)
-    with pytest.raises(ToftrackError, match="same joints"):
-        judged(true.joints_m[:3], flags("..."), true)
+    with pytest.raises(ToftrackError, match="compare the same joints of the same frames"):
+        judged(np.zeros(shape), flags("...."), true)
     with pytest.raises(ToftrackError, match="S at least 1"):
-        slots_of_hands(true.joints_m, flags("...."), [true])
+        slots_of_hands(np.zeros(shape), flags("...."), [true])
 
 
 def test_the_interval_holds_the_mean() -> None:
@@ -150,3 +152,12 @@ def test_runs() -> None:
     ):
         np.testing.assert_array_equal(found, flags(expected))
     assert (until(flags("x..x"), 1), until(flags("x..."), 1)) == (2, None)
+
+
+def test_fingertips_are_moved_along_the_last_bone() -> None:
+    joints = np.zeros((1, J, 3))
+    joints[0, 4] = (0, 0.03, 0)
+    joints[0, 7], joints[0, 8] = (0.1, 0, 0), (0.1, 0, 0.02)
+    moved = tips_inset(joints, 0.005)[0, [4, 8, 7, 20]]
+    np.testing.assert_allclose(moved, [(0, 0.025, 0), (0.1, 0, 0.015), (0.1, 0, 0), (0, 0, 0)])
+    assert joints[0, 4, 1] == 0.03

@@ -35,8 +35,6 @@ from toftrack.evaluation.rows import Row
 from toftrack.evaluation.runs import jobs, run_jobs, sources
 from toftrack.evaluation.tables import accuracy_tables, markdown, plain
 
-_TIMED_BESIDE = "milliseconds were measured beside other processes of this run"
-
 _GIVEN_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smooth", "hydra")
 
 
@@ -157,7 +155,7 @@ def notes_of(result: dict[str, Any]) -> list[str]:
     """What is to be said beside the tables."""
     notes = []
     if result["workers"] > 1:
-        notes.append(f"note: {_TIMED_BESIDE}")
+        notes.append("note: milliseconds were measured beside other processes of this run")
     for where in ("here", "there"):
         left = (result.get("comparison") or {}).get(f"only_{where}", ())
         if left:

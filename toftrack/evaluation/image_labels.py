@@ -40,7 +40,7 @@ import numpy as np
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.evaluation.measures import FLAG_COUNTS, flag_counts
 from toftrack.evaluation.statistics import figure, mean_of
-from toftrack.evaluation.trust import OK_MM, TIPS
+from toftrack.evaluation.trust import OK_MM, TIPS, tips_inset
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.json_text import read_json
 
@@ -176,9 +176,10 @@ def lateral_errors_mm(
             f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
             f"{len(joints_m)} frames; give the recording that was labelled"
         )
+    moved = tips_inset(joints_m, _INSET_M)
     found = {
         number: {
-            row: _lateral_mm(np.asarray(joints_m[number], np.float64), row, place, K)
+            row: _lateral_mm(moved[number, row], place, K)
             for row, place in places.items()
             if row in rows
         }
@@ -187,9 +188,7 @@ def lateral_errors_mm(
     return {number: off for number, off in found.items() if off}
 
 
-def _lateral_mm(joints: np.ndarray, row: int, place: tuple[float, float], K: np.ndarray) -> float:
-    inwards = joints[row - 1] - joints[row]
-    point = joints[row] + _INSET_M * inwards / max(float(np.linalg.norm(inwards)), 1e-9)
+def _lateral_mm(point: np.ndarray, place: tuple[float, float], K: np.ndarray) -> float:
     if not np.isfinite(point).all() or point[2] <= 0:
         return float("inf")
     off = (point[:2] / point[2] - (np.array(place) - K[:2, 2]) / np.diag(K)[:2]) * point[2]

@@ -6,9 +6,9 @@ like any other, so that flagging cannot improve an error. Frames without an esti
 failures: they are left out of means and quantiles, reported as `missing_pct`, and never count as
 good.
 
-Re-acquisition is the number of frames from an event to the first of `FOUND_FRAMES` consecutive
+Re-acquisition is the number of frames from an event to the first of `RIGHT_FRAMES` consecutive
 frames (fewer at the end of the recording) that are not flagged lost and have a mean joint error
-below `FOUND_MM`; None when that does not happen before the hand is gone again, or at all. Events:
+below `RIGHT_MM`; None when that does not happen before the hand is gone again, or at all. Events:
 
 - `return`: the hand becomes visible again;
 - `entered`: after a return, the visible fraction first reaches 0.9;
@@ -31,7 +31,6 @@ from toftrack.evaluation.trust import OK_MM, RIGHT_FRAMES, RIGHT_MM, TIPS, judge
 from toftrack.frames import Truth
 
 SKIPPED = 5
-FOUND_MM, FOUND_FRAMES = RIGHT_MM, RIGHT_FRAMES
 TOLERANCE = 3
 _BACK_IN_VIEW = 0.9
 _COVERED = 0.7
@@ -77,7 +76,7 @@ def evaluate(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, 
         said, gone = flagged[rows], ~present[rows]
         metrics[f"lost_precision{suffix}"] = figure(gone[said])
         metrics[f"lost_recall{suffix}"] = figure(said[gone])
-    found = runs(of.said & (of.mean_mm < FOUND_MM), FOUND_FRAMES, cut=True)
+    found = runs(of.said & (of.mean_mm < RIGHT_MM), RIGHT_FRAMES, cut=True)
     metrics["reacquisition"] = [
         {"event": event, "frame": frame, "delay": _delay(found, present, frame)}
         for event, frame in _events(truth)

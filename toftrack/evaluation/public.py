@@ -21,7 +21,7 @@ from toftrack.evaluation.measures import Estimates
 from toftrack.evaluation.runs import estimates_of
 from toftrack.evaluation.statistics import figure, interval, mean_of, share_pct
 from toftrack.evaluation.tables import plain, table_of
-from toftrack.evaluation.trust import OK_MM, TIPS, judged, trust
+from toftrack.evaluation.trust import OK_MM, TIPS, judged, tips_inset, trust
 from toftrack.frames import Truth
 
 _PERCENT = ("within_pct", "usable_pct", "partly_pct", "silent_pct", "false_alarm_pct")
@@ -49,7 +49,7 @@ def evaluate(
 
     Args:
         overrides: of the tracker's configuration; hand.side among them goes before the data set's.
-        tip_inset_m: as for `compared_joints`.
+        tip_inset_m: as for `tips_inset`.
         frames: so many at the start of each sequence only.
 
     Raises:
@@ -67,7 +67,7 @@ def evaluate(
                     file=sys.stderr,
                 )
             found = _tracked(sequence, count, overrides, bar)
-            joints = compared_joints(found.joints_m, data_set.joints, tip_inset_m)
+            joints = tips_inset(found.joints_m, tip_inset_m)[:, list(data_set.joints)]
             true = sequence.joints_m[:count]
             figures[sequence.name] = labelled_figures(joints, found.lost, true, data_set.joints)
     return figures
@@ -85,25 +85,6 @@ def _tracked(
         reported.append([estimate])
         bar.update()
     return estimates_of(reported)
-
-
-def compared_joints(
-    joints_m: np.ndarray, joints: tuple[int, ...], tip_inset_m: float
-) -> np.ndarray:
-    """Estimates as a data set defines its joints.
-
-    joints_m: (T, 21, 3) metres, in toftrack's order.
-    joints: the rows wanted, J of them.
-    tip_inset_m: how far finger ends move along the last bone towards the joint before.
-
-    Returns (T, J, 3) metres.
-    """
-    moved = np.array(joints_m, np.float64)
-    for tip in TIPS:
-        inwards = moved[:, tip - 1] - moved[:, tip]
-        length = np.linalg.norm(inwards, axis=1, keepdims=True)
-        moved[:, tip] += tip_inset_m * inwards / np.maximum(length, 1e-9)
-    return moved[:, list(joints)]
 
 
 def labelled_figures(

@@ -147,6 +147,17 @@ def joint_errors_mm(joints_m: np.ndarray, truth: Truth) -> tuple[np.ndarray, np.
     return there, 1e3 * np.linalg.norm(somewhere - truth.joints_m, axis=2)
 
 
+def tips_inset(joints_m: np.ndarray, inset_m: float) -> np.ndarray:
+    """Joints (T, 21, 3) with the fingertips where other labels have them: so many metres inwards,
+    along the last bone towards the joint before."""
+    moved = np.array(joints_m, np.float64)
+    for tip in TIPS:
+        inwards = moved[:, tip - 1] - moved[:, tip]
+        length = np.linalg.norm(inwards, axis=1, keepdims=True)
+        moved[:, tip] += inset_m * inwards / np.maximum(length, 1e-9)
+    return moved
+
+
 def slots_of_hands(
     joints_m: np.ndarray, lost: np.ndarray, hands: Sequence[Truth]
 ) -> tuple[int, ...]:
