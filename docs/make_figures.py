@@ -109,7 +109,7 @@ def _measured(options: argparse.Namespace) -> dict[str, Any]:
 def _in_turn(file: Path) -> dict[str, Any]:
     """The rows of times from what `toftrack benchmark alternating --json` wrote."""
     from toftrack import __version__
-    from toftrack.benchmark.results import commit
+    from toftrack.evaluation.results import commit
 
     found = json.loads(file.read_text(encoding="utf-8"))
     machine = found["machine"]
@@ -159,21 +159,21 @@ def _benchmark(
     what: Sequence[str | Path], side: str, options: argparse.Namespace, peer: bool = False
 ) -> dict[str, Any]:
     """What `toftrack benchmark accuracy` writes."""
-    from toftrack.benchmark.accuracy import main as accuracy
+    from toftrack.programs.benchmark import main as benchmark
 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "accuracy.json")
         given = [*what, "--side", side, "--seeds", SEEDS, "--workers", options.workers]
         if peer and options.peer_python is not None:
             given += ["--peer", "mediapipe", "--peer-python", options.peer_python]
-        accuracy([str(word) for word in (*given, "--json", file)])
+        benchmark(["accuracy", *(str(word) for word in (*given, "--json", file))])
         found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return found
 
 
 def _append_strangers(options: argparse.Namespace) -> None:
     """Track the public test set; rows for bare hands and for the rest go into history.md."""
-    from toftrack.output.accuracy import totals
+    from toftrack.evaluation.rows import totals
 
     found = _benchmark([DATA / "strangers"], "told", options, peer=True)
     about = _about(found) | {"date": datetime.date.today().isoformat()}

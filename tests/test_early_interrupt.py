@@ -49,7 +49,7 @@ def test_an_interrupt_while_tracking_is_loaded(tmp_path: Path, moment: str) -> N
 
 @pytest.mark.parametrize("name", ["track", "record", "report", "benchmark"])
 def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
-    moment = "toftrack.benchmark.speed" if name == "benchmark" else "hydra"
+    moment = "toftrack.evaluation.speed" if name == "benchmark" else "hydra"
     reported = interrupted(tmp_path, moment, "-m", "toftrack", name, "x")
     assert reported.returncode == 130 and reported.stderr.startswith("interrupted")
     assert reported.stderr.count("\n") == 1

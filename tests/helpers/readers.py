@@ -23,6 +23,8 @@ from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
+from toftrack.evaluation.datasets import nyu, open_data_set
+from toftrack.evaluation.datasets.base import INTEL_CREATIVE
 from toftrack.gestures.files import NamedPose, read_poses, save_poses
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES
@@ -33,7 +35,6 @@ from toftrack.pose_space.data.pose_files import file_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
 from toftrack.programs.recover import recover
 from toftrack.programs.report import read_runs
-from toftrack.recordings.datasets import icvl, msra, nyu, open_data_set
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.npz_pieces import compressed
 from toftrack.recordings.png_folder import PngFolderWriter
@@ -276,9 +277,9 @@ def _runs(folder: Path) -> list[Reader]:
 
 
 def _data_sets(folder: Path) -> list[Reader]:
-    write_msra(folder / "msra14" / "Subject1", scene(msra._CAMERA, 2), boxed=False)
-    write_msra(folder / "msra" / "P0" / "TIP", scene(msra._CAMERA, 2), boxed=True)
-    write_icvl(folder / "icvl" / "Testing", scene(icvl._CAMERA, 2))
+    write_msra(folder / "msra14" / "Subject1", scene(INTEL_CREATIVE, 2), boxed=False)
+    write_msra(folder / "msra" / "P0" / "TIP", scene(INTEL_CREATIVE, 2), boxed=True)
+    write_icvl(folder / "icvl" / "Testing", scene(INTEL_CREATIVE, 2))
     write_nyu(folder / "nyu" / "test", scene(nyu._CAMERA, 2))
     readers = []
     for name, there in (("MSRA14", "msra14"), ("MSRA15", "msra"), ("ICVL", "icvl"), ("NYU", "nyu")):

@@ -12,14 +12,15 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
+from toftrack.evaluation.metrics import evaluate
+from toftrack.evaluation.trust import judged, trust
 from toftrack.frames import Truth
 from toftrack.hand.shape import default_hand_shape
 from toftrack.output.advice import Watch
-from toftrack.output.evaluation import evaluate, metrics_table
 from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, LINE_FIELDS, json_line
 from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.smoothing import OneEuro, smooth
-from toftrack.output.trust import Hand, trust
+from toftrack.output.summary_table import metrics_table
 from toftrack.programs.recover import recover
 
 NAMES = tuple(f"joint_{i}" for i in range(21))
@@ -167,7 +168,7 @@ def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path)
     for found, one in ((metrics, known), (metrics["second"], known.other)):
         assert one is not None
         joints, lost = content["joints_m"][:, found["slot"]], content["lost"][:, found["slot"]]
-        assert found["trust"] == asdict(trust(joints, lost, Hand(one.joints_m, one.visible)))
+        assert found["trust"] == asdict(trust(judged(joints, lost, one)))
         figures = evaluate(joints, lost, one)
         assert {name: found[name] for name in figures} == figures
         assert found["coverage"]["in_region_90_pct"] == 100

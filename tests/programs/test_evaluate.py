@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from helpers.data_sets import scene, write_msra
 
+from toftrack.evaluation.datasets.base import INTEL_CREATIVE
 from toftrack.programs import command_line
 from toftrack.programs.evaluate import main
-from toftrack.recordings.datasets import msra
 
 FEW = "filter.particles=60"
 
@@ -18,7 +18,7 @@ FEW = "filter.particles=60"
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Two sequences of the same six frames."""
-    seen = scene(msra._CAMERA, 6)
+    seen = scene(INTEL_CREATIVE, 6)
     for gesture in ("1", "TIP"):
         write_msra(tmp_path / "P0" / gesture, seen, boxed=True)
     return tmp_path

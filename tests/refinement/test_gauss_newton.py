@@ -15,10 +15,10 @@ from reference.refinement import TorchRefiner, point_jacobian, points_around, re
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
+from toftrack.evaluation.trust import TIPS
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
-from toftrack.output.evaluation import TIPS
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
 from toftrack.refinement.gauss_newton import JOINT_FRAME, Keypoints, Refinement

@@ -11,7 +11,7 @@ from helpers.configured import nearest_surface
 from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
-from toftrack.output.evaluation import TIPS
+from toftrack.evaluation.trust import TIPS
 from toftrack.render.numba.median import SIDE, thinned
 from toftrack.render.segmentation import Expected, NearestSurface, reduce_image
 

@@ -29,7 +29,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 from breaks import BREAKS, OTHER_SIDE, Break, scaled
 
 from toftrack.api import make_tracker
-from toftrack.output.measures import Estimates, MeasuredRecording, mean_of, measured
+from toftrack.evaluation.measures import Estimates, MeasuredRecording, measured
+from toftrack.evaluation.runs import estimates_of
+from toftrack.evaluation.statistics import mean_of
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.store import open_recording, open_source
 
@@ -75,11 +77,7 @@ def tracked(recording: FrameStore, seed: int, side: str, fault: Break = WHOLE) -
             )
             for i in range(len(recording))
         ]
-    return Estimates(
-        joints_m=np.stack([estimate.joints_m for estimate in found]),
-        lost=np.array([estimate.lost for estimate in found]),
-        joint_sigma_m=np.stack([estimate.joint_sigma_m for estimate in found]),
-    )
+    return estimates_of([[estimate] for estimate in found])
 
 
 def side_of(recording: FrameStore) -> str:

@@ -4,7 +4,7 @@ Of a run with several slots a frame is lost when none has a hand that can be use
 score is that of the hands that are there; `slots` says the same of each. The metrics are those of
 the recording's first hand, in the slot that followed it; under `second` stand those of its other
 hand, and where there are more slots than hands, `ghost_pct` says how often another slot had one all
-the same. What measures.py adds to trust.py stands under `further`.
+the same. What evaluation/measures.py adds to trust.py stands under `further`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from toftrack.errors import ToftrackError
+from toftrack.evaluation.measures import REGION_FIGURES, Estimates, Measured, measured
+from toftrack.evaluation.metrics import evaluate
 from toftrack.frames import Truth
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
-from toftrack.output.evaluation import evaluate
-from toftrack.output.measures import REGION_FIGURES, Estimates, Measured, measured
 from toftrack.output.records import Records
 from toftrack.recordings.doubts import times_doubt
 
@@ -134,16 +134,17 @@ def run_metrics(
     position = np.flatnonzero(counted[inside])
     found = truth.of_frames(index[known])
     done = {name: records.column(name, rows[known]) for name in _MEASURED if name in records.names}
-    both = measured(Estimates(**found_side(done)), found)
+    estimates = Estimates(**found_side(done))
+    both = measured(estimates, found)
     if both.slots is None:
-        return _metrics(both.first, done, found, None, position)
-    metrics = _metrics(both.first, done, found, both.slots[0], position)
-    metrics = {"slot": both.slots[0]} | metrics
+        return _metrics(both.first, estimates, found, position)
+    first = _metrics(both.first, estimates.slot(both.slots[0]), found, position)
+    metrics = {"slot": both.slots[0]} | first
     if both.ghost_pct is not None:
         metrics["ghost_pct"] = both.ghost_pct
     if both.second is None or found.other is None:
         return metrics
-    second = _metrics(both.second, done, found.other, both.slots[1], position)
+    second = _metrics(both.second, estimates.slot(both.slots[1]), found.other, position)
     return metrics | {"second": {"slot": both.slots[1]} | second}
 
 
@@ -160,26 +161,19 @@ def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _metrics(
-    of: Measured,
-    arrays: dict[str, np.ndarray],
-    truth: Truth,
-    slot: int | None,
-    position: np.ndarray,
+    of: Measured, estimates: Estimates, truth: Truth, position: np.ndarray
 ) -> dict[str, Any]:
-    """Of the estimates of one hand.
+    """Of one hand.
 
     position: (T,) of the frames among all, with those that do not count.
     """
-    joints, lost = (
-        arrays[name] if slot is None else arrays[name][:, slot] for name in ("joints_m", "lost")
-    )
-    metrics = {"trust": asdict(of.trust)} | evaluate(joints, lost, truth)
+    metrics = {"trust": asdict(of.trust)} | evaluate(estimates.joints_m, estimates.lost, truth)
     for event in metrics["reacquisition"]:
         event["frame"] = int(position[event["frame"]])
     regions = {name: of.figures.get(name) for name in REGION_FIGURES}
-    further = {name: value for name, value in of.figures.items() if name not in REGION_FIGURES}
-    if "joint_sigma_m" in arrays:
+    if estimates.joint_sigma_m is not None:
         metrics["coverage"] = regions
+    further = {name: value for name, value in of.figures.items() if name not in regions}
     return metrics | {"further": further}
 
 

@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.estimate import confidence_words, state_words
+from toftrack.evaluation.trust import joint_errors_mm
 from toftrack.frames import Truth
 from toftrack.output.run_folder import Footage, Run, observe, read_run
 from toftrack.programs.command_line import plain_parser
@@ -239,8 +240,8 @@ def _course(run: Run, truth: Truth | None, metrics: dict[str, Any], of: str) -> 
     results = run.results
     error, absent = None, None
     if truth is not None:
-        error = 1e3 * np.linalg.norm(results["joints_m"] - truth.joints_m, axis=-1)
-        error[~truth.visible] = np.nan
+        there, error = joint_errors_mm(results["joints_m"], truth)
+        error[~(there & truth.visible)] = np.nan
         absent = ~(truth.visible & truth.in_space)
     score = np.where(np.isfinite(results["score"]), results["score"], np.nan)
     title = f"Score of {len(run)} frames"

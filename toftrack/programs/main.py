@@ -29,7 +29,7 @@ _COMMANDS = {
     "gesture": _Command("toftrack.programs.gesture", "make gestures of your own"),
     "figures": _Command("toftrack.programs.figures", "draw pictures of a finished run"),
     "report": _Command("toftrack.programs.report", "gather the jobs of a sweep"),
-    "benchmark": _Command("toftrack.benchmark.command", "measure speed and accuracy"),
+    "benchmark": _Command("toftrack.programs.benchmark", "measure speed and accuracy"),
     "export": _Command("toftrack.programs.export", "write a run for Blender, or as a table"),
     "recover": _Command("toftrack.programs.recover", "finish a run or a recording that was killed"),
 }

@@ -17,7 +17,6 @@ from typing import Any
 from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.json_text import read_object
-from toftrack.output.evaluation import metrics_table
 from toftrack.output.files import LINES, WHOLE_FILES, cut_unfinished_line, locked_lines
 from toftrack.output.results import (
     count_frames,
@@ -27,6 +26,7 @@ from toftrack.output.results import (
     records_of,
 )
 from toftrack.output.run_folder import found_again, open_tracked
+from toftrack.output.summary_table import metrics_table
 from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.store import open_source
 from toftrack.recordings.unfinished import is_recording, recover_recording

@@ -31,11 +31,11 @@ from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.advice import Watch
-from toftrack.output.evaluation import metrics_line, metrics_table
 from toftrack.output.results import RealTime, ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.output.summary import shape_file
+from toftrack.output.summary_table import metrics_line, metrics_table
 from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.recordings.recorder import Recorder

@@ -16,10 +16,9 @@ from tqdm import tqdm
 from toftrack.api import make_tracker
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.evaluation.image_labels import Points, lateral_errors_mm, read_labels
+from toftrack.evaluation.trust import OK_MM, TIPS
 from toftrack.frames import Truth
-from toftrack.output.evaluation import TIPS
-from toftrack.output.image_labels import Points, lateral_errors_mm, read_labels
-from toftrack.output.trust import OK_MM
 
 
 @dataclass(frozen=True, eq=False)

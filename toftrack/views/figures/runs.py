@@ -249,7 +249,7 @@ _PARTS = (
 def accuracy_figure(each: Mapping[str, Mapping[str, Any]], total: Mapping[str, Any]) -> np.ndarray:
     """A bar a recording and one for their mean, BGR.
 
-    each: figures of recordings, see output/accuracy.py.  total: theirs, with `usable_90`, which is
+    each: figures of recordings, see evaluation/rows.py.  total: theirs, with `usable_90`, which is
     drawn as a line across its end.
     """
     rows = {**each, "mean of the recordings": total}

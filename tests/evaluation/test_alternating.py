@@ -1,0 +1,61 @@
+"""Programs that are timed in turn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toftrack.errors import ToftrackError
+from toftrack.evaluation import alternating
+from toftrack.evaluation.alternating import FIRST, PEER_HANDS, Program, Runner, Times, show
+
+LEFT = str(Path(alternating.__file__).parents[1] / "data" / "sample_left_hand.npz")
+
+
+def times(name: str, *rounds: float) -> Times:
+    """Of ten frames a round, all but two of which take as long."""
+    return Times(name, [[ms] * 8 + [0.5 * ms, 3 * ms] for ms in rounds])
+
+
+def test_rounds_are_compared_one_by_one() -> None:
+    ours, other = times(FIRST, 5.0, 20.0, 8.0), times("other", 10.0, 20.0, 16.0)
+    assert ours.least == 2.5 and ours.medians == [5.0, 20.0, 8.0]
+    assert ours.over(other) == [0.5, 1.0, 0.5]
+    assert all(1 < tail < 3 for tail in ours.tails)
+
+
+def test_the_table_has_the_ratios_and_the_starts() -> None:
+    peer_name = next(iter(PEER_HANDS))
+    found = [
+        times(FIRST, 5.0, 6.0),
+        times("a, one hand", 10.0, 10.0),
+        times("a, both", 15.0, 16.0),
+        times(peer_name, 20.0, 20.0),
+    ]
+    names = ("kernels", "first_s", "wall_s", "user_s", "system_s")
+    begun = [
+        dict(zip(names, values, strict=True))
+        for values in ((False, 12.0, 14.0, 20.0, 1.7), (True, 3.0, 3.9, 4.0, 0.5))
+    ]
+    said = show(found, begun).splitlines()
+    assert said[1].startswith(FIRST) and "0.28 (0.25, 0.30)" in said[1]
+    assert said[5].startswith("a, both over one hand: median 1.55 (1.50, 1.60)")
+    assert said[6].startswith("three frames without kernels") and "14.0" in said[6]
+    assert said[7].startswith("three frames with kernels") and "3.9" in said[7]
+
+
+def test_frames_count_in_which_the_hands_are_believed(tmp_path) -> None:
+    short = tmp_path / "short.npz"
+    with np.load(LEFT) as sample:
+        np.savez(short, **{k: v[:15] if v.shape[:1] == (80,) else v for k, v in sample.items()})
+    quick = ("hand.side=left", "experiment=paper")
+    assert 0 < len(alternating._one_round(Program("one", quick, str(short), hands=1))()) <= 5
+    with pytest.raises(ToftrackError, match="2 hands were in none"):
+        alternating._one_round(Program("two", quick, str(short), hands=2))()
+
+
+def test_what_a_program_s_process_cannot_do_is_one_sentence() -> None:
+    with pytest.raises(ToftrackError, match="wrong"), Runner(Program("wrong", ("nothing=1",))):
+        pass

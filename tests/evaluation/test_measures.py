@@ -1,0 +1,174 @@
+"""What is measured beside usable and silently wrong frames: cases done by hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toftrack.errors import ToftrackError
+from toftrack.evaluation.measures import FLAG_COUNTS, POSE_GESTURES, Estimates, coverage, measured
+from toftrack.frames import Truth
+from toftrack.recordings.npz import read_recording
+
+
+def truth(frames: int = 6, **fields: Any) -> Truth:
+    """A hand whose joints are 20 mm apart, at rest."""
+    joints = np.zeros((frames, 21, 3))
+    joints[:, :, 0] = 0.02 * np.arange(21)
+    joints[:, :, 2] = 0.5
+    yes = np.ones(frames, bool)
+    return Truth(**({"joints_m": joints, "visible": yes, "in_space": yes} | fields))
+
+
+def estimates(true: Truth, **fields: Any) -> Estimates:
+    """The truth itself, never lost."""
+    lost = np.zeros(len(true), bool)
+    return Estimates(**({"joints_m": true.joints_m.copy(), "lost": lost} | fields))
+
+
+def test_a_fingertip_at_another_finger_is_a_swap_and_one_between_two_is_none() -> None:
+    true = truth()
+    found = estimates(true, lost=np.array([False] * 5 + [True]))
+    found.joints_m[0, 8] = true.joints_m[0, 12]
+    found.joints_m[1, 8] = 0.55 * true.joints_m[1, 12] + 0.45 * true.joints_m[1, 8]  # 8 mm nearer
+    found.joints_m[2, 8] = np.nan
+    found.joints_m[5, 8] = true.joints_m[5, 12]  # is flagged lost
+    assert measured(found, true).first.figures["swap_pct"] == pytest.approx(100 / 6)
+
+
+def test_flags_count_for_visible_fingertips_in_frames_that_are_not_lost() -> None:
+    visible = np.ones((6, 21), bool)
+    visible[2, 8] = False
+    true = truth(joint_visible=visible)
+    ok = np.ones((6, 21), bool)
+    ok[0, 8] = ok[:2, 12] = ok[:, 7] = False  # 7 is no tip
+    found = estimates(true, lost=np.array([False] * 5 + [True]), joint_ok=ok)
+    found.joints_m[[0, 1, 2, 5], 8, 1] += 0.05
+    figures = measured(found, true).first.figures
+    assert [figures[name] for name in FLAG_COUNTS] == [2, 1, 5 * 5 - 3, 2]
+    unseen = estimates(truth(), joint_ok=ok)
+    assert not set(FLAG_COUNTS) & set(measured(unseen, truth()).first.figures)
+
+
+def test_jitter_is_the_movement_beyond_the_true_one_while_the_hand_rests() -> None:
+    true = truth(still=np.array([False, True, True, True, True, False]))
+    true.joints_m[3:, :, 0] += 0.001
+    found = estimates(true)
+    found.joints_m[:, :, 1] += np.array([0.9, 0, 0.002, 0.002, 0, 0.9])[:, None]
+    figures = measured(found, true).first.figures
+    assert figures["jitter_mm"] == pytest.approx((2 + 0 + 2) / 3)
+    lost = replace(found, lost=np.array([False, False, True, False, False, False]))
+    assert measured(lost, true).first.figures["jitter_mm"] == pytest.approx(2)
+    assert measured(estimates(truth()), truth()).first.figures["jitter_mm"] is None
+
+
+def test_means_over_usable_frames_leave_the_others_out() -> None:
+    true = truth()
+    found = estimates(true)
+    found.joints_m[:3, :, 1] += 0.01
+    found.joints_m[0, 4, 1] += 0.05  # usable no more
+    figures = measured(found, true).first.figures
+    assert figures["usable_mean_mm"] == pytest.approx(10 * 2 / 5)
+    assert figures["usable_tip_mm"] == pytest.approx(10 * 2 / 5)
+    assert figures["tip_mm"] == pytest.approx((3 * 5 * 10 + 50) / 30)
+
+
+def test_gestures_count_where_the_pose_has_a_name() -> None:
+    poses = np.array(["point", "point", "transition", "hook", "spread", "palm"])
+    named = np.array(["pointing", "palm", "palm", "other", "palm", "palm"])
+    true = truth(pose_name=poses)
+    lost = np.array([False] * 5 + [True])
+    figures = measured(estimates(true, gesture=named, lost=lost), true).first.figures
+    assert figures["gesture_pct"] == 100 * 3 / 5
+    assert {"palm", "fist", "pointing", "other"} <= set(POSE_GESTURES.values())
+
+
+def test_the_side_counts_at_the_end_after_ten_frames_and_where_it_is_certain() -> None:
+    true = truth(20, side="left")
+    side = np.array([""] * 4 + ["right"] * 10 + ["left"] * 6)
+    sure = np.array([np.nan] * 4 + [0.95, 0.92] + [0.6] * 8 + [0.99] * 6)
+    figures = measured(estimates(true, side=side, side_probability=sure), true).first.figures
+    assert figures["side_right_end"] is True and figures["side_right_soon"] is True
+    assert figures["side_wrong_certain_pct"] == 100 * 2 / 20
+    late = np.array([""] * 5 + ["right"] * 15)
+    figures = measured(estimates(true, side=late), true).first.figures
+    assert figures["side_right_end"] is False and figures["side_right_soon"] is False
+    assert "side_right_end" not in measured(estimates(true), true).first.figures  # it was told
+
+
+def test_of_two_slots_each_hand_has_its_own() -> None:
+    other = truth()
+    other.joints_m[:, :, 1] += 0.3
+    true = replace(truth(), other=other)
+    joints = np.stack((other.joints_m, true.joints_m), 1)
+    found = measured(Estimates(joints, np.zeros((6, 2), bool)), true)
+    assert found.slots == (1, 0) and found.ghost_pct is None and found.second is not None
+    assert found.first.trust.usable_pct == found.second.trust.usable_pct == 100
+    more = np.concatenate((joints, joints[:, :1]), 1)
+    ghost = measured(
+        Estimates(more, np.array([[False, False, False]] * 3 + [[False, False, True]] * 3)), true
+    )
+    assert ghost.slots == (1, 0) and ghost.ghost_pct == 50 and ghost.second is not None
+    alone = measured(Estimates(joints, np.zeros((6, 2), bool)), truth())
+    assert alone.second is None and alone.ghost_pct == 100
+
+
+def test_poses_sides_and_rests_are_read_from_a_recording(tmp_path) -> None:
+    file = tmp_path / "a.npz"
+    arrays = {
+        "depth_m": np.full((4, 8, 8), 0.5, np.float32),
+        "K": np.array([[10.0, 0, 4], [0, 10, 4], [0, 0, 1]]),
+        "joints_m": np.full((4, 21, 3), 0.5),
+        "joints2_m": np.full((4, 21, 3), 0.6),
+        "pose_name": np.array(["palm", "palm", "transition", "fist"]),
+    }
+    about = {"handedness": "left", "side2": "right", "still": [[1, 2], "odd", [3]]}
+    np.savez(file, metadata=json.dumps(about), **arrays)
+    found = read_recording(file).truth
+    assert found is not None and found.other is not None
+    assert (found.side, found.other.side) == ("left", "right")
+    assert found.still is not None and found.still.tolist() == [False, True, True, False]
+    assert found.pose_name is not None and found[1:].pose_name.tolist()[-1] == "fist"
+    np.savez(file, **(arrays | {"pose_name": np.arange(4)}))
+    with pytest.raises(ToftrackError, match="'pose_name' must be text"):
+        read_recording(file)
+
+
+def regions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joints that are 10 mm off; standard deviations; which are hidden: 4 frames."""
+    joints = np.random.default_rng(0).normal(0, 0.05, (4, 21, 3)) + (0, 0, 0.5)
+    return joints, np.full(joints.shape, 0.01), np.zeros((4, 21), bool)
+
+
+def truth_beside(joints: np.ndarray, hidden: np.ndarray | None, seen: int = 4) -> Truth:
+    off = np.zeros_like(joints)
+    off[..., 0] = 0.01
+    visible = np.arange(4) < seen
+    return Truth(joints + off, visible, visible, None, None if hidden is None else ~hidden)
+
+
+def test_regions_are_counted_in_visible_frames_and_of_hidden_joints() -> None:
+    joints, sigma, hidden = regions()
+    hidden[:, :3] = True
+    sigma[0, 0] = sigma[1, 5] = 0.001
+    sigma[3] = 0.001  # the hand is out of view
+    found = coverage(joints, sigma, truth_beside(joints, hidden, seen=3))
+    assert found["in_region_90_pct"] == pytest.approx(100 * (1 - 2 / 63))
+    assert found["hidden_in_region_90_pct"] == pytest.approx(100 * (1 - 1 / 9))
+    assert found["without_region_pct"] == 0
+
+
+def test_joints_without_a_region_are_counted_apart() -> None:
+    joints, sigma, _ = regions()
+    sigma[0], joints[1] = np.nan, np.nan
+    found = coverage(joints, sigma, truth_beside(joints, None))
+    assert list(found.values()) == [100.0, None, 50.0]
+
+
+def test_without_a_visible_hand_there_is_no_figure() -> None:
+    joints, sigma, hidden = regions()
+    assert set(coverage(joints, sigma, truth_beside(joints, hidden, seen=0)).values()) == {None}

@@ -1,1 +1,0 @@
-"""How long scoring, decoding and whole frames take: `toftrack benchmark`."""

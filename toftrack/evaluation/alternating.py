@@ -1,0 +1,344 @@
+"""How long frames and starts take: programs in turn, so that all meet what else a machine does.
+
+Every program has a process of its own and sees the packaged recording forwards and backwards, one
+program after another, as often as --rounds says. With --peer-python, MediaPipe Hands is one of
+them, as its accuracy is compared (two hands are looked for) and looking for one. --two-hands names
+recordings with truth in which two hands are tracked, beside one of them. --starts runs the command
+line on three frames, each time without any compiled kernels, and then with them.
+"""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from toftrack.api import make_device, make_hands_tracker
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.evaluation.peer import Peer
+from toftrack.evaluation.results import processor
+from toftrack.evaluation.speed import enlarged
+
+FIRST = "one hand, side given"
+"""The program whose times the others' are compared with."""
+SIZES = ((640, 480), (1280, 720))
+"""Columns and rows of larger images."""
+PEER_HANDS = {"MediaPipe, two hands": 2, "MediaPipe, one hand": 1}
+_UNDERWAY = 10
+"""Frames of a recording before its tracks are under way."""
+_START = ("device=sample", "hand.side=right", "device.stop=3", "stream=stdout")
+
+
+@dataclass(frozen=True)
+class Program:
+    """What is timed.
+
+    overrides: of the tracker.  recording: with truth; None = the packaged one.
+    size: columns and rows to which its images are enlarged.  hands: that must be believed in a
+    frame that counts.
+    """
+
+    name: str
+    overrides: tuple[str, ...] = ()
+    recording: str | None = None
+    size: tuple[int, int] | None = None
+    hands: int = 0
+
+
+@dataclass
+class Times:
+    """Milliseconds of one program's frames, a list for each round."""
+
+    name: str
+    rounds: list[list[float]] = field(default_factory=list)
+
+    @property
+    def least(self) -> float:
+        """Of all frames."""
+        return min(min(times) for times in self.rounds)
+
+    @property
+    def medians(self) -> list[float]:
+        """Of each round."""
+        return [float(np.median(times)) for times in self.rounds]
+
+    @property
+    def tails(self) -> list[float]:
+        """The 90th percentile over the median, of each round."""
+        return [float(np.percentile(times, 90) / np.median(times)) for times in self.rounds]
+
+    def over(self, other: Times) -> list[float]:
+        """Its medians over another's, round by round."""
+        return [a / b for a, b in zip(self.medians, other.medians, strict=True)]
+
+
+def programs(two_hands: Sequence[str] = ()) -> list[Program]:
+    """All that is timed by default, and both hands of recordings beside one of them."""
+    found = [
+        Program(FIRST, ("hand.side=right",)),
+        Program("side found out", ("hand.side=auto",)),
+        Program("hands=2, one in view", ("hands=2",)),
+        *(Program(f"{w}x{h}", ("hand.side=right",), size=(w, h)) for w, h in SIZES),
+        Program("experiment=paper", ("experiment=paper",)),
+    ]
+    for path in two_hands:
+        name = Path(path).stem
+        with Replay(path) as device:
+            if device.truth is None:
+                raise ToftrackError(f"{path}: there is no truth in it; give a recording that has")
+            side = device.truth.side
+        found.append(Program(f"{name}, one hand", (f"hand.side={side}",), str(path), hands=1))
+        found.append(Program(f"{name}, both", (f"hand.side={side}", "hands=2"), str(path), hands=2))
+    return found
+
+
+class Runner:
+    """A program's process, for a `with`; `round` times it once."""
+
+    def __init__(self, program: Program) -> None:
+        self.name, self._program = program.name, program
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+
+    def __enter__(self) -> Runner:
+        try:
+            self.round()  # compiles, and sees everything once
+        except BaseException:
+            self._pool.shutdown()
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def round(self) -> list[float]:
+        """Milliseconds of its frames. Raises ToftrackError when it ended."""
+        try:
+            return self._pool.submit(_round, self._program).result()
+        except BrokenProcessPool:
+            raise ToftrackError(f"the process that timed {self.name!r} has ended") from None
+        except ToftrackError as error:
+            raise ToftrackError(f"{self.name}: {error}") from None
+
+
+def _round(program: Program) -> list[float]:
+    """What Runner asks its process for."""
+    return _one_round(program)()
+
+
+@functools.cache
+def _one_round(program: Program) -> Callable[[], list[float]]:
+    tracker = make_hands_tracker(*program.overrides, "device=sample")
+    device = make_device("device=sample") if program.recording is None else None
+    with device or Replay(str(program.recording)) as source:
+        camera, images = source.camera, [(frame.depth, frame.radial) for frame in source]
+    if program.size is not None:
+        camera, images = enlarged(camera, images, program.size)
+    order = list(range(len(images)))
+    if program.recording is None:
+        order += order[-2:0:-1]
+
+    numbers = count()
+
+    def once() -> list[float]:
+        found = []
+        if program.recording is not None:
+            tracker.restart()
+        for seen, index in enumerate(order):
+            number = next(numbers)
+            began = time.perf_counter()
+            estimates = tracker.step(
+                camera.rectify(*images[index]), camera.K, number, 0.04 * number
+            )
+            took = 1e3 * (time.perf_counter() - began)
+            believed = sum(not estimate.lost for estimate in estimates)
+            if program.recording is None or (seen >= _UNDERWAY and believed >= program.hands):
+                found.append(took)
+        if not found:
+            raise ToftrackError(f"{program.hands} hands were in none of its frames")
+        return found
+
+    return once
+
+
+class _PeerRunner:
+    """MediaPipe as a Runner."""
+
+    def __init__(self, name: str, python: str) -> None:
+        self.name = name
+        self._peer = Peer("mediapipe", python)
+        with make_device("device=sample") as device:
+            camera, frames = device.camera, list(device)
+        self._images = [(camera.rectify(f.depth, f.radial), f.amplitude) for f in frames]
+        self._images += self._images[-2:0:-1]
+        self._peer.begin(camera, "right", PEER_HANDS[name])
+
+    def __enter__(self) -> _PeerRunner:
+        self.round()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._peer.close()
+
+    def round(self) -> list[float]:
+        """Milliseconds of its frames, in its own process."""
+        found = []
+        for depth, amplitude in self._images:
+            assert amplitude is not None, "the packaged recording has amplitudes"
+            found.append(1e3 * self._peer.step(depth, amplitude).compute_s)
+        return found
+
+
+def timed(which: Sequence[Program], rounds: int, peer_python: str | None = None) -> list[Times]:
+    """Milliseconds of frames, each program's in turn with the others'. Raises ToftrackError."""
+    with ExitStack() as stack:
+        runners: list[Runner | _PeerRunner] = [
+            stack.enter_context(Runner(program)) for program in which
+        ]
+        if peer_python is not None:
+            runners += [stack.enter_context(_PeerRunner(name, peer_python)) for name in PEER_HANDS]
+        found = [Times(runner.name) for runner in runners]
+        for _ in range(rounds):
+            for runner, times in zip(runners, found, strict=True):
+                times.rounds.append(runner.round())
+    return found
+
+
+Start = dict[str, float]
+"""One run of the command line on three frames, seconds: `first_s` until its first estimate,
+`wall_s` until its end, `user_s` and `system_s` of the processors; `kernels`: whether they were
+compiled."""
+
+
+def starts(times: int) -> list[Start]:
+    """Runs without compiled kernels, each followed by one with them. Raises ToftrackError."""
+    found = []
+    for _ in range(times):
+        with tempfile.TemporaryDirectory() as folder:
+            found += [_start(folder) | {"kernels": kernels} for kernels in (False, True)]
+    return found
+
+
+def _start(folder: str) -> Start:
+    command = [sys.executable, "-m", "toftrack", "track", *_START, f"hydra.run.dir={folder}/run"]
+    before = os.times()
+    began = time.perf_counter()
+    env = os.environ | {"NUMBA_CACHE_DIR": folder}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        first = time.perf_counter() - began
+        process.stdout.read()
+    wall = time.perf_counter() - began
+    if process.returncode or not line:
+        raise ToftrackError(f"{' '.join(command)} ended with status {process.returncode}")
+    after = os.times()
+    return {
+        "first_s": first,
+        "wall_s": wall,
+        "user_s": after.children_user - before.children_user,
+        "system_s": after.children_system - before.children_system,
+    }
+
+
+def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
+    """As tables of text: the median of the rounds, and in brackets the least and the largest."""
+    lines = []
+    if found:
+        named = {times.name: times for times in found}
+        first = named.get(FIRST)
+        peers = [named[name] for name in PEER_HANDS if name in named]
+        over = [] if first is None else [("side given", first)]
+        over += [(times.name, times) for times in peers]
+        head = f"{'ms':<28}{'least':>7}{'median':>20}{'90th / median':>20}"
+        lines.append(head + "".join(f"{'over ' + name:>28}" for name, _ in over))
+        for times in found:
+            line = f"{times.name:<28}{times.least:>7.1f}{_spread(times.medians, 1):>20}"
+            line += f"{_spread(times.tails, 2):>20}"
+            line += "".join(f"{_spread(times.over(other), 2):>28}" for _, other in over)
+            lines.append(line)
+        for both in (times for times in found if times.name.endswith(", both")):
+            one = named[both.name.removesuffix("both") + "one hand"]
+            tails = zip(both.tails, both.medians, one.medians, strict=True)
+            slow = [tail * median / alone for tail, median, alone in tails]
+            lines.append(
+                f"{both.name} over one hand: median {_spread(both.over(one), 2)}, its 90th"
+                f" percentile over that median {_spread(slow, 2)}"
+            )
+    for kernels in (False, True):
+        some = [start for start in begun if start["kernels"] == kernels]
+        if some:
+            until_first, wall, user, system = (
+                _spread([start[name] for start in some], 1)
+                for name in ("first_s", "wall_s", "user_s", "system_s")
+            )
+            lines.append(
+                f"three frames {'with' if kernels else 'without'} kernels, s: first estimate"
+                f" {until_first}, end {wall}, processors {user} and of the system {system}"
+            )
+    return "\n".join(lines)
+
+
+def _spread(values: Sequence[float], digits: int) -> str:
+    """The median (least, largest)."""
+    middle = float(np.median(values))
+    return f"{middle:.{digits}f} ({min(values):.{digits}f}, {max(values):.{digits}f})"
+
+
+def measure(
+    rounds: int,
+    begins: int,
+    cores: int | None,
+    two_hands: Sequence[str],
+    peer_python: str | None,
+) -> dict[str, Any]:
+    """Time everything and print it, the machine first; returns what --json writes.
+
+    Args:
+        rounds: of all programs.  begins: of the command line.
+        cores: as many as all may use; None: all that there are.
+        two_hands: recordings with truth.
+        peer_python: MediaPipe's; None: without it.
+
+    Raises:
+        ToftrackError: a recording or an environment cannot be used.
+    """
+    if cores is not None:
+        _use(cores)
+    about = {
+        "processor": processor(),
+        "cores": cores or os.cpu_count(),
+        "torch": torch.__version__,
+    }
+    print(f"{about['processor']}, {about['cores']} cores, torch {about['torch']}", flush=True)
+    begun = starts(begins)
+    found = timed(programs(two_hands), rounds, peer_python) if rounds else []
+    print(show(found, begun))
+    return {"machine": about, "frames": [asdict(times) for times in found], "starts": begun}
+
+
+def _use(cores: int) -> None:
+    """Let this process and those it starts use only so many cores."""
+    if not hasattr(os, "sched_setaffinity"):
+        raise ToftrackError("--cores cannot be set on this system; leave it out")
+    allowed = sorted(os.sched_getaffinity(0))
+    if cores > len(allowed):
+        raise ToftrackError(f"--cores {cores}: only {len(allowed)} can be used here")
+    os.sched_setaffinity(0, allowed[:cores])

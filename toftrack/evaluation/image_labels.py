@@ -1,0 +1,218 @@
+"""Single images of a recording that were labelled by eye, and what is measured with them.
+
+Labels are a JSON file of one of two kinds. **Points**: the pixels of joints in some frames of a
+recording, which is tracked as a whole:
+
+    {"image_size": [512, 424], "side": "left", "frames": {"6": {"points":
+        {"thumb_tip": [249.5, 170.8, "visible"], "wrist": [308, 182, "guessed"], ...}}, ...}}
+
+A joint is compared laterally: the distance in pixels between its projection and the label, times
+its own depth over the focal length. Of visible fingertips, which are moved 5 mm towards the joint
+before them, as the labels are: `tips_20_pct`, `tips_40_pct` are the frames in which all are within
+20 and 40 mm; `wrong_pct` those in which one is farther than 40 mm off, unflagged; `flagged_pct`
+those flagged lost; `wrong_no_flag_pct` those not flagged lost in which a tip is so far off that
+`joint_ok` does not flag; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that
+is not finite or not in front of the camera is infinitely far off, and left out of the mean). What
+`joint_ok` flags is counted as in measures.py.
+
+**Stills**: images that have nothing to do with one another, each with what it shows. Every one has
+a fresh start and is shown so many frames, the last of which counts:
+
+    {"image_size": [320, 240], "side": "right", "shown_frames": 10, "images": [1, 1, 2, ...],
+     "called": {"1": ["palm"], "6": ["other", ""], ...}}
+
+`images` says which of `called` each image shows, and `called` what that may be called.
+`found_pct` are the images that are not lost, `named_pct` those of them that are called rightly,
+`wrong_name_pct` those that are called something else, but for nothing and `other`.
+
+Each labelled image counts as a recording of its own in totals, intervals and differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toftrack.errors import ToftrackError, reported_errors
+from toftrack.evaluation.measures import FLAG_COUNTS, flag_counts
+from toftrack.evaluation.statistics import figure, mean_of
+from toftrack.evaluation.trust import OK_MM, TIPS, tips_inset
+from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.json_text import read_json
+
+IMAGE_MEANS = (
+    "tips_20_pct",
+    "tips_40_pct",
+    "wrong_pct",
+    "flagged_pct",
+    "wrong_no_flag_pct",
+    "found_pct",
+    "named_pct",
+    "wrong_name_pct",
+)
+"""Figures of a labelled image, 0 or 100."""
+UNNAMED = ("", "other")
+_INSET_M = 0.005
+_FLAGS = ("visible", "guessed", "absent")
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Labels of points.  frames: by its number, (u, v) of each of the 21 joints that is visible."""
+
+    path: Path
+    size: tuple[int, int]
+    side: str
+    frames: dict[int, dict[int, tuple[float, float]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Stills:
+    """Labels of stills.  images: what each shows.  called: what that may be called."""
+
+    path: Path
+    size: tuple[int, int]
+    side: str
+    shown_frames: int
+    images: tuple[str, ...]
+    called: dict[str, tuple[str, ...]]
+
+
+def read_labels(path: str | Path) -> Points | Stills:
+    """Labels of either kind; ToftrackError, one sentence that names the file."""
+    path = Path(path).expanduser()
+    with reported_errors(
+        f"the labels '{path}' cannot be read", "give a file of JSON", OSError, ValueError
+    ):
+        content = read_json(path)
+    try:
+        return _parsed(path, content)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise ToftrackError(
+            f"the labels '{path}' are of neither kind that toftrack/evaluation/image_labels.py "
+            f"describes ({type(error).__name__}: {error}); give points or stills"
+        ) from None
+
+
+def _parsed(path: Path, content: Any) -> Points | Stills:
+    width, height = (int(side) for side in content["image_size"])
+    side = content["side"]
+    if side not in ("right", "left"):
+        raise ValueError(f"the side is {side!r}")
+    if "frames" in content:
+        frames = {int(key): _visible(frame["points"]) for key, frame in content["frames"].items()}
+        if not any(frames.values()) or min(frames) < 0:
+            raise ValueError("no frame has a visible point")
+        return Points(path, (width, height), side, frames)
+    called = {str(key): tuple(map(str, names)) for key, names in content["called"].items()}
+    images = tuple(str(image) for image in content["images"])
+    shown = int(content["shown_frames"])
+    for image in images:
+        if image not in called:
+            raise ValueError(f"'called' lacks {image}")
+    if not images or shown < 1:
+        raise ValueError("there is no image to show")
+    return Stills(path, (width, height), side, shown, images, called)
+
+
+def _visible(points: Any) -> dict[int, tuple[float, float]]:
+    found = {}
+    for name, (u, v, flag) in points.items():
+        if flag not in _FLAGS:
+            raise ValueError(f"the flag {flag!r} is unknown")
+        row = JOINT_NAMES.index(name)
+        if flag == "visible":
+            found[row] = float(u), float(v)
+    return found
+
+
+def point_rows(
+    points: Points,
+    joints_m: np.ndarray,
+    lost: np.ndarray,
+    joint_ok: np.ndarray,
+    K: np.ndarray,
+) -> dict[int, dict[str, Any]]:
+    """The figures of each labelled frame that has a visible fingertip, by its number.
+
+    Args:
+        joints_m: (T, 21, 3) metres, camera frame.
+        lost: (T,) bool.
+        joint_ok: (T, 21) bool.
+        K: (3, 3), of undistorted pixels.
+
+    Raises ToftrackError when a frame is labelled that the track has not.
+    """
+    found = {}
+    for number, off in lateral_errors_mm(points, joints_m, K, TIPS).items():
+        worst, flagged = max(off.values()), bool(lost[number])
+        ok = joint_ok[number][list(off)]
+        errors = np.array(list(off.values()))
+        found[number] = {
+            "tips_20_pct": 100.0 * (worst < 20),
+            "tips_40_pct": 100.0 * (worst < 40),
+            "wrong_pct": 100.0 * (worst > 40 and not flagged),
+            "flagged_pct": 100.0 * flagged,
+            "wrong_no_flag_pct": 100.0 * (not flagged and bool((ok & (errors > OK_MM)).any())),
+            **(dict.fromkeys(FLAG_COUNTS, 0) if flagged else flag_counts(errors, ~ok)),
+            "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
+        }
+    return found
+
+
+def lateral_errors_mm(
+    points: Points, joints_m: np.ndarray, K: np.ndarray, rows: Sequence[int]
+) -> dict[int, dict[int, float]]:
+    """How far off those of some joints are that are visible: by frame, if it has any, and joint.
+
+    Args and errors: as of point_rows.
+    """
+    if max(points.frames) >= len(joints_m):
+        raise ToftrackError(
+            f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
+            f"{len(joints_m)} frames; give the recording that was labelled"
+        )
+    moved = tips_inset(joints_m, _INSET_M)
+    found = {
+        number: {
+            row: _lateral_mm(moved[number, row], place, K)
+            for row, place in places.items()
+            if row in rows
+        }
+        for number, places in points.frames.items()
+    }
+    return {number: off for number, off in found.items() if off}
+
+
+def _lateral_mm(point: np.ndarray, place: tuple[float, float], K: np.ndarray) -> float:
+    if not np.isfinite(point).all() or point[2] <= 0:
+        return float("inf")
+    off = (point[:2] / point[2] - (np.array(place) - K[:2, 2]) / np.diag(K)[:2]) * point[2]
+    return 1e3 * float(np.hypot(*off))
+
+
+def still_row(called: str, lost: bool, allowed: Sequence[str]) -> dict[str, Any]:
+    """The figures of one still.  called: its gesture.  allowed: what it may be called."""
+    found = not lost
+    right = found and called in allowed
+    return {
+        "found_pct": 100.0 * found,
+        "named_pct": 100.0 * right,
+        "wrong_name_pct": 100.0 * (found and called not in (*allowed, *UNNAMED)),
+    }
+
+
+def tip_figures(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """tips_median_mm and tips_mean_mm of labelled frames, means over their seeds."""
+    medians, means = [], []
+    for seed in dict.fromkeys(row["seed"] for row in rows):
+        off = [v for row in rows if row["seed"] == seed for v in row.get("tips_mm", ())]
+        known = np.array([np.inf if value is None else value for value in off])
+        if np.isfinite(known).any():
+            medians.append(figure(known, np.median))
+            means.append(figure(known[np.isfinite(known)]))
+    return {"tips_median_mm": mean_of(medians), "tips_mean_mm": mean_of(means)}

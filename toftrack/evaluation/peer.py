@@ -1,0 +1,156 @@
+"""Another method beside the tracker: what it says of the same frames, and how long it takes.
+
+MediaPipe's requirements contradict ours, so it runs in an environment of its own and is spoken to
+over pipes: see peer_mediapipe.py for its configuration, and docs/accuracy.md for how to make it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import json
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toftrack.camera import Camera
+from toftrack.errors import ToftrackError
+
+PEERS = {"mediapipe": "peer_mediapipe.py"}
+MAKE_ENVIRONMENT = (
+    "make one with: python3 -m venv peer && peer/bin/pip install mediapipe==0.10.21 'numpy<2'"
+)
+_ANSWER = np.dtype(
+    [("joints_m", "f8", (21, 3)), ("seconds", "f8"), ("sure", "f8"), ("right", "f8")]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PeerEstimate:
+    """What a peer says of a frame.
+
+    joints_m: (21, 3) metres, camera frame, NaN where it sees no hand.  lost: it sees none.
+    side: "right", "left", or "" without a hand.  side_probability: of that, NaN without one.
+    compute_s: wall seconds from the images to the joints, in its own process.
+    """
+
+    joints_m: np.ndarray
+    lost: bool
+    side: str
+    side_probability: float
+    compute_s: float
+
+
+class Peer:
+    """A peer's process, for a `with`; `begin` a recording, then `step` through its frames."""
+
+    def __init__(self, name: str, python: str | Path) -> None:
+        """Start one of PEERS. Raises ToftrackError: its environment lacks it."""
+        self.name, self.python = name, str(python)
+        self._size = (0, 0)
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  a pipe that nobody reads fills up
+        # Isolated: the modules beside the script are not its own.
+        command = [self.python, "-I", str(Path(__file__).parent / PEERS[name])]
+        try:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
+            )
+        except OSError as error:
+            self._errors.close()
+            raise ToftrackError(
+                f"--peer-python {python} cannot be run ({error.strerror}); give the Python of an "
+                f"environment with {name}; {MAKE_ENVIRONMENT}"
+            ) from None
+        self.versions = self._greeting()
+
+    def __enter__(self) -> Peer:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process."""
+        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+            with suppress(OSError):  # it ended first
+                pipe.close()
+        try:
+            self._process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._errors.close()
+
+    def begin(self, camera: Camera, side: str = "", hands: int = 2) -> None:
+        """A new recording. side: whose hand is meant, "" for any.  hands: looked for at most."""
+        self._size = (camera.height, camera.width)
+        facts = {"size": self._size, "k": camera.K.ravel().tolist(), "side": side, "hands": hands}
+        self._send(json.dumps({"begin": facts}).encode() + b"\n")
+
+    def step(self, depth_m: np.ndarray, amplitude: np.ndarray) -> PeerEstimate:
+        """What it says of a frame.
+
+        depth_m: (H, W) metres, 0 = no reading.  amplitude: (H, W) uint16.
+        Raises ToftrackError when its process has ended.
+        """
+        assert self._process.stdout is not None
+        self._send(b'{"frame": true}\n')
+        self._send(np.ascontiguousarray(amplitude, np.uint16).tobytes())
+        self._send(np.ascontiguousarray(depth_m, np.float32).tobytes())
+        answer = self._process.stdout.read(_ANSWER.itemsize)
+        if len(answer) != _ANSWER.itemsize:
+            raise self._ended()
+        row = np.frombuffer(answer, _ANSWER)[0]
+        lost = not bool(np.isfinite(row["joints_m"]).all())
+        side = "" if lost else ("right" if row["right"] else "left")
+        sure, seconds = float(row["sure"]), float(row["seconds"])
+        return PeerEstimate(row["joints_m"].astype(np.float32), lost, side, sure, seconds)
+
+    def _greeting(self) -> Mapping[str, Any]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        try:
+            reported = json.loads(line)
+        except ValueError:
+            reported = {"error": self._last_words()}
+        if "ready" in reported:
+            versions: Mapping[str, Any] = reported["ready"]
+            return versions
+        self.close()
+        raise ToftrackError(
+            f"the environment of --peer-python {self.python} has no usable {self.name} "
+            f"({reported.get('error')}); {MAKE_ENVIRONMENT}"
+        )
+
+    def _send(self, data: bytes) -> None:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(data)
+            self._process.stdin.flush()
+        except OSError:
+            raise self._ended() from None
+
+    def _ended(self) -> ToftrackError:
+        words = self._last_words()
+        return ToftrackError(f"{self.name} ended in the middle of a recording ({words})")
+
+    def _last_words(self) -> str:
+        """The last line of what it wrote to standard error."""
+        self._process.poll()
+        self._errors.seek(0)
+        lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
+        return lines[-1] if lines else "it said nothing"
+
+
+@functools.lru_cache(maxsize=1)
+def peer_process(name: str, python: str) -> Peer:
+    """This process's peer; started once, since that takes seconds."""
+    peer = Peer(name, python)
+    atexit.register(peer.close)
+    return peer

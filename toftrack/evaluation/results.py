@@ -1,0 +1,200 @@
+"""What a measurement of accuracy writes, where it was made, and two of them pair by pair.
+
+A recording's difference is the mean over its seeds of (here - there); the difference of all is the
+mean over recordings, its 90 % interval from resampling the recordings. What all recordings have in
+common, hard or easy, drops out, so that far smaller changes are seen than between two totals.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import toftrack
+from toftrack.errors import ToftrackError, reported_errors
+from toftrack.evaluation.image_labels import IMAGE_MEANS
+from toftrack.evaluation.rows import MEANS, Row, by_recording, groups, image_totals, totals
+from toftrack.evaluation.statistics import interval
+from toftrack.json_text import read_json
+from toftrack.safe_files import write_whole
+
+FORMAT = "toftrack accuracy 1"
+
+
+def circumstances() -> dict[str, Any]:
+    """Commit (None where there is no repository), versions and machine; JSON-able."""
+    return {
+        "format": FORMAT,
+        "toftrack": version("toftrack"),
+        "commit": commit(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "machine": {"processor": processor(), "cores": os.cpu_count()},
+    }
+
+
+def processor() -> str:
+    """The processor's name, as well as it is known here."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def commit() -> str | None:
+    """The commit of the checkout that this package is in, with a + where files differ from it."""
+    root = Path(toftrack.__file__).parents[1]
+    if not (root / ".git").exists():
+        return None
+    try:
+        said = subprocess.run(
+            ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--exclude=*"],
+            capture_output=True,
+            text=True,
+            timeout=20,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return said.stdout.strip() or None
+
+
+def result_of(rows: Sequence[Row]) -> dict[str, Any]:
+    """Totals, recordings, labelled images, groups and the rows themselves; JSON-able."""
+    rows = sorted(rows, key=lambda row: (row["recording"], row["seed"]))
+    true = [row for row in rows if "kind" not in row]
+    images: dict[str, Any] = {}
+    for name in dict.fromkeys(row["recording"].partition("#")[0] for row in rows if "kind" in row):
+        mine = [row for row in rows if "kind" in row and row["recording"].startswith(f"{name}#")]
+        images[name] = image_totals(mine)
+        shown = sorted({row["shown"] for row in mine if "shown" in row}, key=_number)
+        if shown:
+            images[name]["by"] = {
+                of: image_totals([row for row in mine if row["shown"] == of]) for of in shown
+            }
+    return {
+        "total": totals(true) if true else None,
+        "each": by_recording(true),
+        "images": images,
+        "groups": groups(true),
+        "rows": rows,
+    }
+
+
+def _number(text: str) -> tuple[int, str]:
+    return (int(text) if text.isdecimal() else 0), text
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of an earlier measurement; ToftrackError where the file is none."""
+    what = f"'{path}', to compare with, is nothing that toftrack benchmark accuracy --json wrote"
+    with reported_errors(what, "give such a file", OSError, ValueError):
+        rows = rows_of(read_json(path))
+    return rows
+
+
+def comparison_with(rows: Sequence[Row], others: Sequence[Row], name: str) -> dict[str, Any]:
+    """Paired differences, JSON-able; ToftrackError where the two have nothing in common."""
+    found = compared(rows, others)
+    if not found["pairs"]:
+        raise ToftrackError(
+            f"'{name}' has none of these recordings with one of these seeds, so that nothing can "
+            "be compared; measure the same recordings with the same seeds"
+        )
+    return {"with": name, **found}
+
+
+def checked_targets(*paths: Path | None) -> None:
+    """Whether files can be written there; before the work, not after it."""
+    for path in paths:
+        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+            raise ToftrackError(
+                f"'{path}' cannot be written: it is a folder, or lies in none that there is; give "
+                "another name"
+            )
+
+
+def write_text(path: Path, text: str) -> None:
+    """A whole text file, or the old one and a ToftrackError."""
+    with reported_errors(f"the file '{path}' cannot be written", "choose another place"):
+        write_whole(path, text)
+
+
+def json_text(result: dict[str, Any]) -> str:
+    """With a line a row."""
+    rows = ",\n".join(json.dumps(row, allow_nan=False) for row in result["rows"])
+    rest = {name: value for name, value in result.items() if name != "rows"}
+    head = json.dumps(rest, indent=1, allow_nan=False).removesuffix("\n}")
+    return f'{head},\n "rows": [\n{rows}\n ]\n}}\n'
+
+
+COMPARED = ("longest_silent", "never_right", "first_right")
+"""What is compared beside the means."""
+
+
+def compared(here: Sequence[Row], there: Sequence[Row]) -> dict[str, Any]:
+    """The differences of rows by recording and seed, JSON-able.
+
+    Returns:
+        pairs: recordings with a seed that both have.
+        only_here, only_there: what is left out, in words, "crowd/01_back_turn, seed 2".
+        differences: of each figure that both have, its means over the pairs `here` and `there`, and
+            the `mean` difference (here - there) with its 90 % interval, `low` to `high`, over
+            `recordings`.
+    """
+    mine, theirs = (
+        {(row["recording"], row["seed"]): row for row in rows} for rows in (here, there)
+    )
+    common = [pair for pair in mine if pair in theirs]
+    differences = {}
+    for key in (*MEANS, *COMPARED, *IMAGE_MEANS):
+        both: dict[str, list[tuple[float, float]]] = {}
+        for pair in common:
+            values = mine[pair].get(key), theirs[pair].get(key)
+            if values[0] is not None and values[1] is not None:
+                both.setdefault(pair[0], []).append((float(values[0]), float(values[1])))
+        if both:
+            means = np.array([np.mean(values, axis=0) for values in both.values()])
+            found = dict(zip(("here", "there"), means.mean(0).tolist(), strict=True))
+            found |= asdict(interval((means[:, 0] - means[:, 1]).tolist()))
+            differences[key] = {name: round(value, 4) for name, value in found.items()}
+            differences[key]["recordings"] = len(means)
+    return {
+        "pairs": len(common),
+        "only_here": _named(mine, theirs),
+        "only_there": _named(theirs, mine),
+        "differences": differences,
+    }
+
+
+def _named(these: dict[Any, Row], others: dict[Any, Row]) -> list[str]:
+    return [f"{name}, seed {seed}" for name, seed in these if (name, seed) not in others]
+
+
+def rows_of(content: Any) -> list[Row]:
+    """The rows of a measurement's JSON; ValueError, a few words, where it is none."""
+    rows = content.get("rows") if isinstance(content, dict) else None
+    if not isinstance(rows, list) or not rows:
+        raise ValueError("it has no 'rows'")
+    for row in rows:
+        if not isinstance(row, dict) or not isinstance(row.get("recording"), str):
+            raise ValueError("its 'rows' do not name recordings")
+        if type(row.get("seed")) is not int:
+            raise ValueError(f"its row of '{row['recording']}' has no seed")
+        for key in (*MEANS, *COMPARED, *IMAGE_MEANS):
+            value = row.get(key)
+            number = isinstance(value, int | float) and math.isfinite(value)
+            if value is not None and not number:
+                raise ValueError(f"'{key}' of '{row['recording']}' is no number")
+    return rows

@@ -1,0 +1,325 @@
+"""Tracking many recordings, each with several seeds, in this process or in several: rows of
+figures, the same whatever the number of processes and threads."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.estimate import Estimate
+from toftrack.evaluation.image_labels import Points, Stills, point_rows, read_labels, still_row
+from toftrack.evaluation.measures import Estimates, measured
+from toftrack.evaluation.peer import Peer, PeerEstimate, peer_process
+from toftrack.evaluation.rows import Row, group_counts, row_figures
+from toftrack.frames import Truth
+from toftrack.recordings.npz import read_recording
+
+SIDES = ("told", "auto")
+FIELDS = ("joints_m", "lost", "joint_sigma_m", "joint_ok", "gesture")
+"""What the tracker's estimates are measured by."""
+_PEER_FIELDS = ("joints_m", "lost")
+_SIDE_FIELDS = ("side", "side_probability")
+"""What is measured besides where the side is found out."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording that can be measured.
+
+    name: what it is called, its folder's name and its own.  frames: how many it has.
+    labels: the file with labels of its images; None: it has truth.
+    amplitude: whether it has amplitude images.
+    """
+
+    path: Path
+    name: str
+    frames: int
+    labels: Path | None = None
+    amplitude: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """A recording to be tracked with a seed.
+
+    side: of SIDES.  overrides: of the tracker.
+    peer: name and Python of another method that says what it sees in the same frames, in turn with
+        the tracker; None: there is none.
+    """
+
+    source: Source
+    seed: int
+    side: str = "told"
+    overrides: tuple[str, ...] = ()
+    peer: tuple[str, str] | None = None
+
+
+def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> list[Source]:
+    """The recordings with truth or labels among files and in folders, in the order of their names.
+
+    Raises ToftrackError for what is no recording, a folder without any of them, a file without
+    truth that no labels fit, labels that fit none, and two recordings of one name.
+    """
+    known = [read_labels(path) for path in labels]
+    found: list[Source] = []
+    for path in (Path(path).expanduser() for path in paths):
+        files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+        mine = [source for source in (_source(file, known) for file in files) if source]
+        if not mine:
+            what = f"the folder '{path}' has no recording" if path.is_dir() else f"'{path}' comes"
+            raise ToftrackError(
+                f"{what} with truth (an .npz with 'joints_m'); give a folder that has one, or "
+                "labels of its images with --labels FILE"
+            )
+        found += mine
+    for one in known:
+        if not any(source.labels == one.path for source in found):
+            raise ToftrackError(
+                f"the labels '{one.path}' are of images of {one.size[0]} x {one.size[1]} pixels, "
+                "which no recording without truth has; give the recording that was labelled"
+            )
+    names = [source.name for source in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise ToftrackError(
+                f"two recordings are called '{name}', the folder's name and their own; rename one"
+            )
+    return found
+
+
+def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
+    """None where there is neither truth nor labels."""
+    recording = read_recording(file)
+    try:
+        name = f"{file.absolute().parent.name}/{file.stem}"
+        count, size = len(recording), (recording.camera.width, recording.camera.height)
+        if recording.truth is not None:
+            amplitude = count > 0 and recording.image(0)[1] is not None
+            return Source(file, name, count, amplitude=amplitude)
+        fitting = [
+            one
+            for one in known
+            if one.size == size and (isinstance(one, Points) or len(one.images) == count)
+        ]
+        if len(fitting) > 1:
+            raise ToftrackError(
+                f"'{fitting[0].path}' and '{fitting[1].path}' could both be the labels of "
+                f"'{file}'; give one of them at a time"
+            )
+        return Source(file, name, count, fitting[0].path) if fitting else None
+    finally:
+        recording.close()
+
+
+def jobs(
+    found: Sequence[Source],
+    seeds: Sequence[int],
+    side: str,
+    overrides: Sequence[str],
+    peer: tuple[str, str] | None = None,
+) -> list[Job]:
+    """Every recording with every seed; the peer, which has none, beside the first.
+
+    Raises ToftrackError for a recording without amplitude, where there is a peer.
+    """
+    if peer is not None:
+        for one in found:
+            if not one.amplitude:
+                raise ToftrackError(
+                    f"'{one.path}' has no amplitude image, which --peer {peer[0]} needs; leave "
+                    "the recording out, or --peer"
+                )
+    given = tuple(overrides)
+    return [
+        Job(one, seed, side, given, peer if seed == seeds[0] else None)
+        for one in found
+        for seed in seeds
+    ]
+
+
+def run_jobs(todo: Sequence[Job], workers: int, words: str = "") -> Iterator[list[Row]]:
+    """Run all of them; the rows of each, in any order.
+
+    Raises ToftrackError, also of a worker.
+    """
+    total = sum(job.source.frames for job in todo)
+    here = workers == 1 or len(todo) < 2
+    finished = ((job, rows_of_job(job)) for job in todo) if here else _in_processes(todo, workers)
+    with tqdm(total=total, unit=" frames", file=sys.stderr, desc=words or None) as bar:
+        for job, rows in finished:
+            bar.set_postfix_str(f"{job.source.name}, seed {job.seed}", refresh=False)
+            yield rows
+            bar.update(job.source.frames)
+
+
+def _in_processes(todo: Sequence[Job], workers: int) -> Iterator[tuple[Job, list[Row]]]:
+    # Fresh processes: what torch and numba have started does not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    count = min(workers, len(todo))
+    pool = ProcessPoolExecutor(count, context, initializer=_begin_worker)
+    try:
+        running = {pool.submit(rows_of_job, job): job for job in todo}
+        for future in as_completed(running):
+            yield running[future], future.result()
+    except BrokenProcessPool as error:
+        raise ToftrackError(
+            f"one of the {count} processes was ended from outside, perhaps for want of memory; "
+            "give fewer --workers"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process says when to end
+    torch.set_num_threads(1)  # a core each
+
+
+def rows_of_job(job: Job) -> list[Row]:
+    """Track a recording: one row, or one for each labelled image."""
+    if job.source.labels is None:
+        return _true_rows(job)
+    labels = read_labels(job.source.labels)
+    rows = _stills(job, labels) if isinstance(labels, Stills) else _points(job, labels)
+    return [{"recording": name, "seed": job.seed, **figures} for name, figures in rows]
+
+
+def _true_rows(job: Job) -> list[Row]:
+    """A row of the tracker, and one of the peer, if there is one."""
+    with Replay(job.source.path) as device:
+        truth = device.truth
+        assert truth is not None
+        if job.side == "told" and not truth.side:
+            raise ToftrackError(
+                f"'{job.source.path}' does not say whose hand it shows ('side' in its metadata), "
+                "and so no side can be given; give --side auto"
+            )
+        peer = None if job.peer is None else peer_process(*job.peer)
+        if peer is not None:
+            peer.begin(device.camera, truth.side if job.side == "told" else "")
+        reported, others = _tracked(device, job, truth.side, peer)
+    rows = [_row(job, device, truth, reported, FIELDS)]
+    if peer is not None:
+        of_peer = _row(job, device, truth, [(one,) for one in others], _PEER_FIELDS)
+        rows.append({"method": peer.name, **of_peer})
+    return rows
+
+
+def _row(
+    job: Job,
+    device: Replay,
+    truth: Truth,
+    reported: Sequence[Sequence[Estimate | PeerEstimate]],
+    fields: Sequence[str],
+) -> Row:
+    track = estimates_of(reported, (*fields, *(_SIDE_FIELDS if job.side == "auto" else ())))
+    compute_s = np.array([frame[0].compute_s for frame in reported])
+    found = measured(track, truth)
+    about = device.metadata
+    camera = about.get("camera")
+    kind = camera.get("kind") if isinstance(camera, dict) else None
+    size = f"{device.camera.width} x {device.camera.height}"
+    length = about.get("hand_length_mm")
+    length_mm = float(length) if isinstance(length, int | float) else None
+    sensor = kind if isinstance(kind, str) else size
+    return {
+        "recording": job.source.name,
+        "seed": job.seed,
+        **row_figures(found, compute_s),
+        "groups": group_counts(found.first, truth, sensor, length_mm),
+    }
+
+
+def _tracked(
+    device: Replay, job: Job, side: str, peer: Peer | None = None
+) -> tuple[list[tuple[Estimate, ...]], list[PeerEstimate]]:
+    """What the tracker says of each frame, and what a peer says after it."""
+    tracker = _tracker(job, side)
+    reported: list[tuple[Estimate, ...]] = []
+    others: list[PeerEstimate] = []
+    for frame in device:
+        depth = device.camera.rectify(frame.depth, frame.radial)
+        reported.append(tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s))
+        if peer is not None:
+            assert frame.amplitude is not None
+            others.append(peer.step(depth, frame.amplitude))
+    return reported, others
+
+
+def estimates_of(
+    reported: Sequence[Sequence[Estimate | PeerEstimate]], fields: Sequence[str] = FIELDS
+) -> Estimates:
+    """What was said in T frames of each slot; with one slot without its axis.
+
+    fields: which of those of Estimates the reported ones have.
+    """
+
+    def column(name: str) -> np.ndarray:
+        values = np.array([[getattr(one, name) for one in frame] for frame in reported])
+        return values[:, 0] if values.shape[1] == 1 else values
+
+    return Estimates(**{name: column(name) for name in fields})
+
+
+def _points(job: Job, labels: Points) -> Iterator[tuple[str, dict[str, Any]]]:
+    with Replay(job.source.path) as device:
+        reported, _ = _tracked(device, job, labels.side)
+        _expect_one_hand(reported[0])
+        track = estimates_of(reported)
+        assert track.joint_ok is not None
+        rows = point_rows(labels, track.joints_m, track.lost, track.joint_ok, device.camera.K)
+    for number, figures in rows.items():
+        yield f"{job.source.name}#{number:04d}", {"kind": "points", **figures}
+
+
+def _stills(job: Job, labels: Stills) -> Iterator[tuple[str, dict[str, Any]]]:
+    with Replay(job.source.path) as device:
+        for number, (frame, shown) in enumerate(zip(device, labels.images, strict=True)):
+            depth = device.camera.rectify(frame.depth, frame.radial)
+            tracker = _tracker(job, labels.side)
+            for index in range(labels.shown_frames):
+                reported = tracker.step(depth, device.camera.K, index, index / device.fps)
+            _expect_one_hand(reported)
+            figures = still_row(reported[0].gesture, reported[0].lost, labels.called[shown])
+            about = {"kind": "stills", "shown": shown, "gesture": reported[0].gesture}
+            yield f"{job.source.name}#{number:04d}", about | figures
+
+
+def _expect_one_hand(reported: Sequence[Estimate]) -> None:
+    if len(reported) != 1:
+        raise ToftrackError("labelled images are of one hand; leave out --hands")
+
+
+def _tracker(job: Job, side: str) -> Any:
+    """A fresh tracker; the model is the same for all of its configuration."""
+    from toftrack.tracking.tracker import HandsTracker
+
+    side = side if job.side == "told" else "auto"
+    model, hands = _model(f"hand.side={side}", *job.overrides)
+    return HandsTracker(model, job.seed, hands)
+
+
+@functools.lru_cache(maxsize=2)
+def _model(*overrides: str) -> tuple[Any, int]:
+    """The tracker's parts, which keep nothing, and how many hands are followed."""
+    from toftrack.api import build_model
+    from toftrack.configuration.compose import configuration, one_sentence
+
+    config = configuration(*overrides)
+    with one_sentence():
+        return build_model(config), config.get("hands", 1)

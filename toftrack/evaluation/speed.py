@@ -1,0 +1,337 @@
+"""How fast hypotheses are scored, frames tracked and latents decoded: `toftrack benchmark speed`.
+
+All methods of a table are timed in turn within one process, so that what else the machine does hits
+all of them alike. The hypotheses are spread around the true wrist of the packaged recording's first
+frame, cropped around the hand. The baselines, on few particles only:
+
+* stepping: the paper's own way (section 2.2), rays stepped in 5 mm to the quadric's crossing;
+* naive: the closed form over whole images of all ellipsoids (ReferenceScorer).
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
+from itertools import cycle
+
+import numpy as np
+import torch
+from hydra.utils import instantiate
+from torch import Tensor
+
+from toftrack.api import make_device, make_tracker
+from toftrack.camera import Camera
+from toftrack.configuration.compose import configuration
+from toftrack.errors import ToftrackError
+from toftrack.evaluation.results import processor
+from toftrack.hand.shape import default_hand_shape
+from toftrack.pose_space.base import PoseSpace
+from toftrack.pose_space.files import fit_pose_space
+from toftrack.recordings.store import open_source
+from toftrack.render.reference import ReferenceScorer
+from toftrack.render.scoring import Evidence, Scorer
+from toftrack.tracking.backend import BACK_ENDS, make_scorer
+
+PARTICLES = (100, 300, 1000, 3000, 10_000)
+BASELINES = {"stepping": 3, "naive": 5}
+"""The baselines and how often each is timed."""
+SPACES = ("pca", "kernel_pca", "lle", "isomap")
+CONFIGURATIONS: dict[str, tuple[str, ...]] = {"default": (), "paper": ("experiment=paper",)}
+PARTS = (
+    "rectification",
+    "detector",
+    "segmentation and evidence",
+    "filter: scoring",
+    "filter: rest",
+    "refinement",
+    "rest",
+)
+"""What a frame's time is spent on. Of the networks, which look in another thread where there is a
+second core, only what is waited for counts."""
+_SLOW_PARTICLES = 300
+"""The baselines are not timed with more particles than this."""
+_MOST_REPEATS = 200
+_MARGIN_PX = 12
+_FEWEST_FRAMES, _STARTS = 12, 6
+_BODY_M, _WALL_M = 0.9, 1.5
+"""From where on the packaged recording shows the body, and where the wall is."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table, times in milliseconds.
+
+    table: "scoring" (from states to counts), "decoding" (from latents to angles) or "whole frame".
+    method: a back end or baseline, a pose space, or a configuration; ", start" says that the hand
+        was looked for anew in every frame, ", searching" that moreover there was none, but the
+        person and the room.
+    count: hypotheses, latents or particles.
+    pixels: of the image; None where there is none.
+    parts: of a frame, what is spent on each of PARTS.
+    """
+
+    table: str
+    method: str
+    count: int
+    pixels: int | None
+    min_ms: float
+    median_ms: float
+    repeats: int
+    parts: dict[str, float] = field(default_factory=dict)
+
+
+def _row(table: str, method: str, count: int, pixels: int | None, seconds: Sequence[float]) -> Row:
+    least, median = 1e3 * min(seconds), 1e3 * statistics.median(seconds)
+    return Row(table, method, count, pixels, least, median, len(seconds))
+
+
+def interleaved(
+    calls: Mapping[str, Callable[[], object]], seconds: float, device: torch.device
+) -> dict[str, list[float]]:
+    """Seconds of each call, timed in turn; slow ones have fewer repeats, in the first rounds.
+
+    seconds: how long to time each.
+    """
+
+    def timed(call: Callable[[], object]) -> float:
+        began = time.perf_counter()
+        call()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter() - began
+
+    repeats = {}
+    for name, call in calls.items():
+        repeats[name] = BASELINES.get(name, 0)
+        if name not in BASELINES:
+            timed(call)
+            repeats[name] = min(_MOST_REPEATS, max(3, int(seconds / timed(call))))
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(max(repeats.values(), default=0)):
+        for name, call in calls.items():
+            if turn < repeats[name]:
+                times[name].append(timed(call))
+    return times
+
+
+def sample_evidence() -> tuple[Evidence, Tensor]:
+    """Evidence of the sample's first frame around the hand, and the true wrist (3,), metres."""
+    config, sample = configuration("device=sample"), open_source("sample")
+    assert sample.truth is not None
+    depth = sample.image(0)[0]
+    observation = instantiate(config.segmentation)(depth, sample.camera.K)
+    evidence = instantiate(config.likelihood).evidence(observation)
+    v, u = observation.hand.nonzero().unbind(1)
+    left, top = max(int(u.min()) - _MARGIN_PX, 0), max(int(v.min()) - _MARGIN_PX, 0)
+    right = min(int(u.max()) + _MARGIN_PX + 1, depth.shape[1])
+    bottom = min(int(v.max()) + _MARGIN_PX + 1, depth.shape[0])
+    wrist = torch.from_numpy(sample.truth.joints_m[0, 0])
+    return evidence.cropped(left, top, right, bottom), wrist
+
+
+def filter_states(n: int, wrist: Tensor, seed: int = 0) -> Tensor:
+    """(N, 27) open palms at the wrist's position, spread by 1 cm and by 0.1 rad an angle."""
+    generator = torch.Generator().manual_seed(seed)
+    states = torch.zeros(n, 27)
+    states[:, :3] = wrist
+    spread = torch.tensor([0.01] * 3 + [0.1] * 24)
+    return states + spread * torch.randn(n, 27, generator=generator)
+
+
+def methods(device: torch.device, baselines: bool) -> tuple[dict[str, Scorer], list[str]]:
+    """What can score hypotheses on a device, and notes on why others do not."""
+    shape = default_hand_shape().to(device)
+    chunk = 4 if device.type == "cpu" else 128  # hypotheses whose images suit the cache
+    found: dict[str, Scorer] = {}
+    notes = []
+    for name in BASELINES if baselines else ():
+        found[name] = ReferenceScorer(shape, chunk, name == "stepping")
+    for name in BACK_ENDS:
+        if name == "numba" and device.type == "cuda":
+            continue  # it would measure the way to the CPU and back
+        try:
+            found[name] = make_scorer(name, shape, device)
+        except ToftrackError as error:
+            notes.append(f"{name}: {error}")
+    return found, notes
+
+
+def score_times(
+    scorers: Mapping[str, Scorer], particles: Sequence[int], seconds: float, device: torch.device
+) -> list[Row]:
+    """By the number of particles, the baselines at few of them."""
+    found, wrist = sample_evidence()
+    images = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "radius_px"}
+    evidence = replace(found, **{name: image.to(device) for name, image in images.items()})
+    rows: list[Row] = []
+    for n in particles:
+        states = filter_states(n, wrist).to(device)
+        calls = {
+            name: partial(scorer, states, evidence)
+            for name, scorer in scorers.items()
+            if name not in BASELINES or n <= _SLOW_PARTICLES
+        }
+        times = interleaved(calls, seconds, device)
+        pixels = evidence.hand.numel()
+        rows += [_row("scoring", name, n, pixels, took) for name, took in times.items()]
+    return rows
+
+
+def decode_times(
+    spaces: Mapping[str, PoseSpace], count: int, seconds: float, device: torch.device
+) -> list[Row]:
+    """Time the decoding of `count` latents drawn from the box of each space, in turn."""
+
+    def decoding(space: PoseSpace) -> Callable[[], object]:
+        space = space.to(device)
+        generator = torch.Generator(device).manual_seed(0)
+        unit = torch.rand(count, space.dims, generator=generator, device=device)
+        latent = space.lower + unit * (space.upper - space.lower)
+        return lambda: space.decode(latent)
+
+    calls = {name: decoding(space) for name, space in spaces.items()}
+    times = interleaved(calls, seconds, device)
+    return [_row("decoding", name, count, None, found) for name, found in times.items()]
+
+
+def frame_times(seconds: float, compute: str, particles: Sequence[int] = ()) -> Iterator[Row]:
+    """Whole frames of the packaged recording, rectification included, capture and drawing not.
+
+    seconds: how long to time each configuration.
+    particles: numbers of them to time the first configuration with besides its own.
+    """
+    first = next(iter(CONFIGURATIONS))
+    for name, overrides in CONFIGURATIONS.items():
+        yield from _frames(name, [*overrides, f"compute={compute}"], seconds)
+    for n in particles:
+        overrides = (*CONFIGURATIONS[first], f"filter.particles={n}", f"compute={compute}")
+        yield _frames(f"{first}, {n}", overrides, seconds)[0]
+
+
+def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
+    tracker = make_tracker(*overrides)
+    with make_device("device=sample") as device:
+        camera, frames = device.camera, [(frame.depth, frame.radial) for frame in device]
+
+    def step(index: int, anew: bool = False) -> tuple[float, Mapping[str, float]]:
+        if anew:
+            tracker.state = replace(tracker.state, tracks=())
+        depth, radial = frames[index % len(frames)]
+        began = time.perf_counter()
+        rectified = camera.rectify(depth, radial)
+        rectifying = time.perf_counter() - began
+        tracker.step(rectified, camera.K, index, 0.04 * index)
+        took = time.perf_counter() - began
+        # Where no hand is reported, nothing was done but to look for one.
+        spent = tracker.info.seconds if tracker.info else {"detector": took - rectifying}
+        return took, {"rectification": rectifying, **spent}
+
+    def row(what: str, found: Sequence[tuple[float, Mapping[str, float]]]) -> Row:
+        n, pixels = tracker.model.filter.particles, camera.width * camera.height
+        parts = {
+            part: 1e3 * statistics.median(spent.get(part, 0.0) for _, spent in found)
+            for part in PARTS
+        }
+        return replace(_row("whole frame", what, n, pixels, [t for t, _ in found]), parts=parts)
+
+    starts = [step(index, anew=True) for index in range(_STARTS)]
+    step(_STARTS)
+    tracked = []
+    began = time.perf_counter()
+    for index in cycle(range(_STARTS + 1, len(frames))):
+        tracked.append(step(index))
+        if len(tracked) >= _FEWEST_FRAMES and time.perf_counter() - began > seconds:
+            break
+    tracker.restart()
+    # The hand and its arm away.
+    frames = [
+        (np.where(depth > _BODY_M, depth, np.float32(_WALL_M)), radial)
+        for depth, radial in frames[:_STARTS]
+    ]
+    searches = [step(index, anew=True) for index in range(_STARTS)]
+    # The first of a kind still waits for what is only done once.
+    return [
+        row(name, tracked),
+        row(f"{name}, start", starts[1:]),
+        row(f"{name}, searching", searches[1:]),
+    ]
+
+
+def enlarged(
+    camera: Camera, frames: Sequence[tuple[np.ndarray, bool]], size: tuple[int, int]
+) -> tuple[Camera, list[tuple[np.ndarray, bool]]]:
+    """A camera and its frames (depth, radial) as of a camera with so many columns and rows.
+
+    The image is in the middle of the larger one, each pixel repeated, with the wall around it.
+    """
+    scale = min(size[0] / camera.width, size[1] / camera.height)
+    left, top = (
+        (of - round(scale * side)) // 2
+        for of, side in zip(size, (camera.width, camera.height), strict=True)
+    )
+    rows, columns = (
+        (np.arange(round(scale * side)) / scale).astype(int)
+        for side in (camera.height, camera.width)
+    )
+    images = []
+    for depth, radial in frames:
+        image = np.full((size[1], size[0]), _WALL_M, np.float32)
+        rectified = camera.rectify(depth, radial)
+        image[top : top + len(rows), left : left + len(columns)] = rectified[np.ix_(rows, columns)]
+        images.append((image, False))
+    k = camera.K * np.array([[scale], [scale], [1.0]])
+    k[:2, 2] += (scale - 1) / 2 + np.array([left, top])
+    return Camera(k, *size), images
+
+
+def run(
+    particles: Sequence[int], compute: str, seconds: float, frames: bool, baselines: bool
+) -> dict[str, object]:
+    """Measure everything; returns what --json writes.
+
+    Raises ToftrackError where there is no such device.
+    """
+    if compute == "cuda" and not torch.cuda.is_available():
+        raise ToftrackError("there is no CUDA device here; give --compute cpu")
+    device = torch.device(compute)
+    scorers, notes = methods(device, baselines)
+    rows = score_times(scorers, particles, seconds, device)
+    if frames:
+        # On the CPU so many as the table's take seconds; there the configuration's say enough.
+        rows += frame_times(seconds, compute, particles if compute == "cuda" else ())
+    rows += decode_times(
+        {kind: fit_pose_space(kind, 4) for kind in SPACES}, 10_000, seconds, device
+    )
+    return {
+        "machine": {
+            "processor": processor(),
+            "cores": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+            "torch": torch.__version__,
+            "device": torch.cuda.get_device_name() if compute == "cuda" else "cpu",
+        },
+        "rows": [asdict(row) for row in rows],
+        "notes": notes,
+    }
+
+
+def show(result: dict) -> str:
+    """The result as one table of text."""
+    machine = result["machine"]
+    lines = [
+        f"{machine['processor']}, {machine['threads']} threads, torch {machine['torch']},"
+        f" {machine['device']}",
+        f"{'what':<13}{'method':<22}{'N':>7}{'pixels':>9}"
+        f"{'min ms':>11}{'median ms':>11}{'repeats':>9}",
+    ]
+    for row in result["rows"]:
+        lines.append(
+            f"{row['table']:<13}{row['method']:<22}{row['count']:>7}{row['pixels'] or '':>9}"
+            f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}"
+        )
+        lines += [f"    {part:<58}{took:>11.3f}" for part, took in row["parts"].items()]
+    return "\n".join([*lines, *result["notes"]])

@@ -1,0 +1,185 @@
+"""`toftrack benchmark [speed | alternating | accuracy | ablation]`: speed where none is named."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from toftrack.checks import MOST_HANDS
+from toftrack.errors import ToftrackError, reported_errors
+from toftrack.programs.command_line import plain_parser
+from toftrack.safe_files import write_whole
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a measurement; returns the exit status. Raises ToftrackError."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given[:1] in (["-h"], ["--help"]):
+        print(
+            "usage: toftrack benchmark [speed] ...       how fast hypotheses and frames are\n"
+            "       toftrack benchmark alternating ...   frames, in turn with MediaPipe's; starts\n"
+            "       toftrack benchmark accuracy ...      how accurate, on recordings with truth\n"
+            "       toftrack benchmark ablation ...      what each part of the tracker brings\n\n"
+            "toftrack benchmark speed --help and so on say more"
+        )
+        return 0
+    measurements = {
+        "speed": _speed,
+        "alternating": _alternating,
+        "accuracy": _accuracy,
+        "ablation": _ablation,
+    }
+    name, *rest = given if given[:1] and given[0] in measurements else ("speed", *given)
+    measurements[name](rest)
+    return 0
+
+
+def _speed(arguments: Sequence[str]) -> None:
+    from toftrack.evaluation import speed
+
+    parser = plain_parser("toftrack benchmark", speed.__doc__)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    counts = list(speed.PARTICLES)
+    parser.add_argument("--particles", type=int, nargs="+", default=counts, metavar="N")
+    parser.add_argument("--compute", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument(
+        "--seconds", type=float, default=1.0, help="how long to time each method (1)"
+    )
+    parser.add_argument("--frames", action="store_true", help="time whole frames, too")
+    parser.add_argument("--no-baselines", action="store_true", help="leave the slow methods out")
+    given = parser.parse_args(arguments)
+    if min(given.particles) < 1:
+        parser.error("--particles must be above 0")
+    baselines = not given.no_baselines
+    result = speed.run(given.particles, given.compute, given.seconds, given.frames, baselines)
+    print(speed.show(result))
+    if given.json:
+        write_whole(given.json, json.dumps(result, indent=1) + "\n")
+
+
+def _alternating(arguments: Sequence[str]) -> None:
+    from toftrack.evaluation import alternating
+
+    parser = plain_parser("toftrack benchmark alternating", alternating.__doc__)
+    parser.add_argument("--rounds", type=int, default=5, help="of all programs (5); 0 = none")
+    parser.add_argument("--starts", type=int, default=0, help="of the command line (0)")
+    parser.add_argument("--cores", type=int, help="as many as all may use, where that can be set")
+    parser.add_argument("--two-hands", nargs="+", default=[], metavar="RECORDING")
+    parser.add_argument("--peer-python", metavar="PYTHON", help="MediaPipe's")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    given = parser.parse_args(arguments)
+    if min(given.rounds, given.starts) < 0 or (given.cores or 1) < 1:
+        parser.error("--rounds and --starts must be 0 or more, --cores 1 or more")
+    result = alternating.measure(
+        given.rounds, given.starts, given.cores, given.two_hands, given.peer_python
+    )
+    if given.json:
+        write_whole(given.json, json.dumps(result) + "\n")
+
+
+def _accuracy(arguments: Sequence[str]) -> None:
+    from toftrack.evaluation import accuracy
+    from toftrack.evaluation.peer import PEERS
+    from toftrack.evaluation.runs import SIDES
+
+    parser = _parser_of_recordings("accuracy", accuracy.__doc__)
+    parser.add_argument(
+        "--side",
+        choices=SIDES,
+        default="told",
+        help="handedness: told, by the truth, or auto, detected while tracking (told)",
+    )
+    hands = range(1, MOST_HANDS + 1)
+    parser.add_argument("--hands", type=int, choices=hands, default=1, help="followed at once (1)")
+    parser.add_argument(
+        "--labels",
+        type=Path,
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="of a recording without truth; may be given several times",
+    )
+    parser.add_argument("--compare", type=Path, metavar="FILE", help="an earlier --json")
+    parser.add_argument("--peer", choices=PEERS, help="measure another method, too")
+    parser.add_argument("--peer-python", type=Path, metavar="PYTHON", help="of its environment")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the shares there (.png)")
+    command = shlex.join(["toftrack", "benchmark", "accuracy", *arguments])
+    accuracy.measure(parser.parse_intermixed_args(arguments), command, _write_picture)
+
+
+def _ablation(arguments: Sequence[str]) -> None:
+    from toftrack.evaluation import ablation
+
+    def variants(text: str) -> list[str]:
+        names = text.split(",")
+        known = ", ".join(ablation.VARIANTS)
+        for name in names:
+            if name not in ablation.VARIANTS:
+                raise ToftrackError(f"there is no variant '{name}'; give some of {known}")
+        return names
+
+    parser = _parser_of_recordings("ablation", ablation.__doc__)
+    parser.add_argument(
+        "--variants",
+        type=variants,
+        default=list(ablation.VARIANTS),
+        metavar="NAMES",
+        help=f"only some, separated by commas: {', '.join(ablation.VARIANTS)}",
+    )
+    command = shlex.join(["toftrack", "benchmark", "ablation", *arguments])
+    ablation.measure(parser.parse_intermixed_args(arguments), command)
+
+
+def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentParser:
+    """With what accuracy and ablation have in common."""
+    parser = plain_parser(f"toftrack benchmark {name}", about)
+    parser.add_argument(
+        "what",
+        nargs="+",
+        metavar="FOLDER",
+        help="folders of recordings, or recordings; KEY=VALUE is an override as for track.py",
+    )
+    parser.add_argument("--seeds", type=_seeds, default=[0], help="separated by commas (0)")
+    parser.add_argument(
+        "--workers", type=_workers, default=1, metavar="N", help="processes (1); figures stay"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything there")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there")
+    return parser
+
+
+def _seeds(text: str) -> list[int]:
+    seeds = list(dict.fromkeys(int(part) for part in text.split(",")))
+    if min(seeds) < 0:
+        raise ValueError
+    return seeds
+
+
+def _workers(text: str) -> int:
+    count = int(text)
+    if not 1 <= count <= 4 * (os.cpu_count() or 1):
+        raise ValueError
+    return count
+
+
+def _write_picture(path: Path, result: dict[str, Any]) -> None:
+    """The picture of a result; ToftrackError where it cannot be written or drawn."""
+    import cv2
+
+    from toftrack.views.figures.runs import accuracy_figure
+
+    if not result["each"]:
+        raise ToftrackError(
+            "--picture shows recordings with truth, and there is none; leave it out"
+        )
+    kind = path.suffix if path.suffix.lower() in (".png", ".jpg") else ".png"
+    done, data = cv2.imencode(kind, accuracy_figure(result["each"], result["total"]))
+    assert done
+    with reported_errors(f"the picture '{path}' cannot be written", "choose another place"):
+        write_whole(path, data.tobytes())
