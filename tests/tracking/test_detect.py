@@ -266,7 +266,7 @@ def test_on_the_arm_of_a_hand_that_is_seen_no_track_begins(
         assert len(state.tracks) == (2 if begins and frame == 2 else 1)
 
 
-def left_of(seen: Detection, dt_s: float = FRAME_S) -> set[torch.Tensor]:
+def left_of(seen: Detection | None, dt_s: float = FRAME_S) -> set[torch.Tensor]:
     """Of hands about the one that the pose network sees, those that are none of its arm."""
     others = {pose: detection_of(pose, side="left") for pose in EVERYTHING}
     model = replace(any_hand_model(), detector=FixedDetector(list(others.values())))
@@ -274,7 +274,8 @@ def left_of(seen: Detection, dt_s: float = FRAME_S) -> set[torch.Tensor]:
     depth[105:112, 90:150] = 0.5  # a forearm to the right
     state = state_of(known(), model=model, places=places_of(*others.values()))
     scene = scene_of(*state.tracks, image=replace(IMAGE, depth_m=depth), model=model)
-    asked = PendingDetections([lambda: SideDetection(seen, "right", 0)], no_places, False, False)
+    at_tracks = [] if seen is None else [lambda: SideDetection(seen, "right", 0)]
+    asked = PendingDetections(at_tracks, no_places, False, False)
     found, _ = finish_detection(asked, replace(scene, dt_s=dt_s), state)
     return {pose for pose, one in others.items() if any(one is each.detection for each in found)}
 
@@ -287,6 +288,10 @@ def test_the_arm_is_where_the_network_sees_it_or_the_fingers_do_not_point() -> N
     wrist = seen.keypoints.points_m[0].double().numpy()
     parts = Parts(kind, crop_rotation(wrist), wrist, False)
     assert left_of(replace(seen, parts=parts)) == {DOWN_THE_ARM, BESIDE, BELOW}
+
+
+def test_a_track_that_nobody_looks_at_has_its_predicted_arm() -> None:
+    assert left_of(None) == {BESIDE, ACROSS, BELOW}
 
 
 def test_what_is_hardly_a_hand_or_was_seen_long_ago_has_no_arm() -> None:

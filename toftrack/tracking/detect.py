@@ -84,7 +84,7 @@ def finish_detection(
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
     places = _apart_from([*known, *state.refused[:, :3]], places)
     if len(places.centre_m):
-        arms = [] if rare else [_arm(scene, one) for one in seen]
+        arms = [] if rare else _arms(scene, seen)
         found = _elsewhere(scene, state, places, rare)
         seen += [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
     return seen, pending
@@ -157,23 +157,29 @@ Arm = tuple[np.ndarray, np.ndarray]
 """A wrist, and the direction of the forearm from there, (3,) each."""
 
 
-def _arm(scene: Scene, seen: SideDetection) -> Arm | None:
-    """The arm of a detected hand, None where its merit is too low: towards what the pose network
-    calls its forearm, else away from its fingers.
+def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[Arm]:
+    """The arms of detected hands, but for those of low merit, and of reliable tracks that nobody
+    looked at: towards what the pose network calls a forearm, else away from the fingers.
     """
-    if merit(seen.detection, seen.detection.heat) < scene.model.detector.settings.merit:
-        return None
-    wrist, up = seen.detection.keypoints.points_m[0].numpy(), seen.detection.up
-    near = scene.near(wrist, CROP_M / 2)
-    forearm = near[seen.detection.parts.at(near) == FOREARM_PART]
-    along = forearm.mean(0) - wrist if len(forearm) else -up
-    return wrist, along / max(float(np.linalg.norm(along)), 1e-6)
+    arms = []
+    for one in seen:
+        if merit(one.detection, one.detection.heat) < scene.model.detector.settings.merit:
+            continue
+        wrist = one.detection.keypoints.points_m[0].numpy()
+        near = scene.near(wrist, CROP_M / 2)
+        forearm = near[one.detection.parts.at(near) == FOREARM_PART]
+        arms.append((wrist, forearm.mean(0) - wrist if len(forearm) else -one.detection.up))
+    looked = {one.row for one in seen}
+    arms += [
+        (hand.joints_m[0].numpy(), -hand.up_m[0])
+        for row, hand in enumerate(scene.hands)
+        if row not in looked and hand.track.reliable
+    ]
+    return [(wrist, to / max(float(np.linalg.norm(to)), 1e-6)) for wrist, to in arms]
 
 
-def _is_on(arm: Arm | None, detection: Detection) -> bool:
+def _is_on(arm: Arm, detection: Detection) -> bool:
     """Whether a detected palm lies on an arm: then it is that arm, which may look like a hand."""
-    if arm is None:
-        return False
     away = detection.centre_m.numpy() - arm[0]
     along = float(away @ arm[1])
     beside = float(np.linalg.norm(away - along * arm[1]))
