@@ -150,7 +150,7 @@ def test_frames_are_shown_about_the_hand_with_what_the_tracker_says() -> None:
     truth = (truth[:2] / truth[2]).T
     assert np.abs(last.estimate_px - truth).max() < 8
     (bare,) = label_frames(device, config, [7])
-    assert bare.estimate_px is None and bare.confidence is None
+    assert bare.estimate_px is None
     for frame in (bare, last):
         assert np.abs(truth - frame.centre_px).max() < frame.reach_px < 110
         depth_mm = 1e3 * device.truth.joints_m[7, :, 2]

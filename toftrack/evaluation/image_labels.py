@@ -6,6 +6,7 @@ recording, which is tracked as a whole:
     {"image_size": [512, 424], "side": "left", "frames": {"6": {"points":
         {"thumb_tip": [249.5, 170.8, "visible"], "wrist": [308, 182, "guessed"], ...}}, ...}}
 
+`toftrack label` makes such a file; what else stands in it, as a frame's `gesture`, is not measured.
 A joint is compared laterally: the distance in pixels between its projection and the label, times
 its own depth over the focal length. Of visible fingertips, which are moved 5 mm towards the joint
 before them, as the labels are: `tips_20_pct`, `tips_40_pct` are the frames in which all are within

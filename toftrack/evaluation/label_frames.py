@@ -33,7 +33,6 @@ class LabelFrame:
     centre_px, reach_px: what to show first: so far about (u, v).
     near_mm, far_mm: the depths that contrast is given to.
     estimate_px: (21, 2) the tracker's joints; None where it was not asked, or lost the hand.
-    confidence: the tracker's; None likewise.
     """
 
     number: int
@@ -43,7 +42,6 @@ class LabelFrame:
     near_mm: float
     far_mm: float
     estimate_px: np.ndarray | None = None
-    confidence: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +105,6 @@ def label_frames(
                     np.clip(1e3 * depth_m + 0.5, 0, 65535).astype("<u2"),
                     *_about(joints_m, depth_m, camera.K),
                     None if estimate is None else _projected(estimate.joints_m, camera.K),
-                    None if estimate is None else float(estimate.confidence),
                 )
             )
         if len(shown) == len(numbers):

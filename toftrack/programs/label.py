@@ -57,7 +57,8 @@ _OF_CONVERT = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and serve the page until Ctrl-C. Raises ToftrackError."""
     parser = plain_parser("toftrack label", __doc__)
-    parser.add_argument("words", nargs="+", metavar=("FILE", "KEY=VALUE"), help="see below")
+    about = "the recording, and settings KEY=VALUE of it, as for toftrack track"
+    parser.add_argument("words", nargs="*", default=[], metavar="FILE", help=about)
     parser.add_argument("--frames", type=int, help=f"how many ({_FRAMES}, or those in the output)")
     parser.add_argument("--least-sure", action="store_true", help="where the tracker is least sure")
     parser.add_argument("--output", default="labels.json", help="the file (labels.json)")
@@ -91,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 raise
         finally:
             page.close()  # and with it all changes of the labels
-            shutdown.say(_ending(page.labels, Path(path), words), sys.stdout)
+            shutdown.say(ending(page.labels, Path(path), words), sys.stdout)
 
 
 def _page(device: Device, config: DictConfig, path: Path, options: argparse.Namespace) -> LabelPage:
@@ -120,7 +121,7 @@ def _page(device: Device, config: DictConfig, path: Path, options: argparse.Name
     return LabelPage(labels, frames, gestures.names if gestures else (), options.port)
 
 
-def _ending(labels: LabelFile, path: Path, words: Sequence[str]) -> str:
+def ending(labels: LabelFile, path: Path, words: Sequence[str]) -> str:
     """Where the labels are, and how to measure with them."""
     if not labels.path.exists():
         return "nothing was labelled"

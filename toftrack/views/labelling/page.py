@@ -112,7 +112,6 @@ def _picture(frame: LabelFrame) -> dict[str, Any]:
         "near": frame.near_mm,
         "far": frame.far_mm,
         "estimate": None if estimate is None else estimate.round(1).tolist(),
-        "confidence": frame.confidence,
     }
 
 
