@@ -6,6 +6,7 @@ recording, which is tracked as a whole:
     {"image_size": [512, 424], "side": "left", "frames": {"6": {"points":
         {"thumb_tip": [249.5, 170.8, "visible"], "wrist": [308, 182, "guessed"], ...}}, ...}}
 
+`toftrack label` makes such a file; what else stands in it, as a frame's `gesture`, is not measured.
 A joint is compared laterally: the distance in pixels between its projection and the label, times
 its own depth over the focal length. Of visible fingertips, which are moved 5 mm towards the joint
 before them, as the labels are: `tips_20_pct`, `tips_40_pct` are the frames in which all are within
@@ -89,8 +90,17 @@ def read_labels(path: str | Path) -> Points | Stills:
         f"the labels '{path}' cannot be read", "give a file of JSON", OSError, ValueError
     ):
         content = read_json(path)
+    return parsed_labels(path, content)
+
+
+def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Stills:
+    """Labels of either kind as they stand in a file.
+
+    begun: points may still be without any that is visible.
+    Raises ToftrackError, one sentence that names the file.
+    """
     try:
-        return _parsed(path, content)
+        return _parsed(path, content, begun)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise ToftrackError(
             f"the labels '{path}' are of neither kind that toftrack/evaluation/image_labels.py "
@@ -98,14 +108,14 @@ def read_labels(path: str | Path) -> Points | Stills:
         ) from None
 
 
-def _parsed(path: Path, content: Any) -> Points | Stills:
+def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:
     width, height = (int(side) for side in content["image_size"])
     side = content["side"]
     if side not in ("right", "left"):
         raise ValueError(f"the side is {side!r}")
     if "frames" in content:
         frames = {int(key): _visible(frame["points"]) for key, frame in content["frames"].items()}
-        if not any(frames.values()) or min(frames) < 0:
+        if not (any(frames.values()) or begun) or min(frames, default=0) < 0:
             raise ValueError("no frame has a visible point")
         return Points(path, (width, height), side, frames)
     called = {str(key): tuple(map(str, names)) for key, names in content["called"].items()}

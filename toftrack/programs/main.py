@@ -26,6 +26,7 @@ _COMMANDS = {
     "convert": _Command("toftrack.programs.convert", "convert a recording"),
     "calibrate": _Command("toftrack.programs.calibrate", "calibrate a camera with a chequerboard"),
     "evaluate": _Command("toftrack.programs.evaluate", "measure against a public data set"),
+    "label": _Command("toftrack.programs.label", "label a recording by clicks, to measure on it"),
     "gesture": _Command("toftrack.programs.gesture", "make gestures of your own"),
     "figures": _Command("toftrack.programs.figures", "draw pictures of a finished run"),
     "report": _Command("toftrack.programs.report", "gather the jobs of a sweep"),

@@ -78,7 +78,8 @@ class WebServer:
     """Serves from a thread of its own, from construction until `close`.
 
     Args:
-        group: whose settings `host` and `port` are, for errors.
+        group: whose settings `host` and `port` are, for errors; "" where they are the options
+            --host and --port.
         host: name or address of the network interface.
         port: 0 = any free one.
         package: where the files of `pages` are.
@@ -300,17 +301,18 @@ def _quiet_log() -> logging.Logger:
 
 def _refused(group: str, host: str, port: int, error: OSError) -> ToftrackError:
     """What is said when a port cannot be listened at."""
+    set_port, set_host = (f"{group}.port=", f"{group}.host=") if group else ("--port ", "--host ")
     if error.errno == errno.EADDRINUSE:
         return ToftrackError(
             f"port {port} of {host} is taken, perhaps by another tracker; end that one, or choose "
-            f"another with {group}.port=PORT{ANY_PORT}"
+            f"another with {set_port}PORT{ANY_PORT}"
         )
     if error.errno == errno.EACCES:
         return ToftrackError(
-            f"port {port} of {host} may not be used; choose one above 1023 with {group}.port=PORT"
+            f"port {port} of {host} may not be used; choose one above 1023 with {set_port}PORT"
             f"{ANY_PORT}"
         )
     return ToftrackError(
-        f"nothing can be served at {group}.host={host} ({error.strerror or error}); give an "
+        f"nothing can be served at {set_host}{host} ({error.strerror or error}); give an "
         "address of this machine, or leave it at 127.0.0.1"
     )

@@ -1,0 +1,143 @@
+"""Label a recording by eye and measure the tracker on it: `toftrack label FILE`.
+
+Opens a page that shows frames, evenly spaced, and asks for fingertips, knuckles and wrist by a
+click each, for gesture and side. Every click is kept at once; the same command goes on later, until
+Ctrl-C. `toftrack benchmark accuracy FILE --labels labels.json` reads what comes of it.
+
+FILE is any recording, as for `toftrack track`. --least-sure tracks it first and shows the frames in
+which the tracker is least sure: where it errs, not how often.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import signal
+import sys
+import threading
+import webbrowser
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from toftrack.checks import check_number
+from toftrack.configuration.compose import (
+    configuration,
+    devices_of_files,
+    one_sentence,
+    setting_names,
+)
+from toftrack.devices.base import Device
+from toftrack.errors import ToftrackError
+from toftrack.evaluation import label_frames
+from toftrack.evaluation.labelling import LabelFile, chosen_frames
+from toftrack.evaluation.results import checked_targets
+from toftrack.gestures.recognition import Gestures
+from toftrack.output.web.server import ANY_PORT
+from toftrack.programs import shutdown
+from toftrack.programs.command_line import plain_parser
+from toftrack.programs.recording_argument import with_recording
+from toftrack.views.labelling.page import LabelPage
+
+_FRAMES = 20
+_OF_CONVERT = {
+    "device.intrinsics": "--intrinsics",
+    "device.unit_m": "--source-unit",
+    "device.fps": "--fps",
+    "device.topic": "--topic",
+    "device.modulation_mhz": "--modulation",
+    "camera.file": "--camera",
+}
+"""Overrides that say how a recording is to be understood, as options of `toftrack convert`."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line and serve the page until Ctrl-C. Raises ToftrackError."""
+    parser = plain_parser("toftrack label", __doc__)
+    about = "the recording, and settings KEY=VALUE of it, as for toftrack track"
+    parser.add_argument("words", nargs="*", default=[], metavar="FILE", help=about)
+    parser.add_argument("--frames", type=int, help=f"how many ({_FRAMES}, or those in the output)")
+    parser.add_argument("--least-sure", action="store_true", help="where the tracker is least sure")
+    parser.add_argument("--output", default="labels.json", help="the file (labels.json)")
+    parser.add_argument("--side", choices=("right", "left"), help="whose hand; the page asks, too")
+    parser.add_argument("--port", type=int, default=0, help="of the page (any free one)")
+    parser.add_argument("--no-browser", action="store_true", help="only print the address")
+    options = parser.parse_intermixed_args(arguments)
+    if options.frames is not None:
+        check_number("--frames", options.frames, 1, whole=True)
+    check_number("--port", options.port, 0, 65535, whole=True, remedy=ANY_PORT)
+    words = with_recording(options.words, setting_names(), devices_of_files())
+    if not any(word.startswith("device=") for word in words):
+        raise ToftrackError("which recording is to be labelled? Give the name of a file")
+    side = [] if options.side is None else [f"hand.side={options.side}"]
+    config = configuration(*side, *words)
+    path = config.device.get("path")
+    if path is None:
+        raise ToftrackError(
+            "only a recording can be labelled; record the camera first, and give it"
+        )
+    with one_sentence():
+        device: Device = instantiate(config.device)
+    with device, closing(_page(device, config, Path(path), options)) as page:
+        print(f"label at: {page.address} (Ctrl-C ends)", file=sys.stderr, flush=True)
+        if not options.no_browser:
+            webbrowser.open(page.address)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt as end:  # which is how it ends
+            if shutdown.exit_status(end) != 128 + signal.SIGINT:
+                raise
+        finally:
+            page.close()  # and with it all changes of the labels
+            shutdown.say(ending(page.labels, Path(path), words), sys.stdout)
+
+
+def _page(device: Device, config: DictConfig, path: Path, options: argparse.Namespace) -> LabelPage:
+    """The page, with the frames that were chosen."""
+    camera, count = device.camera, device.frames
+    if not count:
+        raise ToftrackError("only a recording that ends can be labelled; leave out device.repeat")
+    target = Path(options.output).expanduser()
+    checked_targets(target)
+    labels = LabelFile(target, path.name, (camera.width, camera.height), count, options.side)
+    if device.truth is not None:
+        note = "has truth, by which the benchmark measures, and not by labels"
+        print(f"note: '{path}' {note}", file=sys.stderr)
+    known = label_frames.track(device, config) if options.least_sure else None
+    given = labels.numbers()
+    numbers = chosen_frames(
+        len(known.confidence) if known else count,
+        options.frames or (len(given) or _FRAMES),
+        given,
+        known.confidence if known else None,
+    )
+    frames = label_frames.label_frames(device, config, numbers, known)
+    labels.begin([frame.number for frame in frames])
+    with one_sentence():
+        gestures: Gestures | None = instantiate(config.gestures)
+    return LabelPage(labels, frames, gestures.names if gestures else (), options.port)
+
+
+def ending(labels: LabelFile, path: Path, words: Sequence[str]) -> str:
+    """Where the labels are, and how to measure with them."""
+    if not labels.path.exists():
+        return "nothing was labelled"
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    options = [
+        word
+        for key, option in _OF_CONVERT.items()
+        if key in given
+        for word in (option, *given[key].strip("[]").replace(",", " ").split())
+    ]
+    lines = [f"{labels.path}: {labels.labelled()} of {len(labels.frames)} frames are labelled"]
+    measured = path
+    if options or path.suffix.lower() != ".npz":
+        measured = Path(f"{path.stem or path.name}_to_measure.npz")
+        command = ["toftrack", "convert", str(path), str(measured), *options]
+        lines.append(f"make an .npz of it: {shlex.join(command)}")
+    command = ["toftrack", "benchmark", "accuracy", str(measured), "--labels", str(labels.path)]
+    lines.append(f"measure the tracker: {shlex.join(command)}")
+    return "\n".join(lines)
