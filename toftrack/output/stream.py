@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError, reported_errors
@@ -34,7 +34,7 @@ class ReaderGoneError(Exception):
     """Whoever read the stream has closed it: there is nobody left to track for."""
 
 
-class Stream(Protocol):
+class Stream:
     """Where estimates are sent, within a `with`."""
 
     def send(self, estimates: Sequence[Estimate]) -> None:
@@ -42,24 +42,17 @@ class Stream(Protocol):
         nobody does.
         """
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *exception: Any) -> None: ...
-
-
-class NoStream:
-    """Sends nothing."""
-
-    def send(self, estimates: Sequence[Estimate]) -> None:
-        """Do nothing."""
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: Any) -> None: ...
 
 
-class StdoutStream:
+class NoStream(Stream):
+    """Sends nothing."""
+
+
+class StdoutStream(Stream):
     """Lines to standard output, which is theirs alone within the `with`.
 
     Whatever else this process prints, its libraries included, goes to standard error meanwhile.
@@ -133,7 +126,7 @@ class StdoutStream:
             self._sent += not self._rest
 
 
-class UdpStream:
+class UdpStream(Stream):
     """A datagram a line to one address, whether anybody listens there or not.
 
     Args:

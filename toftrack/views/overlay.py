@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Self
 
 import cv2
 import numpy as np
@@ -24,7 +23,7 @@ from toftrack.estimate import (
     state_words,
 )
 from toftrack.render.model_image import model_range_image
-from toftrack.views.base import TrackedFrame
+from toftrack.views.base import TrackedFrame, View
 from toftrack.views.pictures import write_picture
 from toftrack.views.skeleton import SLOT_RGB, draw_hands, side_words
 from toftrack.views.video import VideoFile, unwritable, video_library
@@ -128,7 +127,7 @@ def draw_tracked(tracked: TrackedFrame) -> np.ndarray:
     )
 
 
-class VideoView:
+class VideoView(View):
     """Keeps panels as a video, overlay.mp4, and as a filmstrip of ten of them, overlay.png.
 
     Args:
@@ -155,10 +154,6 @@ class VideoView:
         """Append the frame's panel."""
         self.add(draw_tracked(tracked))
 
-    def commands(self) -> Sequence[str]:
-        """A file asks for nothing."""
-        return ()
-
     def add(self, panel: np.ndarray) -> None:
         """Append a (h, w, 3) uint8 BGR panel; the first one decides on the size of the video."""
         if self._video is None:
@@ -180,9 +175,6 @@ class VideoView:
             video.close()
         finally:
             self._write_strip()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
         # What went wrong before is what matters, such as a disk that is full.

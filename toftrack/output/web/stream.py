@@ -21,14 +21,14 @@ from typing import Any, Self
 from toftrack.checks import check_number
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
-from toftrack.output.stream import known_fields, report_dropped
+from toftrack.output.stream import Stream, known_fields, report_dropped
 from toftrack.output.web.server import ANY_PORT, WebServer
 
 STREAM = "/stream"
 _PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js"}
 
 
-class WebSocketStream:
+class WebSocketStream(Stream):
     """A message a line to every client, and the pages, from a thread of its own within the `with`.
 
     A client that is too slow loses its oldest lines. Where there is no client nothing is made.

@@ -6,15 +6,13 @@ import logging
 import queue
 import socket
 import threading
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
 from urllib.parse import urlsplit
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.render.likelihood import FMeasure
 from toftrack.safe_files import open_new
-from toftrack.views.base import TrackedFrame
+from toftrack.views.base import TrackedFrame, View
 from toftrack.views.rerun.entities import Entities, blueprint, rr
 from toftrack.views.video import unwritable
 
@@ -30,7 +28,7 @@ _ADDRESS = f"rerun+http://127.0.0.1:{_PORT}/proxy"
 _RERUN_ERRORS = (OSError, RuntimeError, ValueError)
 
 
-class RerunView:
+class RerunView(View):
     """Writes the file track.rrd, or shows in a viewer while tracking goes on.
 
     A thread of its own does the work, so that the tracker goes on at once. The file gets every
@@ -92,10 +90,6 @@ class RerunView:
         except queue.Full:
             self._left_out += 1
 
-    def commands(self) -> Sequence[str]:
-        """The viewer asks for nothing."""
-        return ()
-
     def close(self) -> None:
         """Finish the file, or send the viewer what is left; ToftrackError when it cannot be done.
 
@@ -116,12 +110,6 @@ class RerunView:
             rr.unregister_shutdown()
             raise _viewer_gone("it takes nothing any more")
         self._raise_failure()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _work(self) -> None:
         """In the thread: log the frames that come, until None, then finish."""
