@@ -100,8 +100,8 @@ def smooth(
         before + slow * (new - before) for before, new in zip(state.speed, now, strict=True)
     )
     speeds = (
-        settings.position_beta * np.linalg.norm(velocity),
-        settings.rotation_beta * np.linalg.norm(turning),
+        settings.position_beta * float(np.linalg.norm(velocity)),
+        settings.rotation_beta * float(np.linalg.norm(turning)),
         settings.angle_beta * np.abs(bending),
     )
     shares = (_share(settings.min_cutoff_hz + faster, seconds) for faster in speeds)
