@@ -10,7 +10,7 @@ from helpers.readers import write_readers
 
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
-from toftrack.programs.recording_argument import with_recording
+from toftrack.programs.applications import with_recording
 from toftrack.programs.report import read_runs, report
 from toftrack.recordings.store import open_recording
 from toftrack.recordings.unfinished import recover_recording

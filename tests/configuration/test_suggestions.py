@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from toftrack import make_tracker
-from toftrack.configuration.compose import configuration, configuration_folder
+from toftrack.configuration import configuration_folder
+from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
 
 

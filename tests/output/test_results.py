@@ -25,7 +25,7 @@ from toftrack.frames import Truth
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import LINE_FIELDS, read_lines
 from toftrack.output.results import ResultWriter, read_results, read_run_facts
-from toftrack.output.summary_table import metrics_table
+from toftrack.output.summary import metrics_table
 from toftrack.programs.recover import recover
 
 NAMES = tuple(f"joint_{i}" for i in range(21))

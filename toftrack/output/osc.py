@@ -35,14 +35,8 @@ Message = tuple[str, list[tuple[str, Any]]]
 class OscStream(UdpStream):
     """A bundle a frame to one address, whether anybody listens there or not.
 
-    Args:
-        host: address or name of the receiving machine.
-        port: 1 to 65535.
-        parts: some of PARTS.
-
-    Raises:
-        ToftrackError: python-osc is not installed, an unknown part, a host that cannot be found or
-            an impossible port.
+    The settings: conf/stream/osc.yaml. Raises ToftrackError where python-osc is not installed, for
+    an unknown part, a host that cannot be found, or an impossible port.
     """
 
     def __init__(self, host: str, port: int, parts: Sequence[str]) -> None:

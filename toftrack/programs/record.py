@@ -21,13 +21,14 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from toftrack.checks import check_number
-from toftrack.configuration.compose import configuration, configuration_folder, one_sentence
+from toftrack.configuration import configuration_folder
+from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.devices.base import Device
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
 from toftrack.programs import shutdown
+from toftrack.programs.applications import quoted
 from toftrack.programs.command_line import plain_parser
-from toftrack.programs.recording_argument import quoted
 from toftrack.programs.shutdown import EndedError
 from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.sr_frame import REGISTERS

@@ -34,8 +34,7 @@ from toftrack.output.advice import Watch
 from toftrack.output.results import RealTime, ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
-from toftrack.output.summary import shape_file
-from toftrack.output.summary_table import metrics_line, metrics_table
+from toftrack.output.summary import metrics_line, metrics_table, shape_file
 from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.recordings.recorder import Recorder

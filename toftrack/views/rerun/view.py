@@ -32,17 +32,11 @@ class RerunView(View):
     """Writes the file track.rrd, or shows in a viewer while tracking goes on.
 
     A thread of its own does the work, so that the tracker goes on at once. The file gets every
-    frame; a viewer that does not keep up misses some, and never holds up the tracker.
+    frame; a viewer that does not keep up misses some, and never holds up the tracker. The settings:
+    conf/view/rerun.yaml.
 
-    Args:
-        folder: exists; the file goes into it.
-        fps, frames: as every view gets them, and of no use here.
-        likelihood: tells correct, false and missed pixels.
-        connect: address of a running viewer, rerun+http://HOST:PORT/proxy; nothing is written then.
-        spawn: start a viewer and show there; nothing is written then.
-
-    Raises:
-        ToftrackError: the file cannot be written, there is no viewer, or both connect and spawn.
+    Raises ToftrackError when the file cannot be written, there is no viewer, or for both connect
+    and spawn.
     """
 
     def __init__(
