@@ -62,17 +62,10 @@ def draw_figures(
     out: str | Path | None = None,
     frame: int | None = None,
 ) -> list[Path]:
-    """Draw and write the figures of a run; returns the files.
+    """Draw and write the figures of a run; returns the files. The arguments are the command's.
 
-    Args:
-        folder: where track.py wrote.
-        recording: where the recording is now, when it is not where it was.
-        out: folder for the figures; None = `figures` in the run's.
-        frame: number of the input frame of measurement.png; None takes one of median score.
-
-    Raises:
-        ToftrackError: the folder is no run's, the recording is gone or another one, the run has no
-            such frame, matplotlib is missing, or nothing can be written.
+    Raises ToftrackError when the folder is no run's, the recording is gone or another one, the run
+    has no such frame, matplotlib is missing, or nothing can be written.
     """
     new_figure(1, 1)  # better missed now than when the recording is open
     run = read_run(folder)

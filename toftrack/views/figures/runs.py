@@ -17,11 +17,10 @@ from toftrack.evaluation.trust import joint_errors_mm
 from toftrack.frames import Truth
 from toftrack.output.run_folder import Footage, Run, observe
 from toftrack.pose_space.base import PoseSpace
-from toftrack.render.model_image import model_range_image
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.figures import chart
 from toftrack.views.figures.poses import scatter_gestures
-from toftrack.views.overlay import draw_panel, film_tile, filmstrip, panel_scale, range_grey
+from toftrack.views.overlay import draw_estimates, film_tile, filmstrip, range_grey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,13 +36,8 @@ _SAME_SPACE = 0.01
 
 def _panel(run: Run, footage: Footage, row: int) -> np.ndarray:
     """A frame of all slots as the overlay shows it."""
-    estimates, camera = run.estimates(row), footage.camera
-    models = [
-        model_range_image(estimate.state, shape, camera.K, camera.height, camera.width)
-        for estimate, shape in zip(estimates, run.shapes, strict=True)
-    ]
     images = footage.depth(row), footage.amplitude(row)
-    return draw_panel(*images, camera, estimates, models, panel_scale(camera.width))
+    return draw_estimates(*images, footage.camera, run.estimates(row), run.shapes)
 
 
 def _strip(run: Run, footage: Footage, rows: Iterable[int]) -> np.ndarray:

@@ -14,7 +14,7 @@ from toftrack.render.likelihood import FMeasure
 from toftrack.safe_files import open_new
 from toftrack.views.base import TrackedFrame, View
 from toftrack.views.rerun.entities import Entities, blueprint, rr
-from toftrack.views.video import unwritable
+from toftrack.views.video import writing
 
 FILE_NAME = "track.rrd"
 
@@ -60,11 +60,9 @@ class RerunView(View):
                 _require_answer(connect)
             self._stream.connect_grpc(connect or _ADDRESS, default_blueprint=blueprint())
         else:
-            try:
+            with writing(self._path, *_RERUN_ERRORS):
                 open_new(self._path, replace=True).close()  # the library follows links
                 self._stream.save(self._path, default_blueprint=blueprint())
-            except (OSError, *_RERUN_ERRORS) as error:
-                raise unwritable(self._path, error) from error
         self._entities = Entities(self._stream, likelihood)
         self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_QUEUED_FRAMES)
         self._left_out = 0
@@ -123,11 +121,10 @@ class RerunView(View):
     def _raise_failure(self) -> None:
         if self._failure is None:
             return
-        if not isinstance(self._failure, _RERUN_ERRORS):
+        if self._path is None and isinstance(self._failure, _RERUN_ERRORS):
+            raise _viewer_gone(str(self._failure)) from self._failure
+        with writing(self._path or Path(FILE_NAME), *_RERUN_ERRORS):
             raise self._failure
-        if self._path is not None:
-            raise unwritable(self._path, self._failure) from self._failure
-        raise _viewer_gone(str(self._failure)) from self._failure
 
 
 def _start_viewer(stream: rr.RecordingStream) -> None:
