@@ -98,15 +98,11 @@ class Records:
 
     def append(self, estimates: Sequence[Estimate]) -> None:
         """Keep a frame, of which there is an estimate for each slot."""
-        if self.slots == 1:
-            self._keep([estimates[0].values()])
-            return
-        hands = [
-            {"slot": slot} | estimate.values()
-            for slot, estimate in enumerate(estimates)
-            if not is_vacant(estimate)
-        ]
-        self._keep([estimates[0].values() | {"hands": hands}])
+        line = estimates[0].values()
+        if self.slots > 1:
+            there = [pair for pair in enumerate(estimates) if not is_vacant(pair[1])]
+            line["hands"] = [{"slot": slot} | estimate.values() for slot, estimate in there]
+        self._keep([line])
 
     def close(self) -> None:
         """The records are gone; a second call does nothing."""

@@ -87,8 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out = Path(options.out).expanduser()
     folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
     result.camera.save(out)
-    text = report_text(result, start)
-    _write_report(folder, result, start, text, board)
+    facts = _facts(result, start)
+    text = report_text(facts)
+    _write_report(folder, result, facts, text, board)
     print(text)
     print(f"camera file: {out}\nreport:      {folder}")
 
@@ -162,9 +163,8 @@ def _amplitude(store: FrameStore, number: int) -> np.ndarray:
     return amplitude
 
 
-def report_text(result: Calibration, start: Camera) -> str:
+def report_text(facts: dict[str, Any]) -> str:
     """What was found, before and after, in lines."""
-    facts = _facts(result, start)
     before, after = facts["before"], facts["after"]
     lines = [
         f"chequerboard found in {facts['frames_used']} of {facts['frames_searched']} frames, "
@@ -217,9 +217,9 @@ def _facts(result: Calibration, start: Camera) -> dict[str, Any]:
 
 
 def _write_report(
-    folder: Path, result: Calibration, start: Camera, text: str, board: tuple[int, int]
+    folder: Path, result: Calibration, facts: dict[str, Any], text: str, board: tuple[int, int]
 ) -> None:
-    facts, views = _facts(result, start), result.lens.views
+    views = result.lens.views
     chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int))
     sheet = corner_sheet([(result.amplitudes[i], views[i].corners_px) for i in chosen], board)
     what = f"the report folder '{folder}' cannot be written"

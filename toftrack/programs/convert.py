@@ -66,17 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--fps", type=float, help="frames a second of bare images (25)")
     options = parser.parse_args(arguments)
-    given = options.intrinsics
-    count = convert(
-        options.source,
-        options.target,
-        options.camera,
-        options.modulation,
-        options.unit,
-        options.overwrite,
-        options.topic,
-        BareFacts(None if given is None else tuple(given), options.source_unit, options.fps),
-    )
+    lens = None if options.intrinsics is None else tuple(options.intrinsics)
+    read = options.camera, options.modulation, options.unit, options.overwrite, options.topic
+    bare = BareFacts(lens, options.source_unit, options.fps)
+    count = convert(options.source, options.target, *read, bare)
     print(f"{options.target}: {count} frames")
 
 

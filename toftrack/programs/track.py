@@ -226,9 +226,7 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 bar.update()
                 if device.live:
                     took_s, reduced = tracker.time.took_s(), tracker.time.reduced
-                    parts.realtime = parts.realtime.after(
-                        frame.timestamp_s, took_s, reduced, device.dropped
-                    )
+                    parts.realtime.add(frame.timestamp_s, took_s, reduced, device.dropped)
                 bar.set_postfix_str(_progress_words(estimates, parts), refresh=False)
 
 
