@@ -46,14 +46,11 @@ _SOON_S = 2.0
 class Records:
     """The frames of a run, for a `with`; each field is a column.
 
-    Args:
-        folder: exists; where the records are kept, under no name.
-        like: what a line says of a hand, or of a frame of one; tells which fields there are, and
-            their shapes.
-        slots: of each frame; of several, a line has `hands`.
+    folder: exists; where the records are kept, under no name.
+    like: what a line says of a hand, or of a frame of one; tells the fields and their shapes.
+    slots: of each frame; of several, a line has `hands`.
 
-    Raises:
-        OSError: (by `append`, too) the records cannot be kept there.
+    Raises OSError (by `append`, too) when the records cannot be kept there.
     """
 
     def __init__(self, folder: Path, like: Mapping[str, Any], slots: int) -> None:

@@ -246,12 +246,9 @@ def _board(text: str) -> tuple[int, int]:
 def corner_sheet(
     images: Sequence[tuple[np.ndarray, np.ndarray]], board: tuple[int, int], columns: int = 4
 ) -> np.ndarray:
-    """(H, W, 3) uint8 BGR: amplitude images with their corners drawn in, in rows.
+    """(H, W, 3) uint8 BGR: amplitude images with their corners drawn in, so many in a row.
 
-    Args:
-        images: of each the (H, W) amplitude and the (columns * rows, 2) corners in pixels.
-        board: columns, rows of inner corners.
-        columns: pictures in a row.
+    images: of each the (H, W) amplitude and the (columns * rows, 2) corners in pixels.
     """
     scale, tiles = 2, []
     for amplitude, corners in images:

@@ -149,13 +149,9 @@ def draw_estimates(
 class VideoView(View):
     """Keeps panels as a video, overlay.mp4, and as a filmstrip of ten of them, overlay.png.
 
-    Args:
-        folder: exists; both files go into it.
-        fps: of the video.
-        frames: how many panels are to come at most, or None where nobody knows.
+    frames: how many panels are to come at most, or None where nobody knows.
 
-    Raises:
-        ToftrackError: nothing encodes; by `add` and `close`, when a file cannot be written.
+    Raises ToftrackError where nothing encodes; by `add` and `close`, when a file cannot be written.
     """
 
     def __init__(self, folder: str | Path, fps: float, frames: int | None = None) -> None:

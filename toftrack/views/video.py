@@ -26,15 +26,11 @@ _FRAGMENTS = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_p
 
 
 class VideoFile:
-    """A video that grows frame by frame.
+    """A video, .mp4, that grows frame by frame.
 
-    Args:
-        path: of the .mp4 file.
-        fps: frames a second; from 1 to 120, 25 where it is not finite.
-        size: width and height, px, both even.
+    fps: from 1 to 120, 25 where it is not finite.  size: width and height, px, both even.
 
-    Raises:
-        ToftrackError: there is no encoder, or (by all methods) the file cannot be written.
+    Raises ToftrackError where there is no encoder, or (by all methods) the file cannot be written.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:

@@ -66,9 +66,7 @@ _BONE_M, _JOINT_M, _PARTICLE_M = 0.003, 0.003, 0.0012
 class Entities:
     """Logs frame after frame to a stream; one thread at a time.
 
-    Args:
-        stream: where to.
-        likelihood: tells correct, false and missed pixels.
+    likelihood: tells correct, false and missed pixels.
     """
 
     def __init__(self, stream: rr.RecordingStream, likelihood: FMeasure) -> None:
