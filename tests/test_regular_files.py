@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from helpers.readers import write_readers
 
-from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
-from toftrack.programs.recording_argument import with_recording
+from toftrack.programs.applications import with_recording
 from toftrack.programs.report import read_runs, report
 from toftrack.recordings.store import open_recording
 from toftrack.recordings.unfinished import recover_recording
@@ -77,25 +76,6 @@ def test_names_that_are_not_utf8_are_reported(
     assert "udcff" in (tmp_path / "sweep.csv").read_text(encoding="utf-8")
     assert "1 of 2 jobs failed" in capsys.readouterr().out
     assert len(read_runs(tmp_path)) == 2
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("filter.particles=10000000", "filter.particles=10000000 is not possible"),
-        ("filter.particles=1e7", "filter.particles=10000000.0 is not possible"),
-        ("filter.passes=1000000000", "filter.passes=1000000000 is not possible"),
-        (f"seed={10**23}", "is not possible"),
-        ("seed=-1", "seed=-1 is not possible"),
-        (".".join("a" * 5000) + "=1", "."),
-        ("seed=" + "[" * 3000 + "]" * 3000, "."),
-        ("+seed.x=" + "{a:" * 400 + "1" + "}" * 400, "."),
-    ],
-)
-def test_what_cannot_be_meant_is_one_sentence(override: str, words: str) -> None:
-    with pytest.raises(ToftrackError, match=words) as reported:
-        configuration(override)
-    assert "\n" not in str(reported.value)
 
 
 def test_an_empty_name_is_no_recording() -> None:

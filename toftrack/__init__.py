@@ -27,18 +27,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from toftrack.api import make_device, make_hands_tracker, make_tracker
-    from toftrack.camera import Camera
-    from toftrack.devices.base import BaseDevice
-    from toftrack.errors import ToftrackError
-    from toftrack.estimate import Estimate
-    from toftrack.frames import Frame
-    from toftrack.hand.openxr import OPENXR_JOINT_NAMES
-    from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_NAMES
-    from toftrack.output.results import read_results
-    from toftrack.output.run_folder import Run, read_run
-    from toftrack.tracking.tracker import HandsTracker, Tracker
-    from toftrack.views.overlay import draw
+    from toftrack.api import make_device as make_device
+    from toftrack.api import make_hands_tracker as make_hands_tracker
+    from toftrack.api import make_tracker as make_tracker
+    from toftrack.camera import Camera as Camera
+    from toftrack.devices.base import BaseDevice as BaseDevice
+    from toftrack.errors import ToftrackError as ToftrackError
+    from toftrack.estimate import Estimate as Estimate
+    from toftrack.frames import Frame as Frame
+    from toftrack.hand.openxr import OPENXR_JOINT_NAMES as OPENXR_JOINT_NAMES
+    from toftrack.hand.skeleton import ANGLE_NAMES as ANGLE_NAMES
+    from toftrack.hand.skeleton import JOINT_NAMES as JOINT_NAMES
+    from toftrack.output.results import read_results as read_results
+    from toftrack.output.run_folder import Run as Run
+    from toftrack.output.run_folder import read_run as read_run
+    from toftrack.tracking.tracker import HandsTracker as HandsTracker
+    from toftrack.tracking.tracker import Tracker as Tracker
+    from toftrack.views.overlay import draw as draw
 
     __version__: str
 
@@ -63,26 +68,7 @@ _PLACES = {
     "read_run": "toftrack.output.run_folder",
 }
 
-__all__ = [
-    "ANGLE_NAMES",
-    "BaseDevice",
-    "Camera",
-    "Estimate",
-    "Frame",
-    "HandsTracker",
-    "JOINT_NAMES",
-    "OPENXR_JOINT_NAMES",
-    "Run",
-    "ToftrackError",
-    "Tracker",
-    "__version__",
-    "draw",
-    "make_device",
-    "make_hands_tracker",
-    "make_tracker",
-    "read_results",
-    "read_run",
-]
+__all__ = sorted((*_PLACES, "__version__"))
 
 
 def __getattr__(name: str) -> Any:

@@ -7,7 +7,7 @@ X = (u - cx) Z / fx and Y = (v - cy) Z / fy on the undistorted image.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -298,15 +298,9 @@ class Camera:
                 f"toftrack reads version {_VERSION}; write it anew"
             )
         try:
-            return cls(
-                K=content["K"],
-                width=content["width"],
-                height=content["height"],
-                distortion=content.get("distortion", np.zeros(5)),
-                depth_polynomial=content.get("depth_polynomial", ()),
-                depth_polynomial_range_m=content.get("depth_polynomial_range_m", ()),
-                lens=content.get("lens", "opencv"),
-            )
+            needed = {name: content[name] for name in ("K", "width", "height")}
+            given = {one.name: content[one.name] for one in fields(cls) if one.name in content}
+            return cls(**needed | given)
         except KeyError as error:
             raise ToftrackError(
                 f"the camera file '{path}' lacks the key {error}; add it or write the file anew"

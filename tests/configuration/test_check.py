@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
@@ -11,26 +13,70 @@ from helpers.tracking import CONF, ROOT
 from omegaconf import OmegaConf
 
 import toftrack.configuration.check as check
+from toftrack import make_tracker
+from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
-WRONG = (
-    ("detector.hypotheses=0", "detector.hypotheses=0 .*whole number above 0"),
-    ("filter.spread.depth_m=-0.1", "filter.spread.depth_m=-0.1 .*at least 0"),
-    ("filter.particles=many", "filter.particles=many .*a whole number"),
-    ("filter.exponent=nan", "filter.exponent=nan .*a number"),
-    ("refine.point_m=[1]", "refine.point_m=.*a number"),
-    ("device.repeat=5", "device.repeat=5 .*true or false"),
-    ("hands=9", "hands=9 .*whole number above 0 and at most 8"),
-)
+WRONG = [
+    ("detector.hypotheses=0", "detector.hypotheses=0 is not possible; give a whole number above 0"),
+    (
+        "filter.spread.depth_m=-0.1",
+        "filter.spread.depth_m=-0.1 is not possible; give a number of at",
+    ),
+    ("filter.particles=many", "filter.particles=many is not possible; give a whole number"),
+    ("filter.particles=10000000", "filter.particles=10000000 is not possible"),
+    ("filter.particles=1e7", "filter.particles=10000000.0 is not possible"),
+    ("filter.passes=1000000000", "filter.passes=1000000000 is not possible"),
+    ("filter.exponent=nan", "filter.exponent=nan is not possible; give a number"),
+    ("refine.point_m=[1]", "refine.point_m=[1] is not possible; give a number"),
+    ("device.repeat=5", "device.repeat=5 is not possible; give true or false"),
+    ("hands=9", "hands=9 is not possible; give a whole number above 0 and at most 8"),
+    (f"seed={10**23}", "is not possible"),
+    ("seed=-1", "seed=-1 is not possible"),
+    (".".join("a" * 5000) + "=1", ""),
+    ("seed=" + "[" * 3000 + "]" * 3000, ""),
+    ("+seed.x=" + "{a:" * 400 + "1" + "}" * 400, ""),
+    # What was probably meant.
+    ("hand.sied=left", "there is no setting hand.sied; did you mean hand.side?"),
+    ("particles=3", "did you mean filter.particles?"),
+    ("devcie=replay", "there is no setting devcie; did you mean device?"),
+    ("view.quux=1", "there is no setting view.quux; view has "),
+    ("quux=1", "there is no setting quux; the configuration has device, "),
+    ("device.path=a.npz", "a recording is given by its name alone: toftrack track FILE"),
+    ("device=replya", "there is no device=replya; did you mean device=replay? The choices are"),
+    ("view=quux", "there is no view=quux; give one of browser, none, rerun, video"),
+    ("device.path=a (1).npz", "give the recording by its name alone: toftrack track 'a (1)"),
+    (
+        "start=rough",
+        "start belongs to experiment=paper; give experiment=paper as well, or leave",
+    ),
+    ("start.pose=0.1", "start.pose belongs to experiment=paper; "),
+    ("experiment=paper start.psoe=0.1", "no setting start.psoe; did you mean start.pose?"),
+    # Parts of two trackers do not mix.
+    ("detector=none", "detector=none belongs to experiment=paper, the tracker without networks; "),
+    (
+        "lost=never",
+        "lost=never belongs to experiment=paper; give experiment=paper as well, or leave",
+    ),
+    (
+        "experiment=paper lost=calibrated",
+        "lost=calibrated goes with these alone; leave lost=calibrated out",
+    ),
+    (
+        "experiment=paper refine=gauss_newton",
+        "refine=gauss_newton goes with these alone; leave refine=gauss_newton out",
+    ),
+]
 
 
-@pytest.mark.parametrize(("override", "words"), WRONG)
-def test_a_wrong_value_is_refused_in_one_sentence(override: str, words: str) -> None:
-    with pytest.raises(ToftrackError, match=words) as error:
-        configuration(override)
-    assert "\n" not in str(error.value)
+@pytest.mark.parametrize(("overrides", "words"), WRONG, ids=lambda text: text[:60])
+def test_what_cannot_be_meant_is_refused_in_one_sentence(overrides: str, words: str) -> None:
+    given = [overrides] if "(" in overrides else overrides.split()
+    with pytest.raises(ToftrackError) as error:
+        configuration(*given)
+    assert words in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -53,35 +99,44 @@ def test_a_right_value_passes(overrides: tuple[str, ...]) -> None:
     configuration(*overrides)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (
-            ("detector=none",),
-            "detector=none belongs to experiment=paper, .* give experiment=paper, or leave",
-        ),
-        (("lost=never",), "lost=never belongs to experiment=paper; .* leave lost=never out"),
-        (
-            ("experiment=paper", "lost=calibrated"),
-            "lost=calibrated goes with these alone; leave lost=calibrated out",
-        ),
-        (
-            ("experiment=paper", "refine=gauss_newton"),
-            "refine=gauss_newton goes with these alone; leave refine=gauss_newton out",
-        ),
-    ],
-)
-def test_parts_of_two_trackers_do_not_mix(overrides: tuple[str, ...], words: str) -> None:
-    with pytest.raises(ToftrackError, match=words) as error:
-        configuration(*overrides)
-    assert "\n" not in str(error.value)
-
-
 def test_what_a_part_of_somebody_else_s_accepts_is_not_judged(tmp_path) -> None:
     (tmp_path / "device").mkdir()
     (tmp_path / "device" / "raw.yaml").write_text("_target_: mine.Raw\ngain: 1\n")
     (tmp_path / "config.yaml").write_text("defaults:\n  - device: raw\n  - _self_\n")
     assert configuration("device.gain=-0.5", config_dir=tmp_path).device.gain == -0.5
+
+
+@pytest.mark.parametrize(
+    ("file", "words", "reported"),
+    [
+        (
+            "lost/calibrated.yaml",
+            ("toftrack.tracking.confidence.", "toftrack.tracking.mine."),
+            "the _target_ toftrack.tracking.mine.make_confidence cannot be imported",
+        ),
+        (
+            "refine/gauss_newton.yaml",
+            ("angle_rad:", "nope: 3\nangle_rad:"),
+            "argument 'nope'.*at refine",
+        ),
+        (
+            "config.yaml",
+            ("  - posterior: default\n", ""),
+            "the configuration has no posterior; add '- posterior: default' to the defaults",
+        ),
+    ],
+)
+def test_what_is_wrong_in_a_folder_of_ones_own_is_named(
+    file: str, words: tuple[str, str], reported: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "conf"
+    shutil.copytree(configuration_folder(), folder)
+    text = (folder / file).read_text(encoding="utf-8")
+    assert words[0] in text
+    (folder / file).write_text(text.replace(*words), encoding="utf-8")
+    with pytest.raises(ToftrackError, match=reported) as error:
+        make_tracker(config_dir=folder)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

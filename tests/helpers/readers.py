@@ -16,7 +16,8 @@ from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
 from helpers.tracking import run
 
 from toftrack.camera import Camera
-from toftrack.configuration.compose import configuration, configuration_folder
+from toftrack.configuration import configuration_folder
+from toftrack.configuration.compose import configuration
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import onnx_file, read_session
 from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save_weights

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -24,14 +23,6 @@ OscBundle = pytest.importorskip("pythonosc.osc_bundle", reason="pip install '.[o
 
 def osc_stream(**changes: Any) -> OscStream:
     return part("stream=osc", "stream", **changes)
-
-
-@pytest.fixture
-def receiver() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
-        listening.bind(("127.0.0.1", 0))
-        listening.settimeout(20)
-        yield listening
 
 
 def sent(receiver: socket.socket, estimate: Estimate, **changes: Any) -> dict[str, list[Any]]:

@@ -25,7 +25,7 @@ from toftrack.frames import Truth
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import LINE_FIELDS, read_lines
 from toftrack.output.results import ResultWriter, read_results, read_run_facts
-from toftrack.output.summary_table import metrics_table
+from toftrack.output.summary import metrics_table
 from toftrack.programs.recover import recover
 
 NAMES = tuple(f"joint_{i}" for i in range(21))
@@ -33,27 +33,18 @@ NAMES = tuple(f"joint_{i}" for i in range(21))
 
 def estimate(index: int, **changes: Any) -> Estimate:
     rng = np.random.default_rng(index)
-    whole = Estimate(
-        index=index,
-        timestamp_s=index / 25,
-        state_name="tracking",
+    sizes = {"joints_m": (21, 3), "state": 27, "latent": 4, "covariance": (10, 10)}
+    whole = no_estimate(index, index / 25, "tracking", 4, 0.01 * (1 + index)).updated(
+        **{name: rng.normal(size=size).astype(np.float32) for name, size in sizes.items()},
+        joint_sigma_m=np.full((21, 3), 0.01, np.float32),
+        joint_ok=np.ones(21, bool),
         lost=index % 4 == 3,
-        joints_m=rng.normal(size=(21, 3)).astype(np.float32),
-        state=rng.normal(size=27).astype(np.float32),
-        latent=rng.normal(size=4).astype(np.float32),
         score=0.5 + index / 100,
-        covariance=rng.normal(size=(10, 10)).astype(np.float32),
-        effective_sample_size=100.0 + index,
-        compute_s=0.01 * (1 + index),
-        gesture="palm",
-        gesture_probability=0.75,
-        pinch=0.5,
-        pinching=True,
         confidence=0.9 - index / 100,
         outside_rad=0.1,
         side="left",
         side_probability=1.0,
-        joint_sigma_m=np.full((21, 3), 0.01, np.float32),
+        gesture="palm",
     )
     return dataclasses.replace(whole, **changes)
 

@@ -77,14 +77,6 @@ def ends_with(index: int) -> Callable[[bytes], bool]:
     return lambda content: content.endswith(b"\n") and content.splitlines()[-1].startswith(start)
 
 
-@pytest.fixture
-def receiver() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
-        listening.bind(("127.0.0.1", 0))
-        listening.settimeout(20)
-        yield listening
-
-
 def test_a_reader_of_standard_output_gets_every_line_as_in_track_jsonl() -> None:
     sent = [estimate(i) for i in range(5)]
     with piped() as pipe, stdout_stream() as stream:

@@ -20,7 +20,7 @@ from toftrack.output.advice import Watch
 from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, LINE_FIELDS, json_line
 from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.smoothing import OneEuro, smooth
-from toftrack.output.summary_table import metrics_table
+from toftrack.output.summary import metrics_table
 from toftrack.programs.recover import recover
 
 NAMES = tuple(f"joint_{i}" for i in range(21))

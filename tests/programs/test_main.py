@@ -14,7 +14,7 @@ import toftrack
 from toftrack.configuration.compose import devices_of_files, setting_names
 from toftrack.errors import ToftrackError
 from toftrack.programs import main as front
-from toftrack.programs.recording_argument import options_first, quoted, with_recording
+from toftrack.programs.applications import options_first, quoted, with_recording
 
 KNOWN = setting_names(), devices_of_files()
 ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')

@@ -15,6 +15,7 @@ from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from toftrack.configuration import configuration_folder
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
@@ -57,13 +58,6 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
             ) from error
         check_overrides(config, name, overrides)
         return config
-
-
-def configuration_folder() -> Path:
-    """toftrack's own conf/: in the package where a wheel was installed, beside it in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    inside = package / "conf"
-    return inside if inside.is_dir() else package.parent / "conf"
 
 
 def setting_names() -> frozenset[str]:

@@ -108,13 +108,9 @@ class RunFacts:
     def mean_apparent_m(self) -> float | None:
         """How long the hand looked, where most of a run was lost and enough was seen to say so."""
         count, lost = self.counts["detections"], self.counts["lost"]
-        if lost <= _MOST * self.counts["frames"]:
-            return None
-        return (
-            self.apparent_m / count
-            if count >= max(_FEWEST_DETECTIONS, _DETECTIONS * lost)
-            else None
-        )
+        mostly_lost = lost > _MOST * self.counts["frames"]
+        often_seen = count >= max(_FEWEST_DETECTIONS, _DETECTIONS * lost)
+        return self.apparent_m / count if mostly_lost and often_seen else None
 
 
 def lost_frame(
@@ -176,12 +172,13 @@ class Watch:
         for slot, (estimate, insight) in enumerate(zip(estimates, insights, strict=True)):
             if vacant[slot] and (slot > 0 or not all(vacant)):
                 continue
+            gathered = self.facts[slot], self._stretch[slot]
             if estimate.lost:
                 frame = lost_frame(estimate, depth_m, insight, self.reach_m)
-                for facts in (self.facts[slot], self._stretch[slot]):
+                for facts in gathered:
                     facts.add_lost(frame)
             else:
-                for facts in (self.facts[slot], self._stretch[slot]):
+                for facts in gathered:
                     facts.add_tracked(_other_side(insight))
         self._seen += 1
         if _FEWEST_FRAMES <= self._seen < _STRETCH:

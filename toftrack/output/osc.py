@@ -1,19 +1,6 @@
 """Estimates as Open Sound Control: a bundle of messages a frame, by UDP.
 
-| address | arguments |
-| --- | --- |
-| `/toftrack/frame` | i number of the frame, d its time in s; in every bundle |
-| `/toftrack/SIDE/tracked` | i 1, or 0 when the hand is lost: then nothing else comes of this hand |
-| `/toftrack/SIDE/confidence` | f 0 to 1 |
-| `/toftrack/SIDE/joint_ok` | i for each of the 21 joints: 1, or 0 for one not to be used |
-| `/toftrack/SIDE/gesture` | s name, f probability; not while a joint that decides is not ok |
-| `/toftrack/SIDE/pinch` | f 0 open, or unknown, to 1 touching, i 1 while pinching |
-| `/toftrack/SIDE/pointing` | fff origin, fff direction; only while it points |
-| `/toftrack/SIDE/joint/NAME` | fff metres, camera axes: x right, y down, z forward |
-| `/toftrack/SIDE/landmark/NAME` | fff image coordinates as MediaPipe's |
-| `/toftrack/SIDE/openxr/NAME` | fff metres, ffff x y z w, f radius: x right, y up, -z forward |
-
-SIDE is right or left; NAME one of the 21 joints (index_tip), for openxr one of its 26.
+The addresses and their arguments: docs/streams.md.
 """
 
 from __future__ import annotations
@@ -48,14 +35,8 @@ Message = tuple[str, list[tuple[str, Any]]]
 class OscStream(UdpStream):
     """A bundle a frame to one address, whether anybody listens there or not.
 
-    Args:
-        host: address or name of the receiving machine.
-        port: 1 to 65535.
-        parts: some of PARTS.
-
-    Raises:
-        ToftrackError: python-osc is not installed, an unknown part, a host that cannot be found or
-            an impossible port.
+    The settings: conf/stream/osc.yaml. Raises ToftrackError where python-osc is not installed, for
+    an unknown part, a host that cannot be found, or an impossible port.
     """
 
     def __init__(self, host: str, port: int, parts: Sequence[str]) -> None:

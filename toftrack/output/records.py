@@ -46,14 +46,11 @@ _SOON_S = 2.0
 class Records:
     """The frames of a run, for a `with`; each field is a column.
 
-    Args:
-        folder: exists; where the records are kept, under no name.
-        like: what a line says of a hand, or of a frame of one; tells which fields there are, and
-            their shapes.
-        slots: of each frame; of several, a line has `hands`.
+    folder: exists; where the records are kept, under no name.
+    like: what a line says of a hand, or of a frame of one; tells the fields and their shapes.
+    slots: of each frame; of several, a line has `hands`.
 
-    Raises:
-        OSError: (by `append`, too) the records cannot be kept there.
+    Raises OSError (by `append`, too) when the records cannot be kept there.
     """
 
     def __init__(self, folder: Path, like: Mapping[str, Any], slots: int) -> None:
@@ -98,15 +95,11 @@ class Records:
 
     def append(self, estimates: Sequence[Estimate]) -> None:
         """Keep a frame, of which there is an estimate for each slot."""
-        if self.slots == 1:
-            self._keep([estimates[0].values()])
-            return
-        hands = [
-            {"slot": slot} | estimate.values()
-            for slot, estimate in enumerate(estimates)
-            if not is_vacant(estimate)
-        ]
-        self._keep([estimates[0].values() | {"hands": hands}])
+        line = estimates[0].values()
+        if self.slots > 1:
+            there = [pair for pair in enumerate(estimates) if not is_vacant(pair[1])]
+            line["hands"] = [{"slot": slot} | estimate.values() for slot, estimate in there]
+        self._keep([line])
 
     def close(self) -> None:
         """The records are gone; a second call does nothing."""

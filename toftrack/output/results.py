@@ -10,7 +10,7 @@ import datetime
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -347,7 +347,7 @@ _MANY = 0.05
 _MOST = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass
 class RealTime:
     """Of a run with a live device.
 
@@ -366,21 +366,14 @@ class RealTime:
     longest_gap_s: float = 0.0
     newest_s: float | None = None
 
-    def after(self, timestamp_s: float, took_s: float, reduced: int, dropped: int) -> RealTime:
-        """With one more frame.
-
-        reduced, dropped: of all frames until now.
-        """
-        gap = 0.0 if self.newest_s is None else timestamp_s - self.newest_s
-        return replace(
-            self,
-            tracked=self.tracked + 1,
-            reduced=reduced,
-            dropped=dropped,
-            busy_s=self.busy_s + took_s,
-            longest_gap_s=max(self.longest_gap_s, gap),
-            newest_s=timestamp_s,
-        )
+    def add(self, timestamp_s: float, took_s: float, reduced: int, dropped: int) -> None:
+        """One more frame.  reduced, dropped: of all frames until now."""
+        gap_s = 0.0 if self.newest_s is None else timestamp_s - self.newest_s
+        self.tracked += 1
+        self.reduced, self.dropped = reduced, dropped
+        self.busy_s += took_s
+        self.longest_gap_s = max(self.longest_gap_s, gap_s)
+        self.newest_s = timestamp_s
 
     @property
     def too_slow(self) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -85,12 +84,12 @@ class Run:
 
         recording: where it is, if it was moved.  Raises ToftrackError when it is gone or changed.
         """
-        device = self.config.get("device") or {}
-        about = self.results["metadata"].get("device") or {}
-        opened = open_tracked(about, device, self.found, recording)
+        opened = open_tracked(self.results["metadata"], self._ran_in, recording)
         if opened is None:
             return None
         store, name = opened
+        device = self.config.get("device") or {}
+        about = self.results["metadata"].get("device") or {}
         given = BareFacts(device.get("intrinsics"))
         camera = given.camera(store.camera.width, store.camera.height) or store.camera
         if about.get("camera_file"):
@@ -264,22 +263,16 @@ def found_again(path: str | Path, ran_in: str | None) -> Path:
 
 
 def open_tracked(
-    about: dict[str, Any],
-    device: dict[str, Any],
-    found: Callable[[str | Path], Path],
-    recording: str | Path | None = None,
+    metadata: dict[str, Any], ran_in: str | None, recording: str | Path | None = None
 ) -> tuple[FrameStore, object] | None:
-    """The recording that a device played, and its name; None when it was a live camera.
+    """The recording that a run's device played, and its name; None when it was a live camera.
 
-    Args:
-        about: what the device said of itself, in the metadata.
-        device: its configuration.
-        found: where a path of the configuration is now.
-        recording: where the recording is now, when it is not where it was.
+    ran_in: the run's working folder.  recording: where it is now, when it is not where it was.
 
-    Raises:
-        ToftrackError: it is gone, or cannot be read.
+    Raises ToftrackError: it is gone, or cannot be read.
     """
+    about = metadata.get("device") or {}
+    device = (metadata.get("config") or {}).get("device") or {}
     name, kind = about.get("recording"), about.get("device")
     if recording is None and kind == "synthetic":
         return _synthetic(device), "the synthetic frames"
@@ -287,7 +280,7 @@ def open_tracked(
         return open_sample(about.get("name", FIRST_SAMPLE)), name
     if recording is None and name is None:
         return None
-    path = Path(recording).expanduser() if recording is not None else found(str(name))
+    path = found_again(str(name), ran_in) if recording is None else Path(recording).expanduser()
     if not path.exists():
         raise ToftrackError(
             f"the recording '{path}' is not there{' any more' if recording is None else ''}; "
@@ -295,7 +288,7 @@ def open_tracked(
         )
     camera_file = about.get("camera_file")
     modulation_mhz = device.get("modulation_mhz", DEFAULT_MODULATION_MHZ)
-    camera_path = None if camera_file is None else found(camera_file)
+    camera_path = None if camera_file is None else found_again(camera_file, ran_in)
     bare = BareFacts(device.get("intrinsics"), device.get("unit_m"), device.get("fps"))
     return open_recording(path, camera_path, modulation_mhz, device.get("topic"), bare), path
 

@@ -50,21 +50,22 @@ def no_smoothing() -> None:
     """Estimates as the tracker makes them: smooth=none."""
 
 
+_Parts = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Position (3,) m, rotation (3, 3), and angles (21,) rad."""
+
+
 @dataclass(frozen=True, eq=False)
 class SmoothState:
     """What is carried from frame to frame.
 
-    position: (3,) m.  rotation: (3, 3).  angles: (21,) rad.  All three (raw, smooth).
-    velocity: (3,) m/s.  turning: (3,) rad/s, in the hand's frame.  bending: (21,) rad/s. Smooth.
+    speed: of position (3,) m/s, rotation (3,) rad/s in the hand's frame, and angles (21,) rad/s;
+    smooth, too.
     """
 
     timestamp_s: float
-    position: tuple[np.ndarray, np.ndarray]
-    rotation: tuple[np.ndarray, np.ndarray]
-    angles: tuple[np.ndarray, np.ndarray]
-    velocity: np.ndarray
-    turning: np.ndarray
-    bending: np.ndarray
+    raw: _Parts
+    smooth: _Parts
+    speed: _Parts
 
 
 def smooth(
@@ -88,40 +89,28 @@ def smooth(
     starts = estimate.state_name == "initialising" and not estimate.lost
     if settings is None or not (followed or starts):
         return None, estimate
-    raw = estimate.state.astype(np.float64)
-    position, angles = raw[:3], raw[6:]
-    rotation = _exp(raw[3:6])
-    if state is None or starts or not estimate.timestamp_s > state.timestamp_s:
-        pairs = ((position,) * 2, (rotation,) * 2, (angles,) * 2)
-        still = (np.zeros(3), np.zeros(3), np.zeros(len(angles)))
-        return SmoothState(estimate.timestamp_s, *pairs, *still), estimate
-
-    seconds = estimate.timestamp_s - state.timestamp_s
+    vector, time_s = estimate.state.astype(np.float64), estimate.timestamp_s
+    raw = vector[:3], _exp(vector[3:6]), vector[6:]
+    if state is None or starts or not time_s > state.timestamp_s:
+        return SmoothState(time_s, raw, raw, (np.zeros(3), np.zeros(3), np.zeros(21))), estimate
+    seconds = time_s - state.timestamp_s
     slow = _share(settings.speed_cutoff_hz, seconds)
-    velocity = _mix(state.velocity, (position - state.position[0]) / seconds, slow)
-    turning = _mix(state.turning, _log(state.rotation[0].T @ rotation) / seconds, slow)
-    bending = _mix(state.bending, (angles - state.angles[0]) / seconds, slow)
-
-    def share(beta: float, speed: np.ndarray | float) -> np.ndarray | float:
-        return _share(settings.min_cutoff_hz + beta * speed, seconds)
-
-    before = state.position[1], state.rotation[1], state.angles[1]
-    there = share(settings.position_beta, float(np.linalg.norm(velocity)))
-    turned = share(settings.rotation_beta, float(np.linalg.norm(turning)))
-    bent = share(settings.angle_beta, np.abs(bending))
-    smooth_position = _mix(before[0], position, there)
-    smooth_rotation = before[1] @ _exp(turned * _log(before[1].T @ rotation))
-    smooth_angles = _mix(before[2], angles, bent)
-    state = SmoothState(
-        estimate.timestamp_s,
-        (position, smooth_position),
-        (rotation, smooth_rotation),
-        (angles, smooth_angles),
-        velocity,
-        turning,
-        bending,
+    now = (way / seconds for way in _ways(state.raw, raw))
+    velocity, turning, bending = (
+        before + slow * (new - before) for before, new in zip(state.speed, now, strict=True)
     )
-    vector = np.concatenate((smooth_position, _log(smooth_rotation), smooth_angles))
+    speeds = (
+        settings.position_beta * float(np.linalg.norm(velocity)),
+        settings.rotation_beta * float(np.linalg.norm(turning)),
+        settings.angle_beta * np.abs(bending),
+    )
+    shares = (_share(settings.min_cutoff_hz + faster, seconds) for faster in speeds)
+    ways = _ways(state.smooth, raw)
+    moved, turned, bent = (share * way for share, way in zip(shares, ways, strict=True))
+    position, rotation, angles = state.smooth
+    calm = position + moved, rotation @ _exp(turned), angles + bent
+    state = SmoothState(time_s, raw, calm, (velocity, turning, bending))
+    vector = np.concatenate((calm[0], _log(calm[1]), calm[2]))
     return state, _with_state(estimate, vector.astype(np.float32), shape)
 
 
@@ -141,8 +130,9 @@ def _share(cutoff_hz: np.ndarray | float, seconds: float) -> np.ndarray | float:
     return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cutoff_hz * seconds))
 
 
-def _mix(before: np.ndarray, now: np.ndarray, share: np.ndarray | float) -> np.ndarray:
-    return before + share * (now - before)
+def _ways(before: _Parts, now: _Parts) -> _Parts:
+    """From one hand to another; of the rotation as a vector (3,)."""
+    return now[0] - before[0], _log(before[1].T @ now[1]), now[2] - before[2]
 
 
 def _exp(vector: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError, reported_errors
@@ -34,7 +34,7 @@ class ReaderGoneError(Exception):
     """Whoever read the stream has closed it: there is nobody left to track for."""
 
 
-class Stream(Protocol):
+class Stream:
     """Where estimates are sent, within a `with`."""
 
     def send(self, estimates: Sequence[Estimate]) -> None:
@@ -42,24 +42,17 @@ class Stream(Protocol):
         nobody does.
         """
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *exception: Any) -> None: ...
-
-
-class NoStream:
-    """Sends nothing."""
-
-    def send(self, estimates: Sequence[Estimate]) -> None:
-        """Do nothing."""
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: Any) -> None: ...
 
 
-class StdoutStream:
+class NoStream(Stream):
+    """Sends nothing."""
+
+
+class StdoutStream(Stream):
     """Lines to standard output, which is theirs alone within the `with`.
 
     Whatever else this process prints, its libraries included, goes to standard error meanwhile.
@@ -67,15 +60,9 @@ class StdoutStream:
     A reader that falls behind fills the operating system's pipe first (64 KiB on Linux, about 7
     lines). Then `waiting` lines wait for the next call of `send`, and when there are more, the
     oldest of them is dropped, so that the reader gets the newest. If it still does not read at the
-    end, its last line may be cut short.
+    end, its last line may be cut short. The settings: conf/stream/stdout.yaml.
 
-    Args:
-        fields: what to send of each estimate, of lines.LINE_FIELDS; None for all.
-        waiting: lines, at least 1.
-
-    Raises:
-        ToftrackError: an unknown field or number; by `with`, when standard output is closed.
-        ReaderGoneError: by `send`, when the reader has closed the pipe or the disk is full.
+    Raises ToftrackError for an unknown field or number; by `with`, when standard output is closed.
     """
 
     def __init__(self, fields: Sequence[str] | None, waiting: int) -> None:
@@ -96,7 +83,10 @@ class StdoutStream:
         return self
 
     def send(self, estimates: Sequence[Estimate]) -> None:
-        """Write the lines that wait and this one, as far as the reader has room for them."""
+        """Write the lines that wait and this one, as far as the reader has room for them.
+
+        Raises ReaderGoneError when the reader has closed the pipe or the disk is full.
+        """
         self._dropped += len(self._lines) == self._lines.maxlen
         self._lines.append((json_line(estimates, self._fields) + "\n").encode())
         try:
@@ -133,16 +123,11 @@ class StdoutStream:
             self._sent += not self._rest
 
 
-class UdpStream:
+class UdpStream(Stream):
     """A datagram a line to one address, whether anybody listens there or not.
 
-    Args:
-        host: address or name of the receiving machine.
-        port: 1 to 65535.
-        fields: what to send of each estimate, of lines.LINE_FIELDS; None for all.
-
-    Raises:
-        ToftrackError: an unknown field, a host that cannot be found, or an impossible port.
+    The settings: conf/stream/udp.yaml. Raises ToftrackError for an unknown field, a host that
+    cannot be found, or an impossible port.
     """
 
     def __init__(self, host: str, port: int, fields: Sequence[str] | None) -> None:

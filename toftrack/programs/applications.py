@@ -1,16 +1,29 @@
-"""The two programs that take Hydra's overrides: `toftrack track` and `toftrack train`."""
+"""The two programs that take Hydra's overrides: `toftrack track` and `toftrack train`; and
+`toftrack track FILE`: a recording's name in place of device=replay device.path=FILE.
+"""
 
 from __future__ import annotations
 
+import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import hydra
 from omegaconf import DictConfig
 
-from toftrack.configuration.compose import configuration_folder, devices_of_files, setting_names
+from toftrack.configuration import configuration_folder
+from toftrack.configuration.compose import devices_of_files, setting_names
+from toftrack.errors import ToftrackError
 from toftrack.programs import command_line
-from toftrack.programs.recording_argument import options_first, with_recording
+from toftrack.recordings.bag_names import is_bag
+
+_WITH_VALUE = frozenset(
+    "--config-path -cp --config-name -cn --config-dir -cd --cfg -c --package -p "
+    "--experimental-rerun".split()
+)
+"""Hydra's options that are followed by a value."""
+_KEY = re.compile(r"[+~]{0,2}[\w./@:]+")
 
 
 @command_line.sweep_job
@@ -54,3 +67,97 @@ def start(
         application()
     finally:
         sys.argv = before
+
+
+def with_recording(
+    arguments: Sequence[str], known: Collection[str], players: Collection[str]
+) -> list[str]:
+    """The arguments with a file's name as overrides.
+
+    known: the first parts of keys, groups and settings: what begins with one and has a = is one,
+    whatever files there are.
+    players: the devices that play a file; where none is chosen, rosbag is taken for a ROS bag,
+    folder for another folder, and replay for everything else.
+
+    Raises ToftrackError for two recordings, or one beside a device that plays none.
+    """
+    others: list[str] = []
+    files: list[str] = []
+    value_follows = False
+    for argument in arguments:
+        if value_follows or not _is_file(argument, known):
+            others.append(argument)
+            value_follows = not value_follows and argument in _WITH_VALUE
+        else:
+            files.append(argument)
+    if not files:
+        return others
+    if "" in files:
+        raise ToftrackError("the recording's name is empty; give that of a file")
+    if len(files) > 1:
+        raise ToftrackError(
+            f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"
+            " a name that has blanks in it"
+        )
+    if "${" in files[0]:  # OmegaConf would look for a setting of that name, however it is quoted
+        raise ToftrackError(
+            f"the recording's name, '{files[0]}', has ${{ in it, which means something else in "
+            "settings; rename the file"
+        )
+    device = next((word for word in others if word.startswith("device=")), None)
+    if device is not None and device.removeprefix("device=") not in players:
+        raise ToftrackError(
+            f"{device} and the recording '{files[0]}' both give the frames; leave one out"
+        )
+    # What the shell has left of a ~ is the file's own, where there is one.
+    name = f"./{files[0]}" if files[0][0] == "~" and os.path.exists(files[0]) else files[0]
+    chosen = [] if device is not None else [f"device={_player(os.path.expanduser(name), players)}"]
+    return [*chosen, f"device.path={quoted(name)}", *others]
+
+
+def options_first(arguments: Sequence[str]) -> list[str]:
+    """The arguments in the order that Hydra's parser wants: options, and then all overrides."""
+    options: list[str] = []
+    overrides: list[str] = []
+    words = iter(arguments)
+    for word in words:
+        if not word.startswith("-"):
+            overrides.append(word)
+        elif word in _WITH_VALUE:
+            options += (word, *(value for value in (next(words, None),) if value is not None))
+        elif word in ("--info", "-i"):  # its value may be left out, and would be an override
+            options.append("--info=all")
+        else:
+            options.append(word)
+    return [*options, *overrides]
+
+
+def _player(name: str, players: Collection[str]) -> str:
+    """The device that plays a file or folder."""
+    if is_bag(name):
+        return "rosbag"
+    return "folder" if os.path.isdir(name) and "folder" in players else "replay"
+
+
+def quoted(text: str) -> str:
+    """A text as a value of Hydra's that stands for just that, whatever signs are in it."""
+    # Hydra takes a backslash for itself only before a quote.
+    text = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    text = re.sub(r"(\\+)$", r"\1\1", text)
+    return f"'{text}'"
+
+
+def _is_file(argument: str, known: Collection[str]) -> bool:
+    if argument.startswith("-") and not os.path.exists(argument):
+        return False
+    key, separator, _ = argument.partition("=")
+    if not separator:  # without one, only a deletion is an override
+        return not argument.startswith("~") or _exists(argument)
+    if not _KEY.fullmatch(key):
+        return True
+    first = re.split(r"[./@:]", key.lstrip("+~"))[0]
+    return first not in known and _exists(argument)
+
+
+def _exists(name: str) -> bool:
+    return os.path.exists(name) or os.path.exists(os.path.expanduser(name))

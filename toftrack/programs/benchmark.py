@@ -170,16 +170,13 @@ def _workers(text: str) -> int:
 
 def _write_picture(path: Path, result: dict[str, Any]) -> None:
     """The picture of a result; ToftrackError where it cannot be written or drawn."""
-    import cv2
-
     from toftrack.views.figures.runs import accuracy_figure
+    from toftrack.views.pictures import write_picture
 
     if not result["each"]:
         raise ToftrackError(
             "--picture shows recordings with truth, and there is none; leave it out"
         )
-    kind = path.suffix if path.suffix.lower() in (".png", ".jpg") else ".png"
-    done, data = cv2.imencode(kind, accuracy_figure(result["each"], result["total"]))
-    assert done
+    picture = accuracy_figure(result["each"], result["total"])
     with reported_errors(f"the picture '{path}' cannot be written", "choose another place"):
-        write_whole(path, data.tobytes())
+        write_picture(path, picture)

@@ -87,8 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out = Path(options.out).expanduser()
     folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
     result.camera.save(out)
-    text = report_text(result, start)
-    _write_report(folder, result, start, text, board)
+    facts = _facts(result, start)
+    text = report_text(facts)
+    _write_report(folder, result, facts, text, board)
     print(text)
     print(f"camera file: {out}\nreport:      {folder}")
 
@@ -101,18 +102,12 @@ def calibrate(
     keep_lens: bool = False,
     frames: int = 80,
 ) -> Calibration:
-    """Calibrate from the frames of a recording.
+    """Calibrate from so many frames, evenly spread, of a recording.
 
-    Args:
-        store: with amplitudes.
-        board: columns, rows of inner corners.
-        square_m: side of a square.
-        start: the camera as it is known so far.
-        keep_lens: trust its intrinsics and distortion, and fit the depth only.
-        frames: how many frames, evenly spread, are searched for the board.
+    board: columns, rows of inner corners.  start: the camera as it is known so far.
+    keep_lens: trust its intrinsics and distortion, and fit the depth only.
 
-    Raises:
-        ToftrackError: there are no amplitudes, or too few frames show the board.
+    Raises ToftrackError when there are no amplitudes, or too few frames show the board.
     """
     if store.image(0)[1] is None:
         raise ToftrackError(
@@ -168,9 +163,8 @@ def _amplitude(store: FrameStore, number: int) -> np.ndarray:
     return amplitude
 
 
-def report_text(result: Calibration, start: Camera) -> str:
+def report_text(facts: dict[str, Any]) -> str:
     """What was found, before and after, in lines."""
-    facts = _facts(result, start)
     before, after = facts["before"], facts["after"]
     lines = [
         f"chequerboard found in {facts['frames_used']} of {facts['frames_searched']} frames, "
@@ -223,24 +217,18 @@ def _facts(result: Calibration, start: Camera) -> dict[str, Any]:
 
 
 def _write_report(
-    folder: Path, result: Calibration, start: Camera, text: str, board: tuple[int, int]
+    folder: Path, result: Calibration, facts: dict[str, Any], text: str, board: tuple[int, int]
 ) -> None:
-    facts, views = _facts(result, start), result.lens.views
+    views = result.lens.views
     chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int))
     sheet = corner_sheet([(result.amplitudes[i], views[i].corners_px) for i in chosen], board)
-    before, after = facts["before"], facts["after"]
-    errors = (
-        np.array(before["board_distance_m"]),
-        np.array(before["board_error_mm"]) / 1000,
-        np.array(after["board_error_mm"]) / 1000,
-    )
     what = f"the report folder '{folder}' cannot be written"
     with reported_errors(what, "choose another with --report"):
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / "report.txt", text + "\n")
         write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
         write_picture(folder / "corners.png", sheet)
-        write_figures(folder, {"depth_error.png": lambda: error_plot(*errors)})
+        write_figures(folder, {"depth_error.png": lambda: error_plot(facts)})
 
 
 def _board(text: str) -> tuple[int, int]:
@@ -258,12 +246,9 @@ def _board(text: str) -> tuple[int, int]:
 def corner_sheet(
     images: Sequence[tuple[np.ndarray, np.ndarray]], board: tuple[int, int], columns: int = 4
 ) -> np.ndarray:
-    """(H, W, 3) uint8 BGR: amplitude images with their corners drawn in, in rows.
+    """(H, W, 3) uint8 BGR: amplitude images with their corners drawn in, so many in a row.
 
-    Args:
-        images: of each the (H, W) amplitude and the (columns * rows, 2) corners in pixels.
-        board: columns, rows of inner corners.
-        columns: pictures in a row.
+    images: of each the (H, W) amplitude and the (columns * rows, 2) corners in pixels.
     """
     scale, tiles = 2, []
     for amplitude, corners in images:
@@ -280,22 +265,15 @@ def corner_sheet(
     return np.vstack(rows)
 
 
-def error_plot(distance_m: np.ndarray, before_m: np.ndarray, after_m: np.ndarray) -> np.ndarray:
-    """(480, 720, 3) uint8 BGR: the boards' mean depth errors over their distance.
-
-    Args:
-        distance_m: (V,) true distances.
-        before_m: (V,) errors of the measured distance.
-        after_m: (V,) errors of the corrected distance.
-    """
+def error_plot(facts: dict[str, Any]) -> np.ndarray:
+    """(480, 720, 3) uint8 BGR: the boards' mean depth errors over their distance, of a report."""
     figure = chart.new_figure(720, 480)
     axes = figure.subplots()
     chart.label(axes, "true distance, m", "mean error of each board, mm")
     axes.axhline(0, color=chart.GREY, linewidth=1)
-    for errors_m, name, colour in (
-        (before_m, "before", chart.VERMILLION),
-        (after_m, "after", chart.GREEN),
-    ):
-        axes.plot(distance_m, 1000 * errors_m, "o", color=colour, markersize=4, label=name)
+    distances_m = facts["before"]["board_distance_m"]
+    for name, colour in (("before", chart.VERMILLION), ("after", chart.GREEN)):
+        errors_mm = facts[name]["board_error_mm"]
+        axes.plot(distances_m, errors_mm, "o", color=colour, markersize=4, label=name)
     axes.legend()
     return chart.picture_of(figure)

@@ -66,17 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--fps", type=float, help="frames a second of bare images (25)")
     options = parser.parse_args(arguments)
-    given = options.intrinsics
-    count = convert(
-        options.source,
-        options.target,
-        options.camera,
-        options.modulation,
-        options.unit,
-        options.overwrite,
-        options.topic,
-        BareFacts(None if given is None else tuple(given), options.source_unit, options.fps),
-    )
+    lens = None if options.intrinsics is None else tuple(options.intrinsics)
+    read = options.camera, options.modulation, options.unit, options.overwrite, options.topic
+    bare = BareFacts(lens, options.source_unit, options.fps)
+    count = convert(options.source, options.target, *read, bare)
     print(f"{options.target}: {count} frames")
 
 
@@ -118,7 +111,7 @@ def convert(
     store = open_recording(source, camera_file, modulation_mhz, topic, bare)
     try:
         if camera_file is not None:
-            store = _with_camera(store, Camera.load(camera_file), camera_file)
+            store = _with_camera(store, camera_file)
         if store.truth is not None and kind != ".npz":
             _warn("the ground truth has no place in the new format and is left out")
         if damage := getattr(store, "damage", None):
@@ -165,12 +158,9 @@ def _to_folder(store: FrameStore, target: Path, unit_m: float | None, bar: tqdm)
             bar.update()
 
 
-def _with_camera(store: FrameStore, camera: Camera, path: str | Path) -> FrameStore:
-    if (camera.width, camera.height) != (store.camera.width, store.camera.height):
-        raise ToftrackError(
-            f"the camera file '{path}' is for {camera.width}x{camera.height} pixels, but the "
-            f"recording has {store.camera.width}x{store.camera.height}"
-        )
+def _with_camera(store: FrameStore, path: str | Path) -> FrameStore:
+    size = store.camera.width, store.camera.height
+    camera = Camera.load_for(path, *size, "the recording")
     if isinstance(store, Recording):
         return replace(store, camera=camera)
     assert isinstance(store, PngFolder | SrsRecording | RosBag | DepthVideo | NpyStack)

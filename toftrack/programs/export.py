@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.output.exports.glb import glb_of
 from toftrack.output.exports.motion import HandMotion, motions_of
+from toftrack.output.lines import DROPPED
 from toftrack.output.run_folder import Run, read_run
 from toftrack.programs.command_line import plain_parser
 from toftrack.safe_files import write_whole
@@ -116,7 +118,6 @@ _PLAIN = (
     *("state_name", "lost", "dropped", "confidence", "side", "side_probability", "score"),
     *("outside_rad", "gesture", "gesture_probability", "pinch", "pinching"),
 )
-_POINTS = ("pointing_origin_m", "pointing_direction")
 
 
 def csv_of(results: Mapping[str, Any]) -> str:
@@ -133,34 +134,31 @@ def csv_of(results: Mapping[str, Any]) -> str:
 def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
     several = np.ndim(results["lost"]) > 1
     slots = np.shape(results["lost"])[1] if several else 1
-    plain = [name for name in _PLAIN if name in results]
-    points = [name for name in _POINTS if name in results]
-    names = [name.removesuffix("_m") for name in points]
-    units = ["_m" if name.endswith("_m") else "" for name in points]
-    header = ["index", "timestamp_s", *(["slot"] if several else []), *plain]
-    header += [f"{n}_{axis}{u}" for n, u in zip(names, units, strict=True) for axis in "xyz"]
-    header += [f"{joint}_{axis}_m" for joint in results["joint_names"] for axis in "xyz"]
-    flags = [name for name in ("joint_ok",) if name in results]  # older runs have none
-    header += [f"{joint}_ok" for _ in flags for joint in results["joint_names"]]
-    header += [f"{angle}_rad" for angle in ANGLE_NAMES]
-    yield header
+    joints = results["joint_names"]
+    titles = {name: [name] for name in _PLAIN} | {
+        "pointing_origin_m": [f"pointing_origin_{axis}_m" for axis in "xyz"],
+        "pointing_direction": [f"pointing_direction_{axis}" for axis in "xyz"],
+        "joints_m": [f"{joint}_{axis}_m" for joint in joints for axis in "xyz"],
+        "joint_ok": [f"{joint}_ok" for joint in joints],
+        "state": [f"{angle}_rad" for angle in ANGLE_NAMES],  # the last of its numbers
+    }
+    arrays = {name: np.asarray(results[name]) for name in titles if name in results}
+    of_arrays = chain.from_iterable(titles[name] for name in arrays)
+    yield ["index", "timestamp_s", *(["slot"] if several else []), *of_arrays]
     index = results.get("index", np.arange(len(results["lost"])))
     for row, number in enumerate(index):
         for slot in range(slots):
-            here = (row, slot) if several else (row,)
-            seconds = f"{results['timestamp_s'][row]:.6f}"
-            cells = [number, seconds, *([slot] if several else [])]
-            # A frame is dropped for all of its hands.
-            cells += [np.asarray(results[name])[here[: np.ndim(results[name])]] for name in plain]
-            for name in (*points, "joints_m", *flags):
-                cells += results[name][here].ravel().tolist()
-            cells += results["state"][here][-len(ANGLE_NAMES) :].tolist()
+            cells = [number, f"{results['timestamp_s'][row]:.6f}", *([slot] if several else [])]
+            for name, array in arrays.items():
+                # A frame is dropped for all of its hands.
+                here = (row, slot) if several and name != DROPPED else row
+                cells += array[here].ravel().tolist()[-len(titles[name]) :]
             yield [_cell(value) for value in cells]
 
 
 def _cell(value: Any) -> str:
-    if isinstance(value, (bool, np.bool_)):
+    if isinstance(value, bool):
         return str(int(value))
-    if isinstance(value, (float, np.floating)):
-        return "" if not np.isfinite(value) else f"{value:.6g}"
+    if isinstance(value, float):
+        return f"{value:.6g}" if np.isfinite(value) else ""
     return str(value)

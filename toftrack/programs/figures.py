@@ -24,18 +24,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.estimate import confidence_words, state_words
-from toftrack.evaluation.trust import joint_errors_mm
 from toftrack.frames import Truth
-from toftrack.output.run_folder import Footage, Run, observe, read_run
+from toftrack.output.run_folder import Footage, Run, read_run
 from toftrack.programs.command_line import plain_parser
-from toftrack.render.model_image import model_range_image
 from toftrack.safe_files import make_folder
-from toftrack.views.classified import classify
 from toftrack.views.figures.chart import new_figure
 from toftrack.views.figures.runs import (
     course_figure,
@@ -44,15 +39,7 @@ from toftrack.views.figures.runs import (
     lost_figure,
     measurement_figure,
 )
-from toftrack.views.overlay import draw_panel, panel_scale
 from toftrack.views.pictures import write_picture
-
-_FILM_FRAMES = 10
-_LOST_FRAMES = 5
-_APART = 3
-"""Frames of the lowest score are at least so far from one another."""
-_SAME_SPACE = 0.01
-"""Of a coordinate's range: a pose that is encoded elsewhere now is of another space."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -75,17 +62,10 @@ def draw_figures(
     out: str | Path | None = None,
     frame: int | None = None,
 ) -> list[Path]:
-    """Draw and write the figures of a run; returns the files.
+    """Draw and write the figures of a run; returns the files. The arguments are the command's.
 
-    Args:
-        folder: where track.py wrote.
-        recording: where the recording is now, when it is not where it was.
-        out: folder for the figures; None = `figures` in the run's.
-        frame: number of the input frame of measurement.png; None takes one of median score.
-
-    Raises:
-        ToftrackError: the folder is no run's, the recording is gone or another one, the run has no
-            such frame, matplotlib is missing, or nothing can be written.
+    Raises ToftrackError when the folder is no run's, the recording is gone or another one, the run
+    has no such frame, matplotlib is missing, or nothing can be written.
     """
     new_figure(1, 1)  # better missed now than when the recording is open
     run = read_run(folder)
@@ -135,13 +115,13 @@ def _of_slot(
     row = _typical_row(one) if frame is None else _row_of(run, frame)
     figures: dict[str, Callable[[], np.ndarray]] = {}
     if footage is not None:
-        figures[f"measurement{after}"] = lambda: _measurement(one, footage, row, of)
+        figures[f"measurement{after}"] = lambda: measurement_figure(one, footage, row, of)
         if with_film:
-            figures["filmstrip"] = lambda: _film(run, footage)
-        figures[f"lost{after}"] = lambda: _lost(run, one, footage, of)
+            figures["filmstrip"] = lambda: filmstrip_figure(run, footage)
+        figures[f"lost{after}"] = lambda: lost_figure(run, one, footage, of)
     truth, metrics = _truth(run, footage, slot)
-    figures[f"course{after}"] = lambda: _course(one, truth, metrics, of)
-    figures[f"latent{after}"] = lambda: _latent(one, of)
+    figures[f"course{after}"] = lambda: course_figure(one, truth, metrics, of)
+    figures[f"latent{after}"] = lambda: latent_figure(one, of)
     return figures
 
 
@@ -170,102 +150,3 @@ def _row_of(run: Run, frame: int) -> int:
             f"the run has no frame {frame}; give --frame from {run.frames[0]} to {run.frames[-1]}"
         )
     return int(rows[0])
-
-
-def _panel(run: Run, footage: Footage, row: int) -> np.ndarray:
-    estimates, camera = run.estimates(row), footage.camera
-    models = [
-        model_range_image(estimate.state, shape, camera.K, camera.height, camera.width)
-        for estimate, shape in zip(estimates, run.shapes, strict=True)
-    ]
-    return draw_panel(
-        footage.depth(row),
-        footage.amplitude(row),
-        camera,
-        estimates,
-        models,
-        panel_scale(camera.width),
-    )
-
-
-def _measurement(run: Run, footage: Footage, row: int, of: str) -> np.ndarray:
-    estimate = run.estimate(row)
-    observation = observe(run, footage, row)
-    pixels = classify(estimate.state, run.shape, observation, run.likelihood())
-    state = f"LOST: {state_words(estimate)}" if estimate.lost else ""
-    facts = (f"score {estimate.score:.2f}", confidence_words(estimate.confidence), state)
-    title = f"{of}Frame {estimate.index}: " + ", ".join(filter(None, facts))
-    return measurement_figure(observation, pixels, title)
-
-
-def _film(run: Run, footage: Footage) -> np.ndarray:
-    count = min(_FILM_FRAMES, len(run))
-    rows = np.linspace(0, len(run) - 1, count).round().astype(int)
-    title = f"{count} of {len(run)} frames; lost in all: {run.summary['lost_frames']}"
-    if count == len(run):
-        title = f"{count} frames"
-    return filmstrip_figure([_panel(run, footage, row) for row in rows], title)
-
-
-def _lost(run: Run, one: Run, footage: Footage, of: str) -> np.ndarray:
-    """Of one slot of a run; the frames show all of them."""
-    lost, score = one.results["lost"], np.nan_to_num(one.results["score"])
-    if lost.any():
-        # Of a time in which there was nothing to see, one frame is enough.
-        nothing = lost & (score == 0)
-        among = np.flatnonzero(lost & ~(nothing & np.roll(nothing, 1)))
-        among = among if len(among) else np.flatnonzero(lost)
-        count = min(_LOST_FRAMES, len(among))
-        rows = among[np.linspace(0, len(among) - 1, count).round().astype(int)].tolist()
-        title = f"Lost: {int(lost.sum())} of {len(run)} frames, {count} of them shown"
-    else:
-        rows = _lowest_rows(score)
-        title = f"No frame was lost: the {len(rows)} frames of the lowest score"
-    panels = [_panel(run, footage, row) for row in rows]
-    sure = one.results.get("confidence")
-    return lost_figure(panels, rows, _time(run), run.frames, score, lost, of + title, sure)
-
-
-def _lowest_rows(score: np.ndarray) -> list[int]:
-    rows: list[int] = []
-    for row in np.argsort(score, kind="stable").tolist():
-        if all(abs(row - other) >= _APART for other in rows):
-            rows.append(row)
-        if len(rows) == _LOST_FRAMES:
-            break
-    return sorted(rows)
-
-
-def _course(run: Run, truth: Truth | None, metrics: dict[str, Any], of: str) -> np.ndarray:
-    results = run.results
-    error, absent = None, None
-    if truth is not None:
-        there, error = joint_errors_mm(results["joints_m"], truth)
-        error[~(there & truth.visible)] = np.nan
-        absent = ~(truth.visible & truth.in_space)
-    score = np.where(np.isfinite(results["score"]), results["score"], np.nan)
-    title = f"Score of {len(run)} frames"
-    mean = metrics.get("mean_mm")
-    if mean is not None:
-        height = float(score[np.isfinite(score)].mean())
-        title = f"{len(run)} frames: mean joint error {mean:.1f} mm, mean score {height:.2f}"
-    lost, sure = results["lost"], results.get("confidence")
-    return course_figure(_time(run), run.frames, score, lost, of + title, error, absent, sure)
-
-
-def _latent(run: Run, of: str) -> np.ndarray:
-    space, results = run.pose_space(), run.results
-    latent, note = results["latent"], ""
-    with torch.inference_mode():
-        now = space.encode(torch.from_numpy(results["state"][:, 6:])).numpy()
-    span = (space.upper - space.lower).numpy()
-    if np.nanmax(np.abs(now - latent) / span, initial=0.0) > _SAME_SPACE:
-        latent, note = now, " The space has changed since the run; its poses are encoded anew."
-    about = f"({space.kind}, {space.dims} coordinates)"
-    title = f"{of}Pose space {about}: training poses and estimates"
-    return latent_figure(space, latent, results["lost"], _time(run), title, note)
-
-
-def _time(run: Run) -> np.ndarray:
-    """(T,) seconds since the first frame."""
-    return run.results["timestamp_s"] - run.results["timestamp_s"][0]

@@ -68,16 +68,12 @@ def add(
 ) -> NamedPose:
     """Learn a gesture from a part of a recording and write it into the file.
 
-    Args:
-        path: the file, a .json; made where there is none.
-        poses: what is in it.
-        part_s: from and to, seconds from the recording's first frame.
-        replace: whether a gesture of that name, the user's or a known one, gives way.
-        overrides: of the tracker's configuration, "hand.side=left".
+    path: a .json; made where there is none.  poses: what is in it.
+    part_s: from and to, seconds from the recording's first frame.
+    replace: whether a gesture of that name, the user's or a known one, gives way.
 
-    Raises:
-        ToftrackError: the recording cannot be read, the name is taken, the hand was not followed or
-            moved in that part, or the gesture looks like another.
+    Raises ToftrackError when the recording cannot be read, the name is taken, the hand was not
+    followed or moved in that part, or the gesture looks like another.
     """
     with one_sentence():
         config = configuration(*overrides)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import toftrack
+from toftrack.configuration import configuration_folder
 
 
 @dataclass(frozen=True)
@@ -37,33 +38,31 @@ _COMMANDS = {
 _HELP = ("-h", "--help")
 _VERSION = "--version"
 
-_OVERVIEW = """toftrack follows a human hand in the depth images of a camera or a recording.
-
+_EXAMPLES = """
   toftrack track                              the recording that comes with it
   toftrack track FILE hand.side=left          a recording of your own, of a left hand
   toftrack track device=realsense view=browser    a camera, live in the browser
+"""
 
+_OVERVIEW = f"""toftrack follows a human hand in the depth images of a camera or a recording.
+{_EXAMPLES}
 commands (toftrack COMMAND --help says more):
-{commands}"""
+{{commands}}"""
 
-_TRACK = """toftrack track follows a hand and writes joints, state and gesture of every frame.
-
-  toftrack track                              the recording that comes with it
-  toftrack track FILE hand.side=left          a recording of your own, of a left hand
-  toftrack track device=realsense view=browser    a camera, live in the browser
-
+_TRACK = f"""toftrack track follows a hand and writes joints, state and gesture of every frame.
+{_EXAMPLES}
 FILE is .npz, .srs, a folder of 16-bit PNG images, a ROS bag, an Azure Kinect's .mkv, or what
 docs/cameras.md names. The results go into outputs/DATE/TIME/, or where hydra.run.dir=DIR says;
 Ctrl-C ends a run and keeps what was done. Everything else are settings: KEY=VALUE, or
 GROUP=CHOICE of
 
-{groups}
+{{groups}}
 
   toftrack track --cfg job                    all settings, composed
   toftrack track -m seed=1,2,3 view=none      a sweep: one run after another
   toftrack track --hydra-help                 further options
 
-The settings stand in {folder}, each with what it does."""
+The settings stand in {{folder}}, each with what it does."""
 
 _TRAIN = """toftrack train learns the space of hand poses that the tracker searches.
 
@@ -116,19 +115,13 @@ def overview() -> str:
 
 def long_help(name: str) -> str:
     """What `toftrack track --help` prints."""
-    folder = _configuration_folder()
+    folder = configuration_folder()
     groups = []
     for group in sorted(path for path in folder.iterdir() if path.is_dir()):
         choices = sorted(path.stem for path in group.glob("*.yaml"))
         if (group.name in _GROUPS_OF_TRAINING) if name == "train" else group.name != "data":
             groups.append(f"  {group.name:<14}{', '.join(choices)}")
     return _LONG_HELP[name].format(groups="\n".join(groups), folder=folder)
-
-
-def _configuration_folder() -> Path:
-    """As configuration.compose has it, which takes the time to load Hydra."""
-    inside = Path(toftrack.__file__).resolve().parent / "conf"
-    return inside if inside.is_dir() else inside.parent.parent / "conf"
 
 
 def _program(name: str) -> Callable[[Sequence[str]], object]:

@@ -21,13 +21,14 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from toftrack.checks import check_number
-from toftrack.configuration.compose import configuration, configuration_folder, one_sentence
+from toftrack.configuration import configuration_folder
+from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.devices.base import Device
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
 from toftrack.programs import shutdown
+from toftrack.programs.applications import quoted
 from toftrack.programs.command_line import plain_parser
-from toftrack.programs.recording_argument import quoted
 from toftrack.programs.shutdown import EndedError
 from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.sr_frame import REGISTERS
@@ -88,15 +89,10 @@ def record_frames(
 ) -> None:
     """Write the frames of any device, which is opened and closed here, and finish the file.
 
-    Args:
-        device: one that drops no frames; of a live one (keep=newest), those that it delivers.
-        recorder: of the device, closed at the end.
-        frames: stop after so many; None = go on.
-        seconds: stop after so long; None = go on.
+    It ends after so many frames or seconds, where they are given.
 
-    Raises:
-        ToftrackError: the camera was given up, no frame came, or not all could be written.
-        KeyboardInterrupt: somebody ended it. In all cases what came until then is in the file.
+    Raises ToftrackError when the camera was given up, no frame came, or not all could be written,
+    and KeyboardInterrupt when somebody ended it. What came until then is in the file.
     """
     try:
         with device, tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
@@ -129,24 +125,14 @@ def record(
     limit_gb: float = math.inf,
     overwrite: bool = False,
 ) -> int | None:
-    """Write every frame of an opened camera to a `.srs` file.
+    """Write every frame of an opened camera (keep=every) to a `.srs` file, until there are so many
+    frames, seconds or times 1e9 bytes.
 
-    SIGINT, SIGTERM and SIGHUP end the recording after the frames that were received until then.
+    SIGINT, SIGTERM and SIGHUP end it after the frames that were received until then. Returns the
+    number of the signal that did; None: none did.
 
-    Args:
-        device: of keep=every, or what comes too fast is dropped.
-        path: the file.
-        frames: stop after so many; None = go on.
-        seconds: stop after so long; None = go on.
-        limit_gb: stop where the file has so many times 1e9 bytes.
-        overwrite: replace an existing file.
-
-    Returns:
-        The number of the signal that ended it; None: none did.
-
-    Raises:
-        ToftrackError: the file cannot be written, or the camera was given up; the frames until then
-            are in the file.
+    Raises ToftrackError when the file cannot be written, or the camera was given up; the frames
+    until then are in the file.
     """
     facts = device.description
     init = SrsInit(

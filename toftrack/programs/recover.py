@@ -18,15 +18,9 @@ from toftrack.errors import ToftrackError
 from toftrack.frames import Truth
 from toftrack.json_text import read_object
 from toftrack.output.files import LINES, WHOLE_FILES, cut_unfinished_line, locked_lines
-from toftrack.output.results import (
-    count_frames,
-    finish,
-    read_results,
-    read_run_facts,
-    records_of,
-)
+from toftrack.output.results import count_frames, finish, read_results, read_run_facts, records_of
 from toftrack.output.run_folder import found_again, open_tracked
-from toftrack.output.summary_table import metrics_table
+from toftrack.output.summary import metrics_table
 from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.store import open_source
 from toftrack.recordings.unfinished import is_recording, recover_recording
@@ -56,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{path}: {frames} frames")
         return
     print(metrics_table(recover(folder, options.recording, options.replace)))
-    for name in ("track.npz", "summary.json"):
+    for name in _MADE:
         print(f"  {folder / name}")
 
 
@@ -121,18 +115,13 @@ def _truth(facts: dict[str, Any], recording: str | Path | None) -> Truth | None:
     """Of the run's frames, by their numbers; None where it had none or it cannot be found."""
     if not facts.get("truth"):
         return None
-    metadata = facts["metadata"]
-    about = metadata.get("device") or {}
+    metadata, ran_in = facts["metadata"], facts.get("working_folder")
     device = (metadata.get("config") or {}).get("device") or {}
-
-    def found(path: str | Path) -> Path:
-        return found_again(path, facts.get("working_folder"))
-
     source = (device.get("emulated") or {}).get("source") if recording is None else None
     if source is not None:  # an emulated camera sees a recording, too
-        return open_source(source if source == "sample" else str(found(source))).truth
+        return open_source(source if source == "sample" else str(found_again(source, ran_in))).truth
     try:
-        opened = open_tracked(about, device, found, recording)
+        opened = open_tracked(metadata, ran_in, recording)
     except ToftrackError as error:
         if recording is not None:
             raise

@@ -135,7 +135,7 @@ def error_figure(runs: Sequence[Run]) -> str:
 
 def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
     """Groups in the order of their first run, with the mean and the spread of a figure."""
-    varied = _telling(runs)
+    varied = [key for key in _varied(runs) if key not in (SEED, RECORDING)]
     groups: dict[str, Group] = {}
     for run in runs:
         settings = " ".join(f"{key}={run.overrides.get(key, '-')}" for key in varied) or "all alike"
@@ -145,10 +145,9 @@ def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
     return list(groups.values())
 
 
-def _telling(runs: Sequence[Run]) -> list[str]:
-    """Overrides, other than seed and recording, in which runs differ."""
-    apart = [key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1]
-    return [key for key in apart if key not in (SEED, RECORDING)]
+def _varied(runs: Sequence[Run]) -> list[str]:
+    """Overrides in which runs differ."""
+    return [key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1]
 
 
 def _keys(runs: Sequence[Run]) -> list[str]:
@@ -241,7 +240,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     failed = [run for run in runs if run.error is not None]
     if failed:
         print(f"\n{len(failed)} of {len(runs)} jobs failed:")
-        varied = {key for key in _keys(runs) if len({run.overrides.get(key) for run in runs}) > 1}
+        varied = _varied(runs)
         for run in failed:
             changed = " ".join(f"{k}={value}" for k, value in run.overrides.items() if k in varied)
             print(f"  {run.name} ({changed}): {run.error}")

@@ -8,7 +8,7 @@ import platform
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -25,7 +25,7 @@ from tqdm import tqdm
 from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import Pace
 from toftrack.devices.base import Device
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.estimate import Estimate, confidence_words, is_vacant
 from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
@@ -34,8 +34,7 @@ from toftrack.output.advice import Watch
 from toftrack.output.results import RealTime, ResultWriter
 from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
-from toftrack.output.summary import shape_file
-from toftrack.output.summary_table import metrics_line, metrics_table
+from toftrack.output.summary import metrics_line, metrics_table, shape_file
 from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.recordings.recorder import Recorder
@@ -53,7 +52,12 @@ def track(config: DictConfig, device: Device) -> float:
     """
     # Both tell at once what is wrong with them.
     with _recorder(config, device) as recorder, hydra.utils.instantiate(config.stream) as stream:
-        return _track(config, device, stream, recorder)
+        parts = _parts(config, device, stream, recorder)
+        try:
+            return _run(config, device, parts)
+        finally:  # a live run that lost the hand ends by an interruption
+            for sentence in _notes(parts):
+                _note(sentence)
 
 
 def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Recorder | None]:
@@ -65,27 +69,22 @@ def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Reco
     return Recorder(str(config.record), device, limit_gb, tell=_log.warning)
 
 
-def _track(config: DictConfig, device: Device, stream: Stream, recorder: Recorder | None) -> float:
+def _parts(config: DictConfig, device: Device, stream: Stream, recorder: Recorder | None) -> _Parts:
     tracker = build_hands_tracker(config)
-    tracker.time.pace = _pace(tracker.time.pace, device)
+    if not device.live:  # recordings have no budget, so that they stay reproducible
+        tracker.time.pace = Pace()
+    elif tracker.time.pace.budget_s is None:
+        tracker.time.pace = Pace(1 / device.fps)
     reach_m = float(config.segmentation.get("max_distance_m", math.inf))
-    make = hydra.utils.instantiate
-    shapes = ShapeFiles(Path(HydraConfig.get().runtime.output_dir), tracker)
-    watch = Watch(reach_m, len(tracker.states))
-    realtime = RealTime(device.fps)
-    parts = _Parts(tracker, stream, make(config.smooth), watch, shapes, realtime, recorder)
-    try:
-        return _run(config, device, parts)
-    finally:  # a live run that lost the hand ends by an interruption
-        for sentence in _notes(parts):
-            _note(sentence)
-
-
-def _pace(configured: Pace, device: Device) -> Pace:
-    """Recordings have no budget, so that they stay reproducible."""
-    if not device.live:
-        return Pace()
-    return Pace(1 / device.fps) if configured.budget_s is None else configured
+    return _Parts(
+        tracker,
+        stream,
+        smoothing=hydra.utils.instantiate(config.smooth),
+        watch=Watch(reach_m, len(tracker.states)),
+        shapes=ShapeFiles(Path(HydraConfig.get().runtime.output_dir), tracker),
+        realtime=RealTime(device.fps),
+        recorder=recorder,
+    )
 
 
 def _notes(parts: _Parts) -> tuple[str, ...]:
@@ -227,9 +226,7 @@ def _loop(device: Device, results: ResultWriter, view: View, parts: _Parts) -> N
                 bar.update()
                 if device.live:
                     took_s, reduced = tracker.time.took_s(), tracker.time.reduced
-                    parts.realtime = parts.realtime.after(
-                        frame.timestamp_s, took_s, reduced, device.dropped
-                    )
+                    parts.realtime.add(frame.timestamp_s, took_s, reduced, device.dropped)
                 bar.set_postfix_str(_progress_words(estimates, parts), refresh=False)
 
 
@@ -354,13 +351,8 @@ class ShapeFiles:
             if shape is self._saved[slot] or not due:
                 continue
             self._saved_s[slot] = now_s
-            try:
+            remedy = "make room, or choose another folder with hydra.run.dir=DIR"
+            reported = reported_errors(f"'{path}' cannot be written", remedy)
+            with reported if last else suppress(OSError):
                 shape.to("cpu").save(path)
-            except OSError as error:
-                if last:
-                    raise ToftrackError(
-                        f"'{path}' cannot be written ({error.strerror or error}); make room, or "
-                        "choose another folder with hydra.run.dir=DIR"
-                    ) from error
-            else:
                 self._saved[slot] = shape

@@ -48,7 +48,7 @@ def train(config: DictConfig) -> float:
     kind, dims = settings.pop("kind"), settings.pop("dims")
     folder = Path(HydraConfig.get().runtime.output_dir)
     data: PoseData = hydra.utils.instantiate(config.data)
-    say = _nothing if in_sweep() else print
+    say = print if not in_sweep() else lambda text: None  # a sweep's jobs say one line each
     for note in data.notes:
         say(note)
     space = fit_pose_space(kind, dims, data, **settings)
@@ -78,10 +78,6 @@ def train(config: DictConfig) -> float:
     if in_sweep():
         print(f"{job_words()}: {len(data)} training poses, error {error:.2f} degrees; {folder}")
     return error
-
-
-def _nothing(text: str) -> None:
-    """In place of `print` in a sweep, whose jobs say one line each."""
 
 
 def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any]) -> list[Row]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class TrackedFrame:
         return tuple(hand.estimate for hand in self.hands)
 
 
-class View(Protocol):
+class View:
     """Where tracked frames are shown or kept; made with folder, fps and frames (None: unknown).
 
     Used with `with`, which closes it. It is left when the results are written, so it may stay.
@@ -63,31 +63,19 @@ class View(Protocol):
 
     def commands(self) -> Sequence[str]:
         """What was asked since the last call, of COMMANDS, in order."""
+        return ()
 
     def close(self) -> None:
         """Finish what is kept; raises ToftrackError when it cannot be."""
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *exception: Any) -> None: ...
-
-
-class NoView:
-    """Shows and keeps nothing."""
-
-    def __init__(self, *_: Any, **__: Any) -> None: ...
-
-    def show(self, tracked: TrackedFrame) -> None:
-        """Do nothing."""
-
-    def commands(self) -> Sequence[str]:
-        """Nobody asks for anything."""
-        return ()
-
-    def close(self) -> None:
-        """Nothing to close."""
-
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception: object) -> None: ...
+    def __exit__(self, *exception: Any) -> None:
+        self.close()
+
+
+class NoView(View):
+    """Shows and keeps nothing."""
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...

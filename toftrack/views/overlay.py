@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Self
 
 import cv2
 import numpy as np
@@ -23,11 +22,12 @@ from toftrack.estimate import (
     is_vacant,
     state_words,
 )
+from toftrack.hand.shape import HandShape
 from toftrack.render.model_image import model_range_image
-from toftrack.views.base import TrackedFrame
+from toftrack.views.base import TrackedFrame, View
 from toftrack.views.pictures import write_picture
 from toftrack.views.skeleton import SLOT_RGB, draw_hands, side_words
-from toftrack.views.video import VideoFile, unwritable, video_library
+from toftrack.views.video import VideoFile, video_library, writing
 
 _RED = (40, 40, 220)
 _WHITE = (255, 255, 255)
@@ -82,10 +82,8 @@ def draw_panel(
     height, width = depth_m.shape
     # Even, so that a video of it can be encoded.
     size = (max(2, 2 * round(width * scale / 2)), max(2, 2 * round(height * scale / 2)))
-    grey = grey_of(depth_m, amplitude)
-    smooth = cv2.INTER_NEAREST if amplitude is None else cv2.INTER_LINEAR
-    left = cv2.cvtColor(cv2.resize(grey, size, interpolation=smooth), cv2.COLOR_GRAY2BGR)
-    draw_hands(left, camera, estimates, (size[0] / width, size[1] / height))
+    grey = _depth_grey(depth_m) if amplitude is None else _amplitude_grey(amplitude)
+    left = _with_hands(grey, amplitude is not None, camera, estimates, size)
     surfaces = [np.zeros((height, width)) if model is None else model for model in models]
     # Nearest, because mixing the hand with the background would draw a dark rim around it.
     right = cv2.resize(_model_picture(surfaces), size, interpolation=cv2.INTER_NEAREST)
@@ -106,38 +104,54 @@ def mark_lost(picture: np.ndarray) -> None:
     cv2.rectangle(picture, (0, 0), (width - 1, height - 1), _RED, 2 * max(2, width // 130))
 
 
-def grey_of(depth_m: np.ndarray | None, amplitude: np.ndarray | None) -> np.ndarray:
-    """(H, W) uint8 of the amplitude, where there is one, else of the depth in metres."""
-    if amplitude is not None:
-        return _amplitude_grey(amplitude)
-    assert depth_m is not None
-    return _depth_grey(depth_m)
+def _with_hands(
+    image: np.ndarray,
+    smooth: bool,
+    camera: Camera,
+    estimates: Sequence[Estimate],
+    size: tuple[int, int],
+) -> np.ndarray:
+    """A grey or BGR image at another size (w, h), with the skeletons.
+
+    smooth: not for depth, where mixing the hand with the background shows what is not there.
+    """
+    how = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
+    picture = cv2.resize(image, size, interpolation=how)
+    if picture.ndim == 2:
+        picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+    height, width = image.shape[:2]
+    draw_hands(picture, camera, estimates, (size[0] / width, size[1] / height))
+    return picture
 
 
 def draw_tracked(tracked: TrackedFrame) -> np.ndarray:
     """The panel of a tracked frame, (h, w, 3); see draw_panel."""
-    camera = tracked.camera
-    height, width = tracked.depth_m.shape
+    amplitude = tracked.camera.undistort_amplitude(tracked.frame.amplitude)
+    shapes = [hand.shape for hand in tracked.hands]
+    return draw_estimates(tracked.depth_m, amplitude, tracked.camera, tracked.estimates, shapes)
+
+
+def draw_estimates(
+    depth_m: np.ndarray,
+    amplitude: np.ndarray | None,
+    camera: Camera,
+    estimates: Sequence[Estimate],
+    shapes: Sequence[HandShape],
+) -> np.ndarray:
+    """The panel of estimates of hands of these shapes; see draw_panel."""
     models = [
-        model_range_image(hand.estimate.state, hand.shape, camera.K, height, width)
-        for hand in tracked.hands
+        model_range_image(estimate.state, shape, camera.K, camera.height, camera.width)
+        for estimate, shape in zip(estimates, shapes, strict=True)
     ]
-    amplitude = camera.undistort_amplitude(tracked.frame.amplitude)
-    return draw_panel(
-        tracked.depth_m, amplitude, camera, tracked.estimates, models, panel_scale(width)
-    )
+    return draw_panel(depth_m, amplitude, camera, estimates, models, panel_scale(camera.width))
 
 
-class VideoView:
+class VideoView(View):
     """Keeps panels as a video, overlay.mp4, and as a filmstrip of ten of them, overlay.png.
 
-    Args:
-        folder: exists; both files go into it.
-        fps: of the video.
-        frames: how many panels are to come at most, or None where nobody knows.
+    frames: how many panels are to come at most, or None where nobody knows.
 
-    Raises:
-        ToftrackError: nothing encodes; by `add` and `close`, when a file cannot be written.
+    Raises ToftrackError where nothing encodes; by `add` and `close`, when a file cannot be written.
     """
 
     def __init__(self, folder: str | Path, fps: float, frames: int | None = None) -> None:
@@ -154,10 +168,6 @@ class VideoView:
     def show(self, tracked: TrackedFrame) -> None:
         """Append the frame's panel."""
         self.add(draw_tracked(tracked))
-
-    def commands(self) -> Sequence[str]:
-        """A file asks for nothing."""
-        return ()
 
     def add(self, panel: np.ndarray) -> None:
         """Append a (h, w, 3) uint8 BGR panel; the first one decides on the size of the video."""
@@ -181,9 +191,6 @@ class VideoView:
         finally:
             self._write_strip()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
         # What went wrong before is what matters, such as a disk that is full.
         ended = kind is None or issubclass(kind, KeyboardInterrupt)
@@ -191,10 +198,8 @@ class VideoView:
             self.close()
 
     def _write_strip(self) -> None:
-        try:
+        with writing(self.strip_path):
             write_picture(self.strip_path, filmstrip(self._tiles))
-        except OSError as error:
-            raise unwritable(self.strip_path, error) from error
 
     def _keep(self, panel: np.ndarray) -> None:
         """Keep a tile; when they become too many, every other one goes and the stride doubles."""
@@ -365,13 +370,9 @@ def draw(
         )
     factor = panel_scale(width) if scale is None else scale
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    # Depth is enlarged as it is: mixing the hand with the background would show what is not there.
-    how = cv2.INTER_NEAREST if np.asarray(image).dtype.kind == "f" else cv2.INTER_LINEAR
-    picture = cv2.resize(grey, size, interpolation=how)
-    if picture.ndim == 2:
-        picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
     estimates = (estimate,) if isinstance(estimate, Estimate) else tuple(estimate)
-    draw_hands(picture, camera, estimates, (size[0] / width, size[1] / height))
+    smooth = np.asarray(image).dtype.kind != "f"
+    picture = _with_hands(grey, smooth, camera, estimates, size)
     if all(one.lost for one in estimates):
         mark_lost(picture)
     return np.ascontiguousarray(picture[..., ::-1])
@@ -383,7 +384,7 @@ def _checked(image: np.ndarray) -> np.ndarray:
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8 and image.size:
         return np.ascontiguousarray(image[..., ::-1])
     if image.ndim == 2 and image.size and image.dtype.kind in "fui":
-        return grey_of(image, None) if image.dtype.kind == "f" else grey_of(None, image)
+        return _depth_grey(image) if image.dtype.kind == "f" else _amplitude_grey(image)
     raise ToftrackError(
         f"the image is {image.dtype} of the shape {image.shape}; give (H, W) metres or amplitude, "
         "or (H, W, 3) uint8 RGB"

@@ -10,13 +10,15 @@ from toftrack.safe_files import write_whole
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write a (H, W, 3) uint8 BGR picture as PNG; it is there as a whole, or as it was.
+    """Write a (H, W, 3) uint8 BGR picture, as JPEG where its name says so, else as PNG; it is there
+    as a whole, or as it was.
 
     Raises OSError.
     """
     import cv2  # slow to import
 
-    done, content = cv2.imencode(".png", picture)
+    kind = ".jpg" if path.suffix.lower() == ".jpg" else ".png"
+    done, content = cv2.imencode(kind, picture)
     if not done:
         raise OSError(f"a picture of the shape {picture.shape} cannot be encoded")
     write_whole(path, content.tobytes())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 import os
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,15 +26,11 @@ _FRAGMENTS = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_p
 
 
 class VideoFile:
-    """A video that grows frame by frame.
+    """A video, .mp4, that grows frame by frame.
 
-    Args:
-        path: of the .mp4 file.
-        fps: frames a second; from 1 to 120, 25 where it is not finite.
-        size: width and height, px, both even.
+    fps: from 1 to 120, 25 where it is not finite.  size: width and height, px, both even.
 
-    Raises:
-        ToftrackError: there is no encoder, or (by all methods) the file cannot be written.
+    Raises ToftrackError where there is no encoder, or (by all methods) the file cannot be written.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
@@ -42,18 +38,17 @@ class VideoFile:
         self._path, self._new_frame = path, av.VideoFrame.from_ndarray
         # Two decimals, so that the clock's steps are whole numbers of modest size.
         rate = min(max(round(float(fps), 2), 1.0), 120.0) if math.isfinite(fps) else 25.0
-        try:
+        with writing(path):
             self._disk = open_new(path, replace=True)
-        except OSError as error:
-            raise unwritable(path, error) from error
         try:
-            self._file: Any = av.open(self._disk, "w", format="mp4", options=_FRAGMENTS)
-            self._stream: Any = self._file.add_stream(
-                "libx264", rate=Fraction(rate).limit_denominator(100), options=_OPTIONS
-            )
-        except (OSError, ValueError) as error:
+            with writing(path, OSError, ValueError):
+                self._file: Any = av.open(self._disk, "w", format="mp4", options=_FRAGMENTS)
+                self._stream: Any = self._file.add_stream(
+                    "libx264", rate=Fraction(rate).limit_denominator(100), options=_OPTIONS
+                )
+        except ToftrackError:
             self._disk.close()
-            raise unwritable(path, error) from error
+            raise
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.gop_size = max(1, round(rate))
@@ -70,10 +65,9 @@ class VideoFile:
             self._write(None)
         finally:
             try:
-                self._file.close()
-                self._disk.flush()
-            except OSError as error:
-                raise unwritable(self._path, error) from error
+                with writing(self._path):
+                    self._file.close()
+                    self._disk.flush()
             finally:
                 # Not every failure to write is told by the library.
                 with suppress(OSError):
@@ -82,11 +76,9 @@ class VideoFile:
                     self._disk.close()
 
     def _write(self, frame: Any) -> None:
-        try:
+        with writing(self._path):
             self._file.mux(self._stream.encode(frame))
             self._disk.flush()
-        except OSError as error:
-            raise unwritable(self._path, error) from error
 
 
 def cut_to_whole(path: Path) -> None:
@@ -117,13 +109,10 @@ def _cut(file: BinaryIO | io.FileIO) -> None:
         file.truncate(whole)
 
 
-def unwritable(path: Path, error: Exception | None = None) -> ToftrackError:
-    """What is said about a file of a view."""
-    reason = getattr(error, "strerror", None)
-    why = f" ({reason})" if reason else ""
-    return ToftrackError(
-        f"'{path}' cannot be written{why}; check the folder and the free space, or choose view=none"
-    )
+def writing(path: Path, *kinds: type[Exception]) -> AbstractContextManager[None]:
+    """Errors of these kinds, by default the system's, become a sentence on a file of a view."""
+    remedy = "check the folder and the free space, or choose view=none"
+    return reported_errors(f"'{path}' cannot be written", remedy, *kinds)
 
 
 def video_library() -> Any:

@@ -21,29 +21,21 @@ from typing import Any, Self
 from toftrack.checks import check_number
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
-from toftrack.output.stream import known_fields, report_dropped
+from toftrack.output.stream import Stream, known_fields, report_dropped
 from toftrack.output.web.server import ANY_PORT, WebServer
 
 STREAM = "/stream"
 _PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js"}
 
 
-class WebSocketStream:
+class WebSocketStream(Stream):
     """A message a line to every client, and the pages, from a thread of its own within the `with`.
 
-    A client that is too slow loses its oldest lines. Where there is no client nothing is made.
+    A client that is too slow loses its oldest lines. Where there is no client nothing is made. The
+    settings: conf/stream/websocket.yaml; `live` is for the devices alone, which follow it.
 
-    Args:
-        host: name or address of the network interface.
-        port: 0 = any free one.
-        fields: what to send of each estimate, of lines.LINE_FIELDS; None for all.
-        waiting: lines kept for a client that falls behind, at least 1.
-        origins: of pages of other servers that may listen, as "http://localhost:3000".
-        live: nothing to the stream; the devices' `realtime` follows it in the configuration.
-
-    Raises:
-        ToftrackError: an unknown field, an impossible number; by `with`, when the port is taken or
-            not allowed, or there is no such host here.
+    Raises ToftrackError for an unknown field or an impossible number; by `with`, when the port is
+    taken or not allowed, or there is no such host here.
     """
 
     def __init__(

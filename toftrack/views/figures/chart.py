@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, module_of_extra
 from toftrack.views.pictures import write_picture
 
 if TYPE_CHECKING:
@@ -35,13 +35,10 @@ class MissingMatplotlibError(ToftrackError):
 def new_figure(width: int, height: int) -> Figure:
     """An empty figure of so many pixels; raises MissingMatplotlibError."""
     try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingMatplotlibError(
-            "figures need matplotlib, which is not installed: pip install 'toftrack[figures]', in "
-            "a checkout pip install -e '.[figures]'"
-        ) from None
-    figure = Figure((width / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
+        module = module_of_extra("matplotlib.figure", "figures need matplotlib", "figures")
+    except ToftrackError as error:
+        raise MissingMatplotlibError(str(error)) from None
+    figure = module.Figure((width / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     return figure
 

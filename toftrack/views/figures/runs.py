@@ -1,33 +1,57 @@
 """Figures of a finished run, as the paper has them (figs. 3, 5, 6), and its course over time.
 
-Pictures are (h, w, 3) uint8 BGR.
+Pictures are (h, w, 3) uint8 BGR. Of a run with several slots, `run` is as if only one had been
+followed (Run.slot) where a figure is of one hand, and `of` is what its title begins with.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
+from toftrack.estimate import confidence_words, state_words
+from toftrack.evaluation.trust import joint_errors_mm
+from toftrack.frames import Truth
+from toftrack.output.run_folder import Footage, Run, observe
 from toftrack.pose_space.base import PoseSpace
-from toftrack.render.segmentation import Observation
-from toftrack.views.classified import CLASS_RGB, CLASSES, Classified
+from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.figures import chart
 from toftrack.views.figures.poses import scatter_gestures
-from toftrack.views.overlay import film_tile, filmstrip, range_grey
+from toftrack.views.overlay import draw_estimates, film_tile, filmstrip, range_grey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MARGIN_PX = 8
+_FILM_FRAMES = 10
+_LOST_FRAMES = 5
+_APART = 3
+"""Frames of the lowest score are at least so far from one another."""
+_SAME_SPACE = 0.01
+"""Of a coordinate's range: a pose that is encoded elsewhere now is of another space."""
 
 
-def measurement_figure(observation: Observation, pixels: Classified, title: str) -> np.ndarray:
+def _panel(run: Run, footage: Footage, row: int) -> np.ndarray:
+    """A frame of all slots as the overlay shows it."""
+    images = footage.depth(row), footage.amplitude(row)
+    return draw_estimates(*images, footage.camera, run.estimates(row), run.shapes)
+
+
+def _strip(run: Run, footage: Footage, rows: Iterable[int]) -> np.ndarray:
+    return filmstrip([film_tile(_panel(run, footage, row)) for row in rows])
+
+
+def measurement_figure(run: Run, footage: Footage, row: int, of: str) -> np.ndarray:
     """How one hypothesis is measured: input, range image, neighbourhood, classified (fig. 3).
 
     The observation's grid, cut to where something is counted.
     """
+    estimate = run.estimate(row)
+    observation = observe(run, footage, row)
+    pixels = classify(estimate.state, run.shape, observation, run.likelihood())
     hand, depth = observation.hand.cpu().numpy(), observation.depth_m.cpu().numpy()
     counted = pixels.neighbourhood | (pixels.range_m > 0)
     shown = counted if counted.any() else hand
@@ -63,85 +87,97 @@ def measurement_figure(observation: Observation, pixels: Classified, title: str)
     for name, rgb in zip(names, (*CLASS_RGB[2:], CLASS_RGB[1]), strict=True):
         axes.scatter([], [], marker="s", s=80, color=np.divide(rgb, 255), label=name)
     figure.legend(loc="outside lower left", ncols=4, frameon=False)
+    state = f"LOST: {state_words(estimate)}" if estimate.lost else ""
+    facts = (f"score {estimate.score:.2f}", confidence_words(estimate.confidence), state)
+    title = f"{of}Frame {estimate.index}: " + ", ".join(filter(None, facts))
     note = "Nearer is darker, in both range images alike. Pixels as the likelihood counts them."
     return chart.titled(chart.picture_of(figure), title, note)
 
 
-def filmstrip_figure(panels: Sequence[np.ndarray], title: str) -> np.ndarray:
-    """Frames with the skeleton, below each the model's range image (fig. 5); panels of the
-    overlay.
-    """
-    strip = filmstrip([film_tile(panel) for panel in panels])
+def filmstrip_figure(run: Run, footage: Footage) -> np.ndarray:
+    """Frames with the skeleton, below each the model's range image (fig. 5), of all slots."""
+    count = min(_FILM_FRAMES, len(run))
+    rows = np.linspace(0, len(run) - 1, count).round().astype(int)
+    title = f"{count} of {len(run)} frames; lost in all: {run.summary['lost_frames']}"
     note = (
         "Above: the camera's image with the estimated skeleton. Below: the range image of the "
         "estimate, nearer is darker. Red: lost."
     )
-    return chart.titled(strip, title, note)
+    strip = _strip(run, footage, rows)
+    return chart.titled(strip, title if count < len(run) else f"{count} frames", note)
 
 
-def lost_figure(
-    panels: Sequence[np.ndarray],
-    rows: Sequence[int],
-    time_s: np.ndarray,
-    frames: np.ndarray,
-    score: np.ndarray,
-    lost: np.ndarray,
-    title: str,
-    confidence: np.ndarray | None = None,
-) -> np.ndarray:
+def lost_figure(run: Run, one: Run, footage: Footage, of: str) -> np.ndarray:
     """Frames that went wrong above the course of the score, in which they are marked (fig. 6).
 
-    panels: of the overlay, one for each of `rows`.  The others: (T,), confidence as for
-    course_figure.
+    one: slot of the run; the frames show all of them.
     """
-    strip = filmstrip([film_tile(panel) for panel in panels])
+    lost, score, time_s = one.results["lost"], np.nan_to_num(one.results["score"]), _time(run)
+    if lost.any():
+        # Of a time in which there was nothing to see, one frame is enough.
+        nothing = lost & (score == 0)
+        among = np.flatnonzero(lost & ~(nothing & np.roll(nothing, 1)))
+        among = among if len(among) else np.flatnonzero(lost)
+        count = min(_LOST_FRAMES, len(among))
+        rows = among[np.linspace(0, len(among) - 1, count).round().astype(int)].tolist()
+        title = f"Lost: {int(lost.sum())} of {len(run)} frames, {count} of them shown"
+    else:
+        rows = _lowest_rows(score)
+        title = f"No frame was lost: the {len(rows)} frames of the lowest score"
+    strip = _strip(run, footage, rows)
     width = max(strip.shape[1], 1000)
     strip = np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0)), constant_values=255)
     figure = chart.new_figure(width, 340)
     axes = figure.subplots()
-    _draw_score(axes, time_s, score, lost, confidence)
-    shown = list(rows)
-    axes.plot(time_s[shown], score[shown], "o", color=chart.VERMILLION, label="frames shown above")
-    _number_frames(axes, time_s[shown], frames[shown])
+    _draw_score(axes, one, score)
+    axes.plot(time_s[rows], score[rows], "o", color=chart.VERMILLION, label="frames shown above")
+    _number_frames(axes, time_s[rows], run.frames[rows])
     figure.legend(loc="outside lower left", ncols=4, frameon=False)
     note = "Above: the camera's image with the estimated skeleton, and the estimate's range image."
-    return chart.titled(np.vstack([strip, chart.picture_of(figure)]), title, note)
+    return chart.titled(np.vstack([strip, chart.picture_of(figure)]), of + title, note)
 
 
-def course_figure(
-    time_s: np.ndarray,
-    frames: np.ndarray,
-    score: np.ndarray,
-    lost: np.ndarray,
-    title: str,
-    error_mm: np.ndarray | None = None,
-    absent: np.ndarray | None = None,
-    confidence: np.ndarray | None = None,
-) -> np.ndarray:
-    """Error, score and confidence over time, lost frames shaded.
+def _lowest_rows(score: np.ndarray) -> list[int]:
+    rows: list[int] = []
+    for row in np.argsort(score, kind="stable").tolist():
+        if all(abs(row - other) >= _APART for other in rows):
+            rows.append(row)
+        if len(rows) == _LOST_FRAMES:
+            break
+    return sorted(rows)
 
-    Args:
-        time_s, frames, score, lost: (T,).
-        error_mm: (T, 21) against the truth, NaN where there is none; None draws the score alone.
-        absent: (T,) the truth says that there is no hand to track, or not one of the known poses.
-        confidence: (T,) that every joint is within 40 mm, NaN where nothing says; or None.
+
+def course_figure(run: Run, truth: Truth | None, metrics: dict[str, Any], of: str) -> np.ndarray:
+    """Error against the truth, if there is one, score and confidence over time, lost frames shaded.
+
+    truth, metrics: of the hand that is followed.
     """
+    results, time_s = run.results, _time(run)
+    score = np.where(np.isfinite(results["score"]), results["score"], np.nan)
+    error_mm = None
+    if truth is not None:
+        there, error_mm = joint_errors_mm(results["joints_m"], truth)
+        error_mm[~(there & truth.visible)] = np.nan
     count = 1 if error_mm is None else 2
     figure = chart.new_figure(1100, 330 * count)
     *above, below = figure.subplots(count, squeeze=False)[:, 0]
     if error_mm is not None:
         axes = above[0]
         chart.label(axes, "", "joint error, mm (logarithmic)")
-        chart.shade(axes, time_s, lost, chart.SHADE, "")
+        chart.shade(axes, time_s, results["lost"], chart.SHADE, "")
         axes.plot(time_s, error_mm.max(1), ".-", color=chart.ORANGE, label="largest of a joint")
         axes.plot(time_s, error_mm.mean(1), ".-", color=chart.BLUE, label="mean of the joints")
         chart.round_log_ticks(axes, "y")
         axes.set_xlim(*_span(time_s))
         axes.legend(loc="upper left", ncols=2)
-    _draw_score(below, time_s, score, lost, confidence)
-    if absent is not None:
-        name = "no hand of the known poses, says the truth"
+    _draw_score(below, run, score)
+    if truth is not None:
+        absent, name = (
+            ~(truth.visible & truth.in_space),
+            "no hand of the known poses, says the truth",
+        )
         chart.shade(below, time_s, absent, chart.GREY, name, top=0.96)
+    frames = run.frames
     at = np.flatnonzero(np.isin(frames, chart.round_numbers(frames[0], frames[-1])))
     _number_frames(below, time_s[at], frames[at])
     figure.legend(
@@ -152,19 +188,23 @@ def course_figure(
         if error_mm is None
         else "The error is left out where the truth has no visible hand."
     )
-    return chart.titled(chart.picture_of(figure), title, note)
+    title = f"Score of {len(run)} frames"
+    if (mean := metrics.get("mean_mm")) is not None:
+        height = float(np.nanmean(score))
+        title = f"{len(run)} frames: mean joint error {mean:.1f} mm, mean score {height:.2f}"
+    return chart.titled(chart.picture_of(figure), of + title, note)
 
 
-def _draw_score(
-    axes: Axes,
-    time_s: np.ndarray,
-    score: np.ndarray,
-    lost: np.ndarray,
-    confidence: np.ndarray | None,
-) -> None:
-    """Score and confidence over time, lost frames shaded."""
+def _time(run: Run) -> np.ndarray:
+    """(T,) seconds since the first frame."""
+    return run.timestamp_s - run.timestamp_s[0]
+
+
+def _draw_score(axes: Axes, run: Run, score: np.ndarray) -> None:
+    """Score (T,) and confidence over time, lost frames shaded."""
+    time_s, confidence = _time(run), run.results.get("confidence")
     chart.label(axes, "time, s", "score")
-    chart.shade(axes, time_s, lost, chart.SHADE, "lost, says the tracker")
+    chart.shade(axes, time_s, run.results["lost"], chart.SHADE, "lost, says the tracker")
     axes.plot(time_s, score, color=chart.GREEN, label="score")
     if confidence is not None and np.isfinite(confidence).any():
         axes.plot(time_s, confidence, color=chart.PURPLE, label="confidence")
@@ -188,22 +228,25 @@ def _span(time_s: np.ndarray) -> tuple[float, float]:
     return float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3)
 
 
-def latent_figure(
-    space: PoseSpace,
-    latent: np.ndarray,
-    lost: np.ndarray,
-    time_s: np.ndarray,
-    title: str,
-    note: str = "",
-) -> np.ndarray:
-    """The way of the estimates over the manifold: coordinates 1-2 and 3-4 with the training poses.
-
-    Args:
-        space: its training poses are coloured by the nearest gesture.
-        latent: (T, d), NaN where there was no estimate.
-        lost, time_s: (T,).
-        note: what else is to be said, after the explanation.
+def latents(run: Run, space: PoseSpace) -> tuple[np.ndarray, str]:
+    """(T, d) coordinates of the estimates in the space as it is now, NaN where there were none, and
+    what is to be said of them.
     """
+    latent = run.results["latent"]
+    with torch.inference_mode():
+        now = space.encode(torch.from_numpy(run.results["state"][:, 6:])).numpy()
+    span = (space.upper - space.lower).numpy()
+    if np.nanmax(np.abs(now - latent) / span, initial=0.0) > _SAME_SPACE:
+        return now, " The space has changed since the run; its poses are encoded anew."
+    return latent, ""
+
+
+def latent_figure(run: Run, of: str) -> np.ndarray:
+    """The way of the estimates over the manifold: coordinates 1-2 and 3-4 with the training poses,
+    which are coloured by the nearest gesture.
+    """
+    space, lost, time_s = run.pose_space(), run.results["lost"], _time(run)
+    latent, note = latents(run, space)
     # Angles in a linear space are angles; the coordinates of others have no unit.
     linear = space.kind == "pca"
     scale, unit = (180 / np.pi, ", degrees") if linear else (1.0, "")
@@ -235,6 +278,8 @@ def latent_figure(
         "estimates. The rectangle is the range of the training poses, to which the particles keep; "
         "an estimate may lie beyond it, because the refinement is free of it."
     )
+    kind = f"({space.kind}, {space.dims} coordinates)"
+    title = f"{of}Pose space {kind}: training poses and estimates"
     return chart.titled(chart.picture_of(figure), title, about + note)
 
 

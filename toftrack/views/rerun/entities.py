@@ -66,9 +66,7 @@ _BONE_M, _JOINT_M, _PARTICLE_M = 0.003, 0.003, 0.0012
 class Entities:
     """Logs frame after frame to a stream; one thread at a time.
 
-    Args:
-        stream: where to.
-        likelihood: tells correct, false and missed pixels.
+    likelihood: tells correct, false and missed pixels.
     """
 
     def __init__(self, stream: rr.RecordingStream, likelihood: FMeasure) -> None:
@@ -293,25 +291,14 @@ def blueprint() -> rrb.Blueprint:
             position=(0.2, -0.1, 0.15), look_target=(0, 0, 0.5), eye_up=(0, -1, 0)
         ),
     )
+    seen = "world/camera"
     images = rrb.Tabs(
-        rrb.Spatial2DView(
-            origin="world/camera",
-            contents=["world/camera/amplitude", *_SKELETONS],
-            name="amplitude and skeleton",
-        ),
-        rrb.Spatial2DView(
-            origin="world/camera",
-            contents=["world/camera/depth", *_SKELETONS],
-            name="depth",
-        ),
+        _image(seen, "amplitude and skeleton", f"{seen}/amplitude", *_SKELETONS),
+        _image(seen, "depth", f"{seen}/depth", *_SKELETONS),
     )
     labels = rrb.Tabs(
-        rrb.Spatial2DView(
-            origin="world/tracker", contents=["world/tracker/classified"], name="classified pixels"
-        ),
-        rrb.Spatial2DView(
-            origin="world/tracker", contents=["world/tracker/segmentation"], name="segmentation"
-        ),
+        _image("world/tracker", "classified pixels", "world/tracker/classified"),
+        _image("world/tracker", "segmentation", "world/tracker/segmentation"),
         rrb.TextLogView(origin="log", name="changes"),
     )
     plots = rrb.Horizontal(
@@ -331,3 +318,7 @@ def blueprint() -> rrb.Blueprint:
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def _image(origin: str, name: str, *contents: str) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(origin=origin, contents=contents, name=name)

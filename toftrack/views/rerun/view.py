@@ -6,17 +6,15 @@ import logging
 import queue
 import socket
 import threading
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
 from urllib.parse import urlsplit
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.render.likelihood import FMeasure
 from toftrack.safe_files import open_new
-from toftrack.views.base import TrackedFrame
+from toftrack.views.base import TrackedFrame, View
 from toftrack.views.rerun.entities import Entities, blueprint, rr
-from toftrack.views.video import unwritable
+from toftrack.views.video import writing
 
 FILE_NAME = "track.rrd"
 
@@ -30,21 +28,15 @@ _ADDRESS = f"rerun+http://127.0.0.1:{_PORT}/proxy"
 _RERUN_ERRORS = (OSError, RuntimeError, ValueError)
 
 
-class RerunView:
+class RerunView(View):
     """Writes the file track.rrd, or shows in a viewer while tracking goes on.
 
     A thread of its own does the work, so that the tracker goes on at once. The file gets every
-    frame; a viewer that does not keep up misses some, and never holds up the tracker.
+    frame; a viewer that does not keep up misses some, and never holds up the tracker. The settings:
+    conf/view/rerun.yaml.
 
-    Args:
-        folder: exists; the file goes into it.
-        fps, frames: as every view gets them, and of no use here.
-        likelihood: tells correct, false and missed pixels.
-        connect: address of a running viewer, rerun+http://HOST:PORT/proxy; nothing is written then.
-        spawn: start a viewer and show there; nothing is written then.
-
-    Raises:
-        ToftrackError: the file cannot be written, there is no viewer, or both connect and spawn.
+    Raises ToftrackError when the file cannot be written, there is no viewer, or for both connect
+    and spawn.
     """
 
     def __init__(
@@ -68,11 +60,9 @@ class RerunView:
                 _require_answer(connect)
             self._stream.connect_grpc(connect or _ADDRESS, default_blueprint=blueprint())
         else:
-            try:
+            with writing(self._path, *_RERUN_ERRORS):
                 open_new(self._path, replace=True).close()  # the library follows links
                 self._stream.save(self._path, default_blueprint=blueprint())
-            except (OSError, *_RERUN_ERRORS) as error:
-                raise unwritable(self._path, error) from error
         self._entities = Entities(self._stream, likelihood)
         self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_QUEUED_FRAMES)
         self._left_out = 0
@@ -91,10 +81,6 @@ class RerunView:
             self._frames.put_nowait(tracked)
         except queue.Full:
             self._left_out += 1
-
-    def commands(self) -> Sequence[str]:
-        """The viewer asks for nothing."""
-        return ()
 
     def close(self) -> None:
         """Finish the file, or send the viewer what is left; ToftrackError when it cannot be done.
@@ -117,12 +103,6 @@ class RerunView:
             raise _viewer_gone("it takes nothing any more")
         self._raise_failure()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
     def _work(self) -> None:
         """In the thread: log the frames that come, until None, then finish."""
         # After a failure, frames are still taken, so that nobody waits for room.
@@ -141,11 +121,10 @@ class RerunView:
     def _raise_failure(self) -> None:
         if self._failure is None:
             return
-        if not isinstance(self._failure, _RERUN_ERRORS):
+        if self._path is None and isinstance(self._failure, _RERUN_ERRORS):
+            raise _viewer_gone(str(self._failure)) from self._failure
+        with writing(self._path or Path(FILE_NAME), *_RERUN_ERRORS):
             raise self._failure
-        if self._path is not None:
-            raise unwritable(self._path, self._failure) from self._failure
-        raise _viewer_gone(str(self._failure)) from self._failure
 
 
 def _start_viewer(stream: rr.RecordingStream) -> None:
