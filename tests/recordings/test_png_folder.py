@@ -15,6 +15,7 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.output.run_folder import read_run
 from toftrack.programs.main import main
+from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.png_folder import read_png_folder
 
 LENS = "device.intrinsics=[201,202,87,71]"
@@ -85,7 +86,7 @@ def test_lenses_that_are_none_are_reported(given: str, words: str, folder: Path)
 
 
 def test_a_lens_is_reported_once(folder: Path) -> None:
-    read_png_folder(folder, intrinsics=[201, 202, 87, 71]).camera.save(folder / "mine.json")
+    read_png_folder(folder, bare=BareFacts([201, 202, 87, 71])).camera.save(folder / "mine.json")
     words = ["device=folder", f"device.path={folder}", f"camera.file={folder / 'mine.json'}"]
     with make_device(*words) as device:
         np.testing.assert_array_equal(device.camera.K, K)

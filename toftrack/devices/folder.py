@@ -8,6 +8,7 @@ from typing import Any
 
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.png_folder import read_png_folder
 
 
@@ -36,7 +37,7 @@ class Folder(Replay):
     ) -> None:
         if not path:
             raise ToftrackError("no folder was given; set device.path=FOLDER")
-        store = read_png_folder(path, camera_file, unit_m, fps, intrinsics)
+        store = read_png_folder(path, camera_file, BareFacts(intrinsics, unit_m, fps))
         playback |= {"camera_file": camera_file, "intrinsics": intrinsics}
         super().__init__(path, store=store, **playback)
         self.description |= {"device": "folder", "unit_m": store.unit_m}

@@ -70,9 +70,8 @@ class Replay(BaseDevice):
             bare = BareFacts(intrinsics)
             store = open_recording(path, camera_file, modulation_mhz, bare=bare)
         self._recording = store
-        damage = getattr(store, "damage", None)
-        if damage:
-            _log.warning("%s: %s; its %d whole frames are used", path, damage, len(store))
+        if store.damage:
+            _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
         self._range = _checked_range(start, stop, len(self._recording), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         camera = store.camera

@@ -30,7 +30,7 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import parse_json
-from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, rate_of
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     FRAME_BYTES,
@@ -212,14 +212,13 @@ class SrsWriter:
             return
 
 
-class SrsRecording:
+class SrsRecording(FrameStore):
     """The frames of a `.srs` file, read from the disk one at a time.
 
     `image` opens the file when it is first needed and `close` closes it.
     """
 
     radial = True
-    truth = None
 
     def __init__(
         self, path: Path, offsets: np.ndarray, timestamp_s: np.ndarray, scan: _Scan, range_m: float
@@ -229,21 +228,14 @@ class SrsRecording:
         self.camera = facts.camera or nominal_camera()
         self.range_m = range_m
         self.timestamp_s = timestamp_s
-        """(T,) float64 seconds, not decreasing."""
-        steps = np.diff(timestamp_s)
-        median = float(np.median(steps)) if len(steps) else 0.0
-        self.fps = 1.0 / median if median > 0 else facts.fps
+        self.fps = rate_of(timestamp_s, facts.fps)
         self.metadata = facts.metadata
         self.init = scan.init or SrsInit()
         self.registers = scan.registers
         """The first Configure object's 64 bytes."""
         self.damage = scan.damage
-        """Why the file ends earlier than it should, in words; None when it is whole."""
         self._offsets = offsets
         self._stream: BinaryIO | None = None
-
-    def __len__(self) -> int:
-        return len(self._offsets)
 
     def raw(self, index: int) -> bytes:
         """A frame as the camera sent it, FRAME_BYTES bytes. Raises ToftrackError if unreadable."""
@@ -257,11 +249,9 @@ class SrsRecording:
         return data
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """A frame's radial distance, (144, 176) float32 m, and amplitude, uint16; new arrays."""
         return decode_frame(self.raw(index), self.range_m)
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
