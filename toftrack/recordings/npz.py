@@ -361,22 +361,16 @@ def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> T
         name = keys["joints_m"]
         raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
 
-    def flags(name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-        key = keys[name]
-        return of_shape(arrays, key, shape).astype(bool) if key in arrays else None
-
-    visible, in_space = flags("visible", (count,)), flags("in_space", (count,))
-    fraction = None
-    if keys["visible_fraction"] in arrays:
-        fraction = of_shape(arrays, keys["visible_fraction"], (count,)).astype(np.float32)
-    return Truth(
-        joints_m=joints,
-        visible=np.ones(count, bool) if visible is None else visible,
-        in_space=np.ones(count, bool) if in_space is None else in_space,
-        visible_fraction=fraction,
-        joint_visible=flags("joint_visible", (count, _JOINTS)),
-        pose_name=_names(arrays, keys["pose_name"], count),
-    )
+    found: dict[str, Any] = {"visible": np.ones(count, bool), "in_space": np.ones(count, bool)}
+    for name, kind, shape in (
+        ("visible", bool, (count,)),
+        ("in_space", bool, (count,)),
+        ("visible_fraction", np.float32, (count,)),
+        ("joint_visible", bool, (count, _JOINTS)),
+    ):
+        if keys[name] in arrays:
+            found[name] = of_shape(arrays, keys[name], shape).astype(kind)
+    return Truth(joints, pose_name=_names(arrays, keys["pose_name"], count), **found)
 
 
 def _names(arrays: dict[str, Any], key: str, count: int) -> np.ndarray | None:
