@@ -102,18 +102,23 @@ def test_an_unplugged_camera_is_reported_after_its_last_frame(plug: Callable[...
     assert indices == [0, 1]
 
 
-def test_a_silent_camera_is_reported(plug: Callable[..., Sdk]) -> None:
-    camera = a_camera(numbers=(1,))
-    plug(camera)
-    with pytest.raises(ToftrackError, match="no frame has come.*0.05 s"):
+@pytest.mark.parametrize(
+    ("sent", "error", "words"),
+    [
+        ([Images(image(1))], None, "no frame has come.*0.05 s"),
+        ([Images(image(1, few=True))], None, "sent 5 bytes for 8x6 pixels"),
+        ([], "busy\nor so", r"cannot be started \(busy or so\); close other"),
+    ],
+)
+def test_a_camera_that_fails_is_reported(
+    plug: Callable[..., Sdk], sent: list[Images], error: str | None, words: str
+) -> None:
+    camera = a_camera()
+    camera.sets = sent
+    plug(camera, **({} if error is None else {"start_error": error}))
+    with pytest.raises(ToftrackError, match=words):
         list(orbbec(timeout_s=0.05))
     assert not camera.started
-
-
-def test_a_camera_that_cannot_be_started_is_reported(plug: Callable[..., Sdk]) -> None:
-    plug(a_camera(), start_error="busy\nor so")
-    with pytest.raises(ToftrackError, match=r"cannot be started \(busy or so\); close other"):
-        list(orbbec())
 
 
 def test_leaving_stops_the_camera_and_iterating_again_starts_it_again(
@@ -130,14 +135,6 @@ def test_leaving_stops_the_camera_and_iterating_again_starts_it_again(
     device.close()
 
 
-def test_frames_with_too_few_bytes_are_reported(plug: Callable[..., Sdk]) -> None:
-    camera = a_camera()
-    camera.sets = [Images(image(1, few=True))]
-    plug(camera)
-    with pytest.raises(ToftrackError, match="sent 5 bytes for 8x6 pixels"):
-        list(orbbec())
-
-
 def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Callable[..., Sdk]) -> None:
     plug(a_camera("0042"), a_camera("CL77"))
     with pytest.raises(ToftrackError, match="2 Orbbec cameras.*device.serial=.*0042, CL77"):
@@ -148,9 +145,12 @@ def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Callable[..., Sdk]
         orbbec(serial=5)
 
 
-def test_no_camera_is_reported_with_what_else_there_is(plug: Callable[..., Sdk]) -> None:
+def test_no_camera_and_one_without_depth_are_reported(plug: Callable[..., Sdk]) -> None:
     plug()
     with pytest.raises(ToftrackError, match="no Orbbec camera.*udev.*device.bag"):
+        orbbec()
+    plug(FakeCamera("1", {IR: [profile("y8")]}))
+    with pytest.raises(ToftrackError, match="the camera has no depth images"):
         orbbec()
 
 
@@ -162,12 +162,6 @@ def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(
         orbbec(width=641)
     assert orbbec(fps=15).fps == 15
     assert orbbec(width=16, height=12).camera.width == 16
-
-
-def test_a_camera_without_depth_is_reported(plug: Callable[..., Sdk]) -> None:
-    plug(FakeCamera("1", {IR: [profile("y8")]}))
-    with pytest.raises(ToftrackError, match="the camera has no depth images"):
-        orbbec()
 
 
 @pytest.mark.parametrize("model", ["brown_conrady", "brown_conrady_k6", None])

@@ -12,8 +12,7 @@ from helpers.videos import RATIONAL, calibration, seen_through, write_kinect
 
 from toftrack.camera import Camera
 from toftrack.devices.base import Device
-from toftrack.devices.replay import Replay
-from toftrack.devices.rosbag import Bag
+from toftrack.devices.replay import Bag, Replay
 from toftrack.devices.sample import Sample
 
 FRAMES = 30

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import toftrack
+from toftrack.devices.base import Device
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.recordings.store import SAMPLES, sample_file
@@ -49,3 +50,34 @@ def test_a_sample_is_tracked(name: str, start: int, least: float, one_thread: No
             right = [not one.lost for one, far in zip(found, errors, strict=True) if far < 0.04]
             usable.append(any(right))
     assert np.mean(usable[len(usable) // 3 :]) > least
+
+
+def test_sample_is_the_packaged_recording() -> None:
+    device = Sample()
+    assert isinstance(device, Device)
+    assert (device.frames, device.fps) == (100, 25)
+    assert (device.camera.width, device.camera.height) == (176, 144)
+    assert device.truth.joint_visible.shape == (100, 21)
+    assert device.truth.visible_fraction.shape == (100,)
+    assert device.metadata["handedness"] == "right"
+    frame = next(iter(device))
+    assert 0.4 < np.median(frame.depth[frame.depth > 0]) < 2
+    assert frame.amplitude.max() > 1000
+
+
+def test_sample_is_small_and_carries_its_licence() -> None:
+    assert len((DATA / "sample.npz").read_bytes()) <= 4_500_000
+    licence = (DATA / "README.md").read_text(encoding="utf-8")
+    assert "MIT" in licence
+    assert "2019 Amazon" in licence
+
+
+def test_samples_truth_lies_on_the_recorded_hand() -> None:
+    # The joints are inside the hand, so the surface in front of a visible one is a little nearer.
+    device = Sample(stop=20)
+    gaps = []
+    for row, frame in enumerate(device):
+        joints = device.truth.joints_m[row][device.truth.joint_visible[row]]
+        u, v = np.round(device.camera.project(joints)).astype(int).T
+        gaps.extend(joints[:, 2] - frame.depth[v, u])
+    assert 0.003 < np.median(gaps) < 0.025

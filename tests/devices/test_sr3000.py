@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import usb.core
-from helpers.settings import (
-    sr3000,
-)
+from helpers.settings import sr3000
 from helpers.sr3000_camera import STEP_M, camera, read
 
 from toftrack.devices.base import Device
@@ -125,20 +123,18 @@ def test_a_camera_that_never_answers_is_reported(kind: str) -> None:
         read(camera(kind))
 
 
-@pytest.mark.parametrize("kind", ["timeout", "short"])
-def test_a_camera_that_falls_silent_is_reported_after_its_last_frame(kind: str) -> None:
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("timeout@4+", "cable and power"),
+        ("short@4+", "cable and power"),
+        ("unplug_during@4", "gone.*no SR3000"),
+    ],
+)
+def test_a_camera_that_is_given_up_is_reported_after_its_last_frame(fault: str, words: str) -> None:
     # Over and over: a short frame uses up one of the recording, which else ends on a fast machine.
-    device, seen = camera(f"{kind}@4+", loop=True), []
-    with pytest.raises(ToftrackError, match="cable and power"), device:
-        for frame in device:
-            seen.append(frame.index)
-    assert seen == [0, 1, 2, 3]
-    assert device.emulator.open_handles == set()
-
-
-def test_unplugged_for_ever_is_given_up_after_its_last_frame() -> None:
-    device, seen = camera("unplug_during@4", replug_s=100.0), []
-    with pytest.raises(ToftrackError, match="gone.*no SR3000"), device:
+    device, seen = camera(fault, loop=True, replug_s=100.0), []
+    with pytest.raises(ToftrackError, match=words), device:
         for frame in device:
             seen.append(frame.index)
     assert seen == [0, 1, 2, 3]
@@ -164,19 +160,17 @@ def test_never_gives_up_when_asked_not_to() -> None:
     assert [frame.index for frame in read(device)] == [0, 1, 2, 3]
 
 
-def no_library(**_: Any) -> None:
-    raise usb.core.NoBackendError("No backend available")
+def test_no_camera_and_no_library_are_reported_with_the_ids(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_library(**_: Any) -> None:
+        raise usb.core.NoBackendError("No backend available")
 
-
-def test_no_library_is_reported_with_the_ids(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*plug.*libmesasr.*emulated"):
+        camera("missing")
     monkeypatch.setattr(sr3000_usb.usb.core, "find", no_library)
     with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*libusb.*libmesasr.*emulated"):
         sr3000()
-
-
-def test_no_camera_is_reported_with_the_ids() -> None:
-    with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*plug.*libmesasr.*emulated"):
-        camera("missing")
 
 
 @pytest.mark.parametrize(("kind", "words"), [("permission", "udev"), ("busy", "another program")])

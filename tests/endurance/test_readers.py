@@ -184,7 +184,10 @@ def test_a_recording_is_read_as_it_was_written(
     K = np.array([[focal * size, 0, width / 2], [0, focal * size, height / 2], [0, 0, 1]])
     times = np.arange(count) / 25
     path: Path = tmp_path_factory.mktemp("written") / "recording.npz"
-    write_recording(path, Recording(depth, radial, Camera(K, width, height), times, 25.0))
+    camera = Camera(K, width, height)
+    write_recording(
+        path, Recording(depth=depth, radial=radial, camera=camera, timestamp_s=times, fps=25.0)
+    )
     read = read_recording(path)
     assert read.radial == radial
     assert (read.camera.K == K).all()

@@ -140,7 +140,16 @@ def _recordings(folder: Path) -> list[Reader]:
     amplitude = np.full(depth.shape, 700, np.uint16)
     npz = _new(folder, "npz") / "recording.npz"
     facts: dict[str, Any] = {"what": "a test"}
-    write_recording(npz, Recording(depth, False, camera, times, 25.0, amplitude, None, facts))
+    recording = Recording(
+        depth=depth,
+        radial=False,
+        camera=camera,
+        timestamp_s=times,
+        fps=25.0,
+        amplitude=amplitude,
+        metadata=facts,
+    )
+    write_recording(npz, recording)
     unfinished = _new(folder, "unfinished") / "recording.npz.part"
     growing = UnfinishedRecording(unfinished)
     growing.begin(Facts(camera, False, True, 25.0, facts))

@@ -14,8 +14,7 @@ from helpers.tracking import ROOT
 from helpers.videos import write_grey
 
 from toftrack.camera import Camera
-from toftrack.devices.folder import Folder
-from toftrack.devices.replay import Replay
+from toftrack.devices.replay import Folder, Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.programs import convert, record

@@ -11,8 +11,7 @@ import pytest
 
 from toftrack.api import make_device, make_hands_tracker
 from toftrack.camera import Camera
-from toftrack.devices.folder import Folder
-from toftrack.devices.replay import Replay
+from toftrack.devices.replay import Folder, Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames import checked_image
 from toftrack.output.advice import Watch

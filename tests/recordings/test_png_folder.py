@@ -1,8 +1,9 @@
-"""The camera of a folder of images: the file that the documentation shows, or the command line."""
+"""A folder of images: its camera, given by a file or on the command line; PNG images of others."""
 
 from __future__ import annotations
 
 import re
+import struct
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,8 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.output.run_folder import read_run
 from toftrack.programs.main import main
+from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.png import decoded_png
 from toftrack.recordings.png_folder import read_png_folder
 
 LENS = "device.intrinsics=[201,202,87,71]"
@@ -85,9 +88,32 @@ def test_lenses_that_are_none_are_reported(given: str, words: str, folder: Path)
 
 
 def test_a_lens_is_reported_once(folder: Path) -> None:
-    read_png_folder(folder, intrinsics=[201, 202, 87, 71]).camera.save(folder / "mine.json")
+    read_png_folder(folder, bare=BareFacts([201, 202, 87, 71])).camera.save(folder / "mine.json")
     words = ["device=folder", f"device.path={folder}", f"camera.file={folder / 'mine.json'}"]
     with make_device(*words) as device:
         np.testing.assert_array_equal(device.camera.K, K)
     with pytest.raises(ToftrackError, match="both tell the lens; leave one out"):
         make_device(*words, LENS)
+
+
+IMAGE = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32)
+CONTENT = cv2.imencode(".png", IMAGE)[1].tobytes()
+
+
+def test_a_whole_image_is_decoded() -> None:
+    assert (decoded_png(CONTENT) == IMAGE).all()
+
+
+@pytest.mark.parametrize("length", [0, 8, 20, len(CONTENT) // 2, len(CONTENT) - 1])
+def test_an_image_that_was_cut_off_is_none(length: int) -> None:
+    assert decoded_png(CONTENT[:length]) is None
+
+
+def test_a_chunk_that_claims_gigabytes_is_not_handed_to_the_decoder(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    at = CONTENT.index(b"IDAT") - 4
+    assert decoded_png(CONTENT[:at] + struct.pack(">I", 2**31 - 1) + CONTENT[at + 4 :]) is None
+    huge = CONTENT[:16] + struct.pack(">II", 50_000, 50_000) + CONTENT[24:]
+    assert decoded_png(huge) is None

@@ -125,34 +125,26 @@ def whole_frames(content: bytes, until: int) -> int:
     return sum(end <= until for end in [*begins[1:], len(content)])
 
 
+@pytest.mark.parametrize("damaged", [False, True])
 @pytest.mark.parametrize("share", [0.3, 0.55, 0.98, 1.0])
-def test_what_was_whole_is_recovered_wherever_it_was_cut_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
+def test_what_was_whole_is_recovered_wherever_it_was_cut_off_or_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, damaged: bool
 ) -> None:
     part = unfinished(tmp_path, monkeypatch)
-    content = part.read_bytes()
-    part.write_bytes(content[: int(share * len(content))])
-    path, count = recover_recording(tmp_path / "hand.npz")
-    assert count == whole_frames(content, int(share * len(content)))
+    content = bytearray(part.read_bytes())
+    at = int(share * len(content)) - damaged
+    expected = whole_frames(content, at)
+    if damaged:
+        content[at] ^= 1
+    part.write_bytes(content if damaged else content[:at])
+    path, count = recover_recording(part if damaged else tmp_path / "hand.npz")
+    assert (path, count) == (tmp_path / "hand.npz", expected)
     recording = read_recording(path)
     assert len(recording) == count >= 1
     for number, frame in zip(range(count), Images(), strict=False):
         assert recording.image(number)[0].tobytes() == frame.depth.tobytes()
         np.testing.assert_array_equal(recording.image(number)[1], frame.amplitude)
     assert not part.exists()
-
-
-def test_a_damaged_frame_ends_what_is_recovered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    part = unfinished(tmp_path, monkeypatch)
-    content = bytearray(part.read_bytes())
-    middle = len(content) // 2
-    count = whole_frames(content, middle)
-    content[middle] ^= 1
-    part.write_bytes(content)
-    assert recover_recording(part) == (tmp_path / "hand.npz", count)
-    assert len(read_recording(tmp_path / "hand.npz")) == count > 1
 
 
 @pytest.mark.parametrize("content", [b"", b"something else", None])
@@ -186,7 +178,8 @@ def test_what_is_there_is_not_replaced_unless_it_is_asked_for(
     path.write_text("mine")
     with pytest.raises(ToftrackError, match="exists already"):
         recorded(path)
-    part = unfinished_beside(path, monkeypatch)
+    (tmp_path / "other").mkdir()
+    part = unfinished(tmp_path / "other", monkeypatch).rename(tmp_path / "hand.npz.part")
     with pytest.raises(ToftrackError, match="exists already"):
         recover_recording(path)
     assert path.read_text() == "mine"
@@ -197,14 +190,6 @@ def test_what_is_there_is_not_replaced_unless_it_is_asked_for(
     path.write_text("mine")
     assert recorded(path, overwrite=True).frames == FRAMES
     assert len(read_recording(path)) == FRAMES
-
-
-def unfinished_beside(path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """As `unfinished`, of a recording that was to replace another one."""
-    other = path.parent / "other"
-    other.mkdir()
-    part = unfinished(other, monkeypatch)
-    return part.rename(path.with_name(part.name))
 
 
 def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:

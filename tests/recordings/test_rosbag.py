@@ -29,8 +29,7 @@ from helpers.bags import (
 from helpers.damage import damaged
 
 from toftrack.camera import Camera
-from toftrack.devices.replay import Replay
-from toftrack.devices.rosbag import Bag
+from toftrack.devices.replay import Bag, Replay
 from toftrack.errors import ToftrackError
 from toftrack.recordings import ros_messages
 from toftrack.recordings.bag_names import is_bag

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -283,13 +284,21 @@ def test_stacks_of_another_kind_are_reported(
         open_recording(tmp_path / "a.npy", bare=REPORTED)
 
 
+def stack_with_header(shape: str) -> bytes:
+    text = f"{{'descr': '<u2', 'fortran_order': False, 'shape': {shape}".encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(4608)
+
+
 def test_damaged_stacks_are_reported(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", words())
     content = (tmp_path / "a.npy").read_bytes()
-    for part in (b"", content[:7], content[:50], content[:-9], b"nonsense" * 30):
+    parts = [b"", content[:7], content[:50], content[:-9], b"nonsense" * 30]
+    shapes = ("(-1, 24, 32)}", "(3, 24, 32, }", "(3, 24, 32)}" + 10_000 * " ", f"({30 * '9'},)}}")
+    for part in (*parts, *map(stack_with_header, shapes)):
         (tmp_path / "a.npy").write_bytes(part)
-        with pytest.raises(ToftrackError, match="a.npy' is no .npy of numbers, or was cut off"):
+        with pytest.raises(ToftrackError, match="a.npy' (is no .npy of numbers|cannot)") as caught:
             open_recording(tmp_path / "a.npy", bare=REPORTED)
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["a.oni", "a.ply", "a.png", "a.xef", "a.h5"])

@@ -135,13 +135,7 @@ def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, gue
 
     Raises ToftrackError: there are too few views, or they do not determine the camera.
     """
-    views, points = list(views), board_points(board, square_m)
-    if len(views) < _FEWEST_VIEWS:
-        raise ToftrackError(
-            f"the {board[0]}x{board[1]} chequerboard was found in {len(views)} frames, but at "
-            f"least {_FEWEST_VIEWS} are needed; check --board (inner corners, columns x rows) and "
-            "show the whole board, near and far, turned in all directions"
-        )
+    views, points = _enough(views, board), board_points(board, square_m)
     # Coefficients of another model (rational, fisheye) mean something else, and are no start.
     known = guess.distortion if guess.distortion.size == 5 else np.zeros(5)
     # More terms than two radial ones are not to be had from so few pixels; they only fit noise.
@@ -177,11 +171,7 @@ def known_lens(
     views: Sequence[View], board: tuple[int, int], square_m: float, camera: Camera
 ) -> Lens:
     """The board's place in each view where the camera is known already; errors as `fit_lens`."""
-    if len(views) < _FEWEST_VIEWS:
-        raise ToftrackError(
-            f"the {board[0]}x{board[1]} chequerboard was found in {len(views)} frames, but at "
-            f"least {_FEWEST_VIEWS} are needed; check --board (inner corners, columns x rows)"
-        )
+    views = _enough(views, board)
     if camera.lens == "fisheye":
         raise ToftrackError(
             "a fisheye lens cannot be kept; leave out --keep-lens, which fits another model to it"
@@ -195,7 +185,17 @@ def known_lens(
         gap = projected.reshape(-1, 2) - view.corners_px
         errors.append(float(np.sqrt((gap**2).sum(1).mean())))
     plain = Camera(camera.K, camera.width, camera.height, camera.distortion)
-    return _lens(plain, list(views), rvecs, tvecs, np.array(errors))
+    return _lens(plain, views, rvecs, tvecs, np.array(errors))
+
+
+def _enough(views: Sequence[View], board: tuple[int, int]) -> list[View]:
+    if len(views) < _FEWEST_VIEWS:
+        raise ToftrackError(
+            f"the {board[0]}x{board[1]} chequerboard was found in {len(views)} frames, but at "
+            f"least {_FEWEST_VIEWS} are needed; check --board (inner corners, columns x rows) and "
+            "show the whole board, near and far, turned in all directions"
+        )
+    return list(views)
 
 
 def true_distances(lens: Lens, number: int, board: tuple[int, int], square_m: float) -> np.ndarray:

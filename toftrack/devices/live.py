@@ -7,7 +7,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
@@ -15,6 +15,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
 
 _log = logging.getLogger(__name__)
+T = TypeVar("T")
 BUSY = (
     "close other programs that use it, plug it in again, into a USB 3 port, and on Linux install "
     "its udev rules"
@@ -75,6 +76,29 @@ def chosen_serial(
             return number
     raise ToftrackError(
         f"there is no {maker} camera of the serial number {serial}; there is {listed}"
+    )
+
+
+Size = tuple[int | None, int | None, int | None]
+"""Width, height and frames a second; None = whatever the camera proposes."""
+
+
+def chosen_profile(offered: Sequence[T], size_of: Callable[[T], Size], size: Size, owner: str) -> T:
+    """The first profile of that size, of those of depth images that a camera offers.
+
+    owner: what errors call the camera.
+
+    Raises ToftrackError where it has no depth images, or none of that size.
+    """
+    if not offered:
+        raise ToftrackError(f"{owner} has no depth images; use a camera with a depth sensor")
+    for profile in offered:
+        if all(w in (None, s) for w, s in zip(size, size_of(profile), strict=True)):
+            return profile
+    listed = ", ".join("{}x{} at {}".format(*s) for s in sorted(set(map(size_of, offered))))
+    raise ToftrackError(
+        f"{owner} has no depth images of device.width={size[0]}, device.height={size[1]}, "
+        f"device.fps={size[2]}; set them to one of {listed} (a USB 2 port or cable leaves few)"
     )
 
 

@@ -1,4 +1,4 @@
-"""A recording played back as if it were a camera."""
+"""Recordings played back as if they were cameras."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from toftrack.frames import Frame
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.doubts import doubts
 from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.png_folder import read_png_folder
+from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import open_recording
 
@@ -70,9 +72,8 @@ class Replay(BaseDevice):
             bare = BareFacts(intrinsics)
             store = open_recording(path, camera_file, modulation_mhz, bare=bare)
         self._recording = store
-        damage = getattr(store, "damage", None)
-        if damage:
-            _log.warning("%s: %s; its %d whole frames are used", path, damage, len(store))
+        if store.damage:
+            _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
         self._range = _checked_range(start, stop, len(self._recording), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         camera = store.camera
@@ -167,6 +168,65 @@ class Replay(BaseDevice):
             amplitude=amplitude,
             radial=recording.radial,
         )
+
+
+class Folder(Replay):
+    """The images of a folder, as `Replay`; what the folder does not state can be given.
+
+    Args:
+        path: the folder; see `toftrack.recordings.png_folder` for what lies in it.
+        unit_m: metres of one step of the images; None = as the folder says, else 0.001.
+        fps: frames a second; None = as the folder says, else 25.
+        intrinsics: fx, fy, cx, cy in pixels, without distortion, instead of the folder's camera.
+        camera_file, start, stop, realtime, repeat: as for `Replay`.
+
+    Raises:
+        ToftrackError: as `Replay`, and when the images are not 16-bit grey PNGs of one size.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        unit_m: float | None = None,
+        fps: float | None = None,
+        camera_file: str | Path | None = None,
+        intrinsics: Sequence[float] | None = None,
+        **playback: Any,
+    ) -> None:
+        if not path:
+            raise ToftrackError("no folder was given; set device.path=FOLDER")
+        store = read_png_folder(path, camera_file, BareFacts(intrinsics, unit_m, fps))
+        playback |= {"camera_file": camera_file, "intrinsics": intrinsics}
+        super().__init__(path, store=store, **playback)
+        self.description |= {"device": "folder", "unit_m": store.unit_m}
+
+
+class Bag(Replay):
+    """The depth images of one topic of a bag, as `Replay`.
+
+    Args:
+        path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.
+        topic: of the depth images; None = the only one there is.
+        unit_m: metres of one step of 16UC1; None = a millimetre, as ROS says.
+        camera_file, start, stop, realtime, repeat: as for `Replay`.
+
+    Raises:
+        ToftrackError: as `Replay`, and as `read_rosbag`.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        topic: str | None = None,
+        unit_m: float | None = None,
+        camera_file: str | Path | None = None,
+        **playback: Any,
+    ) -> None:
+        if not path:
+            raise ToftrackError("no bag was given; set device.path=BAG")
+        store = read_rosbag(path, topic, camera_file, unit_m)
+        super().__init__(path, camera_file=camera_file, store=store, **playback)
+        self.description |= {"device": "rosbag", **store.metadata, "unit_m": store.unit_m}
 
 
 def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -> range:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,8 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.npz import Recording, write_recording
-from toftrack.recordings.png_folder import PngFolder, PngFolderWriter
-from toftrack.recordings.rosbag import RosBag
+from toftrack.recordings.npz import write_recording
+from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     REGISTERS,
@@ -34,7 +32,6 @@ from toftrack.recordings.sr_frame import (
 )
 from toftrack.recordings.srs import SrsFacts, SrsRecording, SrsWriter
 from toftrack.recordings.store import open_recording
-from toftrack.recordings.video import DepthVideo, NpyStack
 
 _MILLIMETRE = 0.001
 
@@ -111,10 +108,11 @@ def convert(
     store = open_recording(source, camera_file, modulation_mhz, topic, bare)
     try:
         if camera_file is not None:
-            store = _with_camera(store, camera_file)
+            size = store.camera.width, store.camera.height
+            store.camera = Camera.load_for(camera_file, *size, "the recording")
         if store.truth is not None and kind != ".npz":
             _warn("the ground truth has no place in the new format and is left out")
-        if damage := getattr(store, "damage", None):
+        if damage := store.damage:
             _warn(f"{source}: {damage}; the frames before are converted")
         with tqdm(total=len(store), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
             if kind == ".npz":
@@ -156,16 +154,6 @@ def _to_folder(store: FrameStore, target: Path, unit_m: float | None, bar: tqdm)
         for index, time_s in enumerate(store.timestamp_s):
             writer.append(*store.image(index), float(time_s))
             bar.update()
-
-
-def _with_camera(store: FrameStore, path: str | Path) -> FrameStore:
-    size = store.camera.width, store.camera.height
-    camera = Camera.load_for(path, *size, "the recording")
-    if isinstance(store, Recording):
-        return replace(store, camera=camera)
-    assert isinstance(store, PngFolder | SrsRecording | RosBag | DepthVideo | NpyStack)
-    store.camera = camera
-    return store
 
 
 def _warn(text: str) -> None:

@@ -1,8 +1,9 @@
-"""What is given of images that do not say it themselves: lens, unit, frame rate."""
+"""Images that say nothing of lens, unit and frame rate: what is given instead; `.npy` stacks."""
 
 from __future__ import annotations
 
 import math
+import tokenize
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,9 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames import LARGEST_MEDIAN_M, median_reading
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore
+from toftrack.safe_files import check_readable
 
 MILLIMETRE = 0.001
 _BESIDE = "camera.json"
@@ -33,7 +37,7 @@ class BareFacts:
     def __post_init__(self) -> None:
         for name in ("unit_m", "fps"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < 1e6:
+            if value is not None and not is_positive(value):
                 raise ToftrackError(f"{name} must be a positive number, but is {value!r}")
         if self.intrinsics is not None and not _four_numbers(self.intrinsics):
             raise ToftrackError(
@@ -47,6 +51,11 @@ class BareFacts:
             return None
         fx, fy, cx, cy = self.intrinsics
         return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), width, height)
+
+
+def is_positive(value: object) -> bool:
+    """Whether it is a number above 0 that may be a unit or a rate."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e6
 
 
 def _four_numbers(values: object) -> bool:
@@ -79,3 +88,78 @@ def bare_camera(
         "device.intrinsics=[FX,FY,CX,CY] (toftrack convert: --intrinsics FX FY CX CY), or a camera "
         "file with camera.file=FILE (toftrack convert: --camera FILE)"
     )
+
+
+class NpyStack(FrameStore):
+    """The frames of a stack, mapped from the disk as long as this object lives."""
+
+    def __init__(self, images: np.ndarray, camera: Camera, bare: BareFacts) -> None:
+        whole = images.dtype.kind in "ui"
+        self.camera, self.metadata = camera, {}
+        self.unit_m = (MILLIMETRE if whole else 1.0) if bare.unit_m is None else bare.unit_m
+        self.fps = DEFAULT_FPS if bare.fps is None else bare.fps
+        self.timestamp_s = np.arange(len(images)) / self.fps
+        self._images = images
+
+    def image(self, index: int) -> tuple[np.ndarray, None]:
+        image = np.asarray(self._images[index])
+        depth = image.astype(np.float32) * np.float32(self.unit_m)
+        return np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)), None
+
+
+def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> NpyStack:
+    """Open a stack.
+
+    path: the `.npy`.
+    camera_file: of the camera; None = the given intrinsics, or camera.json beside the file.
+    bare: intrinsics, unit of whole numbers (a millimetre) and frame rate (25) where given.
+
+    Raises ToftrackError: it is no such stack, holds pickled objects, or nothing tells its camera.
+    """
+    path = Path(path).expanduser()
+    images = _mapped(path)
+    if images.ndim == 2:
+        images = images[None]
+    if images.ndim != 3 or images.size == 0 or images.dtype.kind not in "uif":
+        raise ToftrackError(
+            f"'{path}' has the shape {images.shape} of {images.dtype}, but must be depth images, "
+            "(frames, rows, columns) of numbers"
+        )
+    count, height, width = images.shape
+    stack = NpyStack(images, bare_camera(path, camera_file, bare, width, height), bare)
+    some = [stack.image(i)[0] for i in np.unique(np.linspace(0, count - 1, 8).astype(int))]
+    remedy = "; say what one step is with toftrack convert --source-unit METRES"
+    check_metres(np.stack(some), f"'{path}'", remedy)
+    return stack
+
+
+def check_metres(depth_m: np.ndarray, what: str, remedy: str) -> None:
+    """ToftrackError where depth cannot be in metres."""
+    median = median_reading(depth_m)
+    if median > LARGEST_MEDIAN_M:
+        raise ToftrackError(
+            f"the median of {what} is {median:.0f} m, which is plainly another unit{remedy}"
+        )
+
+
+def _mapped(path: Path) -> np.ndarray:
+    try:
+        check_readable(path)
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        raise ToftrackError(f"there is no file '{path}'; give the path of a recording") from None
+    except OSError as error:
+        raise ToftrackError(f"'{path}' cannot be read ({error.strerror or error})") from error
+    except (
+        ValueError,
+        EOFError,
+        TypeError,
+        SyntaxError,
+        OverflowError,
+        tokenize.TokenError,
+    ) as error:
+        reason = " ".join(str(error).split())
+        raise ToftrackError(
+            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
+            "numpy.save"
+        ) from error

@@ -78,7 +78,7 @@ def _images_doubt(store: FrameStore) -> str:
         return "no pixel has a reading (0 = none); was the depth saved, and not another image?"
     if readings.size > 1 and readings.min() == readings.max():
         return f"every reading is {readings[0]:g} m, which no camera measures; was it saved whole?"
-    return _unit_doubt(some, getattr(store, "unit_m", None))
+    return _unit_doubt(some, store.unit_m)
 
 
 def _first_image(store: FrameStore) -> np.ndarray:

@@ -36,11 +36,10 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Truth, median_reading, wrong_unit
 from toftrack.json_text import parse_json
 from toftrack.recordings.doubts import check_layout, some_images
-from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, rate_of
 from toftrack.recordings.npz_pieces import Images, StreamedImages
 from toftrack.safe_files import open_to_read
 
-DEFAULT_FPS = 25.0
 LOADED_BYTES = MOST_BYTES
 """Longer recordings are not loaded: their images are read in turn."""
 _IMAGES = ("depth_m", "radial_m", "amplitude")
@@ -48,33 +47,26 @@ CAMERA_KEYS = ("K", "distortion", "lens", "depth_polynomial", "depth_polynomial_
 _POLYNOMIAL = CAMERA_KEYS[3:]
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
+@dataclass(eq=False, kw_only=True)
+class Recording(FrameStore):
     """What a camera saw, as it lies in the file: depth keeps the file's type."""
 
     depth: Images
     """(T, H, W) float16 or float32 metres."""
     radial: bool
-    """True: `depth` is the distance along each pixel's ray; False: Z along the optical axis."""
     camera: Camera
     timestamp_s: np.ndarray
-    """(T,) float64, not decreasing."""
     fps: float
     amplitude: Images | None = None
     """(T, H, W) uint16."""
     truth: Truth | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
 
-    def __len__(self) -> int:
-        return len(self.depth)
-
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """A frame's depth, (H, W) float32 metres, a new array, and its amplitude, (H, W) uint16."""
         amplitude = None if self.amplitude is None else self.amplitude[index]
         return self.depth[index].astype(np.float32), amplitude
 
     def close(self) -> None:
-        """Close the file, if it is read in turn."""
         for images in (self.depth, self.amplitude):
             if isinstance(images, StreamedImages):
                 images.close()
@@ -237,12 +229,9 @@ def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
         fps = DEFAULT_FPS if fps is None else fps
         return np.arange(count) / fps, fps
     timestamp_s = of_shape(arrays, "timestamp_s", (count,)).astype(np.float64)
-    steps = np.diff(timestamp_s)
-    if not np.isfinite(timestamp_s).all() or (steps < 0).any():
+    if not np.isfinite(timestamp_s).all() or (np.diff(timestamp_s) < 0).any():
         raise ToftrackError("'timestamp_s' must be finite and must not go backwards")
-    if len(steps) and np.median(steps) > 0:
-        fps = 1.0 / float(np.median(steps))
-    return timestamp_s, DEFAULT_FPS if fps is None else fps
+    return timestamp_s, rate_of(timestamp_s, DEFAULT_FPS if fps is None else fps)
 
 
 def _amplitude(arrays: dict[str, Any], shape: tuple[int, ...]) -> Images | None:
@@ -372,22 +361,16 @@ def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> T
         name = keys["joints_m"]
         raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
 
-    def flags(name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-        key = keys[name]
-        return of_shape(arrays, key, shape).astype(bool) if key in arrays else None
-
-    visible, in_space = flags("visible", (count,)), flags("in_space", (count,))
-    fraction = None
-    if keys["visible_fraction"] in arrays:
-        fraction = of_shape(arrays, keys["visible_fraction"], (count,)).astype(np.float32)
-    return Truth(
-        joints_m=joints,
-        visible=np.ones(count, bool) if visible is None else visible,
-        in_space=np.ones(count, bool) if in_space is None else in_space,
-        visible_fraction=fraction,
-        joint_visible=flags("joint_visible", (count, _JOINTS)),
-        pose_name=_names(arrays, keys["pose_name"], count),
-    )
+    found: dict[str, Any] = {"visible": np.ones(count, bool), "in_space": np.ones(count, bool)}
+    for name, kind, shape in (
+        ("visible", bool, (count,)),
+        ("in_space", bool, (count,)),
+        ("visible_fraction", np.float32, (count,)),
+        ("joint_visible", bool, (count, _JOINTS)),
+    ):
+        if keys[name] in arrays:
+            found[name] = of_shape(arrays, keys[name], shape).astype(kind)
+    return Truth(joints, pose_name=_names(arrays, keys["pose_name"], count), **found)
 
 
 def _names(arrays: dict[str, Any], key: str, count: int) -> np.ndarray | None:

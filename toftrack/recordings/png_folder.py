@@ -16,9 +16,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,18 +26,21 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import read_json
-from toftrack.recordings.bare import BareFacts
-from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, BareFacts, is_positive
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore
 from toftrack.recordings.png import read_png
 from toftrack.safe_files import open_new, open_to_read, write_whole
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
 
 
-class PngFolder:
-    """The frames of a folder, read from the disk one at a time."""
+class PngFolder(FrameStore):
+    """The frames of a folder, read from the disk one at a time.
 
-    truth = None
+    Raises ToftrackError where `stated`, the content of the folder's `camera.json`, makes no sense.
+    """
+
+    unit_m: float
 
     def __init__(
         self,
@@ -47,29 +48,34 @@ class PngFolder:
         depth: list[Path],
         amplitude: list[Path],
         camera: Camera,
-        facts: _Facts,
-        timestamp_s: np.ndarray | None,
+        stated: dict[str, Any],
+        bare: BareFacts,
     ) -> None:
-        self.path = folder
         self.camera = camera
-        self.radial = facts.radial
-        self.unit_m = facts.unit_m
-        self.fps = facts.fps
-        self.metadata = facts.metadata
-        self.timestamp_s = np.arange(len(depth)) / self.fps if timestamp_s is None else timestamp_s
-        """(T,) float64 seconds, not decreasing."""
         self._depth, self._amplitude = depth, amplitude
+        path = folder / _CAMERA
 
-    def __len__(self) -> int:
-        return len(self._depth)
+        def positive(name: str, given: float | None, default: float) -> float:
+            value = stated.get(name, default) if given is None else given
+            if not is_positive(value):
+                raise ToftrackError(
+                    f"{name} must be a positive number, but is {value!r} ('{path}')"
+                )
+            return float(value)
+
+        self.radial, self.metadata = stated.get("radial", False), stated.get("metadata", {})
+        if not isinstance(self.radial, bool) or not isinstance(self.metadata, dict):
+            raise ToftrackError(
+                f"in '{path}', radial must be true or false, and metadata an object"
+            )
+        self.unit_m = positive("depth_unit_m", bare.unit_m, MILLIMETRE)
+        self.fps = positive("fps", bare.fps, DEFAULT_FPS)
+        times_s = _timestamps(folder / _TIMES, len(depth))
+        self.timestamp_s = np.arange(len(depth)) / self.fps if times_s is None else times_s
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """A frame's depth, (H, W) float32 metres, and amplitude, (H, W) uint16; new arrays."""
         depth = self._read(self._depth[index]).astype(np.float32) * np.float32(self.unit_m)
         return depth, self._read(self._amplitude[index]) if self._amplitude else None
-
-    def close(self) -> None:
-        """Nothing to close: every image is opened for itself."""
 
     def _read(self, path: Path) -> np.ndarray:
         return read_png(path, np.uint16, (self.camera.height, self.camera.width))
@@ -78,17 +84,13 @@ class PngFolder:
 def read_png_folder(
     folder: str | Path,
     camera_file: str | Path | None = None,
-    unit_m: float | None = None,
-    fps: float | None = None,
-    intrinsics: Sequence[float] | None = None,
+    bare: BareFacts = NOTHING_GIVEN,
 ) -> PngFolder:
     """Open a folder of depth images: the first one is checked, the others stay on the disk.
 
     folder: its path.
     camera_file: a camera file instead of the folder's `camera.json`.
-    unit_m: metres of one step of the images; None = as `camera.json` says, else 0.001.
-    fps: frames a second; None = as `camera.json` says, else 25.
-    intrinsics: fx, fy, cx, cy in pixels instead of the camera of `camera.json`.
+    bare: what is given goes before what `camera.json` says; the unit is else 0.001, fps 25.
 
     Raises ToftrackError: there is no folder, image or camera, or the first image is not a 16-bit
     grey PNG, or of another size than the camera's; later, another one.
@@ -109,10 +111,9 @@ def read_png_folder(
         )
     height, width = read_png(depth[0], np.uint16).shape
     content = _camera_content(folder / _CAMERA)
-    facts = _facts(folder / _CAMERA, content, unit_m, fps)
     if camera_file is not None:
         camera = Camera.load(camera_file)
-    elif configured := BareFacts(intrinsics).camera(width, height):
+    elif configured := bare.camera(width, height):
         camera = configured
     elif content is not None:
         camera = Camera.from_dict(content, folder / _CAMERA)
@@ -127,8 +128,7 @@ def read_png_folder(
             f"the image '{depth[0]}' has {width}x{height} pixels, but the camera has "
             f"{camera.width}x{camera.height}; give the camera of these images"
         )
-    times = _timestamps(folder / _TIMES, len(depth))
-    return PngFolder(folder, depth, amplitude, camera, facts, times)
+    return PngFolder(folder, depth, amplitude, camera, content or {}, bare)
 
 
 class PngFolderWriter:
@@ -200,14 +200,6 @@ class PngFolderWriter:
         return reported_errors(what, "choose another place")
 
 
-@dataclass(frozen=True)
-class _Facts:
-    unit_m: float
-    radial: bool
-    fps: float
-    metadata: dict[str, Any]
-
-
 def _camera_content(path: Path) -> dict[str, Any] | None:
     try:
         content = read_json(path)
@@ -222,24 +214,6 @@ def _camera_content(path: Path) -> dict[str, Any] | None:
     if not isinstance(content, dict):
         raise ToftrackError(f"'{path}' is not a camera file")
     return content
-
-
-def _facts(
-    path: Path, content: dict[str, Any] | None, unit_m: float | None, fps: float | None
-) -> _Facts:
-    stated = content or {}
-
-    def positive(name: str, given: float | None, default: float) -> float:
-        value = given if given is not None else stated.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e6:
-            raise ToftrackError(f"{name} must be a positive number, but is {value!r} ('{path}')")
-        return float(value)
-
-    radial, metadata = stated.get("radial", False), stated.get("metadata", {})
-    if not isinstance(radial, bool) or not isinstance(metadata, dict):
-        raise ToftrackError(f"in '{path}', radial must be true or false, and metadata an object")
-    unit = positive("depth_unit_m", unit_m, 0.001)
-    return _Facts(unit, radial, positive("fps", fps, DEFAULT_FPS), metadata)
 
 
 def _timestamps(path: Path, count: int) -> np.ndarray | None:

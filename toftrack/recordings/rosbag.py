@@ -19,10 +19,9 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import LARGEST_MEDIAN_M
 from toftrack.recordings.bag_names import storage_of
-from toftrack.recordings.bare import MILLIMETRE, BareFacts
-from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.recordings.bare import MILLIMETRE, BareFacts, check_metres
+from toftrack.recordings.frame_store import FrameStore, rate_of
 from toftrack.recordings.ros_messages import (
     CAMERA_INFO,
     COMPRESSED,
@@ -40,40 +39,30 @@ _REPAIR = {
     ".db3": "record or copy it again",
     "": "ros2 bag reindex FOLDER repairs one that was cut off",
 }
+_OTHER_UNIT = (
+    ": 32FC1 must be metres, and of 16UC1 one step is told by device=rosbag device.unit_m="
+)
 _OF_CAMERAS = {"/device_0/sensor_": "realsense", "/cam/sensor_": "orbbec"}
 """How topics begin in the bags that cameras' own programs write, and the devices that play them."""
 
 
-class RosBag:
+class RosBag(FrameStore):
     """The depth images of one topic, from the disk one at a time. Made by `read_rosbag`."""
 
-    truth = None
-    radial = False
+    unit_m: float
 
     def __init__(
         self, bag: _Bag, topic: _Topic, camera: Camera, times: _Times, unit_m: float
     ) -> None:
         self.path, self.camera, self.unit_m = bag.path, camera, unit_m
         self.timestamp_s = times.seconds
-        """(T,) float64, not decreasing: when the images were taken, by their own stamps, or when
-        they were recorded, where those make no sense."""
-        self.damage = times.damage
-        steps = np.diff(self.timestamp_s)
-        median = float(np.median(steps)) if len(steps) else 0.0
-        self.fps = 1 / median if median > 0 else DEFAULT_FPS
-        self.metadata: dict[str, Any] = {"topic": topic.name, "encoding": topic.encoding}
+        self.fps, self.damage = rate_of(times.seconds), times.damage
+        self.metadata = {"topic": topic.name, "encoding": topic.encoding}
         self._bag, self._topic, self._recorded_ns = bag, topic, times.recorded_ns
         self._messages: Iterator[tuple[int, Any]] | None = None
         self._next = 0
 
-    def __len__(self) -> int:
-        return len(self.timestamp_s)
-
     def image(self, index: int) -> tuple[np.ndarray, None]:
-        """A frame's depth, (H, W) float32 metres, 0 = no reading; bags have no amplitude here.
-
-        Raises ToftrackError when it is damaged or of another size than its camera.
-        """
         if self._messages is None or index != self._next:
             self._go_to(index)
         assert self._messages is not None
@@ -91,7 +80,6 @@ class RosBag:
         return depth, None
 
     def close(self) -> None:
-        """Close the file; it opens again by itself."""
         self._messages = None
         self._bag.close()
 
@@ -131,7 +119,8 @@ def read_rosbag(
         chosen = _choose(bag, topic)
         camera = _camera(bag, chosen) if camera_file is None else Camera.load(camera_file)
         first = _image(path, chosen, chosen.first, unit_m, 0)
-        _check_metres(path, chosen, first)
+        what = f"the first image of {chosen.name} in '{path}'"
+        check_metres(first, what, _OTHER_UNIT)
         return RosBag(bag, chosen, camera, _times(bag, chosen), unit_m)
     finally:
         bag.close()
@@ -302,21 +291,11 @@ def _image(path: Path, topic: _Topic, message: Any, unit_m: float, index: int) -
         ) from None
 
 
-def _check_metres(path: Path, topic: _Topic, depth: np.ndarray) -> None:
-    readings = depth[depth > 0]
-    median = float(np.median(readings)) if readings.size else 0.0
-    if median > LARGEST_MEDIAN_M:
-        raise ToftrackError(
-            f"the median of the first image of {topic.name} in '{path}' is {median:.0f} m, which "
-            "is plainly another unit: 32FC1 must be metres, and of 16UC1 one step is told by "
-            "device=rosbag device.unit_m="
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class _Times:
     seconds: np.ndarray
-    """(T,) float64."""
+    """(T,) float64: when the images were taken, by their own stamps, or when they were recorded,
+    where those make no sense."""
     recorded_ns: np.ndarray
     """(T,) int64, not decreasing: by it the messages are found."""
     damage: str | None

@@ -30,7 +30,7 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import parse_json
-from toftrack.recordings.npz import DEFAULT_FPS
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, rate_of
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     FRAME_BYTES,
@@ -41,7 +41,8 @@ from toftrack.recordings.sr_frame import (
     nominal_camera,
     unambiguous_range_m,
 )
-from toftrack.safe_files import open_new, open_to_read
+from toftrack.recordings.unfinished import GrowingFile
+from toftrack.safe_files import open_to_read
 
 _SIGNATURE, _VERSION = 0x4F497273, 1
 _INIT, _CONFIGURE, _FRAME = 1, 2, 3
@@ -90,22 +91,18 @@ def parse_facts(path: Path, text: bytes) -> SrsFacts:
 
     Raises ToftrackError: what the recorder stated must not be replaced by a guess in silence.
     """
-    damaged = ToftrackError(f"the TOFT object of the recording '{path}' is damaged")
     try:
         content = parse_json(text)
         range_m, fps = content["range_m"], float(content["fps"])
         range_m = None if range_m is None else float(range_m)
         camera, metadata = content["camera"], content["metadata"]
+        sensible = all(0 < number < np.inf for number in (fps, 1.0 if range_m is None else range_m))
+        camera = None if camera is None else Camera.from_dict(camera, path)
+        size = (WIDTH, HEIGHT) if camera is None else (camera.width, camera.height)
+        if not sensible or not isinstance(metadata, dict) or size != (WIDTH, HEIGHT):
+            raise ValueError
     except (ValueError, TypeError, KeyError):
-        raise damaged from None
-    for number in (fps, 1.0 if range_m is None else range_m):
-        if not (np.isfinite(number) and number > 0):
-            raise damaged
-    if not isinstance(metadata, dict):
-        raise damaged
-    camera = None if camera is None else Camera.from_dict(camera, path)
-    if camera is not None and (camera.width, camera.height) != (WIDTH, HEIGHT):
-        raise damaged
+        raise ToftrackError(f"the TOFT object of the recording '{path}' is damaged") from None
     return SrsFacts(range_m, camera, fps, metadata)
 
 
@@ -137,7 +134,7 @@ class SrsWriter:
         """Whole frames written."""
         init, facts = init or SrsInit(), facts or SrsFacts()
         try:
-            self._stream = open_new(self.path, replace=overwrite, buffered=False)
+            self._file = GrowingFile(self.path, overwrite)
         except FileExistsError:
             raise ToftrackError(
                 f"the file '{self.path}' exists already; choose another name or give --overwrite"
@@ -147,7 +144,6 @@ class SrsWriter:
                 f"the recording '{self.path}' cannot be written ({error.strerror}); choose another "
                 "place"
             ) from error
-        self._end = 0
         try:
             numbers = (init.product_id, init.interface_type, init.serial_number)
             self._write(
@@ -157,13 +153,13 @@ class SrsWriter:
             )
             self.configure(registers)
         except BaseException:
-            self._stream.close()
+            self.close()
             raise
 
     @property
     def size_bytes(self) -> int:
         """Of the file."""
-        return self._end
+        return self._file.bytes
 
     def configure(self, registers: bytes) -> None:
         """The 64 registers under which the frames that follow are taken."""
@@ -183,7 +179,7 @@ class SrsWriter:
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
-        self._stream.close()
+        self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -192,34 +188,18 @@ class SrsWriter:
         self.close()
 
     def _write(self, content: bytes) -> None:
-        rest = memoryview(content)
-        try:
-            while rest:
-                written = self._stream.write(rest)
-                rest = rest[written:]
-        except OSError as error:
-            self._cut_off()
-            raise ToftrackError(
-                f"the recording '{self.path}' cannot be written any further ({error.strerror}); "
-                f"free some space; its {self.frames} whole frames are kept"
-            ) from error
-        self._end += len(content)
-
-    def _cut_off(self) -> None:
-        try:
-            self._stream.truncate(self._end)
-        except OSError:  # a device or pipe; the reader copes with a partial object at the end
-            return
+        what = f"the recording '{self.path}' cannot be written any further"
+        with reported_errors(what, f"free some space; its {self.frames} whole frames are kept"):
+            self._file.write(content)
 
 
-class SrsRecording:
+class SrsRecording(FrameStore):
     """The frames of a `.srs` file, read from the disk one at a time.
 
     `image` opens the file when it is first needed and `close` closes it.
     """
 
     radial = True
-    truth = None
 
     def __init__(
         self, path: Path, offsets: np.ndarray, timestamp_s: np.ndarray, scan: _Scan, range_m: float
@@ -229,21 +209,14 @@ class SrsRecording:
         self.camera = facts.camera or nominal_camera()
         self.range_m = range_m
         self.timestamp_s = timestamp_s
-        """(T,) float64 seconds, not decreasing."""
-        steps = np.diff(timestamp_s)
-        median = float(np.median(steps)) if len(steps) else 0.0
-        self.fps = 1.0 / median if median > 0 else facts.fps
+        self.fps = rate_of(timestamp_s, facts.fps)
         self.metadata = facts.metadata
         self.init = scan.init or SrsInit()
         self.registers = scan.registers
         """The first Configure object's 64 bytes."""
         self.damage = scan.damage
-        """Why the file ends earlier than it should, in words; None when it is whole."""
         self._offsets = offsets
         self._stream: BinaryIO | None = None
-
-    def __len__(self) -> int:
-        return len(self._offsets)
 
     def raw(self, index: int) -> bytes:
         """A frame as the camera sent it, FRAME_BYTES bytes. Raises ToftrackError if unreadable."""
@@ -257,11 +230,9 @@ class SrsRecording:
         return data
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """A frame's radial distance, (144, 176) float32 m, and amplitude, uint16; new arrays."""
         return decode_frame(self.raw(index), self.range_m)
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None

@@ -9,14 +9,14 @@ from pathlib import Path
 
 from toftrack.errors import ToftrackError
 from toftrack.recordings.bag_names import is_bag
-from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
+from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts, read_npy
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.png_folder import read_png_folder
 from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.srs import read_srs
-from toftrack.recordings.video import VIDEOS, read_npy, read_video
+from toftrack.recordings.video import VIDEOS, read_video
 
 _BY_OPENNI = (
     "write its depth out as 16-bit PNG images by OpenNI, put a camera.json beside them "
@@ -69,7 +69,7 @@ def open_recording(
     if topic is not None:
         raise ToftrackError(f"'{path}' is no ROS bag, and has no topic {topic}; leave it out")
     if path.is_dir():
-        return read_png_folder(path, camera_file, bare.unit_m, bare.fps, bare.intrinsics)
+        return read_png_folder(path, camera_file, bare)
     if suffix == ".srs":
         return read_srs(path, modulation_mhz)
     if suffix == ".npy":

@@ -74,12 +74,43 @@ class _Kept:
     index: int
     timestamp_s: float
     at: int
-    sizes: tuple[int, int]
-    sums: tuple[int, int]
+    sizes: Sequence[int]
+    sums: Sequence[int]
 
 
-class UnfinishedRecording:
-    """A file that grows by frames; each is the operating system's before `append` returns.
+class GrowingFile:
+    """A new file that grows by whole records; each is the operating system's when `write` returns.
+
+    Raises OSError: something stands there, or it cannot be made.
+    """
+
+    def __init__(self, path: Path, replace: bool) -> None:
+        self.bytes = 0
+        """What its whole records take."""
+        # Without a buffer of Python's: what is written outlives the process.
+        self.stream = open_new(path, replace, buffered=False)
+
+    def write(self, *parts: bytes) -> None:
+        """Write a record. Raises OSError; the file then ends with the record before."""
+        try:
+            for part in parts:
+                rest = memoryview(part)
+                while rest:  # a disk that is nearly full takes a part
+                    rest = rest[self.stream.write(rest) :]
+        except OSError:
+            with suppress(OSError):  # whoever reads it copes with a record that is cut off
+                self.stream.truncate(self.bytes)
+                self.stream.seek(self.bytes)
+            raise
+        self.bytes += sum(map(len, parts))
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        self.stream.close()
+
+
+class UnfinishedRecording(GrowingFile):
+    """A file that grows by frames.
 
     path: of the new file.
     replace: let a file that stands there go.
@@ -92,14 +123,10 @@ class UnfinishedRecording:
     def __init__(self, path: Path, replace: bool = False) -> None:
         if replace and path.exists():
             _locked(path).close()
-        self.path, self.frames, self.bytes = path, 0, 0
-        """The last two: whole frames, and what they take."""
+        self.path, self.frames = path, 0
         self._sums = [0, 0]
-        # Without a buffer of Python's: what is written outlives the process.
-        buffered = open_new(path, replace)
-        assert isinstance(buffered, io.BufferedRandom)
-        self._stream = buffered.detach()
-        _lock(self._stream, path)
+        super().__init__(path, replace)
+        _lock(self.stream, path)
 
     def begin(self, facts: Facts) -> None:
         """Write what holds for all frames."""
@@ -112,7 +139,7 @@ class UnfinishedRecording:
                 "metadata": facts.metadata,
             }
         ).encode()
-        self._write((_FIRST_LINE, _BLOCK.pack(len(content), zlib.crc32(content)), content))
+        self.write(_FIRST_LINE, _BLOCK.pack(len(content), zlib.crc32(content)), content)
 
     def append(self, index: int, timestamp_s: float, images: Sequence[bytes]) -> None:
         """Write a frame.  images: of each kind, the raw bytes and the `compressed` ones in turn."""
@@ -125,29 +152,12 @@ class UnfinishedRecording:
         check = 0
         for part in (head, *pieces):
             check = zlib.crc32(part, check)
-        self._write((head, *pieces, _CHECK.pack(check)))
+        self.write(head, *pieces, _CHECK.pack(check))
         self._sums, self.frames = sums, self.frames + 1
 
     def has_space(self, spare_bytes: int) -> bool:
         """Whether the disk would take the `.npz`, too, and leave so much to others."""
         return shutil.disk_usage(self.path.parent).free > self.bytes + spare_bytes
-
-    def close(self) -> None:
-        """Close the file; a second call does nothing."""
-        self._stream.close()
-
-    def _write(self, parts: Sequence[bytes]) -> None:
-        try:
-            for part in parts:
-                rest = memoryview(part)
-                while rest:  # a disk that is nearly full takes a part
-                    rest = rest[self._stream.write(rest) :]
-        except OSError:
-            with suppress(OSError):  # a record that is cut off is told by its checksum
-                self._stream.truncate(self.bytes)
-                self._stream.seek(self.bytes)
-            raise
-        self.bytes += sum(map(len, parts))
 
 
 def finish(part: Path, path: Path, overwrite: bool = False) -> int:
@@ -226,13 +236,17 @@ def _pieces(source: BinaryIO, frames: Sequence[_Kept], kind: int) -> Iterator[by
     """Of all frames, the pieces of one kind of image."""
     for frame in frames:
         source.seek(frame.at + sum(frame.sizes[:kind]))
-        left = frame.sizes[kind]
-        while left:
-            piece = source.read(min(left, _PIECE_BYTES))
-            if not piece:
-                raise OSError("it became shorter while it was read")
-            left -= len(piece)
-            yield piece
+        yield from _in_pieces(source, frame.sizes[kind])
+
+
+def _in_pieces(source: BinaryIO, size: int) -> Iterator[bytes]:
+    """So many bytes from where a file stands."""
+    while size:
+        piece = source.read(min(size, _PIECE_BYTES))
+        if not piece:
+            raise OSError("it became shorter while it was read")
+        size -= len(piece)
+        yield piece
 
 
 def _read(stream: BinaryIO, path: Path) -> tuple[Facts, list[_Kept]]:
@@ -247,47 +261,40 @@ def _read(stream: BinaryIO, path: Path) -> tuple[Facts, list[_Kept]]:
 
 
 def _read_facts(stream: BinaryIO, path: Path) -> Facts:
-    damaged = ToftrackError(f"'{path}' ends before its first frame, or its beginning is damaged")
-    block = stream.read(_BLOCK.size)
-    if len(block) < _BLOCK.size:
-        raise damaged
-    length, check = _BLOCK.unpack(block)
-    text = stream.read(length) if length <= _LARGEST_FACTS else b""
-    if len(text) < length or zlib.crc32(text) != check:
-        raise damaged
     try:
+        length, check = _BLOCK.unpack(stream.read(_BLOCK.size))
+        text = stream.read(min(length, _LARGEST_FACTS))
+        if len(text) < length or zlib.crc32(text) != check:
+            raise ValueError
         content = parse_json(text)
-        camera = Camera.from_dict(content["camera"], path)
-        radial, amplitude = bool(content["radial"]), bool(content["amplitude"])
-        fps, metadata = float(content["fps"]), content["metadata"]
-    except (KeyError, TypeError, ValueError):
-        raise damaged from None
-    if not isinstance(metadata, dict):
-        raise damaged
-    return Facts(camera, radial, amplitude, fps, metadata)
+        if not isinstance(content["metadata"], dict):
+            raise TypeError
+        return Facts(
+            camera=Camera.from_dict(content["camera"], path),
+            radial=bool(content["radial"]),
+            amplitude=bool(content["amplitude"]),
+            fps=float(content["fps"]),
+            metadata=content["metadata"],
+        )
+    except (KeyError, TypeError, ValueError, struct.error):
+        raise ToftrackError(
+            f"'{path}' ends before its first frame, or its beginning is damaged"
+        ) from None
 
 
 def _records(stream: BinaryIO) -> Iterator[_Kept]:
-    at = stream.tell()
-    end = stream.seek(0, os.SEEK_END)
-    stream.seek(at)
+    end = os.fstat(stream.fileno()).st_size
     while len(head := stream.read(_RECORD.size)) == _RECORD.size:
-        mark, index, timestamp_s, *rest = _RECORD.unpack(head)
-        length = rest[0] + rest[1]
-        at += _RECORD.size
-        if mark != _MARK or at + length + _CHECK.size > end:
+        mark, index, timestamp_s, *sizes_and_sums = _RECORD.unpack(head)
+        sizes, sums = sizes_and_sums[:2], sizes_and_sums[2:]
+        at, check = stream.tell(), zlib.crc32(head)
+        if mark != _MARK or at + sum(sizes) + _CHECK.size > end:
             return
-        check = zlib.crc32(head)
-        left = length
-        while left:
-            piece = stream.read(min(left, _PIECE_BYTES))
-            if not piece:
-                return
-            check, left = zlib.crc32(piece, check), left - len(piece)
+        for piece in _in_pieces(stream, sum(sizes)):
+            check = zlib.crc32(piece, check)
         if stream.read(_CHECK.size) != _CHECK.pack(check):
             return
-        yield _Kept(index, timestamp_s, at, (rest[0], rest[1]), (rest[2], rest[3]))
-        at += length + _CHECK.size
+        yield _Kept(index, timestamp_s, at, sizes, sums)
 
 
 def _locked(path: Path) -> BinaryIO:

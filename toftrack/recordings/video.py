@@ -1,4 +1,4 @@
-"""Depth as other programs write it: an Azure Kinect's recordings, lossless grey videos, and `.npy`.
+"""Depth in videos: an Azure Kinect's recordings, and lossless grey ones of 16 bits.
 
 k4arecorder, and the Orbbec Femto's recorder, write Matroska (Microsoft's "Azure Kinect file
 format"): tracks titled COLOR, DEPTH and IR, depth and infrared as big-endian 16-bit words, depth in
@@ -12,8 +12,7 @@ come from the disk one at a time.
 
 from __future__ import annotations
 
-import tokenize
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +21,9 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import LARGEST_MEDIAN_M
 from toftrack.json_text import parse_json
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera
-from toftrack.recordings.npz import DEFAULT_FPS
-from toftrack.safe_files import check_readable
+from toftrack.recordings.frame_store import FrameStore, rate_of
 
 VIDEOS = frozenset(".mkv .avi .mov .mp4 .m4v .webm .mpg .mpeg .wmv .nut".split())
 """How the names of videos end."""
@@ -34,40 +31,27 @@ _GREY = ("gray16le", "gray16be")
 _MISSING_FRAMES = 5  # fewer at the end say nothing of a file that was cut off
 
 
-class DepthVideo:
+class DepthVideo(FrameStore):
     """The frames of a video. Made by `read_video`."""
-
-    truth = None
-    radial = False
 
     def __init__(
         self,
-        path: Path,
         camera: Camera,
-        depth: Track,
-        amplitude: Track | None,
-        unit_m: float,
-        fps: float | None,
+        bare: BareFacts,
+        kinect: Kinect | None,
+        tracks: Sequence[Track],
         damage: str | None,
-        metadata: dict[str, Any],
     ) -> None:
-        self.path, self.camera, self.unit_m = path, camera, unit_m
-        self.damage, self.metadata = damage, metadata
-        steps = np.diff(depth.times_s)
-        median = float(np.median(steps)) if len(steps) else 0.0
-        self.fps = fps or (1 / median if median > 0 else DEFAULT_FPS)
-        self.timestamp_s = np.arange(len(steps) + 1) / fps if fps else depth.times_s
-        """(T,) float64 seconds, not decreasing."""
-        self._depth, self._amplitude = depth, amplitude
-
-    def __len__(self) -> int:
-        return len(self.timestamp_s)
+        self._depth, self._amplitude = tracks[0], tracks[1] if len(tracks) > 1 else None
+        times_s = self._depth.times_s + (0.0 if kinect is None else kinect.offset_s)
+        self.camera, self.damage = camera, damage
+        self.metadata = {} if kinect is None else kinect.facts
+        self.unit_m = MILLIMETRE if bare.unit_m is None else bare.unit_m
+        self.fps = bare.fps or rate_of(times_s)
+        self.timestamp_s = np.arange(len(times_s)) / bare.fps if bare.fps else times_s
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """A frame's depth, (H, W) float32 metres, and amplitude, (H, W) uint16; new arrays.
-
-        An infrared image that is missing is black. Raises ToftrackError when one is damaged.
-        """
+        """As of every store; an infrared image that is missing is black."""
         depth = self._depth.image(index).astype(np.float32) * np.float32(self.unit_m)
         if self._amplitude is None:
             return depth, None
@@ -77,7 +61,6 @@ class DepthVideo:
         return depth, self._amplitude.image(found)
 
     def close(self) -> None:
-        """Close the file; it opens again by itself."""
         self._depth.close()
         if self._amplitude is not None:
             self._amplitude.close()
@@ -150,7 +133,7 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
         raise ToftrackError(f"there is no file '{path}'; give the path of a recording")
     container = opened(path)
     try:
-        own = tracks_of(container, path)
+        own = kinect_of(container, path)
         number = _grey_stream(container, path, None if own is None else own.depth)
         shape = container.streams[number].width, container.streams[number].height
         if camera_file is not None or own is None:
@@ -159,19 +142,9 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
             camera = camera_of(container, path, *shape)
         infrared = [] if own is None else own.infrared
         grey = [index for index in infrared if _kind(container.streams[index])[1] in _GREY]
-        found = _scanned(container, path, [number, *grey])
+        return DepthVideo(camera, bare, own, *_scanned(container, path, [number, *grey]))
     finally:
         container.close()
-    depth, *others = (
-        Track(path, stream, ticks, found.tick_s[stream]) for stream, ticks in found.ticks.items()
-    )
-    unit_m = MILLIMETRE if bare.unit_m is None else bare.unit_m
-    about = {} if own is None else own.facts
-    if own is not None:
-        depth.times_s += own.offset_s
-    return DepthVideo(
-        path, camera, depth, others[0] if others else None, unit_m, bare.fps, found.damage, about
-    )
 
 
 def opened(path: Path) -> Any:
@@ -205,16 +178,11 @@ def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    ticks: dict[int, np.ndarray]
-    """By stream, the images' times, (T,) int64, rising."""
-    tick_s: dict[int, float]
-    damage: str | None
+def _scanned(container: Any, path: Path, streams: Sequence[int]) -> tuple[list[Track], str | None]:
+    """Some tracks with the times of their images, and what ended the file before its end.
 
-
-def _scanned(container: Any, path: Path, streams: list[int]) -> _Found:
-    """The times of all images of some tracks; ToftrackError when the first one has none."""
+    Raises ToftrackError when the first track has no image.
+    """
     import av
 
     ticks: dict[int, list[int]] = {number: [] for number in streams}
@@ -231,14 +199,16 @@ def _scanned(container: Any, path: Path, streams: list[int]) -> _Found:
         damage = f"it is damaged further on ({_reason(error)})"
     if not ticks[streams[0]]:
         raise ToftrackError(f"'{path}' has no frame of depth ({damage or 'it is empty'})")
-    tick_s = {number: float(container.streams[number].time_base) for number in streams}
-    times = {number: np.unique(np.array(values, np.int64)) for number, values in ticks.items()}
-    first = times[streams[0]]
-    missing_s = (container.duration or 0) / 1e6 - first[-1] * tick_s[streams[0]]
-    step_s = (first[-1] - first[0]) / max(1, len(first) - 1) * tick_s[streams[0]]
-    if damage is None and len(first) > 1 and missing_s > _MISSING_FRAMES * step_s:
+    tracks = [
+        Track(path, number, np.unique(values), float(container.streams[number].time_base))
+        for number, values in ticks.items()
+    ]
+    times_s = tracks[0].times_s
+    missing_s = (container.duration or 0) / 1e6 - times_s[-1]
+    step_s = (times_s[-1] - times_s[0]) / max(1, len(times_s) - 1)
+    if damage is None and len(times_s) > 1 and missing_s > _MISSING_FRAMES * step_s:
         damage = f"it ends {missing_s:.1f} s before the end that it states"
-    return _Found(times, tick_s, damage)
+    return tracks, damage
 
 
 def _kind(stream: Any) -> tuple[str, str | None]:
@@ -273,8 +243,8 @@ _ADVICE = "give a calibrated camera with camera.file=FILE"
 
 
 @dataclass(frozen=True)
-class Tracks:
-    """The tracks of a recording, by their numbers."""
+class Kinect:
+    """What a recording of an Azure Kinect says of itself: its tracks, by their numbers, ..."""
 
     depth: int
     infrared: list[int]
@@ -285,8 +255,8 @@ class Tracks:
     """JSON-able, for the recording's metadata."""
 
 
-def tracks_of(container: Any, path: Path) -> Tracks | None:
-    """The tracks of an Azure Kinect's recording; None for every other video.
+def kinect_of(container: Any, path: Path) -> Kinect | None:
+    """What an Azure Kinect's recording says of itself; None for every other video.
 
     Raises ToftrackError when it was recorded without depth.
     """
@@ -302,7 +272,7 @@ def tracks_of(container: Any, path: Path) -> Tracks | None:
     tags = {**depth.metadata, **container.metadata}
     names = {"camera": "title", "serial": "K4A_DEVICE_SERIAL_NUMBER", "mode": "K4A_DEPTH_MODE"}
     offset = tags.get("K4A_START_OFFSET_NS", "")
-    return Tracks(
+    return Kinect(
         depth=named["DEPTH"],
         infrared=[] if named["IR"] is None else [named["IR"]],
         offset_s=int(offset) / 1e9 if offset.isdecimal() else 0.0,
@@ -362,94 +332,3 @@ def _attachment(container: Any) -> str | None:
             # As the camera stores it, the text ends with zeros.
             return bytes(stream.data).rstrip(b"\0").decode("utf-8", "replace")
     return None
-
-
-class NpyStack:
-    """The frames of a stack, mapped from the disk."""
-
-    truth = None
-    radial = False
-
-    def __init__(
-        self, path: Path, images: np.ndarray, camera: Camera, unit_m: float, fps: float
-    ) -> None:
-        self.path, self.camera, self.unit_m, self.fps = path, camera, unit_m, fps
-        self.metadata: dict[str, Any] = {}
-        self.timestamp_s = np.arange(len(images)) / fps
-        """(T,) float64 seconds."""
-        self._images = images
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def image(self, index: int) -> tuple[np.ndarray, None]:
-        """A frame's depth, (H, W) float32 metres, 0 = no reading, a new array; no amplitude."""
-        image = np.asarray(self._images[index])
-        depth = image.astype(np.float32) * np.float32(self.unit_m)
-        return np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)), None
-
-    def close(self) -> None:
-        """Nothing to close: the file is mapped as long as this object lives."""
-
-
-def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> NpyStack:
-    """Open a stack.
-
-    path: the `.npy`.
-    camera_file: of the camera; None = the given intrinsics, or camera.json beside the file.
-    bare: intrinsics, unit of whole numbers (a millimetre) and frame rate (25) where given.
-
-    Raises ToftrackError: it is no such stack, holds pickled objects, or nothing tells its camera.
-    """
-    path = Path(path).expanduser()
-    images = _mapped(path)
-    if images.ndim == 2:
-        images = images[None]
-    if images.ndim != 3 or images.size == 0 or images.dtype.kind not in "uif":
-        raise ToftrackError(
-            f"'{path}' has the shape {images.shape} of {images.dtype}, but must be depth images, "
-            "(frames, rows, columns) of numbers"
-        )
-    count, height, width = images.shape
-    whole = images.dtype.kind in "ui"
-    unit_m = bare.unit_m if bare.unit_m is not None else (MILLIMETRE if whole else 1.0)
-    stack = NpyStack(
-        path,
-        images,
-        bare_camera(path, camera_file, bare, width, height),
-        unit_m,
-        DEFAULT_FPS if bare.fps is None else bare.fps,
-    )
-    some = np.stack(
-        [stack.image(i)[0] for i in np.unique(np.linspace(0, count - 1, 8).astype(int))]
-    )
-    median = float(np.median(some[some > 0])) if (some > 0).any() else 0.0
-    if median > LARGEST_MEDIAN_M:
-        raise ToftrackError(
-            f"the median of '{path}' is {median:.0f} m, which is plainly another unit; say what "
-            "one step is with toftrack convert --source-unit METRES"
-        )
-    return stack
-
-
-def _mapped(path: Path) -> np.ndarray:
-    try:
-        check_readable(path)
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError:
-        raise ToftrackError(f"there is no file '{path}'; give the path of a recording") from None
-    except OSError as error:
-        raise ToftrackError(f"'{path}' cannot be read ({error.strerror or error})") from error
-    except (
-        ValueError,
-        EOFError,
-        TypeError,
-        SyntaxError,
-        OverflowError,
-        tokenize.TokenError,
-    ) as error:
-        reason = " ".join(str(error).split())
-        raise ToftrackError(
-            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
-            "numpy.save"
-        ) from error

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import BUSY, chosen_serial
+from toftrack.devices.live import BUSY, Size, chosen_profile, chosen_serial
 from toftrack.errors import ToftrackError, reported_errors
 
 _PIXELS = ("Y16", "Z16")
@@ -93,43 +93,25 @@ class Streams:
 
 
 def choose_streams(
-    ob: ModuleType,
-    pipeline: Any,
-    size: tuple[int | None, int | None, int | None],
-    infrared: bool,
-    owner: str,
+    ob: ModuleType, pipeline: Any, size: Size, infrared: bool, owner: str
 ) -> Streams:
     """The depth images of a camera, and infrared ones of the same size and rate.
 
-    Args:
-        ob: the SDK.
-        pipeline: of the camera.
-        size: width, height and frames a second; None = whatever the camera proposes.
-        infrared: look for infrared images, too.
-        owner: what errors call the camera.
+    ob, pipeline: the SDK, and of the camera.
+    size, owner: as for `chosen_profile`.
+    infrared: look for infrared images, too.
 
-    Raises:
-        ToftrackError: it has no depth images, or none of that size.
+    Raises ToftrackError: it has no depth images, or none of that size.
     """
     offered = _profiles(ob, pipeline, "DEPTH_SENSOR", _PIXELS)
-    if not offered:
-        raise ToftrackError(f"{owner} has no depth images; use a camera with a depth sensor")
-    chosen = [
-        p for p in offered if all(w in (None, s) for w, s in zip(size, _size(p), strict=True))
-    ]
-    if not chosen:
-        listed = ", ".join("{}x{} at {}".format(*s) for s in sorted(set(map(_size, offered))))
-        raise ToftrackError(
-            f"{owner} has no depth images of device.width={size[0]}, device.height={size[1]}, "
-            f"device.fps={size[2]}; set them to one of {listed}"
-        )
+    depth = chosen_profile(offered, _size, size, owner)
     if infrared:
         # The only infrared camera of a Femto; of a stereo camera the left one has depth's pixels.
         for name in ("IR", "LEFT_IR"):
             for profile in _profiles(ob, pipeline, f"{name}_SENSOR", _INFRARED):
-                if _size(profile) == _size(chosen[0]):
-                    return Streams(chosen[0], profile, getattr(ob.OBFrameType, f"{name}_FRAME"))
-    return Streams(chosen[0], None, None)
+                if _size(profile) == _size(depth):
+                    return Streams(depth, profile, getattr(ob.OBFrameType, f"{name}_FRAME"))
+    return Streams(depth, None, None)
 
 
 def _profiles(ob: ModuleType, pipeline: Any, sensor: str, pixels: tuple[str, ...]) -> list[Any]:

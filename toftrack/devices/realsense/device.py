@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.devices.live import BUSY, OTHER_FILE, SdkCamera
+from toftrack.devices.live import BUSY, OTHER_FILE, SdkCamera, Size
 from toftrack.devices.realsense import sdk
 from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
 from toftrack.errors import ToftrackError, reported_errors
@@ -83,7 +83,7 @@ class RealSense(SdkCamera):
             )
         rs = self._rs = sdk.load_sdk()
         self._emulator: EmulatedCamera | None = None
-        size = None
+        size: Size = (None, None, None)
         if self._path is not None:
             with reported_errors(
                 f"{self._owner} is not a recording of a RealSense", OTHER_FILE, RuntimeError

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.devices.live import chosen_serial
+from toftrack.devices.live import Size, chosen_profile, chosen_serial
 from toftrack.errors import ToftrackError, reported_errors
 
 _WORST_FIT_PX = 0.5
@@ -83,41 +83,22 @@ class Streams:
     infrared: Any | None
 
 
-def choose_streams(
-    rs: ModuleType,
-    device: Any,
-    size: tuple[int, int, int] | None,
-    infrared: bool,
-    owner: str,
-) -> Streams:
+def choose_streams(rs: ModuleType, device: Any, size: Size, infrared: bool, owner: str) -> Streams:
     """The depth images of a device, and the infrared ones that lie on the same pixels.
 
-    Args:
-        rs: the SDK.
-        device: of the SDK.
-        size: width, height and frames a second; None = the first there are (a recording has one).
-        infrared: look for infrared images, too.
-        owner: what errors call the device.
+    rs, device: of the SDK.
+    size, owner: as for `chosen_profile`.
+    infrared: look for infrared images, too.
 
-    Raises:
-        ToftrackError: it has no depth images, or none of that size.
+    Raises ToftrackError: it has no depth images, or none of that size.
     """
+    sensor, profiles, offered = None, [], []
     for sensor in device.query_sensors():
         profiles = [p for p in sensor.get_stream_profiles() if p.is_video_stream_profile()]
-        depth = _of_kind(profiles, rs.stream.depth, rs.format.z16)
-        if not depth:
-            continue
-        chosen = [p for p in depth if size is None or _size(p) == size]
-        if not chosen:
-            offered = ", ".join("{}x{} at {}".format(*s) for s in sorted(set(map(_size, depth))))
-            wanted = "{}x{} pixels at {} frames/s".format(*(size or ()))
-            raise ToftrackError(
-                f"{owner} has no depth images of {wanted}; "
-                f"set device.width, device.height and device.fps to one of {offered} (a USB 2 port "
-                "or cable leaves few)"
-            )
-        return Streams(sensor, chosen[0], _infrared(rs, profiles, chosen[0]) if infrared else None)
-    raise ToftrackError(f"{owner} has no depth images; use a RealSense with a depth sensor")
+        if offered := _of_kind(profiles, rs.stream.depth, rs.format.z16):
+            break
+    depth = chosen_profile(offered, _size, size, owner)
+    return Streams(sensor, depth, _infrared(rs, profiles, depth) if infrared else None)
 
 
 def _of_kind(profiles: list[Any], kind: Any, pixels: Any) -> list[Any]:

@@ -7,85 +7,80 @@ interface with two bulk endpoints.
 from __future__ import annotations
 
 import array
-from types import SimpleNamespace
+from typing import Any
 
 PACKET_BYTES = 512
 """Of a bulk endpoint at high speed."""
+_VENDORS_OWN = 0xFF  # a class of devices
 _SERIAL_NUMBER = 3  # number of the string
 
 
-def device(vendor: int, product: int, port: int, address: int) -> SimpleNamespace:
+class Descriptor:
+    """The fields of a descriptor; those that nobody states are 0."""
+
+    extra_descriptors = ()
+
+    def __init__(self, **fields: Any) -> None:
+        self.__dict__.update(fields)
+
+    def __getattr__(self, name: str) -> int:
+        return 0
+
+
+def device(vendor: int, product: int, port: int, address: int) -> Descriptor:
     """The device descriptor, with its place on the bus."""
-    return SimpleNamespace(
+    return Descriptor(
         bLength=18,
         bDescriptorType=1,
         bcdUSB=0x0200,
-        bDeviceClass=0xFF,
-        bDeviceSubClass=0,
-        bDeviceProtocol=0,
+        bDeviceClass=_VENDORS_OWN,
         bMaxPacketSize0=64,
         idVendor=vendor,
         idProduct=product,
-        bcdDevice=0x0100,
-        iManufacturer=0,
-        iProduct=0,
         iSerialNumber=_SERIAL_NUMBER,
         bNumConfigurations=1,
         address=address,
         bus=1,
-        port_number=1 + port,
         port_numbers=(1 + port,),
         speed=3,
     )
 
 
-def configuration(number: int) -> SimpleNamespace:
+def configuration(number: int) -> Descriptor:
     """The only configuration's descriptor; IndexError for another."""
     if number > 0:
         raise IndexError(number)
-    return SimpleNamespace(
+    return Descriptor(
         bLength=9,
         bDescriptorType=2,
         wTotalLength=32,
         bNumInterfaces=1,
         bConfigurationValue=1,
-        iConfiguration=0,
         bmAttributes=0xC0,
-        bMaxPower=0,
-        extra_descriptors=[],
     )
 
 
-def interface(number: int, index: int, alternate: int, config: int) -> SimpleNamespace:
+def interface(number: int, index: int, alternate: int, config: int) -> Descriptor:
     """The only interface's descriptor, which has `number`; IndexError for another index."""
     if index > 0 or alternate > 0 or config > 0:
         raise IndexError((index, alternate, config))
-    return SimpleNamespace(
+    return Descriptor(
         bLength=9,
         bDescriptorType=4,
         bInterfaceNumber=number,
-        bAlternateSetting=0,
         bNumEndpoints=2,
-        bInterfaceClass=0xFF,
-        bInterfaceSubClass=0,
-        bInterfaceProtocol=0,
-        iInterface=0,
-        extra_descriptors=[],
+        bInterfaceClass=_VENDORS_OWN,
     )
 
 
-def endpoint(address: int) -> SimpleNamespace:
+def endpoint(address: int) -> Descriptor:
     """A bulk endpoint's descriptor."""
-    return SimpleNamespace(
+    return Descriptor(
         bLength=7,
         bDescriptorType=5,
         bEndpointAddress=address,
         bmAttributes=2,
         wMaxPacketSize=PACKET_BYTES,
-        bInterval=0,
-        bRefresh=0,
-        bSynchAddress=0,
-        extra_descriptors=[],
     )
 
 

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import array
 import errno
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import usb.core
 from usb.backend import IBackend
 
 from toftrack.devices.sr3000 import descriptors
+from toftrack.devices.sr3000.descriptors import Descriptor
 from toftrack.devices.sr3000.faults import (
     HARMLESS,
     OPEN_FAULTS,
@@ -121,23 +121,21 @@ class EmulatedBackend(IBackend):
             serials = self._settings.serials if there else ()
             return iter([_Id(number, self._plugging) for number in range(len(serials))])
 
-    def get_device_descriptor(self, dev: _Id) -> SimpleNamespace:
+    def get_device_descriptor(self, dev: _Id) -> Descriptor:
         ids = self._usb.ids
         vendor, product = parse_id(ids[min(1, len(ids) - 1)])  # by default the usual SR3000
         place = (dev.camera, 4 + dev.camera + 10 * dev.plugging)
         return descriptors.device(vendor, product, *place)
 
-    def get_configuration_descriptor(self, dev: _Id, config: int) -> SimpleNamespace:
+    def get_configuration_descriptor(self, dev: _Id, config: int) -> Descriptor:
         return descriptors.configuration(config)
 
-    def get_interface_descriptor(
-        self, dev: _Id, intf: int, alt: int, config: int
-    ) -> SimpleNamespace:
+    def get_interface_descriptor(self, dev: _Id, intf: int, alt: int, config: int) -> Descriptor:
         return descriptors.interface(self._usb.interface, intf, alt, config)
 
     def get_endpoint_descriptor(
         self, dev: _Id, ep: int, intf: int, alt: int, config: int
-    ) -> SimpleNamespace:
+    ) -> Descriptor:
         return descriptors.endpoint((self._usb.endpoint_in, self._usb.endpoint_out)[ep])
 
     def open_device(self, dev: _Id) -> _Handle:
@@ -306,11 +304,9 @@ class EmulatedBackend(IBackend):
             self._position += 1  # the scene goes on
             self.unplug(self._settings.replug_s)
             raise _error(errno.ENODEV)
-        if fault == "stall":
-            self._queue.append(Chunk(0.0, error=errno.EPIPE))
-            return
-        if fault == "io_error":
-            self._queue.append(Chunk(0.0, error=errno.EIO))
+        if fault in ("stall", "io_error"):
+            number = errno.EPIPE if fault == "stall" else errno.EIO
+            self._queue.append(Chunk(0.0, error=number))
             return
         data = self._next_frame()
         if data is None:
@@ -340,13 +336,4 @@ class EmulatedBackend(IBackend):
 
 
 def _error(number: int) -> usb.core.USBError:
-    words: dict[int, Any] = {
-        errno.ENODEV: "No such device (it may have been disconnected)",
-        errno.EACCES: "Access denied (insufficient permissions)",
-        errno.EBUSY: "Resource busy",
-        errno.EPIPE: "Pipe error",
-        errno.EOVERFLOW: "Overflow",
-        errno.EIO: "Input/Output Error",
-        errno.EINVAL: "Invalid parameter",
-    }
-    return usb.core.USBError(words[number], None, number)
+    return usb.core.USBError(os.strerror(number), None, number)

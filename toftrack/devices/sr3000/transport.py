@@ -12,11 +12,7 @@ from typing import Any, Protocol
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
-from toftrack.recordings.sr_frame import (
-    MODULATION_CODES,
-    REGISTERS,
-    unambiguous_range_m,
-)
+from toftrack.recordings.sr_frame import MODULATION_CODES, REGISTERS, unambiguous_range_m
 
 
 class CameraError(Exception):
@@ -125,13 +121,14 @@ class UsbSettings:
             parse_id(text)
         if not self.ids:
             raise ToftrackError("device.usb.ids is empty; give at least one VENDOR:PRODUCT")
-        for name in ("timeout_ms", "drain_ms", "read_multiple"):
-            check_number(f"device.usb.{name}", getattr(self, name), 1, 600_000, whole=True)
-        check_number("device.usb.tail_check_ms", self.tail_check_ms, 0, 1000, whole=True)
-        for name in ("interface", "endpoint_in", "endpoint_out", "request_type", "request"):
-            check_number(f"device.usb.{name}", getattr(self, name), 0, 255, whole=True)
-        for name in ("request_value", "request_index"):
-            check_number(f"device.usb.{name}", getattr(self, name), 0, 0xFFFF, whole=True)
+        for names, least, most in (
+            (("timeout_ms", "drain_ms", "read_multiple"), 1, 600_000),
+            (("tail_check_ms",), 0, 1000),
+            (("interface", "endpoint_in", "endpoint_out", "request_type", "request"), 0, 255),
+            (("request_value", "request_index"), 0, 0xFFFF),
+        ):
+            for name in names:
+                check_number(f"device.usb.{name}", getattr(self, name), least, most, whole=True)
         registers = {}
         for address, value in dict(self.registers).items():
             address = int(address) if str(address).isdecimal() else address
