@@ -38,8 +38,8 @@ from toftrack.evaluation.results import checked_targets
 from toftrack.gestures.recognition import Gestures
 from toftrack.output.web.server import ANY_PORT
 from toftrack.programs import shutdown
+from toftrack.programs.applications import with_recording
 from toftrack.programs.command_line import plain_parser
-from toftrack.programs.recording_argument import with_recording
 from toftrack.views.labelling.page import LabelPage
 
 _FRAMES = 20
