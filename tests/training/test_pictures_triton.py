@@ -112,7 +112,7 @@ def replace_noise(sensors: torch.Tensor) -> torch.Tensor:
 def test_triton_takes_the_same_pictures_as_far_as_its_interpreter_goes() -> None:
     pytest.importorskip("triton", reason="triton is not installed")
     code = (
-        "import pytest; from detector.test_pictures_triton import compared\n"
+        "import pytest; from training.test_pictures_triton import compared\n"
         "with pytest.MonkeyPatch.context() as monkeypatch: compared('cpu', monkeypatch)"
     )
     env = {**os.environ, "TRITON_INTERPRET": "1"}
