@@ -87,8 +87,7 @@ def compare_sides(
     """A track's evidence after one more comparison; as it was where hardly a hand is detected.
 
     mirrored: the detection there as a hand of the other side.  image: without other hands.
-    told: the side that the user said; where nobody did, the network looks twice more, and a body
-        is searched for in the image.
+    told: the side that the user said; where nobody did, a body is searched for in the image.
     """
     evidence, side = view.track.evidence, view.track.side
     if view.detection.empty or view.detection.present < _LEAST_PRESENT:
@@ -96,9 +95,9 @@ def compare_sides(
     gain = _best_of_side(view, view.detection, side)
     gain -= _best_of_side(view, mirrored, OTHER_SIDE[side])
     lead = _network_log_odds(view.detection) - _network_log_odds(mirrored)
+    lead = 0.5 * (lead + _turned_lead(mirrored, side, image, view.model))
     comparisons, body_m = evidence.comparisons + 1, evidence.body_m
     if told is None:
-        lead = 0.5 * (lead + _turned_lead(mirrored, side, image, view.model))
         offset = body_offset_m(image, view.detection.centre_m.numpy())
         body_m += (offset - body_m) / min(comparisons, _BODY_COMPARISONS)
     gain += _NETWORK * lead
