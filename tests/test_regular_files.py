@@ -80,4 +80,4 @@ def test_names_that_are_not_utf8_are_reported(
 
 def test_an_empty_name_is_no_recording() -> None:
     with pytest.raises(ToftrackError, match="name is empty"):
-        with_recording([""], {"seed"}, {"replay"})
+        with_recording([""])

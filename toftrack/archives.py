@@ -1,14 +1,13 @@
 """`.npz` archives: written in one way, and read with bounds, as they may come from strangers.
 
 numpy's own reader allocates what a header claims, and Python's `zipfile` decompresses without
-bounds what bzip2 or lzma packed. So headers are checked against the archive's directory first,
-arrays that bzip2 packed are read by `bz2`, which stops where it is asked to, those of lzma are not
-read, pickled objects never are, and every way in which an archive can be broken is a ValueError.
+bounds what bzip2 or lzma packed, as numpy never does. So headers are checked against the archive's
+directory first, only stored and deflated arrays are read, pickled objects never are, and every way
+in which an archive can be broken is a ValueError.
 """
 
 from __future__ import annotations
 
-import bz2
 import errno
 import io
 import math
@@ -36,7 +35,6 @@ _MOST_RATIO, _SMALL_BYTES = 1000, 2**26
 depth and amplitude images of real cameras shrink to a tenth to a fortieth."""
 _MOST_HEADER_BYTES = 2**16
 _PIECE_BYTES = 2**20
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)
 _BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -58,10 +56,7 @@ class PickledError(ValueError):
 
 @dataclass(frozen=True)
 class Header:
-    """What an array's header says, checked against the size that the archive states.
-
-    offset: bytes of the header itself.
-    """
+    """What an array's header says, `offset` bytes long, checked against the archive's directory."""
 
     shape: tuple[int, ...]
     kind: np.dtype
@@ -86,7 +81,7 @@ class Archive:
             if not zipfile.is_zipfile(stream):
                 raise ValueError("it is no .npz archive, or cut off")
             stream.seek(0)
-            self._stream, self._zip = stream, zipfile.ZipFile(stream)
+            self._zip = zipfile.ZipFile(stream)
             self._entries = {
                 entry.filename.removesuffix(".npy"): entry for entry in self._zip.infolist()
             }
@@ -98,16 +93,12 @@ class Archive:
 
     def header(self, name: str, most_bytes: int | None = MOST_BYTES) -> Header:
         """An array's header; most_bytes: larger arrays are refused, None: none is."""
-        with broken_is_value_error(name), self._open(name) as stream:
-            header = _header(stream)
-            _check(name, header, self._entries[name], most_bytes)
+        with self._opened(name, most_bytes) as (_, header):
             return header
 
     def read(self, name: str, most_bytes: int = MOST_BYTES) -> np.ndarray:
         """An array as a whole."""
-        with broken_is_value_error(name), self._open(name) as stream:
-            header = _header(stream)
-            _check(name, header, self._entries[name], most_bytes)
+        with self._opened(name, most_bytes) as (stream, header):
             content = bytearray()
             while piece := stream.read(min(_PIECE_BYTES, header.size - len(content))):
                 content += piece
@@ -121,40 +112,23 @@ class Archive:
     @contextmanager
     def rows(self, name: str) -> Iterator[IO[bytes]]:
         """The bytes of an array, after its header, to be read in turn."""
-        with broken_is_value_error(name), self._open(name) as stream:
-            _check(name, _header(stream), self._entries[name], None)
+        with self._opened(name, None) as (stream, _):
             yield stream
 
     def close(self) -> None:
         self._zip.close()
 
-    def _open(self, name: str) -> IO[bytes]:
+    @contextmanager
+    def _opened(self, name: str, most_bytes: int | None) -> Iterator[tuple[IO[bytes], Header]]:
+        """The bytes of an array after its header, and that."""
         entry = self._entries[name]
-        if entry.compress_type not in _METHODS:
-            raise ValueError("its compression is not read; save it with numpy.savez_compressed")
-        if entry.compress_type != zipfile.ZIP_BZIP2:
-            return self._zip.open(entry)
-        self._zip.open(entry).close()  # its own header, checked
-        return bz2.BZ2File(_Packed(self._stream, entry))
-
-
-class _Packed(io.RawIOBase):
-    """The bytes of a member of an archive as they are packed."""
-
-    def __init__(self, stream: IO[bytes], entry: zipfile.ZipInfo) -> None:
-        stream.seek(entry.header_offset + 26)
-        name, extra = struct.unpack("<HH", stream.read(4))
-        self._stream, self._left = stream, entry.compress_size
-        self._at = entry.header_offset + 30 + name + extra
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1) -> bytes:
-        self._stream.seek(self._at)
-        piece = self._stream.read(min(self._left, size if size >= 0 else self._left))
-        self._at, self._left = self._at + len(piece), self._left - len(piece)
-        return piece
+        with broken_is_value_error(name):
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("its compression is not read; save it with numpy.savez_compressed")
+            with self._zip.open(entry) as stream:
+                header = _header(stream)
+                _check(header, entry, most_bytes)
+                yield stream, header
 
 
 def read_archive(path: str | Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -183,14 +157,10 @@ class Pieces:
 
 def write_archive(path: str | Path, arrays: Mapping[str, Any], level: int | None = None) -> None:
     """Write an .npz file, compressed as `np.savez_compressed` does; it is there as a whole, or as
-    it was.
+    it was. Raises OSError.
 
-    Args:
-        path: of the file.
-        arrays: whatever numpy makes numbers or text of, or `Pieces`, by name.
-        level: of the compression, 0 to 9; None = zlib's own, 6.
-
-    Raises OSError.
+    arrays: whatever numpy makes numbers or text of, or `Pieces`, by name.
+    level: of the compression, 0 to 9; None = zlib's own, 6.
     """
     with (
         whole_file(path) as target,
@@ -226,7 +196,7 @@ def broken_is_value_error(name: str | None = None) -> Iterator[None]:
     except OSError as error:
         if error.errno not in (None, errno.EINVAL):
             raise
-        # No stream of bzip2's; or the directory says that it lies before the file's beginning.
+        # The directory says that it lies before the file's beginning.
         raise ValueError(f"{where} is damaged: it is not where it should be") from None
     except PickledError:
         raise PickledError(f"{where} holds pickled objects, not numbers") from None
@@ -254,7 +224,7 @@ def _header(stream: IO[bytes]) -> Header:
     return Header(shape, kind, fortran_order, 8 + len(counted) + length)
 
 
-def _check(name: str, header: Header, entry: zipfile.ZipInfo, most_bytes: int | None) -> None:
+def _check(header: Header, entry: zipfile.ZipInfo, most_bytes: int | None) -> None:
     if min(header.shape, default=0) < 0 or header.offset + header.size != entry.file_size:
         raise ValueError("it is of another length than its header says")
     if most_bytes is not None and header.size > most_bytes:

@@ -20,8 +20,7 @@ from hydra.utils import instantiate
 import toftrack
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
-from toftrack.programs.command_line import run
-from toftrack.programs.sweeps import FailedJobs
+from toftrack.programs.command_line import FailedJobs, run
 
 
 @pytest.fixture(autouse=True)
@@ -71,7 +70,7 @@ if __name__ == "__main__":
 
 
 CALLBACK = """
-hydra: {callbacks: {failed_jobs: {_target_: toftrack.programs.sweeps.FailedJobs}}}
+hydra: {callbacks: {failed_jobs: {_target_: toftrack.programs.command_line.FailedJobs}}}
 """
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +10,10 @@ import pytest
 from helpers.tracking import ROOT, configuration
 
 import toftrack
-from toftrack.configuration.compose import devices_of_files, setting_names
 from toftrack.errors import ToftrackError
 from toftrack.programs import main as front
 from toftrack.programs.applications import options_first, quoted, with_recording
 
-KNOWN = setting_names(), devices_of_files()
 ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')
 ODDER = ("1,2,3.npz", "$HOME.npz", "back\\slash\\'s", "ends\\", "#", "-")
 
@@ -41,8 +38,8 @@ def test_long_help_names_every_group_and_choice() -> None:
 
 
 def test_every_command_is_a_function_that_there_is() -> None:
-    for command in front._COMMANDS.values():
-        assert callable(getattr(importlib.import_module(command.module), command.function))
+    for name in front._COMMANDS:
+        assert callable(front._program(name))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +71,7 @@ def test_any_name_arrives_as_it_is(name: str, tmp_path, monkeypatch) -> None:
     assert config.device.path == name
     monkeypatch.chdir(tmp_path)
     Path(name).touch()
-    assert with_recording([name, "seed=1"], *KNOWN) == [
+    assert with_recording([name, "seed=1"]) == [
         "device=replay",
         f"device.path={quoted(name)}",
         "seed=1",
@@ -88,8 +85,8 @@ def test_a_ros_bag_is_known_by_its_name_or_its_folder(name: str, tmp_path, monke
         Path(folder).mkdir()
         (Path(folder) / file).touch()
     Path("~x.bag").touch()
-    assert with_recording([name, "device.topic=/a"], *KNOWN)[0] == "device=rosbag"
-    assert with_recording(["other"], *KNOWN)[0] == "device=folder"
+    assert with_recording([name, "device.topic=/a"])[0] == "device=rosbag"
+    assert with_recording(["other"])[0] == "device=folder"
 
 
 @pytest.mark.parametrize(
@@ -106,7 +103,7 @@ def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     Path("my_conf").mkdir()
     Path("seed=1").mkdir()  # as sweeps name their folders
-    assert with_recording(words, *KNOWN) == words
+    assert with_recording(words) == words
 
 
 @pytest.mark.parametrize(
@@ -118,7 +115,7 @@ def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypat
     ],
 )
 def test_a_sweep_of_a_recording_may_be_written_in_any_order(words: list[str]) -> None:
-    option, *overrides = options_first(with_recording(words, *KNOWN))
+    option, *overrides = options_first(with_recording(words))
     assert option == "-m"
     expected = ["device=replay", "device.path='a.npz'", "seed=1,2", "view=none"]
     assert sorted(overrides) == sorted(expected)
@@ -139,19 +136,19 @@ def test_the_version_is_ours(words: str, capsys) -> None:
 
 def test_a_device_that_plays_files_may_be_chosen_beside_the_name() -> None:
     words = ["device=folder", "device.unit_m=0.0001"]
-    assert with_recording([*words, "a b"], *KNOWN) == ["device.path='a b'", *words]
+    assert with_recording([*words, "a b"]) == ["device.path='a b'", *words]
 
 
 def test_a_name_that_begins_with_a_tilde_is_not_somebody_s_home(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert with_recording(["~x"], *KNOWN) == ["~x"]
+    assert with_recording(["~x"]) == ["~x"]
     Path("~x").touch()
-    assert with_recording(["~x"], *KNOWN)[1] == "device.path='./~x'"
+    assert with_recording(["~x"])[1] == "device.path='./~x'"
 
 
 def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missing() -> None:
     for name in ("gone.npz", "gone [2]=x.npz"):
-        assert with_recording([name], *KNOWN)[1] == f"device.path={quoted(name)}"
+        assert with_recording([name])[1] == f"device.path={quoted(name)}"
 
 
 @pytest.mark.parametrize(
@@ -164,4 +161,4 @@ def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missin
 )
 def test_what_cannot_be_one_recording_is_reported(words: list[str], reported: str) -> None:
     with pytest.raises(ToftrackError, match=reported):
-        with_recording(words, *KNOWN)
+        with_recording(words)

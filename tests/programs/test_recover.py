@@ -19,8 +19,8 @@ from toftrack.json_text import read_json
 from toftrack.output.files import LINES
 from toftrack.output.results import RealTime, ResultWriter, read_results
 from toftrack.programs import export
+from toftrack.programs.command_line import FailedJobs
 from toftrack.programs.recover import main, recover
-from toftrack.programs.sweeps import FailedJobs
 from toftrack.views.video import VideoFile
 
 MADE = ("track.npz", "summary.json", "overlay.mp4", LINES)

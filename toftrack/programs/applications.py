@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Collection, Sequence
 
 import hydra
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from toftrack.configuration import configuration_folder
@@ -30,10 +31,10 @@ _KEY = re.compile(r"[+~]{0,2}[\w./@:]+")
 def track_job(config: DictConfig) -> float:
     """Track, write the results, and return what a sweep minimises."""
     # The device comes before the seconds that torch takes: a missing camera is reported at once.
-    device = hydra.utils.instantiate(config.device)
-    from toftrack.programs import track as app
+    device = instantiate(config.device)
+    from toftrack.programs.track import track
 
-    return app.track(config, device)
+    return track(config, device)
 
 
 @command_line.sweep_job
@@ -46,8 +47,7 @@ def train_job(config: DictConfig) -> float:
 
 def track(arguments: Sequence[str]) -> None:
     """Track as a command line says, which may name a recording."""
-    words = with_recording(arguments, setting_names(), devices_of_files())
-    start(track_job, "toftrack track", "config", words)
+    start(track_job, "toftrack track", "config", with_recording(arguments))
 
 
 def train(arguments: Sequence[str]) -> None:
@@ -69,18 +69,15 @@ def start(
         sys.argv = before
 
 
-def with_recording(
-    arguments: Sequence[str], known: Collection[str], players: Collection[str]
-) -> list[str]:
+def with_recording(arguments: Sequence[str]) -> list[str]:
     """The arguments with a file's name as overrides.
 
-    known: the first parts of keys, groups and settings: what begins with one and has a = is one,
-    whatever files there are.
-    players: the devices that play a file; where none is chosen, rosbag is taken for a ROS bag,
-    folder for another folder, and replay for everything else.
-
-    Raises ToftrackError for two recordings, or one beside a device that plays none.
+    What begins with a group or a setting and has a = is an override, whatever files there are.
+    Where no device is chosen, rosbag is taken for a ROS bag, folder for another folder, and replay
+    for everything else. Raises ToftrackError for two recordings, or one beside a device that plays
+    none.
     """
+    known = setting_names()
     others: list[str] = []
     files: list[str] = []
     value_follows = False
@@ -105,13 +102,17 @@ def with_recording(
             "settings; rename the file"
         )
     device = next((word for word in others if word.startswith("device=")), None)
-    if device is not None and device.removeprefix("device=") not in players:
+    if device is not None and device.removeprefix("device=") not in devices_of_files():
         raise ToftrackError(
             f"{device} and the recording '{files[0]}' both give the frames; leave one out"
         )
     # What the shell has left of a ~ is the file's own, where there is one.
     name = f"./{files[0]}" if files[0][0] == "~" and os.path.exists(files[0]) else files[0]
-    chosen = [] if device is not None else [f"device={_player(os.path.expanduser(name), players)}"]
+    chosen: list[str] = []
+    if device is None:
+        path = os.path.expanduser(name)
+        player = "rosbag" if is_bag(path) else "folder" if os.path.isdir(path) else "replay"
+        chosen = [f"device={player}"]
     return [*chosen, f"device.path={quoted(name)}", *others]
 
 
@@ -130,13 +131,6 @@ def options_first(arguments: Sequence[str]) -> list[str]:
         else:
             options.append(word)
     return [*options, *overrides]
-
-
-def _player(name: str, players: Collection[str]) -> str:
-    """The device that plays a file or folder."""
-    if is_bag(name):
-        return "rosbag"
-    return "folder" if os.path.isdir(name) and "folder" in players else "replay"
 
 
 def quoted(text: str) -> str:

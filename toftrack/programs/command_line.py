@@ -1,13 +1,5 @@
 """What the command-line programs share: clear errors, exit statuses, and sweeps that carry on.
 
-A program of Hydra's:
-
-    @hydra.main(version_base="1.3", config_path="conf", config_name="track")
-    @sweep_job
-    def main(config: DictConfig) -> float: ...
-
-    sys.exit(run(main))
-
 Exit status: 0 done, 1 an error (one sentence on standard error), 130 interrupted, 143 terminated
 (SIGTERM), 129 hung up (SIGHUP).
 """
@@ -26,8 +18,10 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
@@ -35,7 +29,7 @@ from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
 from toftrack.json_text import read_object
 from toftrack.programs import shutdown
-from toftrack.safe_files import write_whole
+from toftrack.safe_files import let_links_go, write_whole
 
 
 @dataclass
@@ -64,21 +58,17 @@ def run(main: Callable[[], object]) -> int:
 
     With HYDRA_FULL_ERROR=1 in the environment the traceback comes before the sentence.
 
-    Args:
-        main: usually a function under `@hydra.main` and `@sweep_job`.
-
-    Returns:
-        What main returns if it is an int; else 0 done, 1 after an error (also of one job of a
-        sweep), 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
+    main: usually a function under `@hydra.main` and `@sweep_job`; an int that it returns is the
+    status.
     """
     _program.running = True
     _program.tracebacks = os.environ.get(FULL_ERROR) == "1"
     _program.failed_jobs.clear()
-    _forget_folders()
+    _new_folders.clear()
     try:
         with shutdown.obeyed(), _hydra_raises():
             status = main()
-            _forget_folders()
+            _new_folders.clear()
     except KeyboardInterrupt as end:
         shutdown.say("interrupted: what was done until then is kept", sys.stderr)
         shutdown.forget_streams()
@@ -98,7 +88,10 @@ def run(main: Callable[[], object]) -> int:
         _report(error)
         return 1
     finally:
-        _clear_folders()
+        for folder, parents in _new_folders.items():
+            with contextlib.suppress(OSError):  # the error that is being reported counts for more
+                _clear(folder, parents)
+        _new_folders.clear()
         _program.running = False
     if _program.failed_jobs:
         count = len(_program.failed_jobs)
@@ -124,7 +117,8 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
     @functools.wraps(task)
     def guarded(config: DictConfig) -> float:
         try:
-            _check(config)
+            hydra = HydraConfig.get()
+            check_overrides(config, str(hydra.job.config_name), hydra.overrides.task)
             return task(config)
         except Exception as error:
             if not in_sweep():
@@ -133,16 +127,16 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
                 raise
             _report(error, f"{job_words()}: ")
             folder = Path(HydraConfig.get().runtime.output_dir)
-            note_failed_job(folder)
-            _note_error(folder, sentence(error))
+            _program.failed_jobs.add(folder.absolute())
+            path = folder / "summary.json"
+            # What a finished part wrote there stays. The sentence is on the terminal; a folder that
+            # cannot be written must not stop the sweep.
+            with contextlib.suppress(OSError):
+                content = read_object(path) | {"error": sentence(error)}
+                write_whole(path, json.dumps(content, indent=1) + "\n")
             return math.inf
 
     return guarded
-
-
-def note_failed_job(folder: Path) -> None:
-    """A job of the sweep failed, in this process or another: `run` will say how many did."""
-    _program.failed_jobs.add(folder.absolute())
 
 
 @contextlib.contextmanager
@@ -157,11 +151,6 @@ def _hydra_raises() -> Iterator[None]:
             del os.environ[FULL_ERROR]
         else:
             os.environ[FULL_ERROR] = before
-
-
-def _check(config: DictConfig) -> None:
-    hydra = HydraConfig.get()
-    check_overrides(config, str(hydra.job.config_name), hydra.overrides.task)
 
 
 def in_sweep() -> bool:
@@ -181,74 +170,77 @@ def _report(error: BaseException, job: str = "") -> None:
     print(f"error: {job}{sentence(error)}", file=sys.stderr, flush=True)
 
 
-def _note_error(folder: Path, text: str) -> None:
-    """Add the error to the job's summary.json; what a finished part wrote there stays."""
-    path = folder / "summary.json"
-    # The sentence is on the terminal; a folder that cannot be written must not stop the sweep.
-    with contextlib.suppress(OSError):
-        write_whole(path, json.dumps(read_object(path) | {"error": text}, indent=1) + "\n")
-
-
 # Hydra makes the folder of a run, with its own files in it, before the program has looked at its
 # settings: that of one that failed before it wrote anything of its own goes away again.
 _HYDRAS = frozenset({"config.yaml", "hydra.yaml", "overrides.yaml"})
 _SWEEPS = "multirun.yaml"
+_new_folders: dict[Path, tuple[Path, ...]] = {}
+"""Of a run or sweep, with those of them and their parents that were not there, the innermost
+first."""
 
 
-@dataclass(frozen=True)
-class _Folder:
-    path: Path
-    new: tuple[Path, ...]
-    """Those of it and its parents that were not there, the innermost first."""
+class FailedJobs(Callback):
+    """What Hydra tells of runs and sweeps: which folders they make, and which jobs failed: those
+    whose summary.json tells an error, which a launcher may run anywhere.
+
+    Looks for files that are new or were written anew: a sweep may have the folder of an older one.
+    """
+
+    def __init__(self) -> None:
+        self._before: dict[Path, int] = {}
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        _expect(Path(config.hydra.run.dir))
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        folder = Path(config.hydra.sweep.dir)
+        _expect(folder)
+        for job in folder.iterdir() if folder.is_dir() else ():
+            let_links_go(job)
+            _let_links_go(job)
+        self._before = {path: path.stat().st_mtime_ns for path in _summaries(config)}
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        for path in _summaries(config):
+            if path.stat().st_mtime_ns != self._before.get(path) and "error" in read_object(path):
+                _program.failed_jobs.add(path.parent)
 
 
-_expected: list[_Folder] = []
-
-
-def expect_folder(folder: Path) -> None:
+def _expect(folder: Path) -> None:
     """A run or a sweep is about to make this folder. One with files in it is nobody's to clear."""
+    _let_links_go(folder)
     path = folder.absolute()
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        return
-    new = [place for place in (path, *path.parents) if not place.exists()]
-    _expected.append(_Folder(path, tuple(new)))
+    if not path.exists() or path.is_dir() and not any(path.iterdir()):
+        new = tuple(place for place in (path, *path.parents) if not place.exists())
+        _new_folders.setdefault(path, new)
 
 
-def _forget_folders() -> None:
-    """What was expected so far stays as it is."""
-    _expected.clear()
+def _let_links_go(folder: Path) -> None:
+    """Hydra writes its files into an old folder through whatever stands there."""
+    if folder.is_dir():
+        let_links_go(folder / ".hydra")
+        for path in (*folder.glob("*.log"), *folder.glob("*.yaml"), *folder.glob(".hydra/*")):
+            let_links_go(path)
 
 
-def _clear_folders() -> None:
-    """Remove the expected folders that hold nothing but what Hydra put there."""
-    for folder in _expected:
-        with contextlib.suppress(OSError):  # the error that is being reported counts for more
-            _clear(folder)
-    _forget_folders()
+def _summaries(config: DictConfig) -> list[Path]:
+    return sorted(Path(config.hydra.sweep.dir).absolute().glob("**/summary.json"))
 
 
-def _clear(folder: _Folder) -> None:
-    files = [path for path in folder.path.glob("*") if path.name != ".hydra"]
-    inner = list(folder.path.glob(".hydra/*"))
+def _clear(folder: Path, new: tuple[Path, ...]) -> None:
+    """Remove a folder that holds nothing but what Hydra put there."""
+    files = [path for path in folder.glob("*") if path.name != ".hydra"]
+    inner = list(folder.glob(".hydra/*"))
     if any(path.suffix != ".log" and path.name != _SWEEPS for path in files):
         return
     if any(path.name not in _HYDRAS for path in inner):
         return
-    _close_logs(folder.path)
+    for handler in list(logging.root.handlers):  # Windows removes no file that is open
+        if isinstance(handler, logging.FileHandler) and Path(handler.baseFilename) in files:
+            logging.root.removeHandler(handler)
+            handler.close()
     for path in (*files, *inner):
         path.unlink()
-    for place in (folder.path / ".hydra", *folder.new):
+    for place in (folder / ".hydra", *new):
         if place.is_dir():
             place.rmdir()
-
-
-def _close_logs(folder: Path) -> None:
-    """Windows removes no file that is open."""
-    root = logging.getLogger()
-    for handler in list(root.handlers):
-        if (
-            isinstance(handler, logging.FileHandler)
-            and folder in Path(handler.baseFilename).parents
-        ):
-            root.removeHandler(handler)
-            handler.close()

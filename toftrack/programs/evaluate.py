@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 
 from toftrack.errors import ToftrackError, reported_errors
@@ -12,13 +11,24 @@ from toftrack.evaluation.datasets import DATA_SETS, open_data_set
 from toftrack.evaluation.datasets.base import LabelledSequence
 from toftrack.evaluation.public import evaluate, table, totals
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.programs import command_line
 from toftrack.safe_files import write_whole
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, track, print the table. Raises ToftrackError."""
-    options = _parser().parse_intermixed_args(arguments)
+    about = "Evaluate the tracker on a public data set of labelled depth images."
+    parser = argparse.ArgumentParser(prog="toftrack evaluate", description=about)
+    add = parser.add_argument
+    add("data_set", metavar="DATASET", help=", ".join(DATA_SETS))
+    add("folder", metavar="FOLDER", help="where the data set lies")
+    about = "as for track.py, filter.particles=1000"
+    add("overrides", metavar="OVERRIDE", nargs="*", default=[], help=about)
+    add("--sequences", help="only those, by name, separated by commas: P0/1,P0/2")
+    add("--frames", type=_count, help="only so many at the start of each sequence")
+    about = "how far the labels' fingertips lie inside of ours, instead of the data set's own"
+    add("--tip-inset", type=float, metavar="MM", help=about)
+    add("--json", metavar="FILE", help="write the figures here, too")
+    options = parser.parse_intermixed_args(arguments)
     data_set, sequences = open_data_set(options.data_set, options.folder)
     sequences = _chosen(sequences, options.sequences)
     inset_m = data_set.tip_inset_m if options.tip_inset is None else options.tip_inset / 1e3
@@ -41,32 +51,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             write_whole(options.json, json.dumps(facts, indent=1, allow_nan=False) + "\n")
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="toftrack evaluate",
-        description="Evaluate the tracker on a public data set of labelled depth images.",
-    )
-    parser.add_argument("data_set", metavar="DATASET", help=", ".join(DATA_SETS))
-    parser.add_argument("folder", metavar="FOLDER", help="where the data set lies")
-    parser.add_argument(
-        "overrides",
-        metavar="OVERRIDE",
-        nargs="*",
-        default=[],
-        help="as for track.py, filter.particles=1000",
-    )
-    parser.add_argument("--sequences", help="only those, by name, separated by commas: P0/1,P0/2")
-    parser.add_argument("--frames", type=_count, help="only so many at the start of each sequence")
-    parser.add_argument(
-        "--tip-inset",
-        type=float,
-        metavar="MM",
-        help="how far the labels' fingertips lie inside of ours, instead of the data set's own",
-    )
-    parser.add_argument("--json", metavar="FILE", help="write the figures here, too")
-    return parser
-
-
 def _count(text: str) -> int:
     count = int(text)
     if count < 1:
@@ -82,7 +66,3 @@ def _chosen(sequences: list[LabelledSequence], names: str | None) -> list[Labell
         if name not in known:
             raise ToftrackError(f"there is no sequence '{name}'; there are {', '.join(known)}")
     return [known[name] for name in names.split(",")]
-
-
-if __name__ == "__main__":
-    sys.exit(command_line.run(main))

@@ -11,6 +11,7 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,6 @@ from toftrack.errors import ToftrackError
 from toftrack.gestures.definitions import OTHER, SETS
 from toftrack.gestures.files import NamedPose, learned_pose, read_poses, save_poses
 from toftrack.gestures.recognition import Gestures, gestures_with
-from toftrack.programs import command_line
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.store import open_source
 
@@ -34,7 +34,20 @@ _LEAD_S = 1.0
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and do what it says. Raises ToftrackError."""
-    options = _parser().parse_intermixed_args(arguments)
+    parser = argparse.ArgumentParser(
+        prog="toftrack gesture",
+        description="Your own gestures: learn one from a recording, list or remove them.",
+        usage="%(prog)s add NAME RECORDING --from S --to S [OVERRIDE ...] | list | remove NAME",
+    )
+    option = parser.add_argument
+    option("command", choices=("add", "list", "remove"))
+    about = "its name; the recording that shows it (or sample); as for track.py, hand.side=left"
+    option("words", nargs="*", default=[], metavar="NAME RECORDING OVERRIDE", help=about)
+    option("--from", dest="begin", type=float, metavar="S", help="seconds")
+    option("--to", dest="end", type=float, metavar="S", help="seconds")
+    option("--file", default=_FILE, help=f"the file of gestures ({_FILE})")
+    option("--replace", action="store_true", help="in place of one of that name")
+    options = parser.parse_intermixed_args(arguments)
     path = Path(options.file).expanduser()
     if path.suffix.lower() != ".json":
         raise ToftrackError(f"--file {path} is no .json, which is the kind that can be written")
@@ -49,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise ToftrackError("say which part of the recording it is: --from 2.0 --to 3.0")
         name, recording, *overrides = words
         part_s = options.begin, options.end
-        add(path, poses, name, recording, part_s, options.replace, overrides)
+        _add(path, poses, name, recording, part_s, options.replace, overrides)
     else:
         raise ToftrackError(
             f"'{' '.join((options.command, *words))}' is not complete or too much; give"
@@ -57,20 +70,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
 
 
-def add(
+def _add(
     path: Path,
     poses: Sequence[NamedPose],
     name: str,
     recording: str,
     part_s: tuple[float, float],
-    replace: bool = False,
-    overrides: Sequence[str] = (),
-) -> NamedPose:
-    """Learn a gesture from a part of a recording and write it into the file.
-
-    path: a .json; made where there is none.  poses: what is in it.
-    part_s: from and to, seconds from the recording's first frame.
-    replace: whether a gesture of that name, the user's or a known one, gives way.
+    replace: bool,
+    overrides: Sequence[str],
+) -> None:
+    """Learn a gesture from a part of a recording, from and to in seconds from its first frame, and
+    write it into the file, beside the poses that are in it.
 
     Raises ToftrackError when the recording cannot be read, the name is taken, the hand was not
     followed or moved in that part, or the gesture looks like another.
@@ -84,18 +94,14 @@ def add(
     names = [*(pose.name for pose in poses), *(d.name for d in SETS[known])]
     _check_name(name, names, replace)
     with_it = [pose for pose in poses if pose.name != name]
-    frames = open_source(recording)
-    try:
+    with closing(open_source(recording)) as frames:
         angles, believed = _track(frames, recording, part_s, overrides)
-    finally:
-        frames.close()
     pose = learned_pose(name, angles, believed, gestures.settings.flexion_rad)
     with_it.append(pose)
     gestures_with(known, with_it, gestures.settings, str(path))
     save_poses(path, with_it)
     print(f"{path}: {name}, from {int(believed.sum())} of {len(believed)} frames")
     print(f"use it: python track.py gestures.file={path}")
-    return pose
 
 
 def _track(
@@ -164,28 +170,3 @@ def _remove(path: Path, poses: Sequence[NamedPose], name: str) -> None:
     else:  # a file that names no pose is none of gestures
         path.unlink()
     print(f"{path}: without {name}")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="toftrack gesture",
-        description="Your own gestures: learn one from a recording, list or remove them.",
-        usage="%(prog)s add NAME RECORDING --from S --to S [OVERRIDE ...] | list | remove NAME",
-    )
-    parser.add_argument("command", choices=("add", "list", "remove"))
-    parser.add_argument(
-        "words",
-        nargs="*",
-        default=[],
-        metavar="NAME RECORDING OVERRIDE",
-        help="its name; the recording that shows it (or sample); as for track.py, hand.side=left",
-    )
-    parser.add_argument("--from", dest="begin", type=float, metavar="S", help="seconds")
-    parser.add_argument("--to", dest="end", type=float, metavar="S", help="seconds")
-    parser.add_argument("--file", default=_FILE, help=f"the file of gestures ({_FILE})")
-    parser.add_argument("--replace", action="store_true", help="in place of one of that name")
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(command_line.run(main))

@@ -26,9 +26,7 @@ from omegaconf import DictConfig
 from toftrack.checks import check_number
 from toftrack.configuration.compose import (
     configuration,
-    devices_of_files,
     one_sentence,
-    setting_names,
 )
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
@@ -69,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.frames is not None:
         check_number("--frames", options.frames, 1, whole=True)
     check_number("--port", options.port, 0, 65535, whole=True, remedy=ANY_PORT)
-    words = with_recording(options.words, setting_names(), devices_of_files())
+    words = with_recording(options.words)
     if not any(word.startswith("device=") for word in words):
         raise ToftrackError("which recording is to be labelled? Give the name of a file")
     side = [] if options.side is None else [f"hand.side={options.side}"]

@@ -6,35 +6,27 @@ import gc
 import importlib
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import toftrack
 from toftrack.configuration import configuration_folder
 
-
-@dataclass(frozen=True)
-class _Command:
-    module: str
-    about: str
-    function: str = "main"
-
-
 _COMMANDS = {
-    "track": _Command("toftrack.programs.applications", "follow a hand", "track"),
-    "train": _Command("toftrack.programs.applications", "learn a space of poses", "train"),
-    "record": _Command("toftrack.programs.record", "record a camera"),
-    "convert": _Command("toftrack.programs.convert", "convert a recording"),
-    "calibrate": _Command("toftrack.programs.calibrate", "calibrate a camera with a chequerboard"),
-    "evaluate": _Command("toftrack.programs.evaluate", "measure against a public data set"),
-    "label": _Command("toftrack.programs.label", "label a recording by clicks, to measure on it"),
-    "gesture": _Command("toftrack.programs.gesture", "make gestures of your own"),
-    "figures": _Command("toftrack.programs.figures", "draw pictures of a finished run"),
-    "report": _Command("toftrack.programs.report", "gather the jobs of a sweep"),
-    "benchmark": _Command("toftrack.programs.benchmark", "measure speed and accuracy"),
-    "export": _Command("toftrack.programs.export", "write a run for Blender, or as a table"),
-    "recover": _Command("toftrack.programs.recover", "finish a run or a recording that was killed"),
+    "track": "follow a hand",
+    "train": "learn a space of poses",
+    "record": "record a camera",
+    "convert": "convert a recording",
+    "calibrate": "calibrate a camera with a chequerboard",
+    "evaluate": "measure against a public data set",
+    "label": "label a recording by clicks, to measure on it",
+    "gesture": "make gestures of your own",
+    "figures": "draw pictures of a finished run",
+    "report": "gather the jobs of a sweep",
+    "benchmark": "measure speed and accuracy",
+    "export": "write a run for Blender, or as a table",
+    "recover": "finish a run or a recording that was killed",
 }
+"""Each is the function `main` of the module of its name, but for those that Hydra runs."""
 _HELP = ("-h", "--help")
 _VERSION = "--version"
 
@@ -109,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def overview() -> str:
     """What `toftrack --help` prints."""
     width = max(map(len, _COMMANDS))
-    lines = [f"  {name:<{width}}  {command.about}" for name, command in _COMMANDS.items()]
+    lines = [f"  {name:<{width}}  {about}" for name, about in _COMMANDS.items()]
     return _OVERVIEW.format(commands="\n".join(lines))
 
 
@@ -125,10 +117,9 @@ def long_help(name: str) -> str:
 
 
 def _program(name: str) -> Callable[[Sequence[str]], object]:
-    command = _COMMANDS[name]
-    function: Callable[[Sequence[str]], object] = getattr(
-        importlib.import_module(command.module), command.function
-    )
+    hydras = name in _LONG_HELP
+    module = importlib.import_module(f"toftrack.programs.{'applications' if hydras else name}")
+    function: Callable[[Sequence[str]], object] = getattr(module, name if hydras else "main")
     return function
 
 

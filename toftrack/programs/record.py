@@ -9,14 +9,13 @@ changed as for `toftrack track`. An SR3000 may be recorded to `.srs`, too, as it
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
-import hydra
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tqdm import tqdm
 
@@ -34,29 +33,21 @@ from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
 
-_GIGABYTE = 1e9
-
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and record. Raises ToftrackError, and EndedError at the end of an
     interrupted recording, whose frames are all in the file."""
     parser = plain_parser("toftrack record", __doc__)
-    parser.add_argument("out", metavar="OUT", help="the new recording, .npz or .srs")
-    parser.add_argument("--frames", type=int, help="stop after so many (default: at Ctrl-C)")
-    parser.add_argument("--seconds", type=float, help="stop after so long")
-    parser.add_argument("--limit", type=float, metavar="GB", help="stop at this size (default: 1)")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    parser.add_argument(
-        "--conf", default=configuration_folder(), help="folder of the configuration"
-    )
-    parser.add_argument("--config-dir", help="folder of choices of your own")
-    parser.add_argument(
-        "overrides",
-        nargs="*",
-        default=[],
-        metavar="KEY=VALUE",
-        help="device=KIND and settings of it, device.KEY=VALUE",
-    )
+    add, folder = parser.add_argument, configuration_folder()
+    add("out", metavar="OUT", help="the new recording, .npz or .srs")
+    add("--frames", type=int, help="stop after so many (default: at Ctrl-C)")
+    add("--seconds", type=float, help="stop after so long")
+    add("--limit", type=float, metavar="GB", help="stop at this size (default: 1)")
+    add("--overwrite", action="store_true", help="replace an existing file")
+    add("--conf", default=folder, help="folder of the configuration")
+    add("--config-dir", help="folder of choices of your own")
+    about = "device=KIND and settings of it, device.KEY=VALUE"
+    add("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=about)
     # Intermixed: options may stand between the settings.
     options = parser.parse_intermixed_args(arguments)
     for name, whole in (("frames", True), ("seconds", False), ("limit", False)):
@@ -69,19 +60,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "that afterwards with toftrack convert"
         )
     config = _configuration(options, raw=suffix == ".srs")
-    limit_gb = config.record_limit_gb if options.limit is None else options.limit
+    if options.limit is None:
+        options.limit = config.record_limit_gb
     with one_sentence():
-        device: Device = hydra.utils.instantiate(config.device)
-    if suffix == ".srs":
-        assert isinstance(device, Sr3000)
-        limit = (options.frames, options.seconds, limit_gb)
-        with device:
-            interrupted = record(device, options.out, *limit, options.overwrite)
-        if interrupted is not None:
-            raise EndedError(interrupted)
-    else:
-        recorder = Recorder(options.out, device, limit_gb, options.overwrite)
+        device: Device = instantiate(config.device)
+    if suffix == ".npz":
+        recorder = Recorder(options.out, device, options.limit, options.overwrite)
         record_frames(device, recorder, options.frames, options.seconds)
+        return
+    assert isinstance(device, Sr3000)
+    with device:
+        interrupted = _record_raw(device, options)
+    if interrupted is not None:
+        raise EndedError(interrupted)
 
 
 def record_frames(
@@ -95,7 +86,7 @@ def record_frames(
     and KeyboardInterrupt when somebody ended it. What came until then is in the file.
     """
     try:
-        with device, tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
+        with device, _progress(frames) as bar:
             began = time.monotonic()
             for count, frame in enumerate(device, 1):
                 with shutdown.not_now():
@@ -117,27 +108,19 @@ def record_frames(
         raise ToftrackError("the device delivered no frame; nothing was recorded")
 
 
-def record(
-    device: Sr3000,
-    path: str | Path,
-    frames: int | None = None,
-    seconds: float | None = None,
-    limit_gb: float = math.inf,
-    overwrite: bool = False,
-) -> int | None:
+def _record_raw(device: Sr3000, options: argparse.Namespace) -> int | None:
     """Write every frame of an opened camera (keep=every) to a `.srs` file, until there are so many
-    frames, seconds or times 1e9 bytes.
+    frames, seconds or gigabytes.
 
-    SIGINT, SIGTERM and SIGHUP end it after the frames that were received until then. Returns the
-    number of the signal that did; None: none did.
-
+    A signal ends it after the frames that were received until then, and its number is returned.
     Raises ToftrackError when the file cannot be written, or the camera was given up; the frames
     until then are in the file.
     """
     facts = device.description
+    serial = str(facts.get("serial"))
     init = SrsInit(
         product_id=int(facts.get("usb_id", "0:74").partition(":")[2], 16),
-        serial_number=_digits(facts.get("serial")),
+        serial_number=int(serial) & 0xFFFFFFFF if serial.isdecimal() else 0,
     )
     registers = bytearray(REGISTERS)
     for address, value in device.register_writes():
@@ -152,27 +135,31 @@ def record(
 
     about = SrsFacts(device.exposure.range_m, device.camera, device.fps, device.metadata)
     with (
-        SrsWriter(path, init, bytes(registers), about, overwrite) as writer,
+        SrsWriter(options.out, init, bytes(registers), about, options.overwrite) as writer,
         shutdown.handled(stop),
-        tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5) as bar,
+        _progress(options.frames) as bar,
     ):
         began = time.monotonic()
         for capture in device.captures():
             writer.append(capture.data, capture.timestamp_s)
             bar.update()
-            if frames is not None and writer.frames >= frames:
+            if writer.frames == options.frames:
                 break
-            if writer.size_bytes >= limit_gb * _GIGABYTE:
+            if writer.size_bytes >= 1e9 * options.limit:
                 print(
-                    f"the recording '{path}' ends after {writer.frames} frames: it has "
-                    f"{limit_gb:g} GB, its limit",
+                    f"the recording '{options.out}' ends after {writer.frames} frames: it has "
+                    f"{options.limit:g} GB, its limit",
                     file=sys.stderr,
                 )
                 break
-            if seconds is not None and time.monotonic() - began >= seconds:
+            if options.seconds is not None and time.monotonic() - began >= options.seconds:
                 device.request_stop()
-    print(f"{path}: {writer.frames} frames ({device.counts})")
+    print(f"{options.out}: {writer.frames} frames ({device.counts})")
     return came[0] if came else None
+
+
+def _progress(frames: int | None) -> tqdm:
+    return tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5)
 
 
 def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:
@@ -191,7 +178,7 @@ def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:
         raise ToftrackError(f"only an SR3000 is recorded to .srs; record {chosen} to .npz")
     if raw and chosen is None:
         overrides.insert(0, "device=sr3000")
-    if not raw and chosen is None:
+    elif chosen is None:
         kinds = sorted(path.stem for path in Path(options.conf, "device").glob("*.yaml"))
         raise ToftrackError(
             f"which camera is it? Give device={', '.join(kinds)}, or one of your own with "
@@ -201,7 +188,3 @@ def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:
     if "keep" in config.device and not any(word.startswith("device.keep=") for word in overrides):
         config.device.keep = "every"
     return config
-
-
-def _digits(serial: str | None) -> int:
-    return int(serial) & 0xFFFFFFFF if serial is not None and str(serial).isdecimal() else 0

@@ -12,7 +12,7 @@ import csv
 import io
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,44 +25,41 @@ from toftrack.json_text import read_json
 from toftrack.safe_files import open_to_read, write_whole
 from toftrack.views.figures import chart
 
-FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
+_FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
 """What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
 
-SEED = "seed"
-RECORDING = "device.path"
+_SEED = "seed"
+_RECORDING = "device.path"
 """Which recording a job tracked: averaged over, and shown apart where there are several."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One job of a sweep.
-
-    name: its folder below the sweep's.  overrides: as given.  figures: numbers of summary.json,
-    nested names joined by dots.  error: why it failed, None when it did not.
-    """
+    """One job of a sweep."""
 
     name: str
+    """Its folder below the sweep's."""
     overrides: dict[str, str]
     figures: dict[str, float]
+    """Numbers of summary.json, nested names joined by dots."""
     error: str | None = None
+    """Why it failed."""
 
 
 @dataclass
 class Group:
-    """The runs that differ only in the seed and the recording.
-
-    settings: the overrides that tell groups apart.  error, cost_ms: means over the runs, None
-    without any.  spread: deviation over seeds of the mean over recordings, None below two seeds.
-    recordings: the mean error of each.
-    """
+    """The runs that differ only in the seed and the recording."""
 
     settings: str
+    """The overrides that tell groups apart."""
     runs: list[Run] = field(default_factory=list)
     error: float | None = None
+    """Mean over the runs, as cost_ms; None without any."""
     spread: float | None = None
+    """Deviation over seeds of the mean over recordings; None below two seeds."""
     cost_ms: float | None = None
-    seeds: int = 0
     recordings: dict[str, float] = field(default_factory=dict)
+    """The mean error of each."""
 
 
 def read_runs(folder: str | Path) -> list[Run]:
@@ -97,9 +94,8 @@ def _read_run(path: Path, folder: Path) -> Run:
     except FileNotFoundError:
         return Run(name, overrides, {}, "it left no summary.json: it did not finish")
     except (OSError, ValueError) as error:
-        return Run(
-            name, overrides, {}, f"its summary.json cannot be read ({_printable(str(error))})"
-        )
+        why = f"its summary.json cannot be read ({_printable(str(error))})"
+        return Run(name, overrides, {}, why)
     if not isinstance(summary, dict):
         return Run(name, overrides, {}, "its summary.json is not one of track.py")
     varied = summary.get("error")
@@ -126,16 +122,9 @@ def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:
     return figures
 
 
-def error_figure(runs: Sequence[Run]) -> str:
-    """The first of FIGURES that every good run has, else the first."""
-    good = [run for run in runs if run.error is None]
-    everywhere = [name for name in FIGURES if all(name in run.figures for run in good)]
-    return everywhere[0] if good and everywhere else FIGURES[0]
-
-
 def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
     """Groups in the order of their first run, with the mean and the spread of a figure."""
-    varied = [key for key in _varied(runs) if key not in (SEED, RECORDING)]
+    varied = [key for key in _varied(runs) if key not in (_SEED, _RECORDING)]
     groups: dict[str, Group] = {}
     for run in runs:
         settings = " ".join(f"{key}={run.overrides.get(key, '-')}" for key in varied) or "all alike"
@@ -154,9 +143,9 @@ def _keys(runs: Sequence[Run]) -> list[str]:
     return list(dict.fromkeys(key for run in runs for key in run.overrides))
 
 
-def recording(run: Run) -> str:
+def _recording(run: Run) -> str:
     """The name of the run's recording; empty when the sweep does not choose one."""
-    return Path(run.overrides.get(RECORDING, "")).stem
+    return Path(run.overrides.get(_RECORDING, "")).stem
 
 
 def _summarise(group: Group, figure: str) -> None:
@@ -164,25 +153,25 @@ def _summarise(group: Group, figure: str) -> None:
     if not good:
         return
 
-    def mean(runs: Sequence[Run], name: str) -> float:
+    def mean(runs: Iterable[Run], name: str = figure) -> float:
         return statistics.fmean(run.figures[name] for run in runs)
 
-    group.error = mean(good, figure)
-    seeds = sorted({run.overrides.get(SEED, "") for run in good})
+    group.error = mean(good)
+    names = sorted(set(map(_recording, good)))
+    seeds = sorted({run.overrides.get(_SEED, "") for run in good})
     # A seed that failed on a recording would compare other recordings: only complete seeds count.
-    names = sorted({recording(run) for run in good})
-    by_seed = [[run for run in good if run.overrides.get(SEED, "") == seed] for seed in seeds]
-    complete = [runs for runs in by_seed if {recording(run) for run in runs} == set(names)]
-    group.seeds = len(seeds)
+    by_seed = [[run for run in good if run.overrides.get(_SEED, "") == seed] for seed in seeds]
+    complete = [mean(runs) for runs in by_seed if set(map(_recording, runs)) == set(names)]
     if len(complete) > 1:
-        group.spread = statistics.stdev(mean(runs, figure) for runs in complete)
-    timed = [run for run in good if "mean_ms" in run.figures]
-    group.cost_ms = mean(timed, "mean_ms") if timed else None
-    for name in names:
-        group.recordings[name] = mean([run for run in good if recording(run) == name], figure)
+        group.spread = statistics.stdev(complete)
+    if timed := [run for run in good if "mean_ms" in run.figures]:
+        group.cost_ms = mean(timed, "mean_ms")
+    group.recordings = {
+        name: mean(run for run in good if _recording(run) == name) for name in names
+    }
 
 
-def write_csv(runs: Sequence[Run], path: Path) -> None:
+def _write_csv(runs: Sequence[Run], path: Path) -> None:
     """One row a job: its folder, its overrides, its figures, its error."""
     overrides = _keys(runs)
     figures = list(dict.fromkeys(key for run in runs for key in run.figures))
@@ -190,13 +179,13 @@ def write_csv(runs: Sequence[Run], path: Path) -> None:
     writer = csv.writer(text)
     writer.writerow(["run", *overrides, *figures, "error"])
     for run in runs:
-        row = [*(run.overrides.get(key, "") for key in overrides)]
-        row += [*(str(run.figures.get(key, "")) for key in figures)]
-        writer.writerow([run.name, *row, run.error or ""])
+        given = [run.overrides.get(key, "") for key in overrides]
+        found = [run.figures.get(key, "") for key in figures]
+        writer.writerow([run.name, *given, *found, run.error or ""])
     write_whole(path, text.getvalue())
 
 
-def table(groups: Sequence[Group], figure: str) -> str:
+def _table(groups: Sequence[Group], figure: str) -> str:
     """The groups as text for the terminal; a second block by recording where there are several."""
     unit, digits = ("mm", 2) if figure.endswith("_mm") else (figure.removeprefix("metrics."), 3)
     lines = [f" #  runs failed  {unit:>10}   spread    ms/frame  settings"]
@@ -223,20 +212,24 @@ def _text(value: float | None, digits: int) -> str:
 def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], list[Group]]:
     """Read a sweep, write sweep.csv and sweep.png into its folder, print the table.
 
-    figure: a figure of summary.json such as metrics.fingertip_mm; None takes `error_figure`.
+    figure: a figure of summary.json such as metrics.fingertip_mm; None takes the first of _FIGURES
+    that every good run has.
 
     Raises ToftrackError when there is no job, no job has the figure, or nothing can be written.
     """
     folder = Path(folder)
     runs = read_runs(folder)
-    figure = figure or error_figure(runs)
+    if figure is None:
+        good = [run.figures for run in runs if run.error is None]
+        everywhere = (name for name in _FIGURES if all(name in figures for figures in good))
+        figure = next(everywhere, _FIGURES[0])
     known = sorted({name for run in runs for name in run.figures})
     if known and figure not in known:
         raise ToftrackError(f"no job has the figure {figure}; known: {', '.join(known)}")
     groups = group_runs(runs, figure)
     with reported_errors(f"{folder} cannot be written", "copy it to where it can be"):
-        write_csv(runs, folder / "sweep.csv")
-    print(table(groups, figure))
+        _write_csv(runs, folder / "sweep.csv")
+    print(_table(groups, figure))
     failed = [run for run in runs if run.error is not None]
     if failed:
         print(f"\n{len(failed)} of {len(runs)} jobs failed:")
@@ -258,29 +251,25 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     return runs, groups
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0 also when jobs of the sweep failed. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(
-        prog="toftrack report", description="Gather the jobs of a sweep into one table."
-    )
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line; jobs of the sweep that failed are no error. Raises ToftrackError."""
+    about = "Gather the jobs of a sweep into one table."
+    parser = argparse.ArgumentParser(prog="toftrack report", description=about)
     parser.add_argument("folder", help="the sweep's folder, multirun/DATE/TIME")
-    parser.add_argument(
-        "--figure", help="of summary.json, as metrics.fingertip_mm; default the mean joint error"
-    )
+    about = "of summary.json, as metrics.fingertip_mm; default the mean joint error"
+    parser.add_argument("--figure", help=about)
     given = parser.parse_args(arguments)
     report(given.folder, given.figure)
-    return 0
 
 
-Point = tuple[str, float, float, float | None]
+_Point = tuple[str, float, float, float | None]
 """(settings, cost in ms, error, spread of the error over seeds or None)"""
 
 
-def sweep_figure(points: Sequence[Point], label: str) -> np.ndarray:
+def sweep_figure(points: Sequence[_Point], label: str) -> np.ndarray:
     """Numbered dots with bars of one deviation over seeds, a legend below; BGR.
 
-    points: at least one.  label: of the error's axis, which starts at zero. The axis of the cost is
-        logarithmic.
+    label: of the error's axis, which starts at zero. The axis of the cost is logarithmic.
     """
     figure = chart.new_figure(900, 500 + 22 * len(points))
     axes = figure.subplots()
