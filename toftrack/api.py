@@ -28,12 +28,10 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
     Any number of them may work in one process, each in a thread of its own; one tracker must not be
     used by two threads at once.
 
-    Args:
-        overrides: as on the command line, "hand.side=left" or "filter.particles=1000".
-        config_dir: a folder with your own config.yaml and its groups, instead of toftrack's.
+    overrides: as on the command line, "hand.side=left" or "filter.particles=1000".
+    config_dir: a folder with your own config.yaml and its groups, instead of toftrack's.
 
-    Raises:
-        ToftrackError: an override or a file that it names cannot be used, or hands is above 1.
+    Raises ToftrackError: an override or a file that it names cannot be used, or hands is above 1.
     """
     config = configuration(*overrides, config_dir=config_dir)
     if config.get("hands", 1) != 1:
@@ -67,12 +65,10 @@ def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device
     Its frames are as the camera took them; `device.camera.rectify(frame.depth, frame.radial)` is
     what a tracker wants, together with `device.camera.K`.
 
-    Args:
-        overrides: as on the command line, "device=replay" and "device.path=FILE.npz".
-        config_dir: as for make_tracker.
+    overrides: as on the command line, "device=replay" and "device.path=FILE.npz".
+    config_dir: as for make_tracker.
 
-    Raises:
-        ToftrackError: an override cannot be used, or the device cannot deliver.
+    Raises ToftrackError: an override cannot be used, or the device cannot deliver.
     """
     config = configuration(*overrides, config_dir=config_dir)
     with one_sentence():
@@ -94,10 +90,9 @@ def build_hands_tracker(config: DictConfig) -> HandsTracker:
     from toftrack.compute.threads import small_operations
     from toftrack.tracking.tracker import HandsTracker
 
-    hands = config.get("hands", 1)
     with small_operations():
-        model, pace = build_model(config), _pace(config)
-        return HandsTracker(model, config.seed, hands, pace)
+        model, hands = build_model(config), config.get("hands", 1)
+        return HandsTracker(model, config.seed, hands, _pace(config))
 
 
 def _pace(config: DictConfig) -> Pace:
@@ -145,8 +140,8 @@ def compute_device(name: str) -> torch.device:
     """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
     import torch
 
-    if name == "auto":  # a GPU is right, and not faster: docs/lab/gpu.md
-        return torch.device("cpu")
+    if name not in ("auto", "cpu", "cuda"):
+        raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
     if name == "cuda":
         try:
             torch.cuda.init()
@@ -159,6 +154,5 @@ def compute_device(name: str) -> torch.device:
                 "compute=cuda: the process that this one was forked from has used the GPU, which "
                 "CUDA does not allow; start it by multiprocessing's spawn, or give compute=cpu"
             ) from None
-    if name not in ("cpu", "cuda"):
-        raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
-    return torch.device(name)
+    # A GPU is right, and not faster: docs/lab/gpu.md.
+    return torch.device("cpu" if name == "auto" else name)

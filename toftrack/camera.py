@@ -147,21 +147,19 @@ class Camera:
     def _rays(self) -> np.ndarray:
         v, u = np.mgrid[: self.height, : self.width].astype(np.float64)
         focal, centre = self.K[[0, 1], [0, 1]], self.K[:2, 2]
+        pixels = np.stack([u, v], axis=-1)
+        lens = pixels.reshape(-1, 1, 2), self.K, self.distortion
         if not self._distorted:
-            rays = (np.stack([u, v], axis=-1) - centre) / focal
+            rays = (pixels - centre) / focal
+        elif self.lens == "fisheye":
+            rays = cv2.fisheye.undistortPoints(*lens, criteria=_UNTIL)
         else:
-            pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-            rays = self._undistorted_points(pixels).reshape(self.height, self.width, 2)
+            # OpenCV 5 has taken the function of 4 that can be told when to stop into the other one.
+            undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+            rays = undistort(*lens, R=None, P=None, criteria=_UNTIL)
+        rays = rays.reshape(self.height, self.width, 2)
         rays.setflags(write=False)
         return rays
-
-    def _undistorted_points(self, pixels: np.ndarray) -> np.ndarray:
-        """(n, 1, 2) measured pixels to x and y at Z = 1."""
-        if self.lens == "fisheye":
-            return cv2.fisheye.undistortPoints(pixels, self.K, self.distortion, criteria=_UNTIL)
-        # OpenCV 5 has taken the function of 4 that can be told when to stop into the other one.
-        undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
-        return undistort(pixels, self.K, self.distortion, R=None, P=None, criteria=_UNTIL)
 
     @cached_property
     def _ray_lengths(self) -> np.ndarray:
@@ -188,15 +186,9 @@ class Camera:
         polynomial corrects the radial distance; radial distance becomes Z; the lens distortion is
         undone by the nearest pixel (interpolation would invent surfaces at the hand's edge).
 
-        Args:
-            depth: (H, W) metres, Z or, if `radial`, the distance along the pixel's ray.
-            radial: which of the two it is.
+        depth: (H, W) metres, Z or, if `radial`, the distance along the pixel's ray.
 
-        Returns:
-            (H, W) float32 metres, a new array.
-
-        Raises:
-            ToftrackError: the image is not of the camera's size.
+        Returns a new (H, W) float32, metres. Raises ToftrackError: it is not of the camera's size.
         """
         self._check_size(depth)
         # A large image takes as long as memory does: nearly all are clean, and what follows is done
@@ -259,9 +251,7 @@ class Camera:
     def load(cls, path: str | Path) -> Camera:
         """Read a camera that `save` wrote. Raises ToftrackError for anything else."""
         if not str(path):
-            raise ToftrackError(
-                "the name of the camera file is empty; give the path of one (.json)"
-            )
+            raise ToftrackError("the camera file's name is empty; give the path of one (.json)")
         with reported_errors(
             f"the camera file '{path}' cannot be read",
             "give a camera file (.json) that toftrack wrote",

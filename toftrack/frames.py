@@ -30,20 +30,18 @@ def wrong_unit(what: str, depth: np.ndarray, kind: str = "") -> ToftrackError:
     median, nearest = median_reading(depth), nearest_reading(depth)
     whole = f"{what} consists of whole numbers ({kind}), their median"
     given = whole if kind else f"the median of {what}"
-    plainly = None
     if _NEAREST_CM[0] <= nearest < _NEAREST_CM[1] and median <= _LARGEST_CM:
-        plainly = ("centimetres", 100)
+        unit, to_metres = "centimetres", 100
     elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1]:
-        plainly = ("millimetres", 1000)
-    if plainly:
-        unit, to_metres = plainly
+        unit, to_metres = "millimetres", 1000
+    else:
         return ToftrackError(
-            f"{given} is {median:.0f}, which is plainly {unit}, but it must be float metres; "
-            f"convert with depth.astype('float32') / {to_metres}"
+            f"{given} is {median:.4g}, neither metres nor millimetres of a hand before a camera; "
+            "find out in which unit it was recorded, and give float metres (0 = no reading)"
         )
     return ToftrackError(
-        f"{given} is {median:.4g}, neither metres nor millimetres of a hand before a camera; "
-        "find out in which unit it was recorded, and give float metres (0 = no reading)"
+        f"{given} is {median:.0f}, which is plainly {unit}, but it must be float metres; "
+        f"convert with depth.astype('float32') / {to_metres}"
     )
 
 
@@ -143,14 +141,8 @@ class DepthImage:
 def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     """A depth image as (H, W) float32 metres with 0 for no reading, and (3, 3) float64 intrinsics.
 
-    NaN, infinities and negative readings become no reading.
-
-    Args:
-        depth_m: (H, W) of any floating type, metres along the optical axis.
-        k: (3, 3) pinhole matrix in pixels.
-
-    Raises:
-        ToftrackError: one of them has the wrong shape, type or unit.
+    NaN, infinities and negative readings become no reading. Raises ToftrackError: one of them has
+    the wrong shape, type or unit.
     """
     try:
         depth = np.asarray(depth_m)
@@ -169,11 +161,10 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     if depth.dtype.kind != "f":
         raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
     depth = np.ascontiguousarray(depth, np.float32)
-    nearest, farthest = depth.min(), depth.max()
-    if not (nearest >= 0 and farthest < np.inf):  # also true for NaN
+    farthest = depth.max()
+    if not (depth.min() >= 0 and farthest < np.inf):  # also true for NaN
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
         farthest = depth.max()
-    if farthest > LARGEST_MEDIAN_M:
-        if median_reading(depth) > LARGEST_MEDIAN_M:
-            raise wrong_unit("the depth image", depth)
+    if farthest > LARGEST_MEDIAN_M and median_reading(depth) > LARGEST_MEDIAN_M:
+        raise wrong_unit("the depth image", depth)
     return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K

@@ -17,8 +17,8 @@ from toftrack.programs.command_line import plain_parser
 from toftrack.safe_files import write_whole
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a measurement; returns the exit status. Raises ToftrackError."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a measurement. Raises ToftrackError."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     if given[:1] in (["-h"], ["--help"]):
         print(
@@ -28,16 +28,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "       toftrack benchmark ablation ...      what each part of the tracker brings\n\n"
             "toftrack benchmark speed --help and so on say more"
         )
-        return 0
-    measurements = {
-        "speed": _speed,
-        "alternating": _alternating,
-        "accuracy": _accuracy,
-        "ablation": _ablation,
-    }
-    name, *rest = given if given[:1] and given[0] in measurements else ("speed", *given)
-    measurements[name](rest)
-    return 0
+    elif given[:1] == ["alternating"]:
+        _alternating(given[1:])
+    elif given[:1] == ["accuracy"]:
+        _accuracy(given[1:])
+    elif given[:1] == ["ablation"]:
+        _ablation(given[1:])
+    else:
+        _speed(given[1:] if given[:1] == ["speed"] else given)
 
 
 def _speed(arguments: Sequence[str]) -> None:
@@ -48,9 +46,8 @@ def _speed(arguments: Sequence[str]) -> None:
     counts = list(speed.PARTICLES)
     parser.add_argument("--particles", type=int, nargs="+", default=counts, metavar="N")
     parser.add_argument("--compute", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument(
-        "--seconds", type=float, default=1.0, help="how long to time each method (1)"
-    )
+    about = "how long to time each method (1)"
+    parser.add_argument("--seconds", type=float, default=1.0, help=about)
     parser.add_argument("--frames", action="store_true", help="time whole frames, too")
     parser.add_argument("--no-baselines", action="store_true", help="leave the slow methods out")
     given = parser.parse_args(arguments)
@@ -89,22 +86,13 @@ def _accuracy(arguments: Sequence[str]) -> None:
     from toftrack.evaluation.runs import SIDES
 
     parser = _parser_of_recordings("accuracy", accuracy.__doc__)
-    parser.add_argument(
-        "--side",
-        choices=SIDES,
-        default="told",
-        help="handedness: told, by the truth, or auto, detected while tracking (told)",
-    )
+    about = "handedness: told, by the truth, or auto, detected while tracking (told)"
+    parser.add_argument("--side", choices=SIDES, default="told", help=about)
     hands = range(1, MOST_HANDS + 1)
     parser.add_argument("--hands", type=int, choices=hands, default=1, help="followed at once (1)")
-    parser.add_argument(
-        "--labels",
-        type=Path,
-        metavar="FILE",
-        action="append",
-        default=[],
-        help="of a recording without truth; may be given several times",
-    )
+    about = "of a recording without truth; may be given several times"
+    add = parser.add_argument
+    add("--labels", type=Path, metavar="FILE", action="append", default=[], help=about)
     parser.add_argument("--compare", type=Path, metavar="FILE", help="an earlier --json")
     parser.add_argument("--peer", choices=PEERS, help="measure another method, too")
     parser.add_argument("--peer-python", type=Path, metavar="PYTHON", help="of its environment")
@@ -116,22 +104,19 @@ def _accuracy(arguments: Sequence[str]) -> None:
 def _ablation(arguments: Sequence[str]) -> None:
     from toftrack.evaluation import ablation
 
+    known = list(ablation.VARIANTS)
+
     def variants(text: str) -> list[str]:
         names = text.split(",")
-        known = ", ".join(ablation.VARIANTS)
         for name in names:
-            if name not in ablation.VARIANTS:
-                raise ToftrackError(f"there is no variant '{name}'; give some of {known}")
+            if name not in known:
+                some = ", ".join(known)
+                raise ToftrackError(f"there is no variant '{name}'; give some of {some}")
         return names
 
     parser = _parser_of_recordings("ablation", ablation.__doc__)
-    parser.add_argument(
-        "--variants",
-        type=variants,
-        default=list(ablation.VARIANTS),
-        metavar="NAMES",
-        help=f"only some, separated by commas: {', '.join(ablation.VARIANTS)}",
-    )
+    about = f"only some, separated by commas: {', '.join(known)}"
+    parser.add_argument("--variants", type=variants, default=known, metavar="NAMES", help=about)
     command = shlex.join(["toftrack", "benchmark", "ablation", *arguments])
     ablation.measure(parser.parse_intermixed_args(arguments), command)
 
@@ -139,16 +124,11 @@ def _ablation(arguments: Sequence[str]) -> None:
 def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentParser:
     """With what accuracy and ablation have in common."""
     parser = plain_parser(f"toftrack benchmark {name}", about)
-    parser.add_argument(
-        "what",
-        nargs="+",
-        metavar="FOLDER",
-        help="folders of recordings, or recordings; KEY=VALUE is an override as for track.py",
-    )
+    about = "folders of recordings, or recordings; KEY=VALUE is an override as for track.py"
+    parser.add_argument("what", nargs="+", metavar="FOLDER", help=about)
     parser.add_argument("--seeds", type=_seeds, default=[0], help="separated by commas (0)")
-    parser.add_argument(
-        "--workers", type=_workers, default=1, metavar="N", help="processes (1); figures stay"
-    )
+    about = "processes (1); figures stay"
+    parser.add_argument("--workers", type=_workers, default=1, metavar="N", help=about)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything there")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there")
     return parser

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -39,73 +40,60 @@ _SEARCHED = 24
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """A calibrated camera and how it was found."""
+class _Calibration:
+    """A camera with its depth polynomial, and how it was found: in so many frames."""
 
     camera: Camera
-    """With its depth polynomial."""
     lens: Lens
     depth: DepthFit
     pairs: DepthPairs
     amplitudes: list[np.ndarray]
     """Of the lens's views."""
     searched: int
-    """Frames that were searched for the board."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, calibrate, and write the files. Raises ToftrackError."""
     parser = plain_parser("toftrack calibrate", __doc__)
-    parser.add_argument("recording", help=".srs, .npz with amplitude, or a folder")
-    parser.add_argument("--board", required=True, help="inner corners, columns x rows, as 7x5")
-    parser.add_argument("--square", required=True, type=float, help="side of a square, m")
-    parser.add_argument("--out", default="camera.json", help="the camera file to write")
-    parser.add_argument("--report", help="folder of report and pictures (default: beside OUT)")
-    parser.add_argument("--camera", help="camera file to start from instead of the recording's")
-    parser.add_argument(
-        "--keep-lens", action="store_true", help="correct the depth only, trust the lens"
-    )
-    parser.add_argument("--frames", type=int, default=80, help="frames to use, at most (80)")
-    parser.add_argument(
-        "--modulation",
-        type=int,
-        default=DEFAULT_MODULATION_MHZ,
-        help="MHz, of a .srs that does not state its range",
-    )
+    add = parser.add_argument
+    add("recording", help=".srs, .npz with amplitude, or a folder")
+    add("--board", required=True, help="inner corners, columns x rows, as 7x5")
+    add("--square", required=True, type=float, help="side of a square, m")
+    add("--out", default="camera.json", help="the camera file to write")
+    add("--report", help="folder of report and pictures (default: beside OUT)")
+    add("--camera", help="camera file to start from instead of the recording's")
+    add("--keep-lens", action="store_true", help="correct the depth only, trust the lens")
+    add("--frames", type=int, default=80, help="frames to use, at most (80)")
+    mhz, about = DEFAULT_MODULATION_MHZ, "MHz, of a .srs that does not state its range"
+    add("--modulation", type=int, default=mhz, help=about)
     options = parser.parse_args(arguments)
     board, square_m = _board(options.board), options.square
     if not 0 < square_m < 1 or options.frames < 1:
         raise ToftrackError(
             f"--square must be metres (0.03 for 30 mm), not {square_m}, and --frames above 0"
         )
-    store = open_recording(options.recording, options.camera, options.modulation)
-    start = Camera.load(options.camera) if options.camera else store.camera
-    try:
-        result = calibrate(store, board, square_m, start, options.keep_lens, options.frames)
-    finally:
-        store.close()
+    with closing(open_recording(options.recording, options.camera, options.modulation)) as store:
+        start = Camera.load(options.camera) if options.camera else store.camera
+        result = _calibrate(store, board, square_m, start, options.keep_lens, options.frames)
     out = Path(options.out).expanduser()
     folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
     result.camera.save(out)
     facts = _facts(result, start)
-    text = report_text(facts)
+    text = _report(facts)
     _write_report(folder, result, facts, text, board)
     print(text)
     print(f"camera file: {out}\nreport:      {folder}")
 
 
-def calibrate(
+def _calibrate(
     store: FrameStore,
     board: tuple[int, int],
     square_m: float,
     start: Camera,
-    keep_lens: bool = False,
-    frames: int = 80,
-) -> Calibration:
+    keep_lens: bool,
+    frames: int,
+) -> _Calibration:
     """Calibrate from so many frames, evenly spread, of a recording.
-
-    board: columns, rows of inner corners.  start: the camera as it is known so far.
-    keep_lens: trust its intrinsics and distortion, and fit the depth only.
 
     Raises ToftrackError when there are no amplitudes, or too few frames show the board.
     """
@@ -134,7 +122,7 @@ def calibrate(
     camera = replace(
         lens.camera, depth_polynomial=found.polynomial, depth_polynomial_range_m=found.range_m
     )
-    return Calibration(camera, lens, found, pairs, [a for _, a in images], len(numbers))
+    return _Calibration(camera, lens, found, pairs, [a for _, a in images], len(numbers))
 
 
 def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> list[View]:
@@ -159,11 +147,11 @@ def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> li
 
 def _amplitude(store: FrameStore, number: int) -> np.ndarray:
     amplitude = store.image(int(number))[1]
-    assert amplitude is not None  # `calibrate` made sure that there are some
+    assert amplitude is not None  # `_calibrate` made sure that there are some
     return amplitude
 
 
-def report_text(facts: dict[str, Any]) -> str:
+def _report(facts: dict[str, Any]) -> str:
     """What was found, before and after, in lines."""
     before, after = facts["before"], facts["after"]
     lines = [
@@ -185,7 +173,8 @@ def report_text(facts: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _facts(result: Calibration, start: Camera) -> dict[str, Any]:
+def _facts(result: _Calibration, start: Camera) -> dict[str, Any]:
+    """Of report.json."""
     pairs, fit = result.pairs, result.depth
 
     def one(camera: Camera, polynomial: tuple[float, ...]) -> dict[str, Any]:
@@ -217,18 +206,18 @@ def _facts(result: Calibration, start: Camera) -> dict[str, Any]:
 
 
 def _write_report(
-    folder: Path, result: Calibration, facts: dict[str, Any], text: str, board: tuple[int, int]
+    folder: Path, result: _Calibration, facts: dict[str, Any], text: str, board: tuple[int, int]
 ) -> None:
     views = result.lens.views
     chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int))
-    sheet = corner_sheet([(result.amplitudes[i], views[i].corners_px) for i in chosen], board)
+    sheet = _corner_sheet([(result.amplitudes[i], views[i].corners_px) for i in chosen], board)
     what = f"the report folder '{folder}' cannot be written"
     with reported_errors(what, "choose another with --report"):
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / "report.txt", text + "\n")
         write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
         write_picture(folder / "corners.png", sheet)
-        write_figures(folder, {"depth_error.png": lambda: error_plot(facts)})
+        write_figures(folder, {"depth_error.png": lambda: _error_plot(facts)})
 
 
 def _board(text: str) -> tuple[int, int]:
@@ -243,14 +232,11 @@ def _board(text: str) -> tuple[int, int]:
     )
 
 
-def corner_sheet(
-    images: Sequence[tuple[np.ndarray, np.ndarray]], board: tuple[int, int], columns: int = 4
+def _corner_sheet(
+    images: Sequence[tuple[np.ndarray, np.ndarray]], board: tuple[int, int]
 ) -> np.ndarray:
-    """(H, W, 3) uint8 BGR: amplitude images with their corners drawn in, so many in a row.
-
-    images: of each the (H, W) amplitude and the (columns * rows, 2) corners in pixels.
-    """
-    scale, tiles = 2, []
+    """(H, W, 3) uint8 BGR: (H, W) amplitude images with their (n, 2) corners drawn in."""
+    columns, scale, tiles = 4, 2, []
     for amplitude, corners in images:
         root = np.sqrt(amplitude.astype(np.float32))
         grey = (255 * root / max(float(root.max()), 1.0)).astype(np.uint8)
@@ -265,7 +251,7 @@ def corner_sheet(
     return np.vstack(rows)
 
 
-def error_plot(facts: dict[str, Any]) -> np.ndarray:
+def _error_plot(facts: dict[str, Any]) -> np.ndarray:
     """(480, 720, 3) uint8 BGR: the boards' mean depth errors over their distance, of a report."""
     figure = chart.new_figure(720, 480)
     axes = figure.subplots()

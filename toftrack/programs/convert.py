@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -39,29 +40,20 @@ _MILLIMETRE = 0.001
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and convert. Raises ToftrackError."""
     parser = argparse.ArgumentParser(prog="toftrack convert", description=__doc__)
-    parser.add_argument("source", metavar="IN", help="the recording to read")
-    parser.add_argument("target", metavar="OUT", help=".srs, .npz, or a folder")
-    parser.add_argument("--camera", help="camera file instead of the recording's own camera")
-    parser.add_argument(
-        "--modulation",
-        type=int,
-        default=DEFAULT_MODULATION_MHZ,
-        help="MHz of the SR3000: the range of a .srs, read (if it states none) or written",
-    )
-    parser.add_argument("--unit", type=float, help="metres of one step of the PNG images")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    parser.add_argument("--topic", help="of the depth images in a ROS bag that has several")
-    parser.add_argument(
-        "--intrinsics",
-        type=float,
-        nargs=4,
-        metavar=("FX", "FY", "CX", "CY"),
-        help="pixels: the lens of bare images (a video, .npy, PNG without camera.json)",
-    )
-    parser.add_argument(
-        "--source-unit", type=float, help="metres of one step of IN's whole numbers (0.001)"
-    )
-    parser.add_argument("--fps", type=float, help="frames a second of bare images (25)")
+    add = parser.add_argument
+    add("source", metavar="IN", help="the recording to read")
+    add("target", metavar="OUT", help=".srs, .npz, or a folder")
+    add("--camera", help="camera file instead of the recording's own camera")
+    about = "MHz of the SR3000: the range of a .srs, read (if it states none) or written"
+    add("--modulation", type=int, default=DEFAULT_MODULATION_MHZ, help=about)
+    add("--unit", type=float, help="metres of one step of the PNG images")
+    add("--overwrite", action="store_true", help="replace an existing file")
+    add("--topic", help="of the depth images in a ROS bag that has several")
+    names = ("FX", "FY", "CX", "CY")
+    about = "pixels: the lens of bare images (a video, .npy, PNG without camera.json)"
+    add("--intrinsics", type=float, nargs=4, metavar=names, help=about)
+    add("--source-unit", type=float, help="metres of one step of IN's whole numbers (0.001)")
+    add("--fps", type=float, help="frames a second of bare images (25)")
     options = parser.parse_args(arguments)
     lens = None if options.intrinsics is None else tuple(options.intrinsics)
     read = options.camera, options.modulation, options.unit, options.overwrite, options.topic
@@ -86,8 +78,7 @@ def convert(
     metres, exactly enough to come back. From Z into `.srs` they are rounded to 1 / 65535 of the
     range, and into a folder to `unit_m`.
 
-    Raises:
-        ToftrackError: the source cannot be read, the target not be written, or it exists.
+    Raises ToftrackError: the source cannot be read, the target not be written, or it exists.
     """
     target = Path(target).expanduser()
     if unit_m is not None and not 0 < unit_m < 1:
@@ -105,8 +96,8 @@ def convert(
         raise ToftrackError(f"'{target}' cannot be converted into itself; choose another name")
     if camera_file is not None and bare.intrinsics is not None:
         raise ToftrackError("--camera and --intrinsics both tell the lens; leave one out")
-    store = open_recording(source, camera_file, modulation_mhz, topic, bare)
-    try:
+    opened = open_recording(source, camera_file, modulation_mhz, topic, bare)
+    with closing(opened) as store:
         if camera_file is not None:
             size = store.camera.width, store.camera.height
             store.camera = Camera.load_for(camera_file, *size, "the recording")
@@ -121,9 +112,7 @@ def convert(
                 _to_srs(store, target, unambiguous_range_m(modulation_mhz), overwrite, bar)
             else:
                 _to_folder(store, target, unit_m, bar)
-    finally:
-        store.close()
-    return len(store)
+        return len(store)
 
 
 def _to_srs(store: FrameStore, target: Path, range_m: float, overwrite: bool, bar: tqdm) -> None:

@@ -63,7 +63,6 @@ def draw_figures(
     frame: int | None = None,
 ) -> list[Path]:
     """Draw and write the figures of a run; returns the files. The arguments are the command's.
-
     Raises ToftrackError when the folder is no run's, the recording is gone or another one, the run
     has no such frame, matplotlib is missing, or nothing can be written.
     """

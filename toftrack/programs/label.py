@@ -55,14 +55,15 @@ _OF_CONVERT = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and serve the page until Ctrl-C. Raises ToftrackError."""
     parser = plain_parser("toftrack label", __doc__)
+    add = parser.add_argument
     about = "the recording, and settings KEY=VALUE of it, as for toftrack track"
-    parser.add_argument("words", nargs="*", default=[], metavar="FILE", help=about)
-    parser.add_argument("--frames", type=int, help=f"how many ({_FRAMES}, or those in the output)")
-    parser.add_argument("--least-sure", action="store_true", help="where the tracker is least sure")
-    parser.add_argument("--output", default="labels.json", help="the file (labels.json)")
-    parser.add_argument("--side", choices=("right", "left"), help="whose hand; the page asks, too")
-    parser.add_argument("--port", type=int, default=0, help="of the page (any free one)")
-    parser.add_argument("--no-browser", action="store_true", help="only print the address")
+    add("words", nargs="*", default=[], metavar="FILE", help=about)
+    add("--frames", type=int, help=f"how many ({_FRAMES}, or those in the output)")
+    add("--least-sure", action="store_true", help="where the tracker is least sure")
+    add("--output", default="labels.json", help="the file (labels.json)")
+    add("--side", choices=("right", "left"), help="whose hand; the page asks, too")
+    add("--port", type=int, default=0, help="of the page (any free one)")
+    add("--no-browser", action="store_true", help="only print the address")
     options = parser.parse_intermixed_args(arguments)
     if options.frames is not None:
         check_number("--frames", options.frames, 1, whole=True)
