@@ -333,7 +333,7 @@ def test_without_gestures_there_are_no_labels() -> None:
     assert state is None and reported.gesture == "" and math.isnan(reported.gesture_probability)
 
 
-@pytest.mark.parametrize("bad", [{"flexion_rad": 0.0}, {"smoothing": 1.0}, {"known": "most"}])
+@pytest.mark.parametrize("bad", [{"off_rad": 0.0}, {"smoothing": 1.0}, {"known": "most"}])
 def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures"):
         gestures(**bad)

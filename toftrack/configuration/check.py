@@ -31,8 +31,7 @@ _ABOVE_ZERO = frozenset(
     device.persistence.longest_backoff_s device.persistence.reopen_after
     device.usb.drain_ms device.usb.read_multiple device.usb.timeout_ms
     filter.exponent filter.exponent_growth filter.particles filter.passes filter.shrink
-    gestures.flexion_rad gestures.off_rad gestures.other gestures.pinch.open gestures.split_rad
-    gestures.thumb_rad gestures.tips_palms
+    gestures.off_rad gestures.other gestures.pinch.open
     hands
     hand.length_m
     likelihood.beta likelihood.tolerance_m

@@ -32,43 +32,37 @@ from toftrack.pose_space.base import PoseSpace
 _RAY = JOINT_NAMES.index("index_mcp"), JOINT_NAMES.index("index_tip")
 _OFF_RANGE_RAD = 0.5
 """How far off the pose space a hand may be at all, rms over the angles."""
+FLEXION_RAD, _SPLIT_RAD, _THUMB_RAD, _TIPS_PALMS = 0.44, 0.60, 0.20, 0.12
+"""How far out of a gesture's range may be: a finger's total flexion, of which palm and fist are 4
+apart; its split between the knuckle and the outer joints; the thumb's abduction; and, in palm
+lengths, where the tips are: a thumb folded in and one stretched away are 0.4 apart."""
+_WIDTHS = np.repeat(
+    (_THUMB_RAD, FLEXION_RAD, FLEXION_RAD, _SPLIT_RAD, _TIPS_PALMS), (1, 1, 4, 4, 3)
+)
+"""(13,) standard deviations of the features' tails."""
+_DOUBTFUL_SCORE, _SURE_SCORE = 0.5, 0.75
+"""A frame of that score, or confidence where that is higher, says nothing; and all it can."""
+_JOINT = 0.34
+"""Probability of being within 40 mm from which a joint is asked, where `joint_ok` wants more;
+higher leaves more gestures unnamed."""
 
 
 @dataclass(frozen=True)
 class GestureSettings:
     """How labels are decided; see conf/gestures for what each does."""
 
-    flexion_rad: float
-    split_rad: float
-    thumb_rad: float
-    tips_palms: float
     off_rad: float | None
     other: float
-    doubtful_score: float
-    sure_score: float
     smoothing: float
     margin: float
-    joint: float
     pinch: PinchSettings
 
     def __post_init__(self) -> None:
-        widths = [self.flexion_rad, self.split_rad, self.thumb_rad, self.tips_palms, self.other]
-        if self.off_rad is not None:
-            widths.append(self.off_rad)
+        widths = (self.other,) if self.off_rad is None else (self.other, self.off_rad)
         if not all(0 < width < math.inf for width in widths):
-            raise ToftrackError("gestures: the *_rad and *_palms widths and other must be above 0")
-        if not 0 <= self.joint <= 1:
-            raise ToftrackError("gestures.joint must be within 0 .. 1, a probability")
-        if not self.doubtful_score < self.sure_score:
-            raise ToftrackError("gestures.doubtful_score must be below gestures.sure_score")
+            raise ToftrackError("gestures.off_rad and gestures.other must be above 0")
         if not (0 <= self.smoothing < 1 and 0 <= self.margin < 1):
             raise ToftrackError("gestures.smoothing and gestures.margin must be in 0 .. below 1")
-
-    @property
-    def widths(self) -> np.ndarray:
-        """(13,) rad and palm lengths, standard deviations of the features' tails."""
-        sizes = (self.thumb_rad, self.flexion_rad, self.flexion_rad, self.split_rad)
-        return np.append(np.repeat(sizes, (1, 1, 4, 4)), [self.tips_palms] * 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +84,13 @@ class Gestures:
     def probabilities(self, values: np.ndarray, score: float, off_rad: float) -> np.ndarray:
         """Of each class for one frame by itself, (C,), sum 1.
 
-        values: (13,), see features; NaN says nothing.  score: 0..1; below `doubtful_score` all
+        values: (13,), see features; NaN says nothing.  score: 0..1; below _DOUBTFUL_SCORE all
         classes are equally probable.  off_rad: rms distance of the angles from the pose space; NaN
         says nothing.
         """
-        cfg, (widths, most, members) = self.settings, self._tables
+        cfg, (most, members) = self.settings, self._tables
         # Logarithms of densities, in parts of the uniform density of "other".
-        beyond = np.maximum(np.maximum(self.low - values, values - self.high), 0.0) / widths
+        beyond = np.maximum(np.maximum(self.low - values, values - self.high), 0.0) / _WIDTHS
         log_poses = np.nansum(most - 0.5 * beyond**2, axis=1)
         if cfg.off_rad is not None and math.isfinite(off_rad):
             near = math.log(_OFF_RANGE_RAD * 2 / (cfg.off_rad * math.sqrt(2 * math.pi)))
@@ -104,7 +98,7 @@ class Gestures:
         log_poses = np.append(log_poses, 0.0)
         log_classes = np.logaddexp.reduce(log_poses + members, axis=1)
         log_classes[-1] += math.log(cfg.other)
-        trust = (score - cfg.doubtful_score) / (cfg.sure_score - cfg.doubtful_score)
+        trust = (score - _DOUBTFUL_SCORE) / (_SURE_SCORE - _DOUBTFUL_SCORE)
         log_classes *= min(max(trust, 0.0), 1.0)
         parts: np.ndarray = np.exp(log_classes - log_classes.max())
         return parts / parts.sum()
@@ -113,27 +107,26 @@ class Gestures:
         """Whether all is known that makes a hand's pose this class: of its definition that suits
         the values (13,) best every feature. Of "other" nothing needs to be known.
         """
-        widths, most, _ = self._tables
+        most, _ = self._tables
         mine = self.classes == self.names.index(label)
         if label == OTHER or not mine.any():
             return True
         low, high = self.low[mine], self.high[mine]
-        beyond = np.maximum(np.maximum(low - values, values - high), 0.0) / widths
+        beyond = np.maximum(np.maximum(low - values, values - high), 0.0) / _WIDTHS
         best = int(np.nansum(most[mine] - 0.5 * beyond**2, axis=1).argmax())
         return not (np.isnan(values) & ~np.isnan(low[best])).any()
 
     @cached_property
-    def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Widths (13,), log densities (M, 13) within the ranges, and of each class (C, M + 1)
+    def _tables(self) -> tuple[np.ndarray, np.ndarray]:
+        """Log densities (M, 13) within the ranges, and of each class (C, M + 1)
         which definitions it is: minus the log of their number, or -inf. "other" comes last.
         """
-        widths = self.settings.widths
-        extent = self.high - self.low + widths * math.sqrt(2 * math.pi)
+        extent = self.high - self.low + _WIDTHS * math.sqrt(2 * math.pi)
         most = np.log(np.maximum(features.RANGES, extent) / extent)
         count = len(self.names)
         own = np.append(self.classes, count - 1) == np.arange(count)[:, None]
         with np.errstate(divide="ignore"):
-            return widths, most, np.log(own / own.sum(1, keepdims=True))
+            return most, np.log(own / own.sum(1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +158,10 @@ def no_gestures() -> None:
     """No gesture output: gestures=none."""
 
 
-def definition_of(pose: NamedPose, settings: GestureSettings) -> Definition:
+def definition_of(pose: NamedPose) -> Definition:
     """A user's pose as ranges: a tail's width and its spread to both sides."""
     values = features.features_of_angles(pose.angles_rad)
-    half = settings.widths
+    half = _WIDTHS.copy()
     half[: len(features.SUMS)] += np.sqrt(features.SUMS**2 @ pose.spread_rad**2)
     return Definition(pose.name, values - half, values + half)
 
@@ -185,7 +178,7 @@ def gestures_with(
             f"{source} names a gesture 'other', which is what is none of the classes"
         )
     basic = [definition for definition in SETS[known] if definition.name not in taken]
-    definitions = [*basic, *(definition_of(pose, settings) for pose in named)]
+    definitions = [*basic, *map(definition_of, named)]
     names = [name for name in dict.fromkeys(d.name for d in definitions) if name != OTHER]
     names.append(OTHER)
     gestures = Gestures(
@@ -223,7 +216,7 @@ def _alike(gestures: Gestures, own: int, other: int) -> bool:
     thumb = [features.THUMB_ABDUCTION, features.THUMB_FLEXION, features.REACH, features.GAP]
     said = np.column_stack((known[:, features.FLEXION], known[:, thumb].any(1)))
     more = said[0] & ~said[1] if not gestures.own[other] else said[0] != said[1]
-    apart = np.maximum(np.maximum(low[1] - value, value - high[1]), 0) / gestures.settings.widths
+    apart = np.maximum(np.maximum(low[1] - value, value - high[1]), 0) / _WIDTHS
     return not more.any() and bool((apart[known.all(0)] < 1).all())
 
 
@@ -305,7 +298,7 @@ def tell_gesture(
         off_rad = float(np.sqrt(np.square(off).mean()))
     joints = estimate.joints_m.astype(np.float64)
     # Which fingers are straight is told by joints that are less exact than who uses a joint wants.
-    asked = estimate.joint_ok | (estimate.joint_confidence >= gestures.settings.joint)
+    asked = estimate.joint_ok | (estimate.joint_confidence >= _JOINT)
     known = features.known_features(asked)
     values = np.where(known, features.features(angles, joints), np.nan)
     # Of a hand on a table much of the image is not explained, and the pose is right all the same.

@@ -23,7 +23,7 @@ from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
 from toftrack.gestures.definitions import OTHER, SETS
 from toftrack.gestures.files import NamedPose, learned_pose, read_poses, save_poses
-from toftrack.gestures.recognition import Gestures, gestures_with
+from toftrack.gestures.recognition import FLEXION_RAD, Gestures, gestures_with
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.store import open_source
 
@@ -96,7 +96,7 @@ def _add(
     with_it = [pose for pose in poses if pose.name != name]
     with closing(open_source(recording)) as frames:
         angles, believed = _track(frames, recording, part_s, overrides)
-    pose = learned_pose(name, angles, believed, gestures.settings.flexion_rad)
+    pose = learned_pose(name, angles, believed, FLEXION_RAD)
     with_it.append(pose)
     gestures_with(known, with_it, gestures.settings, str(path))
     save_poses(path, with_it)
