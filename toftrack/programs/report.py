@@ -12,8 +12,8 @@ import csv
 import io
 import math
 import statistics
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,24 +46,24 @@ class Run:
     """Why it failed."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Group:
     """The runs that differ only in the seed and the recording."""
 
     settings: str
     """The overrides that tell groups apart."""
-    runs: list[Run] = field(default_factory=list)
-    error: float | None = None
+    runs: list[Run]
+    error: float | None
     """Mean over the runs, as cost_ms; None without any."""
-    spread: float | None = None
+    spread: float | None
     """Deviation over seeds of the mean over recordings; None below two seeds."""
-    cost_ms: float | None = None
-    recordings: dict[str, float] = field(default_factory=dict)
+    cost_ms: float | None
+    recordings: dict[str, float | None]
     """The mean error of each."""
 
 
 def read_runs(folder: str | Path) -> list[Run]:
-    """Every job below a folder, in the order of their names; ToftrackError when there is none."""
+    """Every job below a folder, in the order of their numbers; ToftrackError when there is none."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ToftrackError(f"no folder {folder}; give the folder of a sweep, multirun/DATE/TIME")
@@ -73,12 +73,11 @@ def read_runs(folder: str | Path) -> list[Run]:
             f"no job below {folder} (no .hydra/overrides.yaml); give the folder of a sweep,"
             " multirun/DATE/TIME"
         )
-    return [_read_run(path, folder) for path in sorted(found, key=_natural)]
 
+    def natural(path: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in path.parts]
 
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key that puts job 2 before job 10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in path.parts]
+    return [_read_run(path, folder) for path in sorted(found, key=natural)]
 
 
 def _read_run(path: Path, folder: Path) -> Run:
@@ -86,7 +85,8 @@ def _read_run(path: Path, folder: Path) -> Run:
     try:
         with open_to_read(path / ".hydra" / "overrides.yaml") as stream:
             lines = yaml.safe_load(stream.read().decode("utf-8"))
-        overrides = dict(_split(_printable(line)) for line in lines)
+        given = (_printable(line).partition("=") for line in lines)
+        overrides = {key.lstrip("+~"): value for key, _, value in given}
     except Exception as error:  # whatever a YAML reader may say about a damaged file
         return Run(name, {}, {}, f"its overrides cannot be read ({type(error).__name__})")
     try:
@@ -98,13 +98,8 @@ def _read_run(path: Path, folder: Path) -> Run:
         return Run(name, overrides, {}, why)
     if not isinstance(summary, dict):
         return Run(name, overrides, {}, "its summary.json is not one of track.py")
-    varied = summary.get("error")
-    return Run(name, overrides, _flat(summary), None if varied is None else _printable(str(varied)))
-
-
-def _split(override: str) -> tuple[str, str]:
-    key, _, value = override.partition("=")
-    return key.lstrip("+~"), value
+    why = summary.get("error")
+    return Run(name, overrides, _flat(summary), None if why is None else _printable(str(why)))
 
 
 def _printable(text: str) -> str:
@@ -125,13 +120,11 @@ def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:
 def group_runs(runs: Sequence[Run], figure: str) -> list[Group]:
     """Groups in the order of their first run, with the mean and the spread of a figure."""
     varied = [key for key in _varied(runs) if key not in (_SEED, _RECORDING)]
-    groups: dict[str, Group] = {}
+    groups: dict[str, list[Run]] = {}
     for run in runs:
         settings = " ".join(f"{key}={run.overrides.get(key, '-')}" for key in varied) or "all alike"
-        groups.setdefault(settings, Group(settings)).runs.append(run)
-    for group in groups.values():
-        _summarise(group, figure)
-    return list(groups.values())
+        groups.setdefault(settings, []).append(run)
+    return [_group(settings, members, figure) for settings, members in groups.items()]
 
 
 def _varied(runs: Sequence[Run]) -> list[str]:
@@ -143,32 +136,36 @@ def _keys(runs: Sequence[Run]) -> list[str]:
     return list(dict.fromkeys(key for run in runs for key in run.overrides))
 
 
-def _recording(run: Run) -> str:
-    """The name of the run's recording; empty when the sweep does not choose one."""
-    return Path(run.overrides.get(_RECORDING, "")).stem
-
-
-def _summarise(group: Group, figure: str) -> None:
-    good = [run for run in group.runs if run.error is None and figure in run.figures]
-    if not good:
-        return
-
-    def mean(runs: Iterable[Run], name: str = figure) -> float:
-        return statistics.fmean(run.figures[name] for run in runs)
-
-    group.error = mean(good)
-    names = sorted(set(map(_recording, good)))
-    seeds = sorted({run.overrides.get(_SEED, "") for run in good})
+def _group(settings: str, runs: list[Run], figure: str) -> Group:
+    good = [run for run in runs if run.error is None and figure in run.figures]
+    by_seed, by_recording = _parts(good, _SEED), _parts(good, _RECORDING)
     # A seed that failed on a recording would compare other recordings: only complete seeds count.
-    by_seed = [[run for run in good if run.overrides.get(_SEED, "") == seed] for seed in seeds]
-    complete = [mean(runs) for runs in by_seed if set(map(_recording, runs)) == set(names)]
-    if len(complete) > 1:
-        group.spread = statistics.stdev(complete)
-    if timed := [run for run in good if "mean_ms" in run.figures]:
-        group.cost_ms = mean(timed, "mean_ms")
-    group.recordings = {
-        name: mean(run for run in good if _recording(run) == name) for name in names
-    }
+    complete = [
+        _mean(members, figure)
+        for members in by_seed.values()
+        if len(_parts(members, _RECORDING)) == len(by_recording)
+    ]
+    return Group(
+        settings,
+        runs,
+        error=_mean(good, figure),
+        spread=statistics.stdev(complete) if len(complete) > 1 else None,
+        cost_ms=_mean([run for run in good if "mean_ms" in run.figures], "mean_ms"),
+        recordings={name: _mean(part, figure) for name, part in by_recording.items()},
+    )
+
+
+def _parts(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
+    """The runs by an override, of a recording by its name; sorted."""
+    parts: dict[str, list[Run]] = {}
+    for run in runs:
+        value = run.overrides.get(key, "")
+        parts.setdefault(Path(value).stem if key == _RECORDING else value, []).append(run)
+    return dict(sorted(parts.items()))
+
+
+def _mean(runs: Sequence[Run], name: str) -> float | None:
+    return statistics.fmean(run.figures[name] for run in runs) if runs else None
 
 
 def _write_csv(runs: Sequence[Run], path: Path) -> None:
