@@ -65,9 +65,8 @@ def check_readable(path: str | Path) -> None:
     """For those who open a file by themselves, or all files in a folder: raise OSError for what is
     no file, or is not there.
     """
-    status = os.stat(path)
-    if not stat.S_ISDIR(status.st_mode):
-        _refuse(path, status)
+    if not os.path.isdir(path):
+        _refuse(path, os.stat(path))
         return
     for entry in os.scandir(path):
         if not entry.is_dir():
@@ -80,8 +79,7 @@ def open_new(path: str | Path, replace: bool = False, buffered: bool = True) -> 
     replace: let a file that stands there go; its other names, if any, keep what is in it.
     buffered: False: what is written reaches the operating system at once; `write` may take a part.
 
-    Raises OSError: something stands there, with `replace` something that is no file; or it cannot
-    be made.
+    Raises OSError: something stands there (`replace`: that is no file), or it cannot be made.
     """
     if replace:
         check_replaceable(path)
@@ -91,9 +89,8 @@ def open_new(path: str | Path, replace: bool = False, buffered: bool = True) -> 
 
 
 def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
-    """Open a file of ours to change it, without buffer; what is in it stays.
-
-    make: an empty one where there is none.
+    """Open a file of ours to change it, without buffer; what is in it stays. Where there is none,
+    make an empty one.
 
     Raises OSError: it is a link, has a second name, or is no file; or it cannot be opened.
     """
@@ -155,10 +152,7 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: str | Path, content: bytes | str) -> None:
-    """Write a file, text in UTF-8; it is there as a whole, or as it was.
-
-    Raises OSError.
-    """
+    """Write a file, text in UTF-8; it is there as a whole, or as it was. Raises OSError."""
     with whole_file(path) as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
 
@@ -185,10 +179,7 @@ def let_links_go(path: Path) -> None:
 
 
 def make_folder(path: str | Path) -> None:
-    """Make a folder within one that may be somebody else's; one that is there is no link.
-
-    Raises OSError.
-    """
+    """Make a folder in one that may be somebody else's. Raises OSError, also where it is a link."""
     if Path(path).is_symlink():
         raise OSError(errno.ELOOP, "it is a symbolic link; take it away", str(path))
     Path(path).mkdir(parents=True, exist_ok=True)

@@ -70,12 +70,12 @@ _NO_NETWORKS = "toftrack.detector.hand_detector.no_detector"
 
 
 def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> None:
-    """Compare a composed configuration with what it would be if only options were chosen.
+    """Compare a composed configuration with what it would be if only options were chosen; raise
+    ToftrackError with one sentence that names the setting.
 
     Hydra must be initialised, as it is within `compose` and a job of `@hydra.main`.
 
-    config: what was composed.  name: of the configuration file.  overrides: of the command line.
-    Raises ToftrackError with one sentence that names the setting.
+    name: of the configuration file.  overrides: of the command line.
     """
     check_tracker(config)
     loader = GlobalHydra.instance().config_loader()
@@ -89,7 +89,7 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     except (HydraException, OmegaConfBaseException):
         return  # options that exclude each other unless something is deleted: nothing to compare
     for key, value, usual in _pairs(config, default):
-        check_value(key, value, usual)
+        _check_value(key, value, usual)
 
 
 def check_groups(config: DictConfig) -> None:
@@ -113,9 +113,9 @@ def check_tracker(config: DictConfig) -> None:
     ]
     if without and OmegaConf.select(config, "refine.iterations"):
         given.append("refine=gauss_newton")
+    some = ", ".join(given)
     if not given:
         return
-    some = ", ".join(given)
     if without and {"lost=calibrated", "refine=gauss_newton"} <= set(given):
         raise ToftrackError(
             "detector=none belongs to experiment=paper, the tracker without networks; give"
@@ -131,7 +131,7 @@ def check_tracker(config: DictConfig) -> None:
     )
 
 
-def check_value(key: str, value: object, usual: object) -> None:
+def _check_value(key: str, value: object, usual: object) -> None:
     """Raise ToftrackError where a setting's value cannot stand in for the usual one in conf/."""
     if isinstance(usual, bool):
         if not isinstance(value, bool):
@@ -154,9 +154,7 @@ def _pairs(
     ours = str(OmegaConf.select(config, "_target_", default="toftrack.")).startswith("toftrack.")
     for name in map(str, config):
         key = f"{prefix}{name}"
-        if name not in default or OmegaConf.is_missing(config, name):
-            continue
-        if OmegaConf.is_missing(default, name):
+        if name not in default or any(OmegaConf.is_missing(one, name) for one in (config, default)):
             continue
         try:
             value, usual = config[name], default[name]
@@ -165,10 +163,9 @@ def _pairs(
         if isinstance(value, DictConfig) and isinstance(usual, DictConfig):
             yield from _pairs(value, usual, f"{key}.")
         elif ours:
-            plain, other = _plain(value), _plain(usual)
+            plain, other = (
+                OmegaConf.to_container(one) if OmegaConf.is_config(one) else one
+                for one in (value, usual)
+            )
             if plain != other or type(plain) is not type(other):
                 yield key, plain, other
-
-
-def _plain(value: object) -> object:
-    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value

@@ -16,6 +16,11 @@ from toftrack.errors import ToftrackError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 """The environment variable that asks for tracebacks."""
+_ALIKE, _MOST = 0.6, 12
+"""How much of a name must be right, 0..1; so many names are listed at most."""
+_PAPERS_GROUP = "start"
+"""A group that experiment=paper alone has."""
+_OF_PAPER = "{0} belongs to experiment=paper; give experiment=paper as well, or leave {0} out"
 
 
 def sentence(error: BaseException) -> str:
@@ -41,7 +46,7 @@ def sentence(error: BaseException) -> str:
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         reported = next((cause for cause in chain if str(cause).strip()), error)
-        return better_sentence(chain) or _of_config(reported) or type(error).__name__
+        return _of_override(chain) or _of_config(reported) or type(error).__name__
     text = _one_line(str(error))
     name = type(error).__name__
     return f"unexpected {name}{f': {text}' if text else ''} ({FULL_ERROR}=1 shows the traceback)"
@@ -94,25 +99,13 @@ def _of_config(error: BaseException) -> str:
     return _one_line(message)
 
 
-_ALIKE = 0.6
-"""How much of a name must be right, 0..1."""
-_MOST = 12
-"""So many names are listed at most."""
-_PAPERS_GROUP = "start"
-"""A group that experiment=paper alone has."""
-
-
-def nearest(word: str, names: Sequence[str]) -> str | None:
+def _nearest(word: str, names: Sequence[str]) -> str | None:
     """The name that is most like a word; None where none is."""
-    found = difflib.get_close_matches(word, names, n=1, cutoff=_ALIKE)
-    return found[0] if found else None
+    return next(iter(difflib.get_close_matches(word, names, n=1, cutoff=_ALIKE)), None)
 
 
-def better_sentence(chain: Sequence[BaseException]) -> str | None:
-    """One sentence for an override that means nothing; None for every other error.
-
-    chain: the error and its causes, the error first.
-    """
+def _of_override(chain: Sequence[BaseException]) -> str | None:
+    """For an override that means nothing; None for every other error."""
     for error in chain:
         if isinstance(error, OverrideParseException):
             return _of_syntax(error)
@@ -138,7 +131,7 @@ def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     group, _, word = missing.rpartition("/")
     if not group or not options:
         return None
-    likely = nearest(word, options)
+    likely = _nearest(word, options)
     hint = f"did you mean {group}={likely}? The choices are" if likely else "give one of"
     return f"there is no {group}={word}; {hint} {', '.join(options)}"
 
@@ -152,25 +145,20 @@ def _of_key(chain: Sequence[BaseException]) -> str | None:
         parent = getattr(error, "parent_node", None)
         if isinstance(error, OmegaConfBaseException) and isinstance(parent, DictConfig):
             return _unknown_key(key, parent)
-    return _of_paper(key) if key == _PAPERS_GROUP else None
-
-
-def _of_paper(key: str) -> str:
-    return f"{key} belongs to experiment=paper; give experiment=paper as well, or leave {key} out"
+    return _OF_PAPER.format(key) if key == _PAPERS_GROUP else None
 
 
 def _unknown_key(key: str, parent: DictConfig) -> str:
     root = parent._get_root()
     assert isinstance(root, DictConfig)
     if key.partition(".")[0] == _PAPERS_GROUP and _PAPERS_GROUP not in root:
-        return _of_paper(key)
+        return _OF_PAPER.format(key)
     known = OmegaConf.to_container(root)
     keys = [name for name in _keys(known) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]
-    likely = nearest(key, [name for name in keys if not key.startswith(f"{name}.")]) or (
-        same[0] if same else None
-    )
+    likely = _nearest(key, [name for name in keys if not key.startswith(f"{name}.")])
+    likely = likely or next(iter(same), None)
     text = f"there is no setting {key}"
     if key == "device.path":
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
