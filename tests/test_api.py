@@ -25,19 +25,6 @@ from toftrack.estimate import no_estimate
 QUICK = ("filter.particles=100",)
 
 
-def python(code: str, *arguments: str, folder: Path) -> str:
-    """What a program prints that runs in a process and folder of its own."""
-    reported = subprocess.run(
-        [sys.executable, *arguments, "-c", code],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert reported.returncode == 0, reported.stderr
-    return reported.stdout
-
-
 def test_importing_toftrack_is_light_until_a_name_is_used(tmp_path: Path) -> None:
     heavy = ("torch", "numba", "hydra", "cv2", "numpy", "scipy")
     code = f"""
@@ -46,7 +33,9 @@ print([name for name in {heavy} if name in sys.modules])
 print(set(toftrack.__all__) <= set(dir(toftrack)))
 print(toftrack.__version__)
 """
-    assert python(code, folder=tmp_path).splitlines() == ["[]", "True", toftrack.__version__]
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines() == ["[]", "True", toftrack.__version__], done.stderr
 
 
 def test_every_stable_name_is_there_and_no_other() -> None:

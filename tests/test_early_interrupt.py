@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -53,14 +52,6 @@ def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str)
     reported = interrupted(tmp_path, moment, "-m", "toftrack", name, "x")
     assert reported.returncode == 130 and reported.stderr.startswith("interrupted")
     assert reported.stderr.count("\n") == 1
-
-
-def test_the_command_begins_where_interrupts_are_caught_first() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["scripts"]["toftrack"] == "toftrack.__main__:main"
-    for name in ("toftrack/__main__.py", "track.py", "train_pose_space.py"):
-        first = (ROOT / name).read_text(encoding="utf-8").split("import ", 2)
-        assert first[2].startswith("toftrack.early_interrupt")
 
 
 def test_an_ignored_interrupt_stays_ignored(tmp_path: Path) -> None:

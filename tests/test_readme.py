@@ -156,10 +156,6 @@ def test_a_command_parses(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatc
             importlib.import_module(f"{words[2]}.__main__").main(list(words[3:]))
 
 
-def test_the_readme_is_short() -> None:
-    assert len(PAGES[ROOT / "README.md"].splitlines()) <= 200
-
-
 def test_every_extra_that_is_named_is_there() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for names in re.findall(r"\.\[([\w,-]+)\]", README):

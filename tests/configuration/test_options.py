@@ -113,13 +113,6 @@ def test_every_option_composes_and_can_be_made(
             hydra.utils.instantiate(part)
 
 
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_opens_with_a_line_about_what_it_is(group: str, option: str) -> None:
-    text = (CONF / group / f"{option}.yaml").read_text()
-    opening = [line for line in text.splitlines() if not line.startswith("# @package")]
-    assert opening[0].startswith("# ") and len(opening[0]) > 10
-
-
 def test_the_defaults_are_options_that_there_are() -> None:
     for name in ("config", "train_pose_space", "train_detector"):
         content = yaml.safe_load((CONF / f"{name}.yaml").read_text())

@@ -13,11 +13,20 @@ from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import pytest
 from helpers.tracking import ROOT
 from hydra.core.singleton import Singleton
 
 QUICK = ("filter.particles=100",)
 """Overrides for runs whose accuracy is of no matter."""
+
+
+@pytest.fixture
+def hangups_are_handled() -> Iterator[None]:
+    """Also where the tests were started so that they outlive their terminal."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @contextmanager

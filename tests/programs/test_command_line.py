@@ -8,11 +8,11 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from helpers import programs
+from helpers.programs import hangups_are_handled as hangups_are_handled
 from helpers.tracking import CONF
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
@@ -22,13 +22,7 @@ from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 from toftrack.programs.command_line import FailedJobs, run
 
-
-@pytest.fixture(autouse=True)
-def hangups_are_handled() -> Iterator[None]:
-    """Also where the tests were started so that they outlive their terminal."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
+pytestmark = pytest.mark.usefixtures("hangups_are_handled")
 
 
 APP = """

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator
 
 import pytest
+from helpers.programs import hangups_are_handled as hangups_are_handled
 
 from toftrack.programs import shutdown
 from toftrack.programs.shutdown import EndedError, exit_status
@@ -16,12 +17,7 @@ def ask(number: int = signal.SIGTERM) -> None:
     os.kill(os.getpid(), number)
 
 
-@pytest.fixture(autouse=True)
-def hangups_are_handled() -> Iterator[None]:
-    """Also where the tests were started so that they outlive their terminal."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
+pytestmark = pytest.mark.usefixtures("hangups_are_handled")
 
 
 @pytest.fixture
@@ -50,9 +46,8 @@ def test_what_must_be_whole_is_finished_first(listening) -> None:
 
 
 def test_whoever_finishes_is_left_alone_until_the_fourth_request(listening) -> None:
-    for _ in range(1):
-        with pytest.raises(EndedError):
-            ask()
+    with pytest.raises(EndedError):
+        ask()
     ask()
     ask(signal.SIGINT)
     with pytest.raises(EndedError):
