@@ -120,16 +120,13 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     """The arguments in the order that Hydra's parser wants: options, and then all overrides."""
     options: list[str] = []
     overrides: list[str] = []
-    words = iter(arguments)
-    for word in words:
-        if not word.startswith("-"):
+    value_follows = False
+    for word in arguments:
+        if not word.startswith("-") and not value_follows:
             overrides.append(word)
-        elif word in _WITH_VALUE:
-            options += (word, *(value for value in (next(words, None),) if value is not None))
-        elif word in ("--info", "-i"):  # its value may be left out, and would be an override
-            options.append("--info=all")
-        else:
-            options.append(word)
+        else:  # the value of --info may be left out, and would be an override
+            options.append("--info=all" if word in ("--info", "-i") else word)
+        value_follows = not value_follows and word in _WITH_VALUE
     return [*options, *overrides]
 
 

@@ -48,9 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("run", metavar="RUN_DIR", help="the output folder of track.py")
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
     parser.add_argument("--out", metavar="DIR", help="instead of RUN_DIR/figures")
-    parser.add_argument(
-        "--frame", type=int, metavar="N", help="of measurement.png; default one of median score"
-    )
+    about = "of measurement.png; default one of median score"
+    parser.add_argument("--frame", type=int, metavar="N", help=about)
     options = parser.parse_args(arguments)
     for path in draw_figures(options.run, options.recording, options.out, options.frame):
         print(f"  {path}")
@@ -69,8 +68,6 @@ def draw_figures(
     new_figure(1, 1)  # better missed now than when the recording is open
     run = read_run(folder)
     footage = run.footage(recording)
-    if frame is not None:
-        _row_of(run, frame)
     figures: dict[str, Callable[[], np.ndarray]] = {}
     if footage is None:
         if recording is None and frame is not None:
@@ -80,8 +77,11 @@ def draw_figures(
             "without them are drawn",
             file=sys.stderr,
         )
-    for position, slot in enumerate(_slots(run)):
-        figures |= _of_slot(run, footage, slot, frame, with_film=position == 0)
+    every = range(len(run.shapes))
+    # Those that had a hand; the first one where none had.
+    slots = [n for n in every if np.isfinite(run.slot(n).results["joints_m"]).any()] or [0]
+    for slot in slots:
+        figures |= _of_slot(run, footage, slot, frame, with_film=slot == slots[0])
     target = Path(out).expanduser() if out is not None else run.folder / "figures"
     with (
         nullcontext() if footage is None else closing(footage.store),
@@ -97,21 +97,14 @@ def draw_figures(
     return written
 
 
-def _slots(run: Run) -> list[int]:
-    """Those that had a hand; the first one where none had."""
-    every = range(len(run.shapes))
-    return [n for n in every if np.isfinite(run.slot(n).results["joints_m"]).any()] or [0]
-
-
 def _of_slot(
     run: Run, footage: Footage | None, slot: int, frame: int | None, with_film: bool
 ) -> dict[str, Callable[[], np.ndarray]]:
     """The figures of one slot by their names, and of all, with_film, the filmstrip."""
     one = run.slot(slot)
-    several = len(run.shapes) > 1
     after = f"_{slot + 1}" if slot else ""
-    of = f"Slot {slot}, {one.shape.side} hand. " if several else ""
-    row = _typical_row(one) if frame is None else _row_of(run, frame)
+    of = f"Slot {slot}, {one.shape.side} hand. " if len(run.shapes) > 1 else ""
+    row = _row(one, frame)
     figures: dict[str, Callable[[], np.ndarray]] = {}
     if footage is not None:
         figures[f"measurement{after}"] = lambda: measurement_figure(one, footage, row, of)
@@ -134,15 +127,12 @@ def _truth(run: Run, footage: Footage | None, slot: int) -> tuple[Truth | None, 
     return (None, {}) if truth is None or not second else (truth.other, second)
 
 
-def _typical_row(run: Run) -> int:
-    """The tracked frame (any, if all are lost) whose score is nearest to the median of them."""
-    lost, score = run.results["lost"], run.results["score"]
-    score = np.nan_to_num(score)
-    rows = np.flatnonzero(~lost) if not lost.all() else np.arange(len(run))
-    return int(rows[np.abs(score[rows] - np.median(score[rows])).argmin()])
-
-
-def _row_of(run: Run, frame: int) -> int:
+def _row(run: Run, frame: int | None) -> int:
+    """Of a frame; of none, the tracked one (any, if all are lost) of the most usual score."""
+    if frame is None:
+        lost, score = run.results["lost"], np.nan_to_num(run.results["score"])
+        rows = np.flatnonzero(~lost) if not lost.all() else np.arange(len(run))
+        return int(rows[np.abs(score[rows] - np.median(score[rows])).argmin()])
     rows = np.flatnonzero(run.frames == frame)
     if not len(rows):
         raise ToftrackError(

@@ -34,15 +34,11 @@ _MADE = ("track.npz", "summary.json")
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, write the files, print the table. Raises ToftrackError."""
     parser = plain_parser("toftrack recover", __doc__)
-    parser.add_argument(
-        "run", metavar="RUN|FILE", help="the output folder of toftrack track, or a recording"
-    )
+    about = "the output folder of toftrack track, or a recording"
+    parser.add_argument("run", metavar="RUN|FILE", help=about)
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
-    parser.add_argument(
-        "--replace",
-        action="store_true",
-        help="also a FILE.npz that is there, or a track.npz that has more frames",
-    )
+    about = "also a FILE.npz that is there, or a track.npz that has more frames"
+    parser.add_argument("--replace", action="store_true", help=about)
     options = parser.parse_args(arguments)
     folder = Path(options.run).expanduser()
     if is_recording(folder):
@@ -96,17 +92,14 @@ def recover(
 
 def _check_not_less(folder: Path, frames: int) -> None:
     """ToftrackError where there is a track.npz that has more frames, or that cannot be read."""
-    path = folder / "track.npz"
-    if not path.exists():
-        return
+    path, there = folder / "track.npz", 0
     hint = "nothing was changed; --replace makes it anew of the lines all the same"
     try:
-        there = len(read_results(path)["lost"])
+        if path.exists():
+            there = len(read_results(path)["lost"])
     except ToftrackError:
-        raise ToftrackError(
-            f"there is a '{path}' that is damaged, or no run's, and {LINES} has {frames} frames; "
-            f"{hint}"
-        ) from None
+        what = f"there is a '{path}' that is damaged, or no run's, and {LINES} has {frames} frames"
+        raise ToftrackError(f"{what}; {hint}") from None
     if there > frames:
         raise ToftrackError(f"'{path}' has {there} frames, but {LINES} only {frames}; {hint}")
 
@@ -120,14 +113,14 @@ def _truth(facts: dict[str, Any], recording: str | Path | None) -> Truth | None:
     source = (device.get("emulated") or {}).get("source") if recording is None else None
     if source is not None:  # an emulated camera sees a recording, too
         return open_source(source if source == "sample" else str(found_again(source, ran_in))).truth
+    why = "it is not known where the truth is"
     try:
         opened = open_tracked(metadata, ran_in, recording)
+        if opened is not None and opened[0].truth is not None:
+            return opened[0].truth
     except ToftrackError as error:
         if recording is not None:
             raise
-        print(f"note: no metrics, because {error}", file=sys.stderr)
-        return None
-    if opened is None or opened[0].truth is None:
-        print("note: no metrics, because it is not known where the truth is", file=sys.stderr)
-        return None
-    return opened[0].truth
+        why = str(error)
+    print(f"note: no metrics, because {why}", file=sys.stderr)
+    return None

@@ -93,23 +93,20 @@ def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any])
         return [evaluate_space(kind, number, data, settings, bar.update) for number in dims]
 
 
-def _summary(kind: str, dims: int, data: PoseData, rows: list[Row]) -> dict:
-    kinds = ("training", "held_out", "reached")
-    table = [
-        {key: value._asdict() if value and key in kinds else value for key, value in pairs}
-        for pairs in (row._asdict().items() for row in rows)
-    ]
+def _summary(kind: str, dims: int, data: PoseData, rows: list[Row]) -> dict[str, Any]:
     asked = next(row for row in rows if row.dims == dims)
-    figures = {kind: getattr(asked, kind) for kind in kinds}
-    return {
-        "kind": kind,
-        "dims": dims,
-        "sources": data.sources,
-        **{
-            f"{name}_{unit}": getattr(errors, unit)
-            for name, errors in figures.items()
-            if errors is not None
-            for unit in Errors._fields
-        },
-        "errors": table,
+    figures = {name: getattr(asked, name) for name in ("training", "held_out", "reached")}
+    found = {
+        f"{name}_{unit}": value
+        for name, errors in figures.items()
+        if errors is not None
+        for unit, value in errors._asdict().items()
     }
+    table = [
+        {
+            key: one._asdict() if isinstance(one, Errors) else one
+            for key, one in row._asdict().items()
+        }
+        for row in rows
+    ]
+    return {"kind": kind, "dims": dims, "sources": data.sources, **found, "errors": table}
