@@ -23,9 +23,11 @@ from toftrack.archives import (
     write_archive,
 )
 
-STORED, DEFLATED = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED
+STORED, DEFLATED, BZIP2 = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2
 ZEROS = bytes(2**20)
-every_method = pytest.mark.parametrize("method", [STORED, DEFLATED], ids=["stored", "deflate"])
+every_method = pytest.mark.parametrize(
+    "method", [STORED, DEFLATED, BZIP2], ids=["stored", "deflate", "bzip2"]
+)
 
 
 def npy(array: Any) -> bytes:
@@ -90,15 +92,25 @@ def test_what_was_made_to_fill_memories_is_not_unpacked(tmp_path: Path) -> None:
     assert "'a': it would make 134 MB of" in reported(path)
 
 
-def test_more_than_the_directory_states_is_not_unpacked(tmp_path: Path) -> None:
+def with_more_than_stated(path: Path, method: int) -> Path:
     """The stated size and the header agree, but much more comes."""
-    path = save(tmp_path / "a.npz", {"a": [header((1000,)), *[ZEROS] * 128]}, DEFLATED)
+    save(path, {"a": [header((1000,)), *[ZEROS] * 128]}, method)
     forged = bytearray(path.read_bytes())
     size = struct.pack("<I", len(header((1000,))) + 4000)
     at = forged.index(b"PK\x01\x02")
     forged[at + 24 : at + 28] = size
     path.write_bytes(forged)
-    assert "'a' is damaged: Bad CRC-32" in reported(path)
+    return path
+
+
+def test_more_than_the_directory_states_is_not_unpacked(tmp_path: Path) -> None:
+    bomb = with_more_than_stated(tmp_path / "deflated.npz", DEFLATED)
+    assert "'a' is damaged: Bad CRC-32" in reported(bomb)
+    bomb = with_more_than_stated(tmp_path / "packed.npz", BZIP2)
+    tracemalloc.start()
+    assert read_archive(bomb)["a"].shape == (1000,)
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
 
 
 def test_what_is_written_is_what_numpy_reads(tmp_path: Path) -> None:
@@ -168,10 +180,25 @@ def test_an_array_beyond_the_cap_is_refused(
         Archive(stream).read("a", 100)
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_other_compressions_are_refused(tmp_path: Path, method: int) -> None:
-    path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, method)
+def test_other_compressions_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_LZMA)
     assert "'a': its compression is not read; save it with numpy.savez" in reported(path)
+
+
+def test_what_is_much_larger_than_the_directory_says_is_not_unpacked(
+    tmp_path: Path,
+) -> None:
+    path = save(tmp_path / "a.npz", {"a": [header((2**26,), "<u1"), *[ZEROS] * 64]}, BZIP2)
+    whole = path.read_bytes()
+    size = struct.pack("<I", 2**26 + len(header((2**26,), "<u1")))
+    assert size in whole
+    small = npy(np.zeros(1000, np.uint8))
+    path.write_bytes(whole.replace(size, struct.pack("<I", len(small))))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="'a': it is of another length"):
+        read_archive(path)
+    assert tracemalloc.get_traced_memory()[1] < 1e7
+    tracemalloc.stop()
 
 
 @every_method

@@ -1,13 +1,15 @@
 """`.npz` archives: written in one way, and read with bounds, as they may come from strangers.
 
 numpy's own reader allocates what a header claims, and Python's `zipfile` decompresses without
-bounds what bzip2 or lzma packed, as numpy never does. So headers are checked against the archive's
-directory first, only stored and deflated arrays are read, pickled objects never are, and every way
-in which an archive can be broken is a ValueError.
+bounds what bzip2 or lzma packed. So headers are checked against the archive's directory first,
+arrays that bzip2 packed, as our samples are, are read by `bz2`, which stops where it is asked to,
+those of lzma are not read, pickled objects never are, and every way in which an archive can be
+broken is a ValueError.
 """
 
 from __future__ import annotations
 
+import bz2
 import errno
 import io
 import math
@@ -35,6 +37,7 @@ _MOST_RATIO, _SMALL_BYTES = 1000, 2**26
 depth and amplitude images of real cameras shrink to a tenth to a fortieth."""
 _MOST_HEADER_BYTES = 2**16
 _PIECE_BYTES = 2**20
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)
 _BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -81,7 +84,7 @@ class Archive:
             if not zipfile.is_zipfile(stream):
                 raise ValueError("it is no .npz archive, or cut off")
             stream.seek(0)
-            self._zip = zipfile.ZipFile(stream)
+            self._stream, self._zip = stream, zipfile.ZipFile(stream)
             self._entries = {
                 entry.filename.removesuffix(".npy"): entry for entry in self._zip.infolist()
             }
@@ -123,12 +126,33 @@ class Archive:
         """The bytes of an array after its header, and that."""
         entry = self._entries[name]
         with broken_is_value_error(name):
-            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            if entry.compress_type not in _METHODS:
                 raise ValueError("its compression is not read; save it with numpy.savez_compressed")
-            with self._zip.open(entry) as stream:
+            with self._zip.open(entry) as plain:  # its own header, checked
+                packed = entry.compress_type == zipfile.ZIP_BZIP2
+                stream = bz2.BZ2File(_Packed(self._stream, entry)) if packed else plain
                 header = _header(stream)
                 _check(header, entry, most_bytes)
                 yield stream, header
+
+
+class _Packed(io.RawIOBase):
+    """The bytes of a member of an archive as they are packed."""
+
+    def __init__(self, stream: IO[bytes], entry: zipfile.ZipInfo) -> None:
+        stream.seek(entry.header_offset + 26)
+        name, extra = struct.unpack("<HH", stream.read(4))
+        self._stream, self._left = stream, entry.compress_size
+        self._at = entry.header_offset + 30 + name + extra
+
+    def readable(self) -> bool:
+        return True
+
+    def read(self, size: int = -1) -> bytes:
+        self._stream.seek(self._at)
+        piece = self._stream.read(min(self._left, size if size >= 0 else self._left))
+        self._at, self._left = self._at + len(piece), self._left - len(piece)
+        return piece
 
 
 def read_archive(path: str | Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -196,7 +220,7 @@ def broken_is_value_error(name: str | None = None) -> Iterator[None]:
     except OSError as error:
         if error.errno not in (None, errno.EINVAL):
             raise
-        # The directory says that it lies before the file's beginning.
+        # No stream of bzip2's; or the directory says that it lies before the file's beginning.
         raise ValueError(f"{where} is damaged: it is not where it should be") from None
     except PickledError:
         raise PickledError(f"{where} holds pickled objects, not numbers") from None
