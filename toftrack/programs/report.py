@@ -58,7 +58,7 @@ class Group:
     spread: float | None
     """Deviation over seeds of the mean over recordings; None below two seeds."""
     cost_ms: float | None
-    recordings: dict[str, float | None]
+    recordings: dict[str, float]
     """The mean error of each."""
 
 
@@ -98,8 +98,8 @@ def _read_run(path: Path, folder: Path) -> Run:
         return Run(name, overrides, {}, why)
     if not isinstance(summary, dict):
         return Run(name, overrides, {}, "its summary.json is not one of track.py")
-    why = summary.get("error")
-    return Run(name, overrides, _flat(summary), None if why is None else _printable(str(why)))
+    told = summary.get("error")
+    return Run(name, overrides, _flat(summary), None if told is None else _printable(str(told)))
 
 
 def _printable(text: str) -> str:
@@ -145,12 +145,13 @@ def _group(settings: str, runs: list[Run], figure: str) -> Group:
         for members in by_seed.values()
         if len(_parts(members, _RECORDING)) == len(by_recording)
     ]
+    timed = [run for run in good if "mean_ms" in run.figures]
     return Group(
         settings,
         runs,
-        error=_mean(good, figure),
+        error=_mean(good, figure) if good else None,
         spread=statistics.stdev(complete) if len(complete) > 1 else None,
-        cost_ms=_mean([run for run in good if "mean_ms" in run.figures], "mean_ms"),
+        cost_ms=_mean(timed, "mean_ms") if timed else None,
         recordings={name: _mean(part, figure) for name, part in by_recording.items()},
     )
 
@@ -164,8 +165,8 @@ def _parts(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
     return dict(sorted(parts.items()))
 
 
-def _mean(runs: Sequence[Run], name: str) -> float | None:
-    return statistics.fmean(run.figures[name] for run in runs) if runs else None
+def _mean(runs: Sequence[Run], name: str) -> float:
+    return statistics.fmean(run.figures[name] for run in runs)
 
 
 def _write_csv(runs: Sequence[Run], path: Path) -> None:
