@@ -12,16 +12,21 @@ from helpers.data_sets import Scene, scene, write_icvl, write_msra, write_nyu
 from scipy.io import savemat
 
 from toftrack.errors import ToftrackError
-from toftrack.evaluation.datasets import DATA_SETS, nyu, open_data_set
-from toftrack.evaluation.datasets.base import INTEL_CREATIVE
-from toftrack.evaluation.datasets.nyu import read_numbers
+from toftrack.evaluation import datasets
+from toftrack.evaluation.datasets import (
+    DATA_SETS,
+    INTEL_CREATIVE,
+    NYU_CAMERA,
+    open_data_set,
+    read_matlab,
+)
 
 FRAMES = 3
 
 
 def write(name: str, folder: Path, frames: int = FRAMES) -> Scene:
     """A data set of one sequence; what it shows."""
-    seen = scene(nyu._CAMERA if name == "NYU" else INTEL_CREATIVE, frames)
+    seen = scene(NYU_CAMERA if name == "NYU" else INTEL_CREATIVE, frames)
     if name == "MSRA14":
         write_msra(folder / "Subject1", seen, boxed=False)
     elif name == "MSRA15":
@@ -57,7 +62,7 @@ def test_what_was_written_is_read(name: str, sequence: str, side: str, tmp_path:
     data_set, sequences = open_data_set(name, tmp_path)
     assert [s.name for s in sequences] == [sequence]
     read = sequences[0]
-    assert (len(read), read.side, read.left_out) == (FRAMES, side, 0)
+    assert (len(read.images), read.side, read.left_out) == (FRAMES, side, 0)
     np.testing.assert_array_equal(read.camera.K, seen.K)
     for index in range(FRAMES):
         depth = read.frame(index)
@@ -110,17 +115,17 @@ def test_a_file_of_icvl_may_hold_several_sequences(tmp_path: Path) -> None:
     (tmp_path / "b.txt").unlink()
     (tmp_path / "a.txt").write_text(joined)
     _, sequences = open_data_set("ICVL", tmp_path)
-    assert [(s.name, len(s)) for s in sequences] == [("a", 2), ("b", 2)]
+    assert [(s.name, len(s.images)) for s in sequences] == [("a", 2), ("b", 2)]
 
 
 def test_the_two_persons_of_nyu_are_two_sequences(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(nyu, "_TEST_FRAMES", 3)
-    monkeypatch.setattr(nyu, "_FIRST_PERSON", 1)
+    monkeypatch.setattr(datasets, "_TEST_FRAMES", 3)
+    monkeypatch.setattr(datasets, "_FIRST_PERSON", 1)
     seen = write("NYU", tmp_path)
     _, sequences = open_data_set("NYU", tmp_path)
-    assert [(s.name, len(s)) for s in sequences] == [("test_1", 1), ("test_2", 2)]
+    assert [(s.name, len(s.images)) for s in sequences] == [("test_1", 1), ("test_2", 2)]
     np.testing.assert_allclose(sequences[1].frame(0), seen.depth_m[1], atol=0.00051)
 
 
@@ -129,7 +134,7 @@ def test_msra14_may_come_without_the_number_of_frames(tmp_path: Path) -> None:
     labels = tmp_path / "Subject1" / "joint.txt"
     labels.write_text("\n".join(labels.read_text().splitlines()[1:]))
     _, (read,) = open_data_set("MSRA14", tmp_path)
-    assert len(read) == FRAMES
+    assert len(read.images) == FRAMES
 
 
 @pytest.mark.parametrize("name", list(DATA_SETS))
@@ -138,7 +143,7 @@ def test_labels_without_an_image_are_left_out(name: str, tmp_path: Path) -> None
     images = sorted(path for path in tmp_path.rglob("*") if path.suffix in (".bin", ".png"))
     images[1].unlink()
     data_set, (read,) = open_data_set(name, tmp_path)
-    assert (len(read), read.left_out) == (FRAMES - 1, 1)
+    assert (len(read.images), read.left_out) == (FRAMES - 1, 1)
     kept = seen.joints_m[[0, 2]][:, list(data_set.joints)]
     np.testing.assert_allclose(read.joints_m, kept, atol=5e-6)
     np.testing.assert_allclose(read.frame(1), seen.depth_m[2], atol=0.00051)
@@ -237,7 +242,7 @@ def test_numbers_of_matlab_files_are_read_in_their_own_type(tmp_path: Path) -> N
     wanted = np.random.default_rng(0).integers(0, 200, (2, 3, 4, 5)).astype(np.int16)
     content = {"before": {"a": np.eye(2)}, "wanted": wanted, "x": np.arange(3.0)}
     savemat(tmp_path / "some.mat", content, do_compression=True)
-    read = read_numbers(tmp_path / "some.mat", "wanted")
+    read = read_matlab(tmp_path / "some.mat", "wanted")
     assert read.dtype == wanted.dtype
     np.testing.assert_array_equal(read, wanted)
 
@@ -251,7 +256,7 @@ def test_a_matlab_file_that_crashes_its_reader_gives_one_sentence(tmp_path: Path
     content[at] = 127
     path.write_bytes(content)
     with pytest.raises(ToftrackError, match="cannot be used .*; copy the data set again"):
-        read_numbers(path, "a")
+        read_matlab(path, "a")
 
 
 def test_colour_images_in_place_of_depth_are_refused(tmp_path: Path) -> None:

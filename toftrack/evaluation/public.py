@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
-from toftrack.evaluation.datasets.base import DataSet, LabelledSequence
+from toftrack.evaluation.datasets import FPS, DataSet, LabelledSequence
 from toftrack.evaluation.measures import Estimates
 from toftrack.evaluation.runs import estimates_of
 from toftrack.evaluation.statistics import figure, interval, mean_of, share_pct
@@ -81,7 +81,7 @@ def _tracked(
     reported = []
     for index in range(count):
         depth_m = sequence.frame(index)
-        estimate = tracker.step(depth_m, sequence.camera.K, index, index / sequence.fps)
+        estimate = tracker.step(depth_m, sequence.camera.K, index, index / FPS)
         reported.append([estimate])
         bar.update()
     return estimates_of(reported)
