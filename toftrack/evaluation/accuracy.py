@@ -21,7 +21,7 @@ from typing import Any
 
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
-from toftrack.evaluation.peer import MAKE_ENVIRONMENT, peer_process
+from toftrack.evaluation.peer import MAKE_ENVIRONMENT, PEER, peer_process
 from toftrack.evaluation.results import (
     checked_targets,
     circumstances,
@@ -68,7 +68,7 @@ def measure(
         "overrides": overrides,
     }
     if peer is not None:
-        about["peer"] = {"name": peer[0], **peer_process(*peer).versions}
+        about["peer"] = {"name": PEER, **peer_process(peer).versions}
     rows: list[Row] = []
     try:
         for more in run_jobs(todo, options.workers):
@@ -80,7 +80,8 @@ def measure(
     _report(about, rows, others, options, draw)
 
 
-def _peer(options: argparse.Namespace) -> tuple[str, str] | None:
+def _peer(options: argparse.Namespace) -> str | None:
+    """Its Python."""
     if options.peer is None:
         return None
     if options.peer_python is None:
@@ -90,7 +91,7 @@ def _peer(options: argparse.Namespace) -> tuple[str, str] | None:
         )
     if options.hands > 1:
         raise ToftrackError("--peer is measured with one hand; leave out --hands, or --peer")
-    return options.peer, str(options.peer_python)
+    return str(options.peer_python)
 
 
 def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], list[str]]:

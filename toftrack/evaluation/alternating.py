@@ -181,7 +181,7 @@ class _PeerRunner:
 
     def __init__(self, name: str, python: str) -> None:
         self.name = name
-        self._peer = Peer("mediapipe", python)
+        self._peer = Peer(python)
         with make_device("device=sample") as device:
             camera, frames = device.camera, list(device)
         self._images = [(camera.rectify(f.depth, f.radial), f.amplitude) for f in frames]

@@ -35,6 +35,9 @@ import sys
 import time
 from typing import Any, BinaryIO
 
+import cv2
+import numpy as np
+
 COLUMNS = 640
 WHITE_PERCENTILE = 99.0
 GAMMA = 0.5
@@ -52,7 +55,7 @@ SIDES = {"Left": "right", "Right": "left"}
 """MediaPipe names sides as in a mirrored picture, which these are not."""
 
 
-def picture(amplitude: Any, cv2: Any, np: Any) -> Any:
+def picture(amplitude: np.ndarray) -> np.ndarray:
     """(H, W) uint16 as an 8-bit RGB picture of COLUMNS columns."""
     white = max(float(np.percentile(amplitude, WHITE_PERCENTILE)), 1.0)
     grey = (255 * np.clip(amplitude / white, 0, 1) ** GAMMA).astype(np.uint8)
@@ -62,7 +65,7 @@ def picture(amplitude: Any, cv2: Any, np: Any) -> Any:
     return np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))
 
 
-def lifted(landmarks: Any, depth_m: Any, k: Any, np: Any) -> Any:
+def lifted(landmarks: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
     """Joints (21, 3) in metres; not finite where nothing is read anywhere.
 
     landmarks: (21, 3) x and y in parts of the image's width and height, z of its width.
@@ -73,7 +76,7 @@ def lifted(landmarks: Any, depth_m: Any, k: Any, np: Any) -> Any:
     for tip in TIPS:
         at[tip] += INWARDS * (uv[tip - 1] - uv[tip])
         below[tip] = TIP_BELOW_M
-    read = np.array([_reading(depth_m, u, v, np) for u, v in at]) + below
+    read = np.array([_reading(depth_m, u, v) for u, v in at]) + below
     if not np.isfinite(read).any():
         return np.full((21, 3), np.nan)
     relative = landmarks[:, 2] * width * np.nanmedian(read) / k[0, 0]
@@ -82,7 +85,7 @@ def lifted(landmarks: Any, depth_m: Any, k: Any, np: Any) -> Any:
     return np.concatenate((xy, z[:, None]), axis=1)
 
 
-def _reading(depth_m: Any, u: float, v: float, np: Any) -> float:
+def _reading(depth_m: np.ndarray, u: float, v: float) -> float:
     """The median of the readings in the 3 x 3 pixels about a place, metres; NaN: none."""
     x, y = round(u), round(v)
     patch = depth_m[max(y - 1, 0) : max(y + 2, 0), max(x - 1, 0) : max(x + 2, 0)]
@@ -108,9 +111,7 @@ def chosen(found: Any, side: str) -> tuple[Any, str, float] | None:
 def serve(source: BinaryIO, sink: BinaryIO) -> None:
     """Answer until the source ends."""
     try:
-        import cv2
         import mediapipe
-        import numpy as np
 
         hands = mediapipe.solutions.hands.Hands
     except (ImportError, AttributeError) as error:
@@ -132,12 +133,12 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         depth_m = np.frombuffer(source.read(4 * height * width), np.float32)
         began = time.perf_counter()
         amplitude, depth_m = amplitude.reshape(height, width), depth_m.reshape(height, width)
-        found = chosen(hand.process(picture(amplitude, cv2, np)), side)
+        found = chosen(hand.process(picture(amplitude)), side)
         answer = np.full(66, np.nan)
         if found is not None:
             landmarks, found_side, probability = found
             places = np.array([(p.x, p.y, p.z) for p in landmarks.landmark])
-            answer[:63] = lifted(places, depth_m, k, np).ravel()
+            answer[:63] = lifted(places, depth_m, k).ravel()
             answer[64:] = probability, float(found_side == "right")
         answer[63] = time.perf_counter() - began
         sink.write(answer.tobytes())

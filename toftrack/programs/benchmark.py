@@ -85,7 +85,7 @@ def _alternating(arguments: Sequence[str]) -> None:
 
 def _accuracy(arguments: Sequence[str]) -> None:
     from toftrack.evaluation import accuracy
-    from toftrack.evaluation.peer import PEERS
+    from toftrack.evaluation.peer import PEER
     from toftrack.evaluation.runs import SIDES
 
     parser = _parser_of_recordings("accuracy", accuracy.__doc__)
@@ -106,7 +106,7 @@ def _accuracy(arguments: Sequence[str]) -> None:
         help="of a recording without truth; may be given several times",
     )
     parser.add_argument("--compare", type=Path, metavar="FILE", help="an earlier --json")
-    parser.add_argument("--peer", choices=PEERS, help="measure another method, too")
+    parser.add_argument("--peer", choices=(PEER,), help="measure another method, too")
     parser.add_argument("--peer-python", type=Path, metavar="PYTHON", help="of its environment")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the shares there (.png)")
     command = shlex.join(["toftrack", "benchmark", "accuracy", *arguments])
