@@ -63,23 +63,19 @@ class Estimates:
     """What a method says of the T frames of a recording, of one hand or of slots.
 
     With slots every array has an axis of slots after T. None: it says nothing of it.
+    joints_m: (T, 21, 3) metres, camera frame; not finite where there is none.  lost: (T,) bool.
+    joint_sigma_m: (T, 21, 3), see hand/regions.py.  joint_ok: (T, 21) bool.  gesture: (T,) text.
+    side: (T,) 'right' or 'left' as it was detected, '' for neither; None where it was given.
+    side_probability: (T,).
     """
 
     joints_m: np.ndarray
-    """(T, 21, 3) metres, camera frame; not finite where there is none."""
     lost: np.ndarray
-    """(T,) bool."""
     joint_sigma_m: np.ndarray | None = None
-    """(T, 21, 3), see hand/regions.py."""
     joint_ok: np.ndarray | None = None
-    """(T, 21) bool."""
     gesture: np.ndarray | None = None
-    """(T,) text."""
     side: np.ndarray | None = None
-    """(T,) text, 'right' or 'left', as it was detected; empty where it names none. None where it
-    was given."""
     side_probability: np.ndarray | None = None
-    """(T,)."""
 
     def slot(self, number: int) -> Estimates:
         """Of one slot."""
@@ -89,11 +85,8 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What was measured of one hand.
-
-    trust: its figures.  frames: what each frame is.  figures: see the head of this module;
-    JSON-able, unrounded.  named: (T,) bool, frames whose pose has a name.  called: those of them
-    that are called so.
+    """What was measured of one hand.  figures: see the head of this module; JSON-able, unrounded.
+    named: (T,) bool, frames whose pose has a name.  called: those of them that are called so.
     """
 
     trust: Trust
@@ -105,11 +98,8 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRecording:
-    """What was measured of a recording.
-
-    slots: of the hands; None where the track has no slots.
-    ghost_pct: frames in which a slot without a hand says that it has one; None where there is no
-        such slot.
+    """What was measured of a recording.  slots: of the hands; None where the track has no slots.
+    ghost_pct: frames in which a slot without a hand says that it has one; None: no such slot.
     """
 
     first: Measured
@@ -119,10 +109,8 @@ class MeasuredRecording:
 
 
 def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
-    """All measures of a track of one hand or of several slots.
-
-    Raises ToftrackError when estimates and truth differ in shape.
-    """
+    """All measures of a track of one hand or of several slots. Raises ToftrackError when estimates
+    and truth differ in shape."""
     if np.ndim(estimates.joints_m) == 3:
         return MeasuredRecording(_of_hand(estimates, truth))
     truths = [truth] if truth.other is None else [truth, truth.other]
@@ -131,8 +119,7 @@ def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
     others = ~np.delete(np.asarray(estimates.lost, bool), slots, axis=1)
     ghosts = None
     if others.shape[1]:
-        every = np.ones(len(others), bool)
-        ghosts = share_pct(np.asarray(others.any(1)), every) or 0.0
+        ghosts = share_pct(others.any(1), np.ones(len(others), bool)) or 0.0
     return MeasuredRecording(each[0], each[1] if each[1:] else None, ghosts, slots)
 
 
@@ -177,10 +164,7 @@ def coverage(
 
 
 def flag_counts(off_mm: np.ndarray, flagged: np.ndarray) -> dict[str, int]:
-    """What joint_ok says of N visible fingertips, see the head of this module.
-
-    off_mm: (N,) errors.  flagged: (N,) bool.
-    """
+    """What joint_ok says of visible fingertips with (N,) errors; see the head of this module."""
     wrong = np.asarray(off_mm) > OK_MM
     counted = (wrong, wrong & flagged, ~wrong, ~wrong & flagged)
     return {name: int(rows.sum()) for name, rows in zip(FLAG_COUNTS, counted, strict=True)}

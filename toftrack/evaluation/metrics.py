@@ -37,16 +37,8 @@ _COVERED = 0.7
 
 
 def evaluate(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, Any]:
-    """Metrics of T estimates, unrounded; None for a figure about no frame at all.
-
-    Args and raises as of `judged`, but for all 21 joints.
-
-    Returns:
-        frames, missing_pct, mean_mm, median_mm, p90_mm, fingertip_mm, wrist_aligned_mm (without the
-        wrist), visible_joints_mm, frames_max_below_40mm_pct, mean_not_lost_mm, lost_precision,
-        lost_recall (tolerant), lost_precision_strict, lost_recall_strict, and reacquisition, a list
-        of {event, frame, delay}.
-    """
+    """Metrics of T estimates, as of `judged` but of all 21 joints; unrounded; None for a figure
+    about no frame at all. `reacquisition` is a list of {event, frame, delay}."""
     of, flagged = judged(joints_m, lost, truth), np.asarray(lost, bool)
     error = of.error_mm
     present = of.seen & truth.in_space
@@ -66,7 +58,7 @@ def evaluate(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, 
         "median_mm": figure(error[measured], np.median),
         "p90_mm": figure(error[measured], lambda errors: np.percentile(errors, 90)),
         "fingertip_mm": figure(error[measured][:, TIPS].ravel()),
-        "wrist_aligned_mm": figure(aligned[:, 1:].ravel()),
+        "wrist_aligned_mm": figure(aligned[:, 1:].ravel()),  # without the wrist
         "visible_joints_mm": figure(error[measured[:, None] & in_sight]),
         f"frames_max_below_{OK_MM:g}mm_pct": share_pct(error.max(1) < OK_MM, used) or 0.0,
         "mean_not_lost_mm": figure(error[measured & ~flagged]),

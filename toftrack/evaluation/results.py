@@ -13,7 +13,6 @@ import os
 import platform
 import subprocess
 from collections.abc import Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -167,7 +166,7 @@ def compared(here: Sequence[Row], there: Sequence[Row]) -> dict[str, Any]:
         if both:
             means = np.array([np.mean(values, axis=0) for values in both.values()])
             found = dict(zip(("here", "there"), means.mean(0).tolist(), strict=True))
-            found |= asdict(interval((means[:, 0] - means[:, 1]).tolist()))
+            found |= interval((means[:, 0] - means[:, 1]).tolist())._asdict()
             differences[key] = {name: round(value, 4) for name, value in found.items()}
             differences[key]["recordings"] = len(means)
     return {
