@@ -9,7 +9,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation import alternating
-from toftrack.evaluation.alternating import FIRST, PEER_HANDS, Program, Runner, Times, show
+from toftrack.evaluation.alternating import FIRST, PEER_HANDS, Program, Times, runner, show, timed
 
 LEFT = str(Path(alternating.__file__).parents[1] / "data" / "sample_left_hand.npz")
 
@@ -51,11 +51,11 @@ def test_frames_count_in_which_the_hands_are_believed(tmp_path) -> None:
     with np.load(LEFT) as sample:
         np.savez(short, **{k: v[:15] if v.shape[:1] == (80,) else v for k, v in sample.items()})
     quick = ("hand.side=left", "experiment=paper")
-    assert 0 < len(alternating._one_round(Program("one", quick, str(short), hands=1))()) <= 5
+    assert 0 < len(runner(Program("one", quick, str(short), hands=1))()) <= 5
     with pytest.raises(ToftrackError, match="2 hands were in none"):
-        alternating._one_round(Program("two", quick, str(short), hands=2))()
+        runner(Program("two", quick, str(short), hands=2))()
 
 
 def test_what_a_program_s_process_cannot_do_is_one_sentence() -> None:
-    with pytest.raises(ToftrackError, match="wrong"), Runner(Program("wrong", ("nothing=1",))):
-        pass
+    with pytest.raises(ToftrackError, match="wrong"):
+        timed([Program("wrong", ("nothing=1",))], 1)

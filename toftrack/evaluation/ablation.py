@@ -66,19 +66,10 @@ _SHOWN = (
 
 
 def measure(options: argparse.Namespace, command: str) -> None:
-    """Track with each variant, measure and report.
-
-    An interruption reports the variants that are done before it is passed on.
-
-    Args:
-        options: those of `toftrack benchmark ablation`.
-        command: how it was called.
-
-    Raises:
-        ToftrackError: something that was given cannot be used.
-    """
+    """Track with each variant, measure and report; an interruption reports the variants that are
+    done before it is passed on. Raises ToftrackError: something that was given cannot be used."""
     names = [DEFAULT, *(name for name in options.variants if name != DEFAULT)]
-    paths, overrides = divided(options.what, "told", 1)
+    paths, overrides = divided(options.what)
     checked_targets(options.json, options.markdown)
     found = sources(paths)
     about = circumstances() | {"command": command, "seeds": options.seeds, "overrides": overrides}

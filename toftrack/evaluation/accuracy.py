@@ -41,19 +41,12 @@ _GIVEN_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smoo
 def measure(
     options: argparse.Namespace, command: str, draw: Callable[[Path, dict[str, Any]], None]
 ) -> None:
-    """Track, measure and report.
+    """Track, measure and report; an interruption reports what is done before it is passed on.
 
-    An interruption reports what is done before it is passed on.
-
-    Args:
-        options: those of `toftrack benchmark accuracy`.
-        command: how it was called.
-        draw: makes the picture of a result.
-
-    Raises:
-        ToftrackError: something that was given cannot be used.
+    command: how it was called.  draw: makes the picture of a result.
+    Raises ToftrackError: something that was given cannot be used.
     """
-    paths, overrides = divided(options.what, options.side, options.hands)
+    paths, overrides = divided(options.what, options.hands)
     checked_targets(options.json, options.markdown, options.picture)
     others = None if options.compare is None else read_rows(options.compare)
     found = sources(paths, options.labels)
@@ -94,7 +87,7 @@ def _peer(options: argparse.Namespace) -> str | None:
     return str(options.peer_python)
 
 
-def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], list[str]]:
+def divided(words: Sequence[str], hands: int = 1) -> tuple[list[str], list[str]]:
     """Files and folders, and overrides: those are no file and have a =; the overrides are checked.
 
     Raises ToftrackError for an override that cannot be used, or names another recording.
@@ -123,14 +116,9 @@ def _report(
 ) -> None:
     result = about | result_of([row for row in rows if "method" not in row])
     if "peer" in about:
-        of_peer = result_of(
-            [
-                {key: value for key, value in row.items() if key != "method"}
-                for row in rows
-                if "method" in row
-            ]
-        )
-        result["peer"] = about["peer"] | of_peer
+        of_peer = [row for row in rows if "method" in row]
+        unnamed = [{key: row[key] for key in row if key != "method"} for row in of_peer]
+        result["peer"] = about["peer"] | result_of(unnamed)
     if others is not None:
         result["comparison"] = comparison_with(result["rows"], others, str(options.compare))
     notes = notes_of(result)

@@ -16,10 +16,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
@@ -47,11 +47,9 @@ _START = ("device=sample", "hand.side=right", "device.stop=3", "stream=stdout")
 
 @dataclass(frozen=True)
 class Program:
-    """What is timed.
-
-    overrides: of the tracker.  recording: with truth; None = the packaged one.
-    size: columns and rows to which its images are enlarged.  hands: that must be believed in a
-    frame that counts.
+    """What is timed.  overrides: of the tracker.  recording: with truth; None = the packaged one.
+    size: (columns, rows) that its images are enlarged to.  hands: that must be believed in a frame
+    that counts.
     """
 
     name: str
@@ -108,41 +106,35 @@ def programs(two_hands: Sequence[str] = ()) -> list[Program]:
     return found
 
 
-class Runner:
-    """A program's process, for a `with`; `round` times it once."""
+Runner = Callable[[], list[float]]
+"""Times a program once; milliseconds of its frames. Raises ToftrackError."""
 
-    def __init__(self, program: Program) -> None:
-        self.name, self._program = program.name, program
-        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
 
-    def __enter__(self) -> Runner:
-        try:
-            self.round()  # compiles, and sees everything once
-        except BaseException:
-            self._pool.shutdown()
-            raise
-        return self
+@contextmanager
+def _in_process(program: Program) -> Iterator[Runner]:
+    """A program in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
 
-    def __exit__(self, *error: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
+        def once() -> list[float]:
+            try:
+                return pool.submit(_round, program).result()
+            except BrokenProcessPool:
+                raise ToftrackError(f"the process that timed {program.name!r} has ended") from None
+            except ToftrackError as error:
+                raise ToftrackError(f"{program.name}: {error}") from None
 
-    def round(self) -> list[float]:
-        """Milliseconds of its frames. Raises ToftrackError when it ended."""
-        try:
-            return self._pool.submit(_round, self._program).result()
-        except BrokenProcessPool:
-            raise ToftrackError(f"the process that timed {self.name!r} has ended") from None
-        except ToftrackError as error:
-            raise ToftrackError(f"{self.name}: {error}") from None
+        once()  # compiles, and sees everything once
+        yield once
 
 
 def _round(program: Program) -> list[float]:
-    """What Runner asks its process for."""
-    return _one_round(program)()
+    """What is asked of the process."""
+    return runner(program)()
 
 
 @functools.cache
-def _one_round(program: Program) -> Callable[[], list[float]]:
+def runner(program: Program) -> Runner:
+    """Times a program in this process."""
     tracker = make_hands_tracker(*program.overrides, "device=sample")
     device = make_device("device=sample") if program.recording is None else None
     with device or Replay(str(program.recording)) as source:
@@ -176,47 +168,37 @@ def _one_round(program: Program) -> Callable[[], list[float]]:
     return once
 
 
-class _PeerRunner:
-    """MediaPipe as a Runner."""
+@contextmanager
+def _peer(hands: int, python: str) -> Iterator[Runner]:
+    """MediaPipe, which times itself, in its process."""
+    with make_device("device=sample") as device:
+        camera, frames = device.camera, list(device)
+    images = [(camera.rectify(f.depth, f.radial), f.amplitude) for f in frames]
+    images += images[-2:0:-1]
+    with Peer(python) as peer:
+        peer.begin(camera, "right", hands)
 
-    def __init__(self, name: str, python: str) -> None:
-        self.name = name
-        self._peer = Peer(python)
-        with make_device("device=sample") as device:
-            camera, frames = device.camera, list(device)
-        self._images = [(camera.rectify(f.depth, f.radial), f.amplitude) for f in frames]
-        self._images += self._images[-2:0:-1]
-        self._peer.begin(camera, "right", PEER_HANDS[name])
+        def once() -> list[float]:
+            found = []
+            for depth, amplitude in images:
+                assert amplitude is not None, "the packaged recording has amplitudes"
+                found.append(1e3 * peer.step(depth, amplitude).compute_s)
+            return found
 
-    def __enter__(self) -> _PeerRunner:
-        self.round()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._peer.close()
-
-    def round(self) -> list[float]:
-        """Milliseconds of its frames, in its own process."""
-        found = []
-        for depth, amplitude in self._images:
-            assert amplitude is not None, "the packaged recording has amplitudes"
-            found.append(1e3 * self._peer.step(depth, amplitude).compute_s)
-        return found
+        once()
+        yield once
 
 
 def timed(which: Sequence[Program], rounds: int, peer_python: str | None = None) -> list[Times]:
     """Milliseconds of frames, each program's in turn with the others'. Raises ToftrackError."""
     with ExitStack() as stack:
-        runners: list[Runner | _PeerRunner] = [
-            stack.enter_context(Runner(program)) for program in which
-        ]
-        if peer_python is not None:
-            runners += [stack.enter_context(_PeerRunner(name, peer_python)) for name in PEER_HANDS]
-        found = [Times(runner.name) for runner in runners]
+        runners = [(Times(one.name), stack.enter_context(_in_process(one))) for one in which]
+        for name, hands in PEER_HANDS.items() if peer_python is not None else ():
+            runners.append((Times(name), stack.enter_context(_peer(hands, str(peer_python)))))
         for _ in range(rounds):
-            for runner, times in zip(runners, found, strict=True):
-                times.rounds.append(runner.round())
-    return found
+            for times, once in runners:
+                times.rounds.append(once())
+    return [times for times, _ in runners]
 
 
 Start = dict[str, float]
@@ -263,10 +245,8 @@ def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
     lines = []
     if found:
         named = {times.name: times for times in found}
-        first = named.get(FIRST)
-        peers = [named[name] for name in PEER_HANDS if name in named]
-        over = [] if first is None else [("side given", first)]
-        over += [(times.name, times) for times in peers]
+        compared = {"side given": FIRST} | {name: name for name in PEER_HANDS}
+        over = [(title, named[name]) for title, name in compared.items() if name in named]
         head = f"{'ms':<28}{'least':>7}{'median':>20}{'90th / median':>20}"
         lines.append(head + "".join(f"{'over ' + name:>28}" for name, _ in over))
         for times in found:
@@ -311,14 +291,9 @@ def measure(
 ) -> dict[str, Any]:
     """Time everything and print it, the machine first; returns what --json writes.
 
-    Args:
-        rounds: of all programs.  begins: of the command line.
-        cores: as many as all may use; None: all that there are.
-        two_hands: recordings with truth.
-        peer_python: MediaPipe's; None: without it.
-
-    Raises:
-        ToftrackError: a recording or an environment cannot be used.
+    rounds: of all programs.  begins: of the command line.  cores: as many as all may use; None: all
+    that there are.  two_hands: recordings with truth.  peer_python: MediaPipe's; None: without it.
+    Raises ToftrackError: a recording or an environment cannot be used.
     """
     if cores is not None:
         _use(cores)
