@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
+from toftrack.errors import ToftrackError
 from toftrack.evaluation.measures import FLAG_COUNTS, Estimates, measured
-from toftrack.evaluation.results import compared, rows_of
+from toftrack.evaluation.results import compared, read_rows
 from toftrack.evaluation.rows import (
     by_recording,
     group_counts,
@@ -159,9 +162,11 @@ def test_differences_are_of_pairs_and_what_is_alone_is_named() -> None:
         {"rows": [{"recording": "a", "seed": 0, "usable_pct": float("nan")}]},
     ],
 )
-def test_what_is_no_measurement_is_not_compared_with(content) -> None:
-    with pytest.raises(ValueError):
-        rows_of(content)
+def test_what_is_no_measurement_is_not_compared_with(content, tmp_path) -> None:
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ToftrackError, match="give such a file"):
+        read_rows(file)
 
 
 def test_tables_show_what_there_is_and_leave_out_what_there_is_not() -> None:

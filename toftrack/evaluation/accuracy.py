@@ -25,7 +25,7 @@ from toftrack.evaluation.peer import MAKE_ENVIRONMENT, PEER, peer_process
 from toftrack.evaluation.results import (
     checked_targets,
     circumstances,
-    comparison_with,
+    compared,
     json_text,
     read_rows,
     result_of,
@@ -120,7 +120,12 @@ def _report(
         unnamed = [{key: row[key] for key in row if key != "method"} for row in of_peer]
         result["peer"] = about["peer"] | result_of(unnamed)
     if others is not None:
-        result["comparison"] = comparison_with(result["rows"], others, str(options.compare))
+        result["comparison"] = {"with": str(options.compare), **compared(result["rows"], others)}
+        if not result["comparison"]["pairs"]:
+            raise ToftrackError(
+                f"'{options.compare}' has none of these recordings with one of these seeds, so "
+                "that nothing can be compared; measure the same recordings with the same seeds"
+            )
     notes = notes_of(result)
     tables = accuracy_tables(result)
     if "peer" in result:

@@ -86,19 +86,15 @@ class Stills:
 def read_labels(path: str | Path) -> Points | Stills:
     """Labels of either kind; ToftrackError, one sentence that names the file."""
     path = Path(path).expanduser()
-    with reported_errors(
-        f"the labels '{path}' cannot be read", "give a file of JSON", OSError, ValueError
-    ):
+    what = f"the labels '{path}' cannot be read"
+    with reported_errors(what, "give a file of JSON", OSError, ValueError):
         content = read_json(path)
     return parsed_labels(path, content)
 
 
 def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Stills:
-    """Labels of either kind as they stand in a file.
-
-    begun: points may still be without any that is visible.
-    Raises ToftrackError, one sentence that names the file.
-    """
+    """Labels of either kind as they stand in a file; where `begun`, points may still be without
+    any that is visible. Raises ToftrackError, one sentence that names the file."""
     try:
         return _parsed(path, content, begun)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
@@ -149,38 +145,36 @@ def point_rows(
 ) -> dict[int, dict[str, Any]]:
     """The figures of each labelled frame that has a visible fingertip, by its number.
 
-    Args:
-        joints_m: (T, 21, 3) metres, camera frame.
-        lost: (T,) bool.
-        joint_ok: (T, 21) bool.
-        K: (3, 3), of undistorted pixels.
-
+    joints_m: (T, 21, 3) metres, camera frame.  lost: (T,) bool.  joint_ok: (T, 21) bool.
+    K: (3, 3), of undistorted pixels.
     Raises ToftrackError when a frame is labelled that the track has not.
     """
     found = {}
     for number, off in lateral_errors_mm(points, joints_m, K, TIPS).items():
-        worst, flagged = max(off.values()), bool(lost[number])
-        ok = joint_ok[number][list(off)]
+        flagged, ok = bool(lost[number]), joint_ok[number][list(off)]
         errors = np.array(list(off.values()))
+        worst = errors.max()
         found[number] = {
-            "tips_20_pct": 100.0 * (worst < 20),
-            "tips_40_pct": 100.0 * (worst < 40),
-            "wrong_pct": 100.0 * (worst > 40 and not flagged),
-            "flagged_pct": 100.0 * flagged,
-            "wrong_no_flag_pct": 100.0 * (not flagged and bool((ok & (errors > OK_MM)).any())),
+            "tips_20_pct": _pct(worst < 20),
+            "tips_40_pct": _pct(worst < 40),
+            "wrong_pct": _pct(worst > 40 and not flagged),
+            "flagged_pct": _pct(flagged),
+            "wrong_no_flag_pct": _pct(not flagged and (ok & (errors > OK_MM)).any()),
             **(dict.fromkeys(FLAG_COUNTS, 0) if flagged else flag_counts(errors, ~ok)),
             "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
         }
     return found
 
 
+def _pct(so: bool | np.bool_) -> float:
+    return 100.0 * bool(so)
+
+
 def lateral_errors_mm(
     points: Points, joints_m: np.ndarray, K: np.ndarray, rows: Sequence[int]
 ) -> dict[int, dict[int, float]]:
     """How far off those of some joints are that are visible: by frame, if it has any, and joint.
-
-    Args and errors: as of point_rows.
-    """
+    Arguments and errors are those of point_rows."""
     if max(points.frames) >= len(joints_m):
         raise ToftrackError(
             f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
@@ -207,12 +201,10 @@ def _lateral_mm(point: np.ndarray, place: tuple[float, float], K: np.ndarray) ->
 
 def still_row(called: str, lost: bool, allowed: Sequence[str]) -> dict[str, Any]:
     """The figures of one still.  called: its gesture.  allowed: what it may be called."""
-    found = not lost
-    right = found and called in allowed
     return {
-        "found_pct": 100.0 * found,
-        "named_pct": 100.0 * right,
-        "wrong_name_pct": 100.0 * (found and called not in (*allowed, *UNNAMED)),
+        "found_pct": _pct(not lost),
+        "named_pct": _pct(not lost and called in allowed),
+        "wrong_name_pct": _pct(not lost and called not in (*allowed, *UNNAMED)),
     }
 
 

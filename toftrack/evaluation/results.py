@@ -29,6 +29,7 @@ from toftrack.json_text import read_json
 from toftrack.safe_files import write_whole
 
 FORMAT = "toftrack accuracy 1"
+COMPARED = (*MEANS, "longest_silent", "never_right", "first_right", *IMAGE_MEANS)
 
 
 def circumstances() -> dict[str, Any]:
@@ -99,19 +100,25 @@ def read_rows(path: Path) -> list[Row]:
     """The rows of an earlier measurement; ToftrackError where the file is none."""
     what = f"'{path}', to compare with, is nothing that toftrack benchmark accuracy --json wrote"
     with reported_errors(what, "give such a file", OSError, ValueError):
-        rows = rows_of(read_json(path))
+        content = read_json(path)
+        rows = content.get("rows") if isinstance(content, dict) else None
+        if not isinstance(rows, list) or not rows:
+            raise ValueError("it has no 'rows'")
+        for row in rows:
+            _check_row(row)
     return rows
 
 
-def comparison_with(rows: Sequence[Row], others: Sequence[Row], name: str) -> dict[str, Any]:
-    """Paired differences, JSON-able; ToftrackError where the two have nothing in common."""
-    found = compared(rows, others)
-    if not found["pairs"]:
-        raise ToftrackError(
-            f"'{name}' has none of these recordings with one of these seeds, so that nothing can "
-            "be compared; measure the same recordings with the same seeds"
-        )
-    return {"with": name, **found}
+def _check_row(row: Any) -> None:
+    if not isinstance(row, dict) or not isinstance(row.get("recording"), str):
+        raise ValueError("its 'rows' do not name recordings")
+    if type(row.get("seed")) is not int:
+        raise ValueError(f"its row of '{row['recording']}' has no seed")
+    for key in COMPARED:
+        value = row.get(key)
+        number = isinstance(value, int | float) and math.isfinite(value)
+        if value is not None and not number:
+            raise ValueError(f"'{key}' of '{row['recording']}' is no number")
 
 
 def checked_targets(*paths: Path | None) -> None:
@@ -138,26 +145,18 @@ def json_text(result: dict[str, Any]) -> str:
     return f'{head},\n "rows": [\n{rows}\n ]\n}}\n'
 
 
-COMPARED = ("longest_silent", "never_right", "first_right")
-"""What is compared beside the means."""
-
-
 def compared(here: Sequence[Row], there: Sequence[Row]) -> dict[str, Any]:
     """The differences of rows by recording and seed, JSON-able.
 
-    Returns:
-        pairs: recordings with a seed that both have.
-        only_here, only_there: what is left out, in words, "crowd/01_back_turn, seed 2".
-        differences: of each figure that both have, its means over the pairs `here` and `there`, and
-            the `mean` difference (here - there) with its 90 % interval, `low` to `high`, over
-            `recordings`.
+    pairs: recordings with a seed that both have.  only_here, only_there: what is left out, in
+    words, "crowd/01_back_turn, seed 2".  differences: of each figure that both have, its means over
+    the pairs, `here` and `there`, and the `mean` difference (here - there) with its 90 % interval,
+    `low` to `high`, over `recordings`.
     """
-    mine, theirs = (
-        {(row["recording"], row["seed"]): row for row in rows} for rows in (here, there)
-    )
+    mine, theirs = ({(row["recording"], row["seed"]): row for row in of} for of in (here, there))
     common = [pair for pair in mine if pair in theirs]
     differences = {}
-    for key in (*MEANS, *COMPARED, *IMAGE_MEANS):
+    for key in COMPARED:
         both: dict[str, list[tuple[float, float]]] = {}
         for pair in common:
             values = mine[pair].get(key), theirs[pair].get(key)
@@ -179,21 +178,3 @@ def compared(here: Sequence[Row], there: Sequence[Row]) -> dict[str, Any]:
 
 def _named(these: dict[Any, Row], others: dict[Any, Row]) -> list[str]:
     return [f"{name}, seed {seed}" for name, seed in these if (name, seed) not in others]
-
-
-def rows_of(content: Any) -> list[Row]:
-    """The rows of a measurement's JSON; ValueError, a few words, where it is none."""
-    rows = content.get("rows") if isinstance(content, dict) else None
-    if not isinstance(rows, list) or not rows:
-        raise ValueError("it has no 'rows'")
-    for row in rows:
-        if not isinstance(row, dict) or not isinstance(row.get("recording"), str):
-            raise ValueError("its 'rows' do not name recordings")
-        if type(row.get("seed")) is not int:
-            raise ValueError(f"its row of '{row['recording']}' has no seed")
-        for key in (*MEANS, *COMPARED, *IMAGE_MEANS):
-            value = row.get(key)
-            number = isinstance(value, int | float) and math.isfinite(value)
-            if value is not None and not number:
-                raise ValueError(f"'{key}' of '{row['recording']}' is no number")
-    return rows

@@ -112,9 +112,7 @@ def group_counts(
 ) -> dict[str, dict[str, dict[str, float]]]:
     """By kind of group and group: the visible frames of a row, and what they are.
 
-    Args:
-        sensor: what camera it was.
-        length_mm: of the hand, wrist to middle fingertip; None: by the truth.
+    length_mm: of the hand, wrist to middle fingertip; None: by the truth.
     """
     flags = {
         "usable": of.frames.usable,
