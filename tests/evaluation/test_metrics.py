@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toftrack.evaluation.metrics import evaluate
+from toftrack.evaluation.measures import evaluate
 from toftrack.frames import Truth
 
 
