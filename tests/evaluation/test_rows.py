@@ -9,7 +9,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.measures import FLAG_COUNTS, Estimates, measured
-from toftrack.evaluation.results import compared, read_rows
+from toftrack.evaluation.results import accuracy_tables, compared, markdown, plain, read_rows
 from toftrack.evaluation.rows import (
     by_recording,
     group_counts,
@@ -18,7 +18,6 @@ from toftrack.evaluation.rows import (
     row_figures,
     totals,
 )
-from toftrack.evaluation.tables import accuracy_tables, markdown, plain
 from toftrack.frames import Truth
 
 

@@ -13,16 +13,19 @@ from typing import Any, NamedTuple
 
 from toftrack.evaluation.accuracy import divided
 from toftrack.evaluation.results import (
+    Table,
     checked_targets,
     circumstances,
+    clear_mark,
     compared,
     json_text,
+    markdown,
+    plain,
     result_of,
     write_text,
 )
 from toftrack.evaluation.rows import Row
 from toftrack.evaluation.runs import jobs, run_jobs, sources
-from toftrack.evaluation.tables import Table, clear_mark, markdown, plain
 
 
 class Variant(NamedTuple):

@@ -23,17 +23,19 @@ from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.peer import MAKE_ENVIRONMENT, PEER, peer_process
 from toftrack.evaluation.results import (
+    accuracy_tables,
     checked_targets,
     circumstances,
     compared,
     json_text,
+    markdown,
+    plain,
     read_rows,
     result_of,
     write_text,
 )
 from toftrack.evaluation.rows import Row
 from toftrack.evaluation.runs import jobs, run_jobs, sources
-from toftrack.evaluation.tables import accuracy_tables, markdown, plain
 
 _GIVEN_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smooth", "hydra")
 

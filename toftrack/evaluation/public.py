@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from toftrack.api import make_tracker
 from toftrack.evaluation.datasets import FPS, DataSet, LabelledSequence
+from toftrack.evaluation.results import plain, table_of
 from toftrack.evaluation.runs import estimates_of
 from toftrack.evaluation.statistics import figure, interval, mean_of, share_pct
-from toftrack.evaluation.tables import plain, table_of
 from toftrack.evaluation.trust import OK_MM, TIPS, judged, tips_inset, trust
 from toftrack.frames import Truth
 
