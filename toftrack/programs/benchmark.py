@@ -114,26 +114,26 @@ def _accuracy(arguments: Sequence[str]) -> None:
 
 
 def _ablation(arguments: Sequence[str]) -> None:
-    from toftrack.evaluation import ablation
+    from toftrack.evaluation import accuracy
 
     def variants(text: str) -> list[str]:
         names = text.split(",")
-        known = ", ".join(ablation.VARIANTS)
+        known = ", ".join(accuracy.VARIANTS)
         for name in names:
-            if name not in ablation.VARIANTS:
+            if name not in accuracy.VARIANTS:
                 raise ToftrackError(f"there is no variant '{name}'; give some of {known}")
         return names
 
-    parser = _parser_of_recordings("ablation", ablation.__doc__)
+    parser = _parser_of_recordings("ablation", accuracy.ABLATION)
     parser.add_argument(
         "--variants",
         type=variants,
-        default=list(ablation.VARIANTS),
+        default=list(accuracy.VARIANTS),
         metavar="NAMES",
-        help=f"only some, separated by commas: {', '.join(ablation.VARIANTS)}",
+        help=f"only some, separated by commas: {', '.join(accuracy.VARIANTS)}",
     )
     command = shlex.join(["toftrack", "benchmark", "ablation", *arguments])
-    ablation.measure(parser.parse_intermixed_args(arguments), command)
+    accuracy.ablate(parser.parse_intermixed_args(arguments), command)
 
 
 def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentParser:
