@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
@@ -65,11 +65,6 @@ class Times:
 
     name: str
     rounds: list[list[float]] = field(default_factory=list)
-
-    @property
-    def least(self) -> float:
-        """Of all frames."""
-        return min(min(times) for times in self.rounds)
 
     @property
     def medians(self) -> list[float]:
@@ -201,14 +196,10 @@ def timed(which: Sequence[Program], rounds: int, peer_python: str | None = None)
     return [times for times, _ in runners]
 
 
-Start = dict[str, float]
-"""One run of the command line on three frames, seconds: `first_s` until its first estimate,
-`wall_s` until its end, `user_s` and `system_s` of the processors; `kernels`: whether they were
-compiled."""
-
-
-def starts(times: int) -> list[Start]:
-    """Runs without compiled kernels, each followed by one with them. Raises ToftrackError."""
+def starts(times: int) -> list[dict[str, float]]:
+    """Runs of the command line on three frames without compiled kernels, each followed by one with
+    them (`kernels`), seconds: `first_s` until its first estimate, `wall_s` until its end, `user_s`
+    and `system_s` of the processors. Raises ToftrackError."""
     found = []
     for _ in range(times):
         with tempfile.TemporaryDirectory() as folder:
@@ -216,7 +207,7 @@ def starts(times: int) -> list[Start]:
     return found
 
 
-def _start(folder: str) -> Start:
+def _start(folder: str) -> dict[str, float]:
     command = [sys.executable, "-m", "toftrack", "track", *_START, f"hydra.run.dir={folder}/run"]
     before = os.times()
     began = time.perf_counter()
@@ -240,7 +231,7 @@ def _start(folder: str) -> Start:
     }
 
 
-def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
+def show(found: Sequence[Times], begun: Sequence[Mapping[str, float]]) -> str:
     """As tables of text: the median of the rounds, and in brackets the least and the largest."""
     lines = []
     if found:
@@ -250,8 +241,8 @@ def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
         head = f"{'ms':<28}{'least':>7}{'median':>20}{'90th / median':>20}"
         lines.append(head + "".join(f"{'over ' + name:>28}" for name, _ in over))
         for times in found:
-            line = f"{times.name:<28}{times.least:>7.1f}{_spread(times.medians, 1):>20}"
-            line += f"{_spread(times.tails, 2):>20}"
+            line = f"{times.name:<28}{min(map(min, times.rounds)):>7.1f}"
+            line += f"{_spread(times.medians, 1):>20}{_spread(times.tails, 2):>20}"
             line += "".join(f"{_spread(times.over(other), 2):>28}" for _, other in over)
             lines.append(line)
         for both in (times for times in found if times.name.endswith(", both")):
@@ -265,13 +256,11 @@ def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
     for kernels in (False, True):
         some = [start for start in begun if start["kernels"] == kernels]
         if some:
-            until_first, wall, user, system = (
-                _spread([start[name] for start in some], 1)
-                for name in ("first_s", "wall_s", "user_s", "system_s")
-            )
+            names = ("first_s", "wall_s", "user_s", "system_s")
+            first, wall, user, system = (_spread([one[n] for one in some], 1) for n in names)
             lines.append(
                 f"three frames {'with' if kernels else 'without'} kernels, s: first estimate"
-                f" {until_first}, end {wall}, processors {user} and of the system {system}"
+                f" {first}, end {wall}, processors {user} and of the system {system}"
             )
     return "\n".join(lines)
 

@@ -6,15 +6,14 @@ recording, which is tracked as a whole:
     {"image_size": [512, 424], "side": "left", "frames": {"6": {"points":
         {"thumb_tip": [249.5, 170.8, "visible"], "wrist": [308, 182, "guessed"], ...}}, ...}}
 
-`toftrack label` makes such a file; what else stands in it, as a frame's `gesture`, is not measured.
-A joint is compared laterally: the distance in pixels between its projection and the label, times
-its own depth over the focal length. Of visible fingertips, which are moved 5 mm towards the joint
-before them, as the labels are: `tips_20_pct`, `tips_40_pct` are the frames in which all are within
-20 and 40 mm; `wrong_pct` those in which one is farther than 40 mm off, unflagged; `flagged_pct`
-those flagged lost; `wrong_no_flag_pct` those not flagged lost in which a tip is so far off that
-`joint_ok` does not flag; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that
-is not finite or not in front of the camera is infinitely far off, and left out of the mean). What
-`joint_ok` flags is counted as in measures.py.
+`toftrack label` makes such a file; what else stands in it is not measured. A joint is compared
+laterally: pixels between its projection and the label, times its own depth over the focal length.
+Of visible fingertips, which are moved 5 mm towards the joint before them, as the labels are:
+`tips_20_pct`, `tips_40_pct` are the frames in which all are within 20 and 40 mm; `wrong_pct` those
+in which one is farther than 40 mm off, unflagged; `flagged_pct` those flagged lost;
+`wrong_no_flag_pct` those not flagged lost in which a tip is so far off that `joint_ok` does not
+flag; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that is not finite or not in
+front of the camera is infinitely far off, and left out of the mean); `FLAG_COUNTS` of measures.py.
 
 **Stills**: images that have nothing to do with one another, each with what it shows. Every one has
 a fresh start and is shown so many frames, the last of which counts:

@@ -1,28 +1,22 @@
 """MediaPipe Hands on amplitude images, in an environment of its own: the far end of peer.py.
 
-Run by that environment's Python, it imports nothing of toftrack; what comes in and goes out are
-JSON lines and plain arrays:
+Run by that environment's Python, it imports nothing of toftrack. JSON lines and plain arrays:
 
-- in `{"begin": {"size": [H, W], "k": [...9], "side": "left" | "right" | "", "hands":
-  N}}`: a new recording, in which so many hands are looked for;
-- in `{"frame": true}`, then H * W uint16 of amplitude and H * W float32 of depth in metres: out 63
+- out, at first, `{"ready": {...versions}}` or `{"error": "why not"}`;
+- in `{"begin": {"size": [H, W], "k": [...9], "side": "left" | "right" | "", "hands": N}}`: a new
+  recording, in which so many hands are looked for;
+- in `{"frame": true}`, then H * W uint16 of amplitude and H * W float32 of depth in metres: out 66
   float64, the joints (21, 3) in metres, not finite where there is no hand; the seconds that it
-  took; the probability of the side; and 1.0 for a right hand, 0.0 for a left one;
-- at first, out `{"ready": {...versions}}` or `{"error": "why not"}`.
+  took; the probability of the side; and 1.0 for a right hand, 0.0 for a left one.
 
-**The image.** MediaPipe was trained on photographs; an amplitude image is what comes nearest: how
-much infrared light comes back. It falls off with the square of the distance, so that a hand before
-a person is bright. The 99th percentile becomes white, the square root of it is taken (a display's
-gamma, roughly), and the picture is enlarged to 640 columns by bicubic interpolation.
+**The image.** MediaPipe was trained on photographs; the amplitude, the infrared light that comes
+back, is what comes nearest. The 99th percentile becomes white, the square root is taken (a
+display's gamma, roughly), and the picture is enlarged to 640 columns.
 
-**The lift.** A landmark's place in the image is MediaPipe's; how much farther from the camera than
-the wrist it is, too, which MediaPipe says in parts of the picture's width and which becomes metres
-by the hand's distance. Where the whole hand is, the depth image says: at each landmark the median
-of 3 x 3 pixels is read, at a tip a little inwards, a joint lies 14 mm below the skin there,
-a tip half of that, and the median of what all 21 say of the hand's distance is taken, so that
-landmarks that are hidden, or beside the hand, do not matter.
-
-What else was tried is in docs/lab/mediapipe.md.
+**The lift.** A landmark's place in the image is MediaPipe's, and so is how much farther than the
+wrist it is, in parts of the picture's width, which becomes metres by the hand's distance. That is
+the median of what 3 x 3 pixels of the depth image say at each landmark, at a tip a little inwards;
+a joint lies 14 mm below the skin, a tip 7. What else was tried: docs/lab/mediapipe.md.
 """
 
 from __future__ import annotations
@@ -103,9 +97,9 @@ def chosen(found: Any, side: str) -> tuple[Any, str, float] | None:
     rows = zip(found.multi_hand_landmarks or (), found.multi_handedness or (), strict=True)
     for landmarks, handedness in rows:
         reported = handedness.classification[0]
-        hands.append((landmarks, SIDES[reported.label], float(reported.score)))
-    meant = [hand for hand in hands if side in ("", hand[1])]
-    return max(meant, key=lambda hand: hand[2]) if meant else None
+        if side in ("", SIDES[reported.label]):
+            hands.append((landmarks, SIDES[reported.label], float(reported.score)))
+    return max(hands, key=lambda hand: hand[2], default=None)
 
 
 def serve(source: BinaryIO, sink: BinaryIO) -> None:

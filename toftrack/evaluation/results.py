@@ -249,7 +249,7 @@ def _named(these: dict[Any, Row], others: dict[Any, Row]) -> list[str]:
 
 
 def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
-    """The tables of a result by their titles: recordings, labelled images, groups, differences."""
+    """By their titles: recordings, labelled images, groups, differences."""
     tables: dict[str, Table] = {}
     total = result.get("total")
     if total:
@@ -260,14 +260,11 @@ def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
         keys = {title: (key, digits) for title, key, digits in _COLUMNS}
         table.append(["90 % interval", *(_interval(total, *keys[head]) for head in heads)])
         tables["recordings"] = table
-    images = {
-        name: figures for name, figures in result.get("images", {}).items() if figures["images"]
-    }
-    if images:
-        shown: dict[str, Any] = {}
-        for name, figures in images.items():
-            shown[name] = figures
-            shown |= {f"  {of}": row for of, row in figures.get("by", {}).items()}
+    shown: dict[str, Any] = {}
+    for name, figures in result.get("images", {}).items():
+        shown[name] = figures
+        shown |= {f"  {of}": row for of, row in figures.get("by", {}).items()}
+    if shown:
         tables["labelled images"] = table_of(_IMAGE_COLUMNS, shown, "labels")
     for kind, found in result.get("groups", {}).items():
         tables[kind] = table_of(_GROUP_COLUMNS, found, kind)

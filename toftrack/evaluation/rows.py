@@ -185,8 +185,7 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _means(each: Sequence[Row], keys: Sequence[str]) -> dict[str, Any]:
-    """Of recordings, with intervals; those of one recording say nothing, and are given of shares
-    alone, which others count on."""
+    """Of recordings, with intervals; of one recording, of shares alone."""
     found: dict[str, Any] = {}
     for key in keys:
         values = [row[key] for row in each if row.get(key) is not None]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
@@ -50,8 +50,7 @@ PARTS = (
     "refinement",
     "rest",
 )
-"""What a frame's time is spent on. Of the networks, which look in another thread where there is a
-second core, only what is waited for counts."""
+"""What a frame's time is spent on; of the networks, which have a thread, what is waited for."""
 _SLOW_PARTICLES = 300
 """The baselines are not timed with more particles than this."""
 _MOST_REPEATS = 200
@@ -129,40 +128,35 @@ def sample_evidence() -> tuple[Evidence, Tensor]:
     return evidence.cropped(left, top, right, bottom), wrist
 
 
-def filter_states(n: int, wrist: Tensor, seed: int = 0) -> Tensor:
+def filter_states(n: int, wrist: Tensor) -> Tensor:
     """(N, 27) open palms at the wrist's position, spread by 1 cm and by 0.1 rad an angle."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     states = torch.zeros(n, 27)
     states[:, :3] = wrist
     spread = torch.tensor([0.01] * 3 + [0.1] * 24)
     return states + spread * torch.randn(n, 27, generator=generator)
 
 
-def methods(device: torch.device, baselines: bool) -> tuple[dict[str, Scorer], list[str]]:
-    """What can score hypotheses on a device, and notes on why others do not."""
+def score_times(
+    particles: Sequence[int], seconds: float, device: torch.device, baselines: bool
+) -> tuple[list[Row], list[str]]:
+    """By the number of particles, the baselines at few of them, and notes on why a back end does
+    not score on this device."""
     shape = default_hand_shape().to(device)
     chunk = 4 if device.type == "cpu" else 128  # hypotheses whose images suit the cache
-    found: dict[str, Scorer] = {}
+    scorers: dict[str, Scorer] = {}
     notes = []
     for name in BASELINES if baselines else ():
-        found[name] = ReferenceScorer(shape, chunk, name == "stepping")
+        scorers[name] = ReferenceScorer(shape, chunk, name == "stepping")
     for name in BACK_ENDS:
         if name == "numba" and device.type == "cuda":
             continue  # it would measure the way to the CPU and back
         try:
-            found[name] = make_scorer(name, shape, device)
+            scorers[name] = make_scorer(name, shape, device)
         except ToftrackError as error:
             notes.append(f"{name}: {error}")
-    return found, notes
-
-
-def score_times(
-    scorers: Mapping[str, Scorer], particles: Sequence[int], seconds: float, device: torch.device
-) -> list[Row]:
-    """By the number of particles, the baselines at few of them."""
     found, wrist = sample_evidence()
-    evidence = found.to(device)
-    rows: list[Row] = []
+    evidence, rows = found.to(device), []
     for n in particles:
         states = filter_states(n, wrist).to(device)
         calls = {
@@ -170,10 +164,9 @@ def score_times(
             for name, scorer in scorers.items()
             if name not in BASELINES or n <= _SLOW_PARTICLES
         }
-        times = interleaved(calls, seconds, device)
-        pixels = evidence.hand.numel()
+        times, pixels = interleaved(calls, seconds, device), evidence.hand.numel()
         rows += [_row("scoring", name, n, pixels, took) for name, took in times.items()]
-    return rows
+    return rows, notes
 
 
 def decode_times(seconds: float, device: torch.device) -> list[Row]:
@@ -188,20 +181,9 @@ def decode_times(seconds: float, device: torch.device) -> list[Row]:
     return [_row("decoding", name, _LATENTS, None, found) for name, found in times.items()]
 
 
-def frame_times(seconds: float, compute: str, particles: Sequence[int] = ()) -> Iterator[Row]:
-    """Whole frames of the packaged recording, rectification included, capture and drawing not.
-
-    particles: numbers of them to time the first configuration with besides its own.
-    """
-    first = next(iter(CONFIGURATIONS))
-    for name, overrides in CONFIGURATIONS.items():
-        yield from _frames(name, [*overrides, f"compute={compute}"], seconds)
-    for n in particles:
-        overrides = (*CONFIGURATIONS[first], f"filter.particles={n}", f"compute={compute}")
-        yield _frames(f"{first}, {n}", overrides, seconds)[0]
-
-
-def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
+def frame_times(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
+    """Whole frames of the packaged recording, rectification included, capture and drawing not: as
+    they are tracked, with a start in each, and with a search in each."""
     tracker = make_tracker(*overrides)
     with make_device("device=sample") as device:
         camera, frames = device.camera, [(frame.depth, frame.radial) for frame in device]
@@ -253,10 +235,8 @@ def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
 def enlarged(
     camera: Camera, frames: Sequence[tuple[np.ndarray, bool]], size: tuple[int, int]
 ) -> tuple[Camera, list[tuple[np.ndarray, bool]]]:
-    """A camera and its frames (depth, radial) as of a camera with so many columns and rows.
-
-    The image is in the middle of the larger one, each pixel repeated, with the wall around it.
-    """
+    """A camera and its frames (depth, radial) as of one with so many columns and rows: the image is
+    in the middle of the larger one, each pixel repeated, with the wall around it."""
     scale = min(size[0] / camera.width, size[1] / camera.height)
     left, top = (
         (of - round(scale * side)) // 2
@@ -284,11 +264,14 @@ def run(
     if compute == "cuda" and not torch.cuda.is_available():
         raise ToftrackError("there is no CUDA device here; give --compute cpu")
     device = torch.device(compute)
-    scorers, notes = methods(device, baselines)
-    rows = score_times(scorers, particles, seconds, device)
+    rows, notes = score_times(particles, seconds, device, baselines)
     if frames:
+        for name, overrides in CONFIGURATIONS.items():
+            rows += frame_times(name, [*overrides, f"compute={compute}"], seconds)
         # On the CPU so many as the table's take seconds; there the configuration's say enough.
-        rows += frame_times(seconds, compute, particles if compute == "cuda" else ())
+        for n in particles if compute == "cuda" else ():
+            given = (f"filter.particles={n}", f"compute={compute}")
+            rows.append(frame_times(f"default, {n}", given, seconds)[0])
     rows += decode_times(seconds, device)
     return {
         "machine": {

@@ -47,25 +47,26 @@ _MISS_M = 0.1
 
 @dataclass(frozen=True)
 class Trust:
-    """The figures of one track of one hand, see the head of this module. Shares in per cent."""
+    """The figures of one track of one hand, see the head of this module. Shares in per cent.
+
+    visible: frames that show the hand.  longest_silent: frames of the longest run.
+    mean_mm: mean joint error over visible frames that are not flagged lost; None: there are none.
+    mean_all_mm: the same over all visible frames; one frame counts for at most a metre.
+    first_right: the frame from which the track is right for the first time; None: never.
+    found_after: each time that the hand becomes visible again, frames until the track is right.
+    """
 
     frames: int
     visible: int
-    """How many show the hand."""
     usable_pct: float
     partly_pct: float
     false_alarm_pct: float
     silent_pct: float
     longest_silent: int
-    """Frames of the longest run of silently wrong ones."""
     mean_mm: float | None
-    """Mean joint error over visible frames that are not flagged lost; None: there are none."""
     mean_all_mm: float | None
-    """The same over all visible frames; one frame counts for at most a metre."""
     first_right: int | None
-    """From which frame on the track is right for the first time; None: never."""
     found_after: tuple[int | None, ...]
-    """For each time that the hand becomes visible again: frames until the track is right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +143,7 @@ def joint_errors_mm(joints_m: np.ndarray, truth: Truth) -> tuple[np.ndarray, np.
 
 
 def tips_inset(joints_m: np.ndarray, inset_m: float) -> np.ndarray:
-    """Joints (T, 21, 3) with the fingertips where other labels have them: so many metres inwards,
-    along the last bone towards the joint before."""
+    """Joints (T, 21, 3) with the fingertips, as labels have them, inwards along the last bone."""
     moved = np.array(joints_m, np.float64)
     for tip in TIPS:
         inwards = moved[:, tip - 1] - moved[:, tip]
