@@ -199,17 +199,16 @@ def _msra_depth(path: Path) -> np.ndarray:
     """(240, 320) float32 metres; what lies outside of the stored box is no reading."""
     width, height = INTEL_CREATIVE.width, INTEL_CREATIVE.height
     content = _bytes(path)
-    box, start = (0, 0, width, height), 0
+    left, top, right, bottom, start = 0, 0, width, height, 0
     if len(content) != 4 * width * height:
         start = 4 * _HEADER
         header = np.frombuffer(content[:start], "<i4") if len(content) >= start else ()
         if tuple(header[:2]) != (width, height):
             raise _no_image(path)
-        left, top, right, bottom = box = tuple(map(int, header[2:]))
+        left, top, right, bottom = map(int, header[2:])
         inside = 0 <= left <= right <= width and 0 <= top <= bottom <= height
         if not inside or len(content) != start + 4 * (right - left) * (bottom - top):
             raise _no_image(path)
-    left, top, right, bottom = box
     values = np.frombuffer(content, "<f4", offset=start).reshape(bottom - top, right - left)
     depth = np.zeros((height, width), np.float32)
     depth[top:bottom, left:right] = _metres(values)

@@ -148,7 +148,7 @@ def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
     others = ~np.delete(np.asarray(estimates.lost, bool), slots, axis=1)
     ghosts = None
     if others.shape[1]:
-        ghosts = share_pct(others.any(1), np.ones(len(others), bool)) or 0.0
+        ghosts = share_pct(np.asarray(others.any(1)), np.ones(len(others), bool)) or 0.0
     return MeasuredRecording(each[0], each[1] if each[1:] else None, ghosts, slots)
 
 

@@ -52,7 +52,7 @@ SIDES = {"Left": "right", "Right": "left"}
 def picture(amplitude: np.ndarray) -> np.ndarray:
     """(H, W) uint16 as an 8-bit RGB picture of COLUMNS columns."""
     white = max(float(np.percentile(amplitude, WHITE_PERCENTILE)), 1.0)
-    grey = (255 * np.clip(amplitude / white, 0, 1) ** GAMMA).astype(np.uint8)
+    grey: np.ndarray = (255 * np.clip(amplitude / white, 0, 1) ** GAMMA).astype(np.uint8)
     scale = COLUMNS / grey.shape[1]
     if scale > 1:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)

@@ -189,7 +189,10 @@ def rows_of_job(job: Job) -> list[Row]:
         labels = job.source.labels
         if labels is None:
             return _true_rows(job, device)
-        rows = (_stills if isinstance(labels, Stills) else _points)(job, device, labels)
+        if isinstance(labels, Stills):
+            rows = _stills(job, device, labels)
+        else:
+            rows = _points(job, device, labels)
         return [
             {"recording": f"{job.source.name}#{number:04d}", "seed": job.seed, **figures}
             for number, figures in rows
