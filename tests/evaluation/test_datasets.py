@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -77,19 +76,13 @@ def test_what_was_written_is_read(name: str, sequence: str, side: str, tmp_path:
 def test_labels_lie_on_the_hand(name: str, tmp_path: Path) -> None:
     """Axes and camera belong together: a joint that nothing hides is just behind the surface."""
     write(name, tmp_path, 1)
-    _, (read, *_) = open_data_set(name, tmp_path)
+    data_set, (read, *_) = open_data_set(name, tmp_path)
     depth, joints = read.frame(0), read.joints_m[0]
     uv = joints[:, :2] / joints[:, 2:] * np.diag(read.camera.K)[:2] + read.camera.K[:2, 2]
     columns, rows = np.round(uv).astype(int).T
     behind = joints[:, 2] - depth[rows, columns]
     assert ((behind > -0.005) & (behind < 0.03)).mean() >= 0.5
-
-
-@pytest.mark.parametrize("name", list(DATA_SETS))
-def test_joints_are_named_once(name: str) -> None:
-    joints = DATA_SETS[name].joints
-    assert len(set(joints)) == len(joints)
-    assert set(joints) <= set(range(21))
+    assert len(set(data_set.joints) & set(range(21))) == len(data_set.joints)
 
 
 def test_the_folder_of_a_part_or_sequence_will_do(tmp_path: Path) -> None:
@@ -140,8 +133,7 @@ def test_msra14_may_come_without_the_number_of_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", list(DATA_SETS))
 def test_labels_without_an_image_are_left_out(name: str, tmp_path: Path) -> None:
     seen = write(name, tmp_path)
-    images = sorted(path for path in tmp_path.rglob("*") if path.suffix in (".bin", ".png"))
-    images[1].unlink()
+    sorted(path for path in tmp_path.rglob("*") if path.suffix in IMAGES)[1].unlink()
     data_set, (read,) = open_data_set(name, tmp_path)
     assert (len(read.images), read.left_out) == (FRAMES - 1, 1)
     kept = seen.joints_m[[0, 2]][:, list(data_set.joints)]
@@ -157,42 +149,27 @@ def test_readings_beyond_reason_are_none(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.frame(0)[0, :3], 0)
 
 
-def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-5])
+def file_of(folder: Path, *suffixes: str) -> Path:
+    return min(path for path in folder.rglob("*") if path.suffix in suffixes)
 
 
-def empty(path: Path) -> None:
-    path.write_bytes(b"")
+IMAGES, LABELS = (".bin", ".png"), (".txt", ".mat")
 
 
-def noise(path: Path) -> None:
-    path.write_bytes(np.random.default_rng(0).bytes(999))
-
-
-@pytest.mark.parametrize("harm", [cut, empty, noise])
+@pytest.mark.parametrize("content", [None, b"", np.random.default_rng(0).bytes(999)])
+@pytest.mark.parametrize("kind", [IMAGES, LABELS])
 @pytest.mark.parametrize("name", list(DATA_SETS))
-def test_damaged_images_give_one_sentence(
-    name: str, harm: Callable[[Path], None], tmp_path: Path
+def test_damaged_files_give_one_sentence(
+    name: str, kind: tuple[str, ...], content: bytes | None, tmp_path: Path
 ) -> None:
     write(name, tmp_path, 1)
-    image = next(path for path in tmp_path.rglob("*") if path.suffix in (".bin", ".png"))
-    harm(image)
-    assert str(image) in refusal(name, tmp_path)
-
-
-@pytest.mark.parametrize("harm", [cut, empty, noise])
-@pytest.mark.parametrize("name", list(DATA_SETS))
-def test_damaged_labels_give_one_sentence(
-    name: str, harm: Callable[[Path], None], tmp_path: Path
-) -> None:
-    write(name, tmp_path, 1)
-    labels = next(path for path in tmp_path.rglob("*") if path.suffix in (".txt", ".mat"))
-    if harm is cut and labels.suffix == ".txt":
-        labels.write_text(labels.read_text().rstrip().rpartition(" ")[0])
+    path = file_of(tmp_path, *kind)
+    if path.suffix == ".txt" and content is None:
+        path.write_text(path.read_text().rstrip().rpartition(" ")[0])
     else:
-        harm(labels)
+        path.write_bytes(path.read_bytes()[:-5] if content is None else content)
     text = refusal(name, tmp_path)
-    assert str(labels) in text or (harm is empty and str(tmp_path) in text)
+    assert str(path) in text or (content == b"" and str(tmp_path) in text)
 
 
 @pytest.mark.parametrize(
@@ -200,25 +177,28 @@ def test_damaged_labels_give_one_sentence(
 )
 def test_a_box_outside_of_the_image_is_refused(header: tuple[int, ...], tmp_path: Path) -> None:
     write("MSRA15", tmp_path, 1)
-    image = tmp_path / "P0" / "TIP" / "000000_depth.bin"
-    image.write_bytes(np.array(header, "<i4").tobytes() + bytes(4))
+    file_of(tmp_path, ".bin").write_bytes(np.array(header, "<i4").tobytes() + bytes(4))
     assert "damaged" in refusal("MSRA15", tmp_path)
 
 
-def test_a_wrong_number_of_labels_is_refused(tmp_path: Path) -> None:
-    write("MSRA15", tmp_path)
-    labels = tmp_path / "P0" / "TIP" / "joint.txt"
-    labels.write_text("7\n" + labels.read_text().partition("\n")[2])
-    assert "announces 7 frames, but has 3" in refusal("MSRA15", tmp_path)
-
-
-@pytest.mark.parametrize("value", ["x", "nan", "1 2"])
-def test_labels_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> None:
-    write("ICVL", tmp_path)
-    labels = tmp_path / "Testing" / "test_seq_1.txt"
-    first, *rest = labels.read_text().splitlines()
-    labels.write_text("\n".join([first, rest[0].rstrip().rpartition(" ")[0] + f" {value}"]))
-    assert "line 2" in refusal("ICVL", tmp_path)
+@pytest.mark.parametrize(
+    ("name", "line", "end", "reason"),
+    [
+        ("MSRA15", 0, "7", "announces 7 frames, but has 3"),
+        ("ICVL", 1, " x", "line 2"),
+        ("ICVL", 1, " nan", "line 2"),
+        ("ICVL", 1, " 1 2", "line 2"),
+    ],
+)
+def test_wrong_numbers_of_labels_are_refused(
+    name: str, line: int, end: str, reason: str, tmp_path: Path
+) -> None:
+    write(name, tmp_path)
+    labels = file_of(tmp_path, ".txt")
+    lines = labels.read_text().splitlines()
+    lines[line] = lines[line].rstrip().rpartition(" ")[0] + end
+    labels.write_text("\n".join(lines))
+    assert reason in refusal(name, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +214,7 @@ def test_other_contents_of_joint_data_are_refused(
     content: dict, reason: str, tmp_path: Path
 ) -> None:
     write("NYU", tmp_path, 1)
-    savemat(tmp_path / "test" / "joint_data.mat", content)
+    savemat(file_of(tmp_path, ".mat"), content)
     assert reason in refusal("NYU", tmp_path)
 
 
@@ -261,25 +241,18 @@ def test_a_matlab_file_that_crashes_its_reader_gives_one_sentence(tmp_path: Path
 
 def test_colour_images_in_place_of_depth_are_refused(tmp_path: Path) -> None:
     write("ICVL", tmp_path, 1)
-    image = tmp_path / "Testing" / "Depth" / "test_seq_1" / "image_0000.png"
-    assert cv2.imwrite(str(image), np.zeros((240, 320), np.uint8))
+    assert cv2.imwrite(str(file_of(tmp_path, ".png")), np.zeros((240, 320), np.uint8))
     assert "is 320x240 of uint8, but must be 320x240 of uint16" in refusal("ICVL", tmp_path)
 
 
 @pytest.mark.parametrize("name", list(DATA_SETS))
-def test_no_image_at_all_is_an_error(name: str, tmp_path: Path) -> None:
-    write(name, tmp_path)
-    for path in tmp_path.rglob("*"):
-        if path.suffix in (".bin", ".png"):
-            path.unlink()
-    refusal(name, tmp_path)
-
-
-@pytest.mark.parametrize("name", list(DATA_SETS))
-def test_of_another_folder_the_error_says_what_it_lacks(name: str, tmp_path: Path) -> None:
-    assert "does not hold" in refusal(name, tmp_path)
+def test_what_a_folder_lacks_is_reported(name: str, tmp_path: Path) -> None:
     assert "there is no folder" in refusal(name, tmp_path / "nowhere")
+    assert "does not hold" in refusal(name, tmp_path)
+    write(name, tmp_path, 1)
+    file_of(tmp_path, *IMAGES).unlink()
+    assert "there is no image" in refusal(name, tmp_path)
 
 
-def test_an_unknown_data_set_is_reported_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_data_set_is_reported_with_the_known_ones(tmp_path: Path) -> None:
     assert "MSRA14, MSRA15, ICVL, NYU" in refusal("MSRA", tmp_path)
