@@ -119,7 +119,7 @@ def test_what_is_flagged_is_pooled_over_recordings_and_seeds() -> None:
 def test_a_recording_without_a_visible_hand_has_no_share_of_usable_frames() -> None:
     none = np.zeros(8, bool)
     truth = Truth(np.zeros((8, 21, 3)), none, none)
-    row = row_figures(measured(Estimates(np.ones((8, 21, 3)), none), truth))
+    row = row_figures(measured(Estimates(np.ones((8, 21, 3)), none), truth), np.ones(8))
     assert row["usable_pct"] is None and row["silent_pct"] == 100 and row["never_right"] is None
 
 

@@ -253,12 +253,10 @@ def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
     tables: dict[str, Table] = {}
     total = result.get("total")
     if total:
-        rows = dict(result["each"])
-        all_of = dict(total, first_right=total["median_first_right"])
-        table = table_of(_COLUMNS, {**rows, "total": all_of}, "recording")
-        heads = [title for title, _, _ in _COLUMNS if title in table[0]]
-        keys = {title: (key, digits) for title, key, digits in _COLUMNS}
-        table.append(["90 % interval", *(_interval(total, *keys[head]) for head in heads)])
+        all_of = {**total, "first_right": total["median_first_right"]}
+        table = table_of(_COLUMNS, {**result["each"], "total": all_of}, "recording")
+        shares = [(key, digits) for title, key, digits in _COLUMNS if title in table[0]]
+        table.append(["90 % interval", *(_interval(total, *share) for share in shares)])
         tables["recordings"] = table
     shown: dict[str, Any] = {}
     for name, figures in result.get("images", {}).items():
