@@ -79,11 +79,8 @@ _GIVEN_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smoo
 def measure(
     options: argparse.Namespace, command: str, draw: Callable[[Path, dict[str, Any]], None]
 ) -> None:
-    """Track, measure and report; an interruption reports what is done before it is passed on.
-
-    command: how it was called.  draw: makes the picture of a result.
-    Raises ToftrackError: something that was given cannot be used.
-    """
+    """Track, measure and report, with `draw` for the picture; an interruption reports what is done
+    before it is passed on. Raises ToftrackError: something that was given cannot be used."""
     paths, overrides = _divided(options.what, options.hands)
     results.checked_targets(options.json, options.markdown, options.picture)
     others = None if options.compare is None else results.read_rows(options.compare)
@@ -126,10 +123,8 @@ def _peer(options: argparse.Namespace) -> str | None:
 
 
 def _divided(words: Sequence[str], hands: int = 1) -> tuple[list[str], list[str]]:
-    """Files and folders, and overrides: those are no file and have a =; the overrides are checked.
-
-    Raises ToftrackError for an override that cannot be used, or names another recording.
-    """
+    """Files and folders, and overrides, which are no file and have a =. Raises ToftrackError for an
+    override that cannot be used, or names another recording."""
     overrides = [word for word in words if "=" in word and not Path(word).exists()]
     for word in overrides:
         key = word.split("=")[0].lstrip("+~")

@@ -69,9 +69,7 @@ class LabelledSequence:
 
     def frame(self, index: int) -> np.ndarray:
         """The depth of a frame, (H, W) float32 metres along the optical axis, 0 = no reading.
-
-        Raises ToftrackError when its file is missing or damaged.
-        """
+        Raises ToftrackError when its file is missing or damaged."""
         return self.read(self.images[index])
 
 
@@ -318,10 +316,8 @@ def _nyu_labels(path: Path) -> np.ndarray:
 
 
 def read_matlab(path: Path, name: str) -> np.ndarray:
-    """A real numeric array by its name, in its own type.
-
-    Raises ToftrackError: the file is damaged or of another version, or has no such array.
-    """
+    """A real numeric array by its name, in its own type. Raises ToftrackError: the file is damaged
+    or of another version, or has no such array."""
     command = [sys.executable, "-c", _PROGRAM, name]
     done = subprocess.run(command, input=_bytes(path), capture_output=True, check=False)
     if done.returncode != 0:

@@ -96,11 +96,8 @@ class Peer:
         self._send(json.dumps({"begin": facts}).encode() + b"\n")
 
     def step(self, depth_m: np.ndarray, amplitude: np.ndarray) -> PeerEstimate:
-        """What it says of a frame.
-
-        depth_m: (H, W) metres, 0 = no reading.  amplitude: (H, W) uint16.
-        Raises ToftrackError when its process has ended.
-        """
+        """What it says of a frame: (H, W) metres, 0 = no reading, and (H, W) uint16. Raises
+        ToftrackError when its process has ended."""
         self._send(b'{"frame": true}\n')
         self._send(np.ascontiguousarray(amplitude, np.uint16).tobytes())
         self._send(np.ascontiguousarray(depth_m, np.float32).tobytes())
@@ -136,8 +133,7 @@ class Peer:
             raise self._ended() from None
 
     def _ended(self) -> ToftrackError:
-        words = self._last_words()
-        return ToftrackError(f"{PEER} ended in the middle of a recording ({words})")
+        return ToftrackError(f"{PEER} ended in the middle of a recording ({self._last_words()})")
 
     def _last_words(self) -> str:
         """The last line of what it wrote to standard error."""

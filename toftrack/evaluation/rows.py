@@ -110,10 +110,8 @@ def _figures_of_hand(of: Measured) -> Row:
 def group_counts(
     of: Measured, truth: Truth, sensor: str, length_mm: float | None
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """By kind of group and group: the visible frames of a row, and what they are.
-
-    length_mm: of the hand, wrist to middle fingertip; None: by the truth.
-    """
+    """By kind of group and group: the visible frames of a row, and what they are.  length_mm: of
+    the hand, wrist to middle fingertip; None: by the truth."""
     kinds = [share.removesuffix("_pct") for share in SHARES]
     flags = {kind: getattr(of.frames, kind) for kind in kinds}
     flags |= {"named": of.named, "called_right": of.called, "said": of.frames.seen & of.frames.said}

@@ -128,10 +128,8 @@ def jobs(
     overrides: Sequence[str],
     peer: str | None = None,
 ) -> list[Job]:
-    """Every recording with every seed; the peer, which has none, beside the first.
-
-    Raises ToftrackError for a recording without amplitude, where there is a peer.
-    """
+    """Every recording with every seed; the peer, which has none, beside the first. Raises
+    ToftrackError for a recording without amplitude, where there is a peer."""
     for one in found if peer is not None else ():
         if not one.amplitude:
             raise ToftrackError(
@@ -263,10 +261,8 @@ def _tracked(
 def estimates_of(
     reported: Sequence[Sequence[Estimate | PeerEstimate]], fields: Sequence[str] = FIELDS
 ) -> Estimates:
-    """What was said in T frames of each slot; with one slot without its axis.
-
-    fields: which of those of Estimates the reported ones have.
-    """
+    """What was said in T frames of each slot, by those fields of Estimates that the reported ones
+    have; with one slot without its axis."""
 
     def column(name: str) -> np.ndarray:
         values = np.array([[getattr(one, name) for one in frame] for frame in reported])
