@@ -7,6 +7,7 @@ them; each box is a package or module of toftrack/ with what it imports of the o
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import tomllib
 from html import escape
@@ -25,6 +26,7 @@ def layers() -> list[list[str]]:
     return [re.findall(r"\w+", row) for row in rows]
 
 
+@functools.cache
 def imports(room: str) -> list[str]:
     """The other rooms that a room imports, in the order of their names."""
     path = ROOT / "toftrack" / room

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.evaluation import ablation, accuracy, runs
+from toftrack.evaluation import accuracy, runs
 from toftrack.programs import benchmark
 from toftrack.recordings.store import packaged_sample
 
@@ -160,6 +160,6 @@ def test_every_variant_is_one_that_the_configuration_knows() -> None:
     from toftrack.configuration.compose import configuration
 
     default = configuration()
-    for name, variant in ablation.VARIANTS.items():
+    for name, variant in accuracy.VARIANTS.items():
         config = configuration(*variant.overrides)
-        assert name == ablation.DEFAULT or variant.side == "auto" or config != default
+        assert name == accuracy.DEFAULT or variant.side == "auto" or config != default

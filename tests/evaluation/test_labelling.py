@@ -13,8 +13,7 @@ from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import Points, read_labels
-from toftrack.evaluation.label_frames import label_frames, track
-from toftrack.evaluation.labelling import LABELLED, LabelFile, chosen_frames
+from toftrack.evaluation.labelling import LABELLED, LabelFile, chosen_frames, label_frames, track
 
 ABSENT = [None, None, "absent"]
 

@@ -50,14 +50,14 @@ def pretended(folder: Path, monkeypatch: pytest.MonkeyPatch, ends: int = 1000) -
     """Another program answers instead of peer_mediapipe.py."""
     file = folder / "fake.py"
     file.write_text(FAKE.replace("ENDS", str(ends)), encoding="utf-8")
-    monkeypatch.setitem(peer.PEERS, "mediapipe", str(file))
+    monkeypatch.setattr(peer, "SCRIPT", file)
     peer.peer_process.cache_clear()
 
 
 def test_frames_go_out_and_joints_come_back(tmp_path, monkeypatch) -> None:
     pretended(tmp_path, monkeypatch)
     depth, amplitude = np.full((144, 176), 0.5, np.float32), np.zeros((144, 176), np.uint16)
-    with Peer("mediapipe", sys.executable) as found:
+    with Peer(sys.executable) as found:
         found.begin(Camera(K, 176, 144), "right")
         first, second = found.step(depth, amplitude), found.step(depth, amplitude)
     assert found.versions["mediapipe"] == "0"
@@ -70,7 +70,7 @@ def test_frames_go_out_and_joints_come_back(tmp_path, monkeypatch) -> None:
 def test_a_peer_that_ends_says_its_last_words(tmp_path, monkeypatch) -> None:
     pretended(tmp_path, monkeypatch, ends=1)
     depth, amplitude = np.zeros((4, 4), np.float32), np.zeros((4, 4), np.uint16)
-    with Peer("mediapipe", sys.executable) as found:
+    with Peer(sys.executable) as found:
         found.begin(Camera(K, 4, 4))
         found.step(depth, amplitude)
         with pytest.raises(ToftrackError, match=r"ended in the middle .*out of breath"):
@@ -79,10 +79,10 @@ def test_a_peer_that_ends_says_its_last_words(tmp_path, monkeypatch) -> None:
 
 def test_an_environment_without_mediapipe_is_one_sentence(tmp_path) -> None:
     with pytest.raises(ToftrackError, match="cannot be run .* make one with: python3 -m venv"):
-        Peer("mediapipe", tmp_path / "python")
+        Peer(tmp_path / "python")
     if "mediapipe" not in sys.modules:
         with pytest.raises(ToftrackError, match="no usable mediapipe .*mediapipe.*make one with"):
-            Peer("mediapipe", sys.executable)
+            Peer(sys.executable)
 
 
 def test_a_recording_without_amplitude_is_refused_before_anything_runs(tmp_path) -> None:
@@ -107,14 +107,14 @@ def test_the_lift_finds_a_flat_hand_below_its_skin() -> None:
     depth = np.full((144, 176), 0.5, np.float32)
     landmarks = np.random.default_rng(0).uniform(0.3, 0.7, (21, 3))
     landmarks[:, 2] = 0
-    joints = peer_mediapipe.lifted(landmarks, depth, K, np)
+    joints = peer_mediapipe.lifted(landmarks, depth, K)
     assert np.allclose(joints[:, 2], 0.514, atol=1e-6)
     u = 200 * joints[:, 0] / joints[:, 2] + 88
     assert np.allclose(u, landmarks[:, 0] * 176 - 0.5, atol=1e-6)
     landmarks[8, 2] = -0.1  # of the width: 44 mm nearer, whatever is read there
-    nearer = peer_mediapipe.lifted(landmarks, depth, K, np)
+    nearer = peer_mediapipe.lifted(landmarks, depth, K)
     assert np.allclose(nearer[8, 2], 0.514 - 0.1 * 176 * 0.514 / 200, atol=1e-6)
-    nothing = peer_mediapipe.lifted(landmarks, 0 * depth, K, np)
+    nothing = peer_mediapipe.lifted(landmarks, 0 * depth, K)
     assert np.isnan(nothing).all()
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
+from toftrack.errors import ToftrackError
 from toftrack.evaluation.measures import FLAG_COUNTS, Estimates, measured
-from toftrack.evaluation.results import compared, rows_of
+from toftrack.evaluation.results import accuracy_tables, compared, markdown, plain, read_rows
 from toftrack.evaluation.rows import (
     by_recording,
     group_counts,
@@ -15,7 +18,6 @@ from toftrack.evaluation.rows import (
     row_figures,
     totals,
 )
-from toftrack.evaluation.tables import accuracy_tables, markdown, plain
 from toftrack.frames import Truth
 
 
@@ -117,7 +119,7 @@ def test_what_is_flagged_is_pooled_over_recordings_and_seeds() -> None:
 def test_a_recording_without_a_visible_hand_has_no_share_of_usable_frames() -> None:
     none = np.zeros(8, bool)
     truth = Truth(np.zeros((8, 21, 3)), none, none)
-    row = row_figures(measured(Estimates(np.ones((8, 21, 3)), none), truth))
+    row = row_figures(measured(Estimates(np.ones((8, 21, 3)), none), truth), np.ones(8))
     assert row["usable_pct"] is None and row["silent_pct"] == 100 and row["never_right"] is None
 
 
@@ -159,9 +161,11 @@ def test_differences_are_of_pairs_and_what_is_alone_is_named() -> None:
         {"rows": [{"recording": "a", "seed": 0, "usable_pct": float("nan")}]},
     ],
 )
-def test_what_is_no_measurement_is_not_compared_with(content) -> None:
-    with pytest.raises(ValueError):
-        rows_of(content)
+def test_what_is_no_measurement_is_not_compared_with(content, tmp_path) -> None:
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ToftrackError, match="give such a file"):
+        read_rows(file)
 
 
 def test_tables_show_what_there_is_and_leave_out_what_there_is_not() -> None:

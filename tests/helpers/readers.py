@@ -24,8 +24,7 @@ from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save
 from toftrack.devices.replay import Replay
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
-from toftrack.evaluation.datasets import nyu, open_data_set
-from toftrack.evaluation.datasets.base import INTEL_CREATIVE
+from toftrack.evaluation.datasets import INTEL_CREATIVE, NYU_CAMERA, open_data_set
 from toftrack.gestures.files import NamedPose, read_poses, save_poses
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES
@@ -290,7 +289,7 @@ def _data_sets(folder: Path) -> list[Reader]:
     write_msra(folder / "msra14" / "Subject1", scene(INTEL_CREATIVE, 2), boxed=False)
     write_msra(folder / "msra" / "P0" / "TIP", scene(INTEL_CREATIVE, 2), boxed=True)
     write_icvl(folder / "icvl" / "Testing", scene(INTEL_CREATIVE, 2))
-    write_nyu(folder / "nyu" / "test", scene(nyu._CAMERA, 2))
+    write_nyu(folder / "nyu" / "test", scene(NYU_CAMERA, 2))
     readers = []
     for name, there in (("MSRA14", "msra14"), ("MSRA15", "msra"), ("ICVL", "icvl"), ("NYU", "nyu")):
         first = {path.suffix: path for path in sorted((folder / there).rglob("*.*"))}

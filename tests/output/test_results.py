@@ -18,8 +18,7 @@ from helpers.hands import hand_estimate
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.evaluation.measures import coverage
-from toftrack.evaluation.metrics import evaluate
+from toftrack.evaluation.measures import coverage, evaluate
 from toftrack.evaluation.trust import judged, trust
 from toftrack.frames import Truth
 from toftrack.hand.skeleton import JOINT_NAMES

@@ -12,7 +12,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
-from toftrack.evaluation.metrics import evaluate
+from toftrack.evaluation.measures import evaluate
 from toftrack.evaluation.trust import judged, trust
 from toftrack.frames import Truth
 from toftrack.hand.shape import default_hand_shape

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.data_sets import scene, write_msra
 
-from toftrack.evaluation.datasets.base import INTEL_CREATIVE
+from toftrack.evaluation.datasets import INTEL_CREATIVE
 from toftrack.programs import command_line
 from toftrack.programs.evaluate import main
 

@@ -18,10 +18,8 @@ OTHER_SIDE = {"left": "right", "right": "left"}
 
 @dataclass(frozen=True)
 class Break:
-    """One fault.
-
-    overrides: of the configuration.  patched: entered before the tracker is made, for what no
-    setting can do.  k_scale: times the camera's matrix.  other_side: the side is given wrongly.
+    """One fault.  overrides: of the configuration.  patched: entered before the tracker is made,
+    for what no setting can do.  k_scale: times the camera's matrix.  other_side: a wrong one given.
     """
 
     about: str
@@ -34,15 +32,11 @@ class Break:
 @contextmanager
 def _turned_index(degrees: float) -> Iterator[None]:
     """The index finger bends about another axis, turned about the finger's own direction."""
-    kept = shape._REST_DEGREES
-    rows = list(kept)
+    rows = list(shape._REST_DEGREES)
     abduction, elevation, roll = rows[INDEX]
     rows[INDEX] = (abduction, elevation, roll + degrees)
-    shape._REST_DEGREES = tuple(rows)
-    try:
+    with patch.object(shape, "_REST_DEGREES", tuple(rows)):
         yield
-    finally:
-        shape._REST_DEGREES = kept
 
 
 _judge = confidence.JointConfidence.judge
@@ -71,8 +65,3 @@ BREAKS = {
     "other side": Break("the other hand's side is given", other_side=True),
     "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),
 }
-
-
-def scaled(k: np.ndarray, factor: float) -> np.ndarray:
-    """A pinhole matrix (3, 3) whose focal lengths and principal point are so many times larger."""
-    return k * np.array([[factor], [factor], [1.0]])

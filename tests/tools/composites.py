@@ -8,9 +8,9 @@ four: two recordings of two hands each, of one camera, laid over one another: of
 mirrored: a recording, turned aside, laid over its own mirror image: two hands that move alike.
 leaving: a recording whose camera turns away from the hand and back.
 
-Prints for each, per cent: how often all hands are usable (every joint within 40 mm, and not lost)
-of the frames in which all are visible, the same of each hand, how often one was silently wrong (not
-lost, but the mean error beyond 40 mm or no hand there), and at another hand than its own.
+Prints for each, per cent: how often all hands are usable of the frames in which all are visible,
+the same of each hand, how often one was silently wrong (toftrack/evaluation/trust.py says what that
+is), and at another hand than its own.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ import cv2
 import numpy as np
 
 from toftrack.api import make_hands_tracker
+from toftrack.evaluation.trust import joint_errors_mm, judged, slots_of_hands, trust
+from toftrack.frames import Truth
 
 _BEHIND_M = 0.03
 """A joint that lies so far behind the reading there is hidden."""
 _VISIBLE = 0.1
 """Share of the joints from which on a hand is visible."""
-_FORGIVEN = 3
-"""So many frames after a hand went it may still be said to be there."""
 _ASIDE_M = 0.09
 """Mean distance of a mirrored hand from the mirror."""
 _BEYOND = 0.2
@@ -149,24 +149,21 @@ def measure(scene: Recording, *overrides: str) -> dict[str, float]:
     said = [tracker.step(image, scene.k, n, n / 25) for n, image in enumerate(scene.depth_m)]
     found = np.array([[one.joints_m for one in frame] for frame in said])
     lost = np.array([[one.lost for one in frame] for frame in said])
-    off = np.linalg.norm(found[:, :, None] - scene.joints_m[:, None], axis=-1)  # (T, slot, hand, J)
-    mean = np.where(lost[..., None], 0.3, np.nan_to_num(off, nan=0.3).mean(-1))
-    each = range(hands)
-    slots = min(itertools.permutations(each), key=lambda order: mean[:, order, each].sum())
-    own, unsaid = off[:, slots, each], lost[:, slots]  # (T, hand, 21)
-    usable = (own.max(-1) < 0.04) & ~unsaid
     visible = scene.visible.mean(-1) >= _VISIBLE
-    back = range(_FORGIVEN + 1)
-    recent = np.any([np.roll(visible, n, 0) for n in back], 0)
-    wrong = ~unsaid & np.where(visible, own.mean(-1) > 0.04, ~recent)
+    truths = [Truth(scene.joints_m[:, n], visible[:, n], visible[:, n]) for n in range(hands)]
+    slots = list(slots_of_hands(found, lost, truths))
+    each = [judged(found[:, s], lost[:, s], hand) for s, hand in zip(slots, truths, strict=True)]
+    usable, silent = (
+        np.stack([getattr(one, name) for one in each], 1) for name in ("usable", "silent")
+    )
+    off = [[joint_errors_mm(found[:, s], hand)[1].mean(1) for hand in truths] for s in slots]
+    taken = (np.argmin(off, 1).T != np.arange(hands)) & ~lost[:, slots]
     every = visible.all(1)
-    nearest = np.nan_to_num(off, nan=9.0).mean(-1)[:, slots].argmin(2)
-    taken = (nearest != np.arange(hands)) & ~unsaid
     return {
         "frames": int(every.sum()),
         "all usable": 100 * usable[every].all(1).mean(),
-        **{f"hand {n}": 100 * usable[visible[:, n], n].mean() for n in each},
-        "silent": 100 * wrong.any(1).mean(),
+        **{f"hand {n}": trust(one).usable_pct for n, one in enumerate(each)},
+        "silent": 100 * silent.any(1).mean(),
         "at another hand": 100 * taken.any(1).mean(),
     }
 

@@ -26,10 +26,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from breaks import BREAKS, OTHER_SIDE, Break, scaled
+from breaks import BREAKS, OTHER_SIDE, Break
 
 from toftrack.api import make_tracker
-from toftrack.evaluation.measures import Estimates, MeasuredRecording, measured
+from toftrack.evaluation.measures import Estimates, measured
 from toftrack.evaluation.runs import estimates_of
 from toftrack.evaluation.statistics import mean_of
 from toftrack.recordings.frame_store import FrameStore
@@ -51,47 +51,26 @@ BOUNDS = {
 leave them, and there is a margin for the floats of other processors: docs/lab/guards.md."""
 
 
-def guards() -> dict[str, FrameStore]:
-    """The recordings of tests/data/guards by name."""
-    return {path.stem: open_recording(path) for path in sorted((DATA / "guards").glob("*.npz"))}
+def recordings(folder: str) -> dict[str, FrameStore]:
+    """Those of tests/data/guards or tests/data/empty, by name."""
+    return {path.stem: open_recording(path) for path in sorted((DATA / folder).glob("*.npz"))}
 
 
-def empty() -> dict[str, FrameStore]:
-    """Those of tests/data/empty."""
-    return {path.stem: open_recording(path) for path in sorted((DATA / "empty").glob("*.npz"))}
-
-
-def tracked(recording: FrameStore, seed: int, side: str, fault: Break = WHOLE) -> Estimates:
-    """What the tracker says of all frames of a recording, perhaps with a fault in it."""
+def tracked(recording: FrameStore, seed: int, side: str, fault: Break) -> Estimates:
+    """What the tracker says of all frames of a recording, with a fault in it."""
     side = OTHER_SIDE.get(side, side) if fault.other_side else side
     camera = recording.camera
-    k = scaled(camera.K, fault.k_scale)
+    k = camera.K * np.array([[fault.k_scale], [fault.k_scale], [1.0]])
     with fault.patched():
         tracker = make_tracker(f"seed={seed}", f"hand.side={side}", *fault.overrides)
-        found = [
-            tracker.step(
-                camera.rectify(recording.image(i)[0], recording.radial),
-                k,
-                i,
-                float(recording.timestamp_s[i]),
-            )
-            for i in range(len(recording))
-        ]
-    return estimates_of([[estimate] for estimate in found])
+        found = []
+        for i, time_s in enumerate(recording.timestamp_s.tolist()):
+            depth_m = camera.rectify(recording.image(i)[0], recording.radial)
+            found.append([tracker.step(depth_m, k, i, time_s)])
+    return estimates_of(found)
 
 
-def side_of(recording: FrameStore) -> str:
-    """Whose hand a recording says that it shows."""
-    return str(recording.metadata.get("side", "right"))
-
-
-def judged(recording: FrameStore, seed: int, fault: Break) -> MeasuredRecording:
-    """The figures of a recording whose side is told."""
-    assert recording.truth is not None
-    return measured(tracked(recording, seed, side_of(recording), fault), recording.truth)
-
-
-def sample_figures(seed: int, fault: Break = WHOLE) -> dict[str, float]:
+def sample_figures(seed: int, fault: Break) -> dict[str, float]:
     """Of the sample: its mean joint error, and the share of frames that are lost."""
     sample = open_source("sample")
     assert sample.truth is not None
@@ -103,9 +82,13 @@ def sample_figures(seed: int, fault: Break = WHOLE) -> dict[str, float]:
     }
 
 
-def guard_figures(seed: int, fault: Break = WHOLE) -> dict[str, float]:
+def guard_figures(seed: int, fault: Break) -> dict[str, float]:
     """Of the guards, means over recordings; NaN where nothing could be measured."""
-    found = [judged(recording, seed, fault).first for recording in guards().values()]
+    found = []
+    for recording in recordings("guards").values():
+        assert recording.truth is not None
+        side = str(recording.metadata.get("side", "right"))
+        found.append(measured(tracked(recording, seed, side, fault), recording.truth).first)
     values = {
         "usable_pct": mean_of([one.trust.usable_pct for one in found]),
         "silent_pct": mean_of([one.trust.silent_pct for one in found]),
@@ -117,19 +100,16 @@ def guard_figures(seed: int, fault: Break = WHOLE) -> dict[str, float]:
     return {name: np.nan if value is None else value for name, value in values.items()}
 
 
-def empty_figures(seed: int, fault: Break = WHOLE) -> dict[str, float]:
+def empty_figures(seed: int, fault: Break) -> dict[str, float]:
     """Of rooms, and persons who raise no hand: frames that are called a hand."""
-    lost = [tracked(recording, seed, "auto", fault).lost for recording in empty().values()]
-    return {"called_hand_pct": 100.0 * float(np.mean([(~each).mean() for each in lost]))}
+    found = [tracked(one, seed, "auto", fault) for one in recordings("empty").values()]
+    return {"called_hand_pct": 100.0 * float(np.mean([(~one.lost).mean() for one in found]))}
 
 
 def complaints(
     figures: Sequence[dict[str, float]], sample: Sequence[dict[str, float]]
 ) -> list[str]:
-    """A sentence for each figure whose mean over seeds is out of its bounds.
-
-    figures: of guards and empty recordings, a row a seed.  sample: likewise, of the sample.
-    """
+    """A sentence for each figure whose mean over seeds, a row each, is out of its bounds."""
     said = []
     for name, (low, high) in BOUNDS.items():
         mean = float(np.mean([row[name] for row in figures]))
@@ -150,17 +130,13 @@ def _seeds(text: str) -> tuple[int, ...]:
     return tuple(range(int(first), int(last or first) + 1))
 
 
-def _fault(name: str | None) -> Break:
-    return BREAKS[name] if name else WHOLE
-
-
 def _sample_row(seed: int, fault: str | None) -> dict[str, float]:
-    return {"seed": float(seed), **sample_figures(seed, _fault(fault))}
+    return {"seed": float(seed), **sample_figures(seed, BREAKS.get(str(fault), WHOLE))}
 
 
 def _row(seed: int, fault: str | None) -> dict[str, float]:
-    found = guard_figures(seed, _fault(fault)) | empty_figures(seed, _fault(fault))
-    return {"seed": float(seed), **found}
+    broken = BREAKS.get(str(fault), WHOLE)
+    return {"seed": float(seed), **guard_figures(seed, broken), **empty_figures(seed, broken)}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

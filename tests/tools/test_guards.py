@@ -14,32 +14,25 @@ from toftrack.recordings.store import open_recording
 
 sys.path.insert(0, str(Path(__file__).parent))
 from breaks import BREAKS
-from guards import BOUNDS, SAMPLE_MM, complaints, empty, guards
+from guards import BOUNDS, SAMPLE_MM, complaints, recordings
 
 GOOD = {"seed": 0.0, **{name: (low + high) / 2 for name, (low, high) in BOUNDS.items()}}
 SAMPLE = {"seed": 0.0, "sample_mm": SAMPLE_MM - 0.5, "sample_lost_pct": 0.0}
 
 
-def test_figures_within_their_bounds_are_no_complaint() -> None:
+def test_each_figure_has_a_bound_that_can_be_left() -> None:
     assert complaints([GOOD, GOOD], [SAMPLE]) == []
-
-
-@pytest.mark.parametrize("name", BOUNDS)
-def test_each_figure_has_a_bound_that_can_be_left(name: str) -> None:
-    low, high = BOUNDS[name]
-    assert (low, high) != (0, 100)
-    for wrong in (low - 1, high + 1, np.nan):
-        said = complaints([GOOD | {name: wrong}] * 3, [SAMPLE])
-        assert len(said) == 1 and name in said[0]
-
-
-def test_the_sample_is_followed_closely_and_never_lost() -> None:
+    for name, (low, high) in BOUNDS.items():
+        assert (low, high) != (0, 100)
+        for wrong in (low - 1, high + 1, np.nan):
+            said = complaints([GOOD | {name: wrong}] * 3, [SAMPLE])
+            assert len(said) == 1 and name in said[0]
     assert "mean joint error" in complaints([GOOD], [SAMPLE | {"sample_mm": SAMPLE_MM + 1}])[0]
     assert "are lost" in complaints([GOOD], [SAMPLE | {"sample_lost_pct": 1.0}])[0]
 
 
 def test_the_recordings_are_those_that_the_scripts_make() -> None:
-    tracked, without = guards(), empty()
+    tracked, without = recordings("guards"), recordings("empty")
     assert len(tracked) == 8 and len(without) == 10
     for recording in (*tracked.values(), *without.values()):
         assert len(recording) == 40 and recording.truth is not None
@@ -50,13 +43,9 @@ def test_the_recordings_are_those_that_the_scripts_make() -> None:
 
 def test_the_strangers_are_not_what_the_guards_track() -> None:
     """Nothing here is tracked: one is opened, to see that it is one."""
-    data = ROOT / "tests" / "data"
-    files = sorted((data / "strangers").glob("*.npz"))
-    assert len(files) == 16
-    assert open_recording(files[0]).truth is not None
-    assert not {file.stem for file in files} & {
-        file.stem for kind in ("guards", "empty") for file in (data / kind).glob("*.npz")
-    }
+    files = sorted((ROOT / "tests" / "data" / "strangers").glob("*.npz"))
+    assert len(files) == 16 and open_recording(files[0]).truth is not None
+    assert not {file.stem for file in files} & {*recordings("guards"), *recordings("empty")}
 
 
 def test_a_turned_finger_is_turned_back() -> None:

@@ -23,8 +23,7 @@ from websockets.sync.client import connect
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import read_labels
-from toftrack.evaluation.label_frames import LabelFrame
-from toftrack.evaluation.labelling import LABELLED, LabelFile
+from toftrack.evaluation.labelling import LABELLED, LabelFile, LabelFrame
 from toftrack.evaluation.trust import tips_inset
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.programs import label

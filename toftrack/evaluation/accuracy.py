@@ -15,51 +15,79 @@ gate for a change of the tracker. A * marks intervals that do not hold 0.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
-from toftrack.evaluation.peer import MAKE_ENVIRONMENT, peer_process
-from toftrack.evaluation.results import (
-    checked_targets,
-    circumstances,
-    comparison_with,
-    json_text,
-    read_rows,
-    result_of,
-    write_text,
-)
+from toftrack.evaluation import results
+from toftrack.evaluation.peer import MAKE_ENVIRONMENT, PEER, peer_process
 from toftrack.evaluation.rows import Row
 from toftrack.evaluation.runs import jobs, run_jobs, sources
-from toftrack.evaluation.tables import accuracy_tables, markdown, plain
+from toftrack.evaluation.statistics import text_of
 
+ABLATION = """What each part of the tracker brings: `toftrack benchmark ablation FOLDER...`.
+
+Tracks recordings with truth as the default does, and again with one part changed or left out, with
+the same seeds; differences are paired by recording and seed, with 90 % intervals over recordings.
+A * marks intervals that do not hold 0.
+"""
+
+
+class Variant(NamedTuple):
+    """The default with something changed: overrides, and whether the side is given."""
+
+    about: str
+    overrides: tuple[str, ...] = ()
+    side: str = "told"
+
+
+DEFAULT = "default"
+_STILL = tuple(
+    f"filter.spread.{name}=0" for name in ("translation_m", "depth_m", "rotation_rad", "latent")
+)
+VARIANTS: dict[str, Variant] = {
+    DEFAULT: Variant("side given, one hand"),
+    "few-particles": Variant("20 particles", ("filter.particles=20",)),
+    "no-filter": Variant(
+        "no filter: prediction and refinement",
+        ("filter.passes=1", "filter.speed_gain=0", *_STILL),
+    ),
+    "no-refinement": Variant("no refinement", ("refine=none",)),
+    "no-keypoints": Variant(
+        "no keypoints, neither in the refinement nor in the posterior",
+        ("posterior.keypoints=0", "detector.keypoint_weight=0"),
+    ),
+    "side-found": Variant("handedness detected", (), "auto"),
+    "two-hands": Variant("two hands", ("hands=2",)),
+}
+_SHOWN = {
+    "usable_pct": "usable %",
+    "partly_pct": "partly %",
+    "silent_pct": "silent %",
+    "false_alarm_pct": "false alarms %",
+    "mean_all_mm": "mean mm",
+    "usable_tip_mm": "usable tips mm",
+    "swap_pct": "swaps %",
+    "jitter_mm": "jitter mm",
+    "median_ms": "ms",
+}
 _GIVEN_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smooth", "hydra")
 
 
 def measure(
     options: argparse.Namespace, command: str, draw: Callable[[Path, dict[str, Any]], None]
 ) -> None:
-    """Track, measure and report.
-
-    An interruption reports what is done before it is passed on.
-
-    Args:
-        options: those of `toftrack benchmark accuracy`.
-        command: how it was called.
-        draw: makes the picture of a result.
-
-    Raises:
-        ToftrackError: something that was given cannot be used.
-    """
-    paths, overrides = divided(options.what, options.side, options.hands)
-    checked_targets(options.json, options.markdown, options.picture)
-    others = None if options.compare is None else read_rows(options.compare)
+    """Track, measure and report, with `draw` for the picture; an interruption reports what is done
+    before it is passed on. Raises ToftrackError: something that was given cannot be used."""
+    paths, overrides = _divided(options.what, options.hands)
+    results.checked_targets(options.json, options.markdown, options.picture)
+    others = None if options.compare is None else results.read_rows(options.compare)
     found = sources(paths, options.labels)
     peer = _peer(options)
     todo = jobs(found, options.seeds, options.side, overrides, peer)
-    about = circumstances() | {
+    about = results.circumstances() | {
         "command": command,
         "side": options.side,
         "hands": options.hands,
@@ -68,7 +96,7 @@ def measure(
         "overrides": overrides,
     }
     if peer is not None:
-        about["peer"] = {"name": peer[0], **peer_process(*peer).versions}
+        about["peer"] = {"name": PEER, **peer_process(peer).versions}
     rows: list[Row] = []
     try:
         for more in run_jobs(todo, options.workers):
@@ -80,7 +108,8 @@ def measure(
     _report(about, rows, others, options, draw)
 
 
-def _peer(options: argparse.Namespace) -> tuple[str, str] | None:
+def _peer(options: argparse.Namespace) -> str | None:
+    """Its Python."""
     if options.peer is None:
         return None
     if options.peer_python is None:
@@ -90,14 +119,12 @@ def _peer(options: argparse.Namespace) -> tuple[str, str] | None:
         )
     if options.hands > 1:
         raise ToftrackError("--peer is measured with one hand; leave out --hands, or --peer")
-    return options.peer, str(options.peer_python)
+    return str(options.peer_python)
 
 
-def divided(words: Sequence[str], side: str, hands: int) -> tuple[list[str], list[str]]:
-    """Files and folders, and overrides: those are no file and have a =; the overrides are checked.
-
-    Raises ToftrackError for an override that cannot be used, or names another recording.
-    """
+def _divided(words: Sequence[str], hands: int = 1) -> tuple[list[str], list[str]]:
+    """Files and folders, and overrides, which are no file and have a =. Raises ToftrackError for an
+    override that cannot be used, or names another recording."""
     overrides = [word for word in words if "=" in word and not Path(word).exists()]
     for word in overrides:
         key = word.split("=")[0].lstrip("+~")
@@ -120,33 +147,30 @@ def _report(
     options: argparse.Namespace,
     draw: Callable[[Path, dict[str, Any]], None],
 ) -> None:
-    result = about | result_of([row for row in rows if "method" not in row])
-    if "peer" in about:
-        of_peer = result_of(
-            [
-                {key: value for key, value in row.items() if key != "method"}
-                for row in rows
-                if "method" in row
-            ]
-        )
-        result["peer"] = about["peer"] | of_peer
+    result = about | results.result_of([row for row in rows if "method" not in row])
     if others is not None:
-        result["comparison"] = comparison_with(result["rows"], others, str(options.compare))
+        found = results.compared(result["rows"], others)
+        if not found["pairs"]:
+            raise ToftrackError(
+                f"'{options.compare}' has none of these recordings with one of these seeds, so "
+                "that nothing can be compared; measure the same recordings with the same seeds"
+            )
+        result["comparison"] = {"with": str(options.compare), **found}
     notes = notes_of(result)
-    tables = accuracy_tables(result)
-    if "peer" in result:
-        name = result["peer"]["name"]
-        more = accuracy_tables(result["peer"])
-        tables |= {
-            f"{title}: {name}": [[name, *table[0][1:]], *table[1:]] for title, table in more.items()
-        }
-    print("\n\n".join([*(plain(table) for table in tables.values()), *notes]))
+    tables = results.accuracy_tables(result)
+    if "peer" in about:
+        of_peer = [row for row in rows if "method" in row]
+        unnamed = [{key: row[key] for key in row if key != "method"} for row in of_peer]
+        result["peer"] = about["peer"] | results.result_of(unnamed)
+        for title, table in results.accuracy_tables(result["peer"]).items():
+            tables[f"{title}: {PEER}"] = [[PEER, *table[0][1:]], *table[1:]]
+    print("\n\n".join([*map(results.plain, tables.values()), *notes]))
     if options.json:
-        write_text(options.json, json_text(result))
+        results.write_text(options.json, results.json_text(result))
     if options.markdown:
         parts = [f"`{about['command']}`, commit {about['commit'] or 'unknown'}"]
-        parts += [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
-        write_text(options.markdown, "\n\n".join([*parts, *notes]) + "\n")
+        parts += [f"## {title}\n\n{results.markdown(table)}" for title, table in tables.items()]
+        results.write_text(options.markdown, "\n\n".join([*parts, *notes]) + "\n")
     if options.picture:
         draw(options.picture, result)
 
@@ -162,3 +186,96 @@ def notes_of(result: dict[str, Any]) -> list[str]:
             some = "; ".join(left[:6]) + ("; ..." if len(left) > 6 else "")
             notes.append(f"note: {len(left)} only {where}, not compared: {some}")
     return notes
+
+
+def ablate(options: argparse.Namespace, command: str) -> None:
+    """Track with each variant, measure and report; an interruption reports the variants that are
+    done before it is passed on. Raises ToftrackError: something that was given cannot be used."""
+    names = [DEFAULT, *(name for name in options.variants if name != DEFAULT)]
+    paths, overrides = _divided(options.what)
+    results.checked_targets(options.json, options.markdown)
+    found = sources(paths)
+    about = results.circumstances()
+    about |= {"command": command, "seeds": options.seeds, "overrides": overrides}
+    done: dict[str, list[Row]] = {}
+    try:
+        for number, name in enumerate(names, 1):
+            chosen = [*overrides, *VARIANTS[name].overrides]
+            todo = jobs(found, options.seeds, VARIANTS[name].side, chosen)
+            words = f"{name} ({number} of {len(names)})"
+            done[name] = [row for rows in run_jobs(todo, options.workers, words) for row in rows]
+            _write_ablation(about, done, options)
+    except KeyboardInterrupt:
+        if done:
+            print(results.plain(ablation_table(done)))
+        raise
+    print(results.plain(ablation_table(done)))
+
+
+def _write_ablation(
+    about: dict[str, Any], done: Mapping[str, list[Row]], options: argparse.Namespace
+) -> None:
+    """What is done so far: hours of work must not hang on the last variant."""
+    if options.json:
+        rows = [{"variant": name, **row} for name, rows in done.items() for row in rows]
+        content = about | {"variants": _differences(done), "rows": rows}
+        results.write_text(options.json, results.json_text(content))
+    if options.markdown:
+        results.write_text(options.markdown, _ablation_page(about, done))
+
+
+def _differences(done: Mapping[str, list[Row]]) -> dict[str, Any]:
+    return {
+        name: {
+            "about": VARIANTS[name].about,
+            "overrides": list(VARIANTS[name].overrides),
+            "side": VARIANTS[name].side,
+            "total": results.result_of(rows)["total"],
+            "differences": results.compared(rows, done[DEFAULT])["differences"],
+        }
+        for name, rows in done.items()
+    }
+
+
+def ablation_table(done: Mapping[str, list[Row]]) -> results.Table:
+    """The default's figures, and the differences of each variant to them with their intervals."""
+    table: results.Table = [["variant", *_SHOWN.values()]]
+    for name, of in _differences(done).items():
+        if name == DEFAULT:
+            cells = [text_of(of["total"].get(key)) for key in _SHOWN]
+        else:
+            cells = [_change(of["differences"].get(key)) for key in _SHOWN]
+        table.append([VARIANTS[name].about, *cells])
+    return table
+
+
+def _change(one: Mapping[str, float] | None) -> str:
+    if one is None:
+        return "-"
+    if one["recordings"] == 1:
+        return f"{one['mean']:+.1f} (one recording)"
+    mark = results.clear_mark(one)
+    return f"{one['mean']:+.1f} ({one['low']:+.1f} to {one['high']:+.1f}){mark}"
+
+
+def _ablation_page(about: Mapping[str, Any], done: Mapping[str, list[Row]]) -> str:
+    total = results.result_of(done[DEFAULT])["total"]
+    how = [
+        f"| {VARIANTS[name].about} | `{' '.join(VARIANTS[name].overrides) or '-'}` |"
+        for name in done
+    ]
+    parts = [
+        "# What each part of the tracker brings",
+        f"Generated at commit {about['commit'] or 'unknown'} by\n\n    {about['command']}",
+        f"{total['recordings']} recordings, {total['visible']} frames with a visible hand, seeds "
+        f"{', '.join(map(str, about['seeds']))}. The first row has the default's figures, the "
+        "others the difference to it, paired by recording and seed, with its 90 % interval over "
+        "recordings in brackets; \\* where that does not hold 0. What the columns are: "
+        "[accuracy.md](../accuracy.md).",
+        results.markdown(ablation_table(done)).replace(")*", ")\\*"),
+        "| variant | overrides |\n| --- | --- |\n" + "\n".join(how),
+        "Without keypoints the confidence still knows of them: its weights were fitted with "
+        "them. Milliseconds are measured one variant after another, beside whatever else the "
+        "machine did.",
+    ]
+    return "\n\n".join(parts) + "\n"

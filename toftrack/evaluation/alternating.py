@@ -16,10 +16,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
@@ -47,11 +47,9 @@ _START = ("device=sample", "hand.side=right", "device.stop=3", "stream=stdout")
 
 @dataclass(frozen=True)
 class Program:
-    """What is timed.
-
-    overrides: of the tracker.  recording: with truth; None = the packaged one.
-    size: columns and rows to which its images are enlarged.  hands: that must be believed in a
-    frame that counts.
+    """What is timed.  overrides: of the tracker.  recording: with truth; None = the packaged one.
+    size: (columns, rows) that its images are enlarged to.  hands: that must be believed in a frame
+    that counts.
     """
 
     name: str
@@ -67,11 +65,6 @@ class Times:
 
     name: str
     rounds: list[list[float]] = field(default_factory=list)
-
-    @property
-    def least(self) -> float:
-        """Of all frames."""
-        return min(min(times) for times in self.rounds)
 
     @property
     def medians(self) -> list[float]:
@@ -108,41 +101,35 @@ def programs(two_hands: Sequence[str] = ()) -> list[Program]:
     return found
 
 
-class Runner:
-    """A program's process, for a `with`; `round` times it once."""
+Runner = Callable[[], list[float]]
+"""Times a program once; milliseconds of its frames. Raises ToftrackError."""
 
-    def __init__(self, program: Program) -> None:
-        self.name, self._program = program.name, program
-        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
 
-    def __enter__(self) -> Runner:
-        try:
-            self.round()  # compiles, and sees everything once
-        except BaseException:
-            self._pool.shutdown()
-            raise
-        return self
+@contextmanager
+def _in_process(program: Program) -> Iterator[Runner]:
+    """A program in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
 
-    def __exit__(self, *error: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
+        def once() -> list[float]:
+            try:
+                return pool.submit(_round, program).result()
+            except BrokenProcessPool:
+                raise ToftrackError(f"the process that timed {program.name!r} has ended") from None
+            except ToftrackError as error:
+                raise ToftrackError(f"{program.name}: {error}") from None
 
-    def round(self) -> list[float]:
-        """Milliseconds of its frames. Raises ToftrackError when it ended."""
-        try:
-            return self._pool.submit(_round, self._program).result()
-        except BrokenProcessPool:
-            raise ToftrackError(f"the process that timed {self.name!r} has ended") from None
-        except ToftrackError as error:
-            raise ToftrackError(f"{self.name}: {error}") from None
+        once()  # compiles, and sees everything once
+        yield once
 
 
 def _round(program: Program) -> list[float]:
-    """What Runner asks its process for."""
-    return _one_round(program)()
+    """What is asked of the process."""
+    return runner(program)()
 
 
 @functools.cache
-def _one_round(program: Program) -> Callable[[], list[float]]:
+def runner(program: Program) -> Runner:
+    """Times a program in this process."""
     tracker = make_hands_tracker(*program.overrides, "device=sample")
     device = make_device("device=sample") if program.recording is None else None
     with device or Replay(str(program.recording)) as source:
@@ -176,57 +163,43 @@ def _one_round(program: Program) -> Callable[[], list[float]]:
     return once
 
 
-class _PeerRunner:
-    """MediaPipe as a Runner."""
+@contextmanager
+def _peer(hands: int, python: str) -> Iterator[Runner]:
+    """MediaPipe, which times itself, in its process."""
+    with make_device("device=sample") as device:
+        camera, frames = device.camera, list(device)
+    images = [(camera.rectify(f.depth, f.radial), f.amplitude) for f in frames]
+    images += images[-2:0:-1]
+    with Peer(python) as peer:
+        peer.begin(camera, "right", hands)
 
-    def __init__(self, name: str, python: str) -> None:
-        self.name = name
-        self._peer = Peer("mediapipe", python)
-        with make_device("device=sample") as device:
-            camera, frames = device.camera, list(device)
-        self._images = [(camera.rectify(f.depth, f.radial), f.amplitude) for f in frames]
-        self._images += self._images[-2:0:-1]
-        self._peer.begin(camera, "right", PEER_HANDS[name])
+        def once() -> list[float]:
+            found = []
+            for depth, amplitude in images:
+                assert amplitude is not None, "the packaged recording has amplitudes"
+                found.append(1e3 * peer.step(depth, amplitude).compute_s)
+            return found
 
-    def __enter__(self) -> _PeerRunner:
-        self.round()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._peer.close()
-
-    def round(self) -> list[float]:
-        """Milliseconds of its frames, in its own process."""
-        found = []
-        for depth, amplitude in self._images:
-            assert amplitude is not None, "the packaged recording has amplitudes"
-            found.append(1e3 * self._peer.step(depth, amplitude).compute_s)
-        return found
+        once()
+        yield once
 
 
 def timed(which: Sequence[Program], rounds: int, peer_python: str | None = None) -> list[Times]:
     """Milliseconds of frames, each program's in turn with the others'. Raises ToftrackError."""
     with ExitStack() as stack:
-        runners: list[Runner | _PeerRunner] = [
-            stack.enter_context(Runner(program)) for program in which
-        ]
-        if peer_python is not None:
-            runners += [stack.enter_context(_PeerRunner(name, peer_python)) for name in PEER_HANDS]
-        found = [Times(runner.name) for runner in runners]
+        runners = [(Times(one.name), stack.enter_context(_in_process(one))) for one in which]
+        for name, hands in PEER_HANDS.items() if peer_python is not None else ():
+            runners.append((Times(name), stack.enter_context(_peer(hands, str(peer_python)))))
         for _ in range(rounds):
-            for runner, times in zip(runners, found, strict=True):
-                times.rounds.append(runner.round())
-    return found
+            for times, once in runners:
+                times.rounds.append(once())
+    return [times for times, _ in runners]
 
 
-Start = dict[str, float]
-"""One run of the command line on three frames, seconds: `first_s` until its first estimate,
-`wall_s` until its end, `user_s` and `system_s` of the processors; `kernels`: whether they were
-compiled."""
-
-
-def starts(times: int) -> list[Start]:
-    """Runs without compiled kernels, each followed by one with them. Raises ToftrackError."""
+def starts(times: int) -> list[dict[str, float]]:
+    """Runs of the command line on three frames without compiled kernels, each followed by one with
+    them (`kernels`), seconds: `first_s` until its first estimate, `wall_s` until its end, `user_s`
+    and `system_s` of the processors. Raises ToftrackError."""
     found = []
     for _ in range(times):
         with tempfile.TemporaryDirectory() as folder:
@@ -234,7 +207,7 @@ def starts(times: int) -> list[Start]:
     return found
 
 
-def _start(folder: str) -> Start:
+def _start(folder: str) -> dict[str, float]:
     command = [sys.executable, "-m", "toftrack", "track", *_START, f"hydra.run.dir={folder}/run"]
     before = os.times()
     began = time.perf_counter()
@@ -258,20 +231,18 @@ def _start(folder: str) -> Start:
     }
 
 
-def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
+def show(found: Sequence[Times], begun: Sequence[Mapping[str, float]]) -> str:
     """As tables of text: the median of the rounds, and in brackets the least and the largest."""
     lines = []
     if found:
         named = {times.name: times for times in found}
-        first = named.get(FIRST)
-        peers = [named[name] for name in PEER_HANDS if name in named]
-        over = [] if first is None else [("side given", first)]
-        over += [(times.name, times) for times in peers]
+        compared = {"side given": FIRST} | {name: name for name in PEER_HANDS}
+        over = [(title, named[name]) for title, name in compared.items() if name in named]
         head = f"{'ms':<28}{'least':>7}{'median':>20}{'90th / median':>20}"
         lines.append(head + "".join(f"{'over ' + name:>28}" for name, _ in over))
         for times in found:
-            line = f"{times.name:<28}{times.least:>7.1f}{_spread(times.medians, 1):>20}"
-            line += f"{_spread(times.tails, 2):>20}"
+            line = f"{times.name:<28}{min(map(min, times.rounds)):>7.1f}"
+            line += f"{_spread(times.medians, 1):>20}{_spread(times.tails, 2):>20}"
             line += "".join(f"{_spread(times.over(other), 2):>28}" for _, other in over)
             lines.append(line)
         for both in (times for times in found if times.name.endswith(", both")):
@@ -285,13 +256,11 @@ def show(found: Sequence[Times], begun: Sequence[Start]) -> str:
     for kernels in (False, True):
         some = [start for start in begun if start["kernels"] == kernels]
         if some:
-            until_first, wall, user, system = (
-                _spread([start[name] for start in some], 1)
-                for name in ("first_s", "wall_s", "user_s", "system_s")
-            )
+            names = ("first_s", "wall_s", "user_s", "system_s")
+            first, wall, user, system = (_spread([one[n] for one in some], 1) for n in names)
             lines.append(
                 f"three frames {'with' if kernels else 'without'} kernels, s: first estimate"
-                f" {until_first}, end {wall}, processors {user} and of the system {system}"
+                f" {first}, end {wall}, processors {user} and of the system {system}"
             )
     return "\n".join(lines)
 
@@ -311,14 +280,9 @@ def measure(
 ) -> dict[str, Any]:
     """Time everything and print it, the machine first; returns what --json writes.
 
-    Args:
-        rounds: of all programs.  begins: of the command line.
-        cores: as many as all may use; None: all that there are.
-        two_hands: recordings with truth.
-        peer_python: MediaPipe's; None: without it.
-
-    Raises:
-        ToftrackError: a recording or an environment cannot be used.
+    rounds: of all programs.  begins: of the command line.  cores: as many as all may use; None: all
+    that there are.  two_hands: recordings with truth.  peer_python: MediaPipe's; None: without it.
+    Raises ToftrackError: a recording or an environment cannot be used.
     """
     if cores is not None:
         _use(cores)

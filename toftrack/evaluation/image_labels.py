@@ -6,15 +6,14 @@ recording, which is tracked as a whole:
     {"image_size": [512, 424], "side": "left", "frames": {"6": {"points":
         {"thumb_tip": [249.5, 170.8, "visible"], "wrist": [308, 182, "guessed"], ...}}, ...}}
 
-`toftrack label` makes such a file; what else stands in it, as a frame's `gesture`, is not measured.
-A joint is compared laterally: the distance in pixels between its projection and the label, times
-its own depth over the focal length. Of visible fingertips, which are moved 5 mm towards the joint
-before them, as the labels are: `tips_20_pct`, `tips_40_pct` are the frames in which all are within
-20 and 40 mm; `wrong_pct` those in which one is farther than 40 mm off, unflagged; `flagged_pct`
-those flagged lost; `wrong_no_flag_pct` those not flagged lost in which a tip is so far off that
-`joint_ok` does not flag; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that
-is not finite or not in front of the camera is infinitely far off, and left out of the mean). What
-`joint_ok` flags is counted as in measures.py.
+`toftrack label` makes such a file; what else stands in it is not measured. A joint is compared
+laterally: pixels between its projection and the label, times its own depth over the focal length.
+Of visible fingertips, which are moved 5 mm towards the joint before them, as the labels are:
+`tips_20_pct`, `tips_40_pct` are the frames in which all are within 20 and 40 mm; `wrong_pct` those
+in which one is farther than 40 mm off, unflagged; `flagged_pct` those flagged lost;
+`wrong_no_flag_pct` those not flagged lost in which a tip is so far off that `joint_ok` does not
+flag; `tips_median_mm`, `tips_mean_mm` over all tips (a prediction that is not finite or not in
+front of the camera is infinitely far off, and left out of the mean); `FLAG_COUNTS` of measures.py.
 
 **Stills**: images that have nothing to do with one another, each with what it shows. Every one has
 a fresh start and is shown so many frames, the last of which counts:
@@ -86,19 +85,15 @@ class Stills:
 def read_labels(path: str | Path) -> Points | Stills:
     """Labels of either kind; ToftrackError, one sentence that names the file."""
     path = Path(path).expanduser()
-    with reported_errors(
-        f"the labels '{path}' cannot be read", "give a file of JSON", OSError, ValueError
-    ):
+    what = f"the labels '{path}' cannot be read"
+    with reported_errors(what, "give a file of JSON", OSError, ValueError):
         content = read_json(path)
     return parsed_labels(path, content)
 
 
 def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Stills:
-    """Labels of either kind as they stand in a file.
-
-    begun: points may still be without any that is visible.
-    Raises ToftrackError, one sentence that names the file.
-    """
+    """Labels of either kind as they stand in a file; where `begun`, points may still be without
+    any that is visible. Raises ToftrackError, one sentence that names the file."""
     try:
         return _parsed(path, content, begun)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
@@ -149,38 +144,36 @@ def point_rows(
 ) -> dict[int, dict[str, Any]]:
     """The figures of each labelled frame that has a visible fingertip, by its number.
 
-    Args:
-        joints_m: (T, 21, 3) metres, camera frame.
-        lost: (T,) bool.
-        joint_ok: (T, 21) bool.
-        K: (3, 3), of undistorted pixels.
-
+    joints_m: (T, 21, 3) metres, camera frame.  lost: (T,) bool.  joint_ok: (T, 21) bool.
+    K: (3, 3), of undistorted pixels.
     Raises ToftrackError when a frame is labelled that the track has not.
     """
     found = {}
     for number, off in lateral_errors_mm(points, joints_m, K, TIPS).items():
-        worst, flagged = max(off.values()), bool(lost[number])
-        ok = joint_ok[number][list(off)]
+        flagged, ok = bool(lost[number]), joint_ok[number][list(off)]
         errors = np.array(list(off.values()))
+        worst = errors.max()
         found[number] = {
-            "tips_20_pct": 100.0 * (worst < 20),
-            "tips_40_pct": 100.0 * (worst < 40),
-            "wrong_pct": 100.0 * (worst > 40 and not flagged),
-            "flagged_pct": 100.0 * flagged,
-            "wrong_no_flag_pct": 100.0 * (not flagged and bool((ok & (errors > OK_MM)).any())),
+            "tips_20_pct": _pct(worst < 20),
+            "tips_40_pct": _pct(worst < 40),
+            "wrong_pct": _pct(worst > 40 and not flagged),
+            "flagged_pct": _pct(flagged),
+            "wrong_no_flag_pct": _pct(not flagged and (ok & (errors > OK_MM)).any()),
             **(dict.fromkeys(FLAG_COUNTS, 0) if flagged else flag_counts(errors, ~ok)),
             "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
         }
     return found
 
 
+def _pct(so: bool | np.bool_) -> float:
+    return 100.0 * bool(so)
+
+
 def lateral_errors_mm(
     points: Points, joints_m: np.ndarray, K: np.ndarray, rows: Sequence[int]
 ) -> dict[int, dict[int, float]]:
     """How far off those of some joints are that are visible: by frame, if it has any, and joint.
-
-    Args and errors: as of point_rows.
-    """
+    Arguments and errors are those of point_rows."""
     if max(points.frames) >= len(joints_m):
         raise ToftrackError(
             f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
@@ -207,12 +200,10 @@ def _lateral_mm(point: np.ndarray, place: tuple[float, float], K: np.ndarray) ->
 
 def still_row(called: str, lost: bool, allowed: Sequence[str]) -> dict[str, Any]:
     """The figures of one still.  called: its gesture.  allowed: what it may be called."""
-    found = not lost
-    right = found and called in allowed
     return {
-        "found_pct": 100.0 * found,
-        "named_pct": 100.0 * right,
-        "wrong_name_pct": 100.0 * (found and called not in (*allowed, *UNNAMED)),
+        "found_pct": _pct(not lost),
+        "named_pct": _pct(not lost and called in allowed),
+        "wrong_name_pct": _pct(not lost and called not in (*allowed, *UNNAMED)),
     }
 
 

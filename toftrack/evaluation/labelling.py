@@ -1,28 +1,43 @@
-"""Labels of points in the making: which frames to label, and a file that grows click by click."""
+"""Labels of points in the making: which frames to label, where the hand is in them, what the
+tracker says of them, and a file that grows click by click."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+import sys
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tqdm import tqdm
 
+from toftrack.api import build_tracker
+from toftrack.compute.threads import small_operations
+from toftrack.configuration.compose import one_sentence
+from toftrack.detector.hand_detector import HandDetector
+from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.estimate import Estimate
 from toftrack.evaluation.image_labels import Points, parsed_labels
 from toftrack.hand.skeleton import FINGERS
 from toftrack.json_text import read_json
 from toftrack.safe_files import write_whole
 
 TIPS = tuple(f"{finger}_tip" for finger in FINGERS)
-KNUCKLES = tuple(f"{finger}_mcp" for finger in FINGERS)
-LABELLED = (*TIPS, *KNUCKLES, "wrist")
+LABELLED = (*TIPS, *(f"{finger}_mcp" for finger in FINGERS), "wrist")
 """The joints that are asked for, in this order."""
 _CONVENTIONS = (
     "pixels of the undistorted image, centres at whole numbers; frames by their number in the "
     "recording; tips 5 mm inside the end of the finger"
 )
+_AROUND = 1.7
+"""How much more than the hand is shown."""
+_BEFORE_M, _BEHIND_M = 0.03, 0.05
+"""Of the depths that contrast is given to, beside those of the hand's joints."""
 
 
 def chosen_frames(
@@ -31,13 +46,10 @@ def chosen_frames(
     given: Collection[int] = (),
     confidence: np.ndarray | None = None,
 ) -> list[int]:
-    """Numbers of frames to label, rising: those given, and others until there are `wanted`.
+    """Numbers of frames to label, rising: those `given`, and others until there are `wanted`.
 
-    Args:
-        count: frames of the recording.
-        given: frames that are in the labels already.
-        confidence: (count,) of each frame: the least confident ones are taken, apart from each
-            other where there are enough. None: evenly spaced ones.
+    confidence: (count,) of each frame: the least confident ones are taken, apart from each other
+    where there are enough. None: evenly spaced ones.
     """
     chosen, wanted = set(given), min(wanted, count)
     if confidence is None and not chosen:
@@ -58,26 +70,133 @@ def chosen_frames(
     return sorted(chosen)
 
 
+class Tracked(NamedTuple):
+    """What the tracker says of T frames.
+
+    confidence: (T,), 0 where the hand is lost; 1 where nobody finds one, so that such come last.
+    """
+
+    estimates: Sequence[Estimate]
+    confidence: np.ndarray
+
+
+def track(device: Device, config: DictConfig) -> Tracked:
+    """Track all of a recording, with a configuration of one hand. Raises ToftrackError."""
+    with one_sentence():
+        tracker, detector = build_tracker(config), instantiate(config.detector)
+    camera, estimates, confidence = device.camera, [], []
+    for frame in tqdm(device, total=device.frames, unit=" frames", file=sys.stderr):
+        depth_m = camera.rectify(frame.depth, frame.radial)
+        estimate = tracker.step(depth_m, camera.K, frame.index, frame.timestamp_s)
+        estimates.append(estimate)
+        if not estimate.lost:
+            confidence.append(float(np.nan_to_num(estimate.confidence)))
+        else:
+            nobody = detector is not None and _found(detector, depth_m, camera.K) is None
+            confidence.append(float(nobody))
+    return Tracked(estimates, np.array(confidence))
+
+
+@dataclass(frozen=True, eq=False)
+class LabelFrame:
+    """A frame as it is shown.
+
+    depth_mm: (H, W) uint16 Z, undistorted, 0 = no reading.
+    centre_px, reach_px: what to show first: so far about (u, v).
+    near_mm, far_mm: the depths that contrast is given to.
+    estimate_px: (21, 2) the tracker's joints; None where it was not asked, or lost the hand.
+    """
+
+    number: int
+    depth_mm: np.ndarray
+    centre_px: tuple[float, float]
+    reach_px: float
+    near_mm: float
+    far_mm: float
+    estimate_px: np.ndarray | None = None
+
+
+def label_frames(
+    device: Device,
+    config: DictConfig,
+    numbers: Collection[int],
+    known: Tracked | None = None,
+) -> list[LabelFrame]:
+    """The frames of these numbers, rising, ready to be shown, with what the tracker says of them
+    where it is known. Raises ToftrackError when the frames are not those of a whole recording."""
+    with one_sentence():
+        detector = instantiate(config.detector)
+    K, shown = device.camera.K, []
+    for row, frame in enumerate(device):
+        if frame.index != row:
+            raise ToftrackError(
+                "the tracker is measured on whole recordings; leave out device.start and the like"
+            )
+        if row in numbers:
+            depth_m = device.camera.rectify(frame.depth, frame.radial)
+            estimate = None if known is None or known.estimates[row].lost else known.estimates[row]
+            joints_m = _found(detector, depth_m, K) if estimate is None else estimate.joints_m
+            depth_mm = np.clip(1e3 * depth_m + 0.5, 0, 65535).astype("<u2")
+            pixels = None if estimate is None else _projected(estimate.joints_m, K)
+            shown.append(LabelFrame(row, depth_mm, *_about(joints_m, depth_m, K), pixels))
+        if len(shown) == len(numbers):
+            break
+    return shown
+
+
+def _found(detector: HandDetector | None, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray | None:
+    """(21, 3) m, roughly, of the likeliest hand in an image; None where none is found."""
+    if detector is None:  # the paper's tracker has none
+        return None
+    with small_operations():
+        depth_m = np.require(depth_m, np.float32, ("C", "W"))
+        places = detector.start_search(depth_m, k)()
+        seen = [
+            one for side in ("right", "left") for one in detector.look(depth_m, k, places, side)
+        ]
+    best = max(seen, key=lambda one: one.merit, default=None)
+    return None if best is None else best.keypoints.points_m.numpy()
+
+
+def _about(
+    joints_m: np.ndarray | None, depth_m: np.ndarray, k: np.ndarray
+) -> tuple[tuple[float, float], float, float, float]:
+    """Centre, reach, near and far of what is shown: the whole image where no hand is known."""
+    height, width = depth_m.shape
+    if joints_m is None or not np.isfinite(joints_m).all() or joints_m[:, 2].min() <= 0:
+        seen = depth_m[depth_m > 0]
+        near, far = np.percentile(seen, (1, 50)) if seen.size else (0.2, 1.0)
+        return ((width - 1) / 2, (height - 1) / 2), max(width, height) / 2, 1e3 * near, 1e3 * far
+    pixels = _projected(joints_m, k)
+    low, high = pixels.min(0), pixels.max(0)
+    u, v = np.clip((low + high) / 2, 0, (width - 1, height - 1))
+    near, far = joints_m[:, 2].min() - _BEFORE_M, joints_m[:, 2].max() + _BEHIND_M
+    reach = max(_AROUND * float((high - low).max()) / 2, 8.0)
+    return (float(u), float(v)), reach, 1e3 * float(near), 1e3 * float(far)
+
+
+def _projected(joints_m: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """(21, 2) pixels of the undistorted image."""
+    pixels: np.ndarray = joints_m[:, :2] / joints_m[:, 2:] * np.diag(k)[:2] + k[:2, 2]
+    return pixels
+
+
 class LabelFile:
     """Labels of a recording's frames; every change is in the file when its call returns.
 
     A file that is there is continued: what it holds stays, also what is not known here. None is
     made before the side is known.
-
-    Args:
-        path: the file.
-        recording: name of the recording's file.
-        size: width and height of its images, pixels.
-        count: how many frames it has.
-        side: "right" or "left"; None = as the file says, or not known yet.
-
-    Raises:
-        ToftrackError: the file is not of this recording and side, or cannot be read or written.
     """
 
     def __init__(
         self, path: str | Path, recording: str, size: tuple[int, int], count: int, side: str | None
     ) -> None:
+        """Begin a file, or continue it.
+
+        recording: name of the recording's file.  size: (width, height) of its images.  count: of
+        its frames.  side: "right" or "left"; None = as the file says, or not known yet.
+        Raises ToftrackError: the file is not of this recording and side, or cannot be read.
+        """
         self.path, self._size = Path(path).expanduser(), size
         if self.path.exists():
             self.content = self._continued(recording, count, side)
@@ -131,12 +250,8 @@ class LabelFile:
         self.save()
 
     def set_point(self, number: object, joint: object, point: object) -> None:
-        """Set a joint, or with None take it back.
-
-        point: [u, v, "visible" or "guessed"] in pixels, or [None, None, "absent"].
-
-        Raises ValueError for what is none of these, or before the side is known.
-        """
+        """Set a joint to [u, v, "visible" or "guessed"] in pixels, to [None, None, "absent"], or
+        with None take it back. ValueError for anything else, or before the side is known."""
         points = self._frame(number)["points"]
         if self.content["side"] is None:
             raise ValueError("say first whether it is a right or a left hand")
@@ -167,22 +282,22 @@ class LabelFile:
     def _checked(self, point: object) -> list[Any]:
         if not isinstance(point, list) or len(point) != 3:
             raise ValueError("a point is [u, v, flag]")
-        u, v, flag = point
-        if [u, v, flag] == [None, None, "absent"]:
-            return [u, v, flag]
-        number = all(isinstance(one, int | float) and not isinstance(one, bool) for one in (u, v))
-        inside = number and all(
-            -0.5 <= one <= most - 0.5 for one, most in zip((u, v), self._size, strict=True)
+        if point == [None, None, "absent"]:
+            return point
+        *place, flag = point
+        inside = all(
+            type(one) in (int, float) and -0.5 <= one <= most - 0.5
+            for one, most in zip(place, self._size, strict=True)
         )
         if not inside or flag not in ("visible", "guessed"):
             raise ValueError("a point is visible or guessed, and within the image")
-        return [round(float(u), 2), round(float(v), 2), flag]
+        return [*(round(float(one), 2) for one in place), flag]
 
     def _continued(self, recording: str, count: int, side: str | None) -> dict[str, Any]:
         with reported_errors(
             f"the labels '{self.path}' cannot be read", "give another --output", OSError, ValueError
         ):
-            content = read_json(self.path)
+            content: dict[str, Any] = read_json(self.path)
         known = parsed_labels(self.path, content, begun=True)
         of = content.get("recording", recording)
         if not isinstance(known, Points):
@@ -192,6 +307,5 @@ class LabelFile:
         elif side not in (None, known.side):
             why = f"of a {known.side} hand"
         else:
-            loaded: dict[str, Any] = content
-            return loaded
+            return content
         raise ToftrackError(f"the labels '{self.path}' are {why}; give another --output")

@@ -1,7 +1,8 @@
 """All that is measured of a track of one recording, from estimates and truth alone.
 
-A track is plain arrays, so that what any method found is measured alike. Beside the figures of
-trust.py, of each hand, over the frames in which it is visible:
+A track is plain arrays, so that what any method found is measured alike. A figure is None where
+there is nothing that it could be about. Beside the figures of trust.py, `measured` says of each
+hand, over the frames in which it is visible:
 
 - `usable_mean_mm`, `usable_tip_mm`: mean error of joints and of fingertips in usable frames.
 - `tip_mm`: mean error of the fingertips in frames that are not flagged lost, as `mean_mm`.
@@ -20,7 +21,19 @@ trust.py, of each hand, over the frames in which it is visible:
   tenth after the first one, names the right one.
 - `side_wrong_certain_pct`: frames in which the wrong side is named with a probability above 0.9.
 
-A figure is None where there is nothing that it could be about.
+`evaluate` has the errors of summary.json: over the frames in which the hand is visible and its pose
+in the pose space, from frame `SKIPPED` on. Frames flagged lost count like any other, so that
+flagging cannot improve an error. Frames without an estimate are failures: `missing_pct`, left out
+of means and quantiles, never good. Its other figures:
+
+- Lost detection: a frame is lost, in truth, when the hand is not visible or not in the pose space.
+  The tolerant figures leave out the frames within `TOLERANCE` frames of a change of that truth; the
+  strict ones do not.
+- Re-acquisition: frames from an event to the first of `RIGHT_FRAMES` consecutive ones (fewer at the
+  end) that are not flagged lost and have a mean error below `RIGHT_MM`; None when that does not
+  happen before the hand is gone again. Events: `return`, the hand becomes visible again; `entered`,
+  after a return, the visible fraction first reaches 0.9; `unoccluded`, it is back at 0.9 after a
+  dip below 0.7, visible all the while; `in_space`, the pose enters the pose space again.
 """
 
 from __future__ import annotations
@@ -31,10 +44,26 @@ from typing import Any
 import numpy as np
 
 from toftrack.evaluation.statistics import figure, share_pct
-from toftrack.evaluation.trust import OK_MM, TIPS, Judged, Trust, judged, slots_of_hands, trust
+from toftrack.evaluation.trust import (
+    OK_MM,
+    RIGHT_FRAMES,
+    RIGHT_MM,
+    TIPS,
+    Judged,
+    Trust,
+    judged,
+    runs,
+    slots_of_hands,
+    trust,
+    until,
+)
 from toftrack.frames import Truth
 from toftrack.hand.regions import in_region_90
 
+SKIPPED = 5
+TOLERANCE = 3
+_BACK_IN_VIEW = 0.9
+_COVERED = 0.7
 SWAP_MM = 10.0
 CERTAIN = 0.9
 SOON_FRAMES = 10
@@ -63,23 +92,19 @@ class Estimates:
     """What a method says of the T frames of a recording, of one hand or of slots.
 
     With slots every array has an axis of slots after T. None: it says nothing of it.
+    joints_m: (T, 21, 3) metres, camera frame; not finite where there is none.  lost: (T,) bool.
+    joint_sigma_m: (T, 21, 3), see hand/regions.py.  joint_ok: (T, 21) bool.  gesture: (T,) text.
+    side: (T,) 'right' or 'left' as it was detected, '' for neither; None where it was given.
+    side_probability: (T,).
     """
 
     joints_m: np.ndarray
-    """(T, 21, 3) metres, camera frame; not finite where there is none."""
     lost: np.ndarray
-    """(T,) bool."""
     joint_sigma_m: np.ndarray | None = None
-    """(T, 21, 3), see hand/regions.py."""
     joint_ok: np.ndarray | None = None
-    """(T, 21) bool."""
     gesture: np.ndarray | None = None
-    """(T,) text."""
     side: np.ndarray | None = None
-    """(T,) text, 'right' or 'left', as it was detected; empty where it names none. None where it
-    was given."""
     side_probability: np.ndarray | None = None
-    """(T,)."""
 
     def slot(self, number: int) -> Estimates:
         """Of one slot."""
@@ -89,11 +114,8 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What was measured of one hand.
-
-    trust: its figures.  frames: what each frame is.  figures: see the head of this module;
-    JSON-able, unrounded.  named: (T,) bool, frames whose pose has a name.  called: those of them
-    that are called so.
+    """What was measured of one hand.  figures: see the head of this module; JSON-able, unrounded.
+    named: (T,) bool, frames whose pose has a name.  called: those of them that are called so.
     """
 
     trust: Trust
@@ -105,11 +127,8 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRecording:
-    """What was measured of a recording.
-
-    slots: of the hands; None where the track has no slots.
-    ghost_pct: frames in which a slot without a hand says that it has one; None where there is no
-        such slot.
+    """What was measured of a recording.  slots: of the hands; None where the track has no slots.
+    ghost_pct: frames in which a slot without a hand says that it has one; None: no such slot.
     """
 
     first: Measured
@@ -119,10 +138,8 @@ class MeasuredRecording:
 
 
 def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
-    """All measures of a track of one hand or of several slots.
-
-    Raises ToftrackError when estimates and truth differ in shape.
-    """
+    """All measures of a track of one hand or of several slots. Raises ToftrackError when estimates
+    and truth differ in shape."""
     if np.ndim(estimates.joints_m) == 3:
         return MeasuredRecording(_of_hand(estimates, truth))
     truths = [truth] if truth.other is None else [truth, truth.other]
@@ -131,8 +148,7 @@ def measured(estimates: Estimates, truth: Truth) -> MeasuredRecording:
     others = ~np.delete(np.asarray(estimates.lost, bool), slots, axis=1)
     ghosts = None
     if others.shape[1]:
-        every = np.ones(len(others), bool)
-        ghosts = share_pct(np.asarray(others.any(1)), every) or 0.0
+        ghosts = share_pct(np.asarray(others.any(1)), np.ones(len(others), bool)) or 0.0
     return MeasuredRecording(each[0], each[1] if each[1:] else None, ghosts, slots)
 
 
@@ -177,10 +193,7 @@ def coverage(
 
 
 def flag_counts(off_mm: np.ndarray, flagged: np.ndarray) -> dict[str, int]:
-    """What joint_ok says of N visible fingertips, see the head of this module.
-
-    off_mm: (N,) errors.  flagged: (N,) bool.
-    """
+    """What joint_ok says of visible fingertips with (N,) errors; see the head of this module."""
     wrong = np.asarray(off_mm) > OK_MM
     counted = (wrong, wrong & flagged, ~wrong, ~wrong & flagged)
     return {name: int(rows.sum()) for name, rows in zip(FLAG_COUNTS, counted, strict=True)}
@@ -223,3 +236,82 @@ def _side_figures(estimates: Estimates, of: Judged, truth: Truth) -> dict[str, A
         wrong = certain & (side != "") & ~right
         figures["side_wrong_certain_pct"] = share_pct(wrong & of.seen, of.seen)
     return figures
+
+
+def evaluate(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, Any]:
+    """Metrics of T estimates, as of `judged` but of all 21 joints; unrounded; None for a figure
+    about no frame at all. `reacquisition` is a list of {event, frame, delay}."""
+    of, flagged = judged(joints_m, lost, truth), np.asarray(lost, bool)
+    error = of.error_mm
+    present = of.seen & truth.in_space
+    counted = np.arange(len(present)) >= SKIPPED
+    used = present & counted
+    measured = used & of.there
+    estimate, true = (
+        np.asarray(joints, np.float64)[measured] for joints in (joints_m, truth.joints_m)
+    )
+    relative = (estimate - estimate[:, :1]) - (true - true[:, :1])
+    aligned = 1e3 * np.linalg.norm(relative, axis=-1)
+    in_sight = np.ones(error.shape, bool) if truth.joint_visible is None else truth.joint_visible
+    metrics: dict[str, Any] = {
+        "frames": int(used.sum()),
+        "missing_pct": share_pct(~of.there, used) or 0.0,
+        "mean_mm": figure(error[measured]),
+        "median_mm": figure(error[measured], np.median),
+        "p90_mm": figure(error[measured], lambda errors: np.percentile(errors, 90)),
+        "fingertip_mm": figure(error[measured][:, TIPS].ravel()),
+        "wrist_aligned_mm": figure(aligned[:, 1:].ravel()),  # without the wrist
+        "visible_joints_mm": figure(error[measured[:, None] & in_sight]),
+        f"frames_max_below_{OK_MM:g}mm_pct": share_pct(error.max(1) < OK_MM, used) or 0.0,
+        "mean_not_lost_mm": figure(error[measured & ~flagged]),
+    }
+    clear = counted & ~_near_change(present)
+    for suffix, rows in (("", clear), ("_strict", counted)):
+        said, gone = flagged[rows], ~present[rows]
+        metrics[f"lost_precision{suffix}"] = figure(gone[said])
+        metrics[f"lost_recall{suffix}"] = figure(said[gone])
+    found = runs(of.said & (of.mean_mm < RIGHT_MM), RIGHT_FRAMES, cut=True)
+    metrics["reacquisition"] = [
+        {"event": event, "frame": frame, "delay": _delay(found, present, frame)}
+        for event, frame in _events(truth)
+    ]
+    return metrics
+
+
+def _near_change(present: np.ndarray) -> np.ndarray:
+    """(T,) bool: at most `TOLERANCE` frames lie between the frame and a change of `present`."""
+    near = np.zeros(len(present), bool)
+    for change in np.flatnonzero(np.diff(present)) + 1:  # first frame of the new value
+        near[max(0, change - TOLERANCE) : change + TOLERANCE] = True
+    return near
+
+
+def _delay(found: np.ndarray, present: np.ndarray, frame: int) -> int | None:
+    """Frames until the track is found, before the hand is gone."""
+    gone = until(~present, frame)
+    return until(found[: len(present) if gone is None else frame + gone], frame)
+
+
+def _events(truth: Truth) -> list[tuple[str, int]]:
+    """(event, frame) in the order of time; see the head of this module."""
+    visible, in_space = truth.visible, truth.in_space
+    fraction = truth.visible_fraction
+    fraction = visible.astype(float) if fraction is None else np.asarray(fraction, float)
+    in_full = fraction >= _BACK_IN_VIEW
+    found: list[tuple[str, int]] = []
+    covered = gone = False
+    for t in range(len(visible)):
+        returned = t > 0 and visible[t] and not visible[t - 1]
+        if returned:
+            found.append(("return", t))
+            if in_full[t:].any():
+                found.append(("entered", t + int(in_full[t:].argmax())))
+        if t > 0 and in_space[t] and not in_space[t - 1]:
+            found.append(("in_space", t))
+        gone |= not visible[t]
+        covered |= fraction[t] < _COVERED
+        if covered and in_full[t]:
+            if not gone:
+                found.append(("unoccluded", t))
+            covered = gone = False
+    return sorted(found, key=lambda event: event[1])

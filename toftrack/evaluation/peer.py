@@ -1,7 +1,7 @@
-"""Another method beside the tracker: what it says of the same frames, and how long it takes.
+"""MediaPipe Hands beside the tracker: what it says of the same frames, and how long it takes.
 
-MediaPipe's requirements contradict ours, so it runs in an environment of its own and is spoken to
-over pipes: see peer_mediapipe.py for its configuration, and docs/accuracy.md for how to make it.
+Its requirements contradict ours, so it runs in an environment of its own and is spoken to over
+pipes: see peer_mediapipe.py for its configuration, and docs/accuracy.md for how to make it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 
-PEERS = {"mediapipe": "peer_mediapipe.py"}
+PEER = "mediapipe"
+SCRIPT = Path(__file__).with_name("peer_mediapipe.py")
 MAKE_ENVIRONMENT = (
     "make one with: python3 -m venv peer && peer/bin/pip install mediapipe==0.10.21 'numpy<2'"
 )
@@ -48,15 +49,14 @@ class PeerEstimate:
 
 
 class Peer:
-    """A peer's process, for a `with`; `begin` a recording, then `step` through its frames."""
+    """The peer's process, for a `with`; `begin` a recording, then `step` through its frames."""
 
-    def __init__(self, name: str, python: str | Path) -> None:
-        """Start one of PEERS. Raises ToftrackError: its environment lacks it."""
-        self.name, self.python = name, str(python)
-        self._size = (0, 0)
+    def __init__(self, python: str | Path) -> None:
+        """Start it with its environment's Python. Raises ToftrackError: that lacks MediaPipe."""
+        self.python = str(python)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  a pipe that nobody reads fills up
         # Isolated: the modules beside the script are not its own.
-        command = [self.python, "-I", str(Path(__file__).parent / PEERS[name])]
+        command = [self.python, "-I", str(SCRIPT)]
         try:
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
@@ -65,8 +65,10 @@ class Peer:
             self._errors.close()
             raise ToftrackError(
                 f"--peer-python {python} cannot be run ({error.strerror}); give the Python of an "
-                f"environment with {name}; {MAKE_ENVIRONMENT}"
+                f"environment with {PEER}; {MAKE_ENVIRONMENT}"
             ) from None
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._to, self._from = self._process.stdin, self._process.stdout
         self.versions = self._greeting()
 
     def __enter__(self) -> Peer:
@@ -77,7 +79,7 @@ class Peer:
 
     def close(self) -> None:
         """End the process."""
-        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+        for pipe in (self._to, self._from):
             with suppress(OSError):  # it ended first
                 pipe.close()
         try:
@@ -89,21 +91,17 @@ class Peer:
 
     def begin(self, camera: Camera, side: str = "", hands: int = 2) -> None:
         """A new recording. side: whose hand is meant, "" for any.  hands: looked for at most."""
-        self._size = (camera.height, camera.width)
-        facts = {"size": self._size, "k": camera.K.ravel().tolist(), "side": side, "hands": hands}
+        size, k = (camera.height, camera.width), camera.K.ravel().tolist()
+        facts = {"size": size, "k": k, "side": side, "hands": hands}
         self._send(json.dumps({"begin": facts}).encode() + b"\n")
 
     def step(self, depth_m: np.ndarray, amplitude: np.ndarray) -> PeerEstimate:
-        """What it says of a frame.
-
-        depth_m: (H, W) metres, 0 = no reading.  amplitude: (H, W) uint16.
-        Raises ToftrackError when its process has ended.
-        """
-        assert self._process.stdout is not None
+        """What it says of a frame: (H, W) metres, 0 = no reading, and (H, W) uint16. Raises
+        ToftrackError when its process has ended."""
         self._send(b'{"frame": true}\n')
         self._send(np.ascontiguousarray(amplitude, np.uint16).tobytes())
         self._send(np.ascontiguousarray(depth_m, np.float32).tobytes())
-        answer = self._process.stdout.read(_ANSWER.itemsize)
+        answer = self._from.read(_ANSWER.itemsize)
         if len(answer) != _ANSWER.itemsize:
             raise self._ended()
         row = np.frombuffer(answer, _ANSWER)[0]
@@ -113,8 +111,7 @@ class Peer:
         return PeerEstimate(row["joints_m"].astype(np.float32), lost, side, sure, seconds)
 
     def _greeting(self) -> Mapping[str, Any]:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
+        line = self._from.readline()
         try:
             reported = json.loads(line)
         except ValueError:
@@ -124,21 +121,19 @@ class Peer:
             return versions
         self.close()
         raise ToftrackError(
-            f"the environment of --peer-python {self.python} has no usable {self.name} "
+            f"the environment of --peer-python {self.python} has no usable {PEER} "
             f"({reported.get('error')}); {MAKE_ENVIRONMENT}"
         )
 
     def _send(self, data: bytes) -> None:
-        assert self._process.stdin is not None
         try:
-            self._process.stdin.write(data)
-            self._process.stdin.flush()
+            self._to.write(data)
+            self._to.flush()
         except OSError:
             raise self._ended() from None
 
     def _ended(self) -> ToftrackError:
-        words = self._last_words()
-        return ToftrackError(f"{self.name} ended in the middle of a recording ({words})")
+        return ToftrackError(f"{PEER} ended in the middle of a recording ({self._last_words()})")
 
     def _last_words(self) -> str:
         """The last line of what it wrote to standard error."""
@@ -149,8 +144,8 @@ class Peer:
 
 
 @functools.lru_cache(maxsize=1)
-def peer_process(name: str, python: str) -> Peer:
+def peer_process(python: str) -> Peer:
     """This process's peer; started once, since that takes seconds."""
-    peer = Peer(name, python)
+    peer = Peer(python)
     atexit.register(peer.close)
     return peer

@@ -1,28 +1,22 @@
 """MediaPipe Hands on amplitude images, in an environment of its own: the far end of peer.py.
 
-Run by that environment's Python, it imports nothing of toftrack; what comes in and goes out are
-JSON lines and plain arrays:
+Run by that environment's Python, it imports nothing of toftrack. JSON lines and plain arrays:
 
-- in `{"begin": {"size": [H, W], "k": [...9], "side": "left" | "right" | "", "hands":
-  N}}`: a new recording, in which so many hands are looked for;
-- in `{"frame": true}`, then H * W uint16 of amplitude and H * W float32 of depth in metres: out 63
+- out, at first, `{"ready": {...versions}}` or `{"error": "why not"}`;
+- in `{"begin": {"size": [H, W], "k": [...9], "side": "left" | "right" | "", "hands": N}}`: a new
+  recording, in which so many hands are looked for;
+- in `{"frame": true}`, then H * W uint16 of amplitude and H * W float32 of depth in metres: out 66
   float64, the joints (21, 3) in metres, not finite where there is no hand; the seconds that it
-  took; the probability of the side; and 1.0 for a right hand, 0.0 for a left one;
-- at first, out `{"ready": {...versions}}` or `{"error": "why not"}`.
+  took; the probability of the side; and 1.0 for a right hand, 0.0 for a left one.
 
-**The image.** MediaPipe was trained on photographs; an amplitude image is what comes nearest: how
-much infrared light comes back. It falls off with the square of the distance, so that a hand before
-a person is bright. The 99th percentile becomes white, the square root of it is taken (a display's
-gamma, roughly), and the picture is enlarged to 640 columns by bicubic interpolation.
+**The image.** MediaPipe was trained on photographs; the amplitude, the infrared light that comes
+back, is what comes nearest. The 99th percentile becomes white, the square root is taken (a
+display's gamma, roughly), and the picture is enlarged to 640 columns.
 
-**The lift.** A landmark's place in the image is MediaPipe's; how much farther from the camera than
-the wrist it is, too, which MediaPipe says in parts of the picture's width and which becomes metres
-by the hand's distance. Where the whole hand is, the depth image says: at each landmark the median
-of 3 x 3 pixels is read, at a tip a little inwards, a joint lies 14 mm below the skin there,
-a tip half of that, and the median of what all 21 say of the hand's distance is taken, so that
-landmarks that are hidden, or beside the hand, do not matter.
-
-What else was tried is in docs/lab/mediapipe.md.
+**The lift.** A landmark's place in the image is MediaPipe's, and so is how much farther than the
+wrist it is, in parts of the picture's width, which becomes metres by the hand's distance. That is
+the median of what 3 x 3 pixels of the depth image say at each landmark, at a tip a little inwards;
+a joint lies 14 mm below the skin, a tip 7. What else was tried: docs/lab/mediapipe.md.
 """
 
 from __future__ import annotations
@@ -34,6 +28,9 @@ import os
 import sys
 import time
 from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
 
 COLUMNS = 640
 WHITE_PERCENTILE = 99.0
@@ -52,17 +49,17 @@ SIDES = {"Left": "right", "Right": "left"}
 """MediaPipe names sides as in a mirrored picture, which these are not."""
 
 
-def picture(amplitude: Any, cv2: Any, np: Any) -> Any:
+def picture(amplitude: np.ndarray) -> np.ndarray:
     """(H, W) uint16 as an 8-bit RGB picture of COLUMNS columns."""
     white = max(float(np.percentile(amplitude, WHITE_PERCENTILE)), 1.0)
-    grey = (255 * np.clip(amplitude / white, 0, 1) ** GAMMA).astype(np.uint8)
+    grey: np.ndarray = (255 * np.clip(amplitude / white, 0, 1) ** GAMMA).astype(np.uint8)
     scale = COLUMNS / grey.shape[1]
     if scale > 1:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     return np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))
 
 
-def lifted(landmarks: Any, depth_m: Any, k: Any, np: Any) -> Any:
+def lifted(landmarks: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
     """Joints (21, 3) in metres; not finite where nothing is read anywhere.
 
     landmarks: (21, 3) x and y in parts of the image's width and height, z of its width.
@@ -73,7 +70,7 @@ def lifted(landmarks: Any, depth_m: Any, k: Any, np: Any) -> Any:
     for tip in TIPS:
         at[tip] += INWARDS * (uv[tip - 1] - uv[tip])
         below[tip] = TIP_BELOW_M
-    read = np.array([_reading(depth_m, u, v, np) for u, v in at]) + below
+    read = np.array([_reading(depth_m, u, v) for u, v in at]) + below
     if not np.isfinite(read).any():
         return np.full((21, 3), np.nan)
     relative = landmarks[:, 2] * width * np.nanmedian(read) / k[0, 0]
@@ -82,7 +79,7 @@ def lifted(landmarks: Any, depth_m: Any, k: Any, np: Any) -> Any:
     return np.concatenate((xy, z[:, None]), axis=1)
 
 
-def _reading(depth_m: Any, u: float, v: float, np: Any) -> float:
+def _reading(depth_m: np.ndarray, u: float, v: float) -> float:
     """The median of the readings in the 3 x 3 pixels about a place, metres; NaN: none."""
     x, y = round(u), round(v)
     patch = depth_m[max(y - 1, 0) : max(y + 2, 0), max(x - 1, 0) : max(x + 2, 0)]
@@ -100,17 +97,15 @@ def chosen(found: Any, side: str) -> tuple[Any, str, float] | None:
     rows = zip(found.multi_hand_landmarks or (), found.multi_handedness or (), strict=True)
     for landmarks, handedness in rows:
         reported = handedness.classification[0]
-        hands.append((landmarks, SIDES[reported.label], float(reported.score)))
-    meant = [hand for hand in hands if side in ("", hand[1])]
-    return max(meant, key=lambda hand: hand[2]) if meant else None
+        if side in ("", SIDES[reported.label]):
+            hands.append((landmarks, SIDES[reported.label], float(reported.score)))
+    return max(hands, key=lambda hand: hand[2], default=None)
 
 
 def serve(source: BinaryIO, sink: BinaryIO) -> None:
     """Answer until the source ends."""
     try:
-        import cv2
         import mediapipe
-        import numpy as np
 
         hands = mediapipe.solutions.hands.Hands
     except (ImportError, AttributeError) as error:
@@ -132,12 +127,12 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         depth_m = np.frombuffer(source.read(4 * height * width), np.float32)
         began = time.perf_counter()
         amplitude, depth_m = amplitude.reshape(height, width), depth_m.reshape(height, width)
-        found = chosen(hand.process(picture(amplitude, cv2, np)), side)
+        found = chosen(hand.process(picture(amplitude)), side)
         answer = np.full(66, np.nan)
         if found is not None:
             landmarks, found_side, probability = found
             places = np.array([(p.x, p.y, p.z) for p in landmarks.landmark])
-            answer[:63] = lifted(places, depth_m, k, np).ravel()
+            answer[:63] = lifted(places, depth_m, k).ravel()
             answer[64:] = probability, float(found_side == "right")
         answer[63] = time.perf_counter() - began
         sink.write(answer.tobytes())

@@ -16,11 +16,10 @@ import numpy as np
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
-from toftrack.evaluation.datasets.base import DataSet, LabelledSequence
-from toftrack.evaluation.measures import Estimates
+from toftrack.evaluation.datasets import FPS, DataSet, LabelledSequence
+from toftrack.evaluation.results import plain, table_of
 from toftrack.evaluation.runs import estimates_of
 from toftrack.evaluation.statistics import figure, interval, mean_of, share_pct
-from toftrack.evaluation.tables import plain, table_of
 from toftrack.evaluation.trust import OK_MM, TIPS, judged, tips_inset, trust
 from toftrack.frames import Truth
 
@@ -47,13 +46,9 @@ def evaluate(
 ) -> dict[str, dict[str, Any]]:
     """Track sequences and compare them with their labels; the figures by the sequences' names.
 
-    Args:
-        overrides: of the tracker's configuration; hand.side among them goes before the data set's.
-        tip_inset_m: as for `tips_inset`.
-        frames: so many at the start of each sequence only.
-
-    Raises:
-        ToftrackError: an override or a file cannot be used.
+    overrides: of the configuration; hand.side among them goes before the data set's.  tip_inset_m:
+    of `tips_inset`.  frames: so many at the start of each sequence only.
+    Raises ToftrackError: an override or a file cannot be used.
     """
     counts = [len(sequence.joints_m[:frames]) for sequence in sequences]
     figures = {}
@@ -61,30 +56,19 @@ def evaluate(
         for sequence, count in zip(sequences, counts, strict=True):
             bar.set_postfix_str(sequence.name, refresh=False)
             if sequence.left_out:
-                bar.write(
-                    f"note: {sequence.name}: {sequence.left_out} labels have no image and are left "
-                    "out",
-                    file=sys.stderr,
-                )
-            found = _tracked(sequence, count, overrides, bar)
+                note = f"{sequence.left_out} labels have no image and are left out"
+                bar.write(f"note: {sequence.name}: {note}", file=sys.stderr)
+            tracker = make_tracker(f"hand.side={sequence.side}", *overrides)
+            reported = []
+            for index in range(count):
+                depth_m, time_s = sequence.frame(index), index / FPS
+                reported.append([tracker.step(depth_m, sequence.camera.K, index, time_s)])
+                bar.update()
+            found = estimates_of(reported)
             joints = tips_inset(found.joints_m, tip_inset_m)[:, list(data_set.joints)]
             true = sequence.joints_m[:count]
             figures[sequence.name] = labelled_figures(joints, found.lost, true, data_set.joints)
     return figures
-
-
-def _tracked(
-    sequence: LabelledSequence, count: int, overrides: Sequence[str], bar: tqdm
-) -> Estimates:
-    """What the tracker says of the first frames."""
-    tracker = make_tracker(f"hand.side={sequence.side}", *overrides)
-    reported = []
-    for index in range(count):
-        depth_m = sequence.frame(index)
-        estimate = tracker.step(depth_m, sequence.camera.K, index, index / sequence.fps)
-        reported.append([estimate])
-        bar.update()
-    return estimates_of(reported)
 
 
 def labelled_figures(
@@ -93,17 +77,8 @@ def labelled_figures(
     """The figures of one sequence, JSON-able, unrounded; None for errors of no frame.
 
     Frames without an estimate (`missing_pct`) are never `within_pct`, where every joint is within
-    40 mm.
-
-    Args:
-        joints_m: (T, J, 3) estimates in metres, with joints as the labels define them; not finite
-            where there is none.
-        lost: (T,) bool.
-        true_m: (T, J, 3) labels in metres.
-        joints: which of toftrack's joints the J are.
-
-    Raises:
-        ToftrackError: the shapes do not fit.
+    40 mm. joints_m, true_m: (T, J, 3) metres, joints as the labels define them, not finite where
+    there is no estimate.  lost: (T,) bool.  joints: which of toftrack's joints the J are.
     """
     every = np.ones(len(true_m), bool)
     frames = judged(joints_m, lost, Truth(true_m, every, every))

@@ -1,4 +1,5 @@
-"""What a measurement of accuracy writes, where it was made, and two of them pair by pair.
+"""What a measurement of accuracy writes, as JSON, text and Markdown, where it was made, and two of
+them pair by pair; rows.py says what the figures are.
 
 A recording's difference is the mean over its seeds of (here - there); the difference of all is the
 mean over recordings, its 90 % interval from resampling the recordings. What all recordings have in
@@ -12,8 +13,7 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,80 @@ import torch
 import toftrack
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.evaluation.image_labels import IMAGE_MEANS
-from toftrack.evaluation.rows import MEANS, Row, by_recording, groups, image_totals, totals
-from toftrack.evaluation.statistics import interval
+from toftrack.evaluation.rows import (
+    MEANS,
+    Row,
+    by_recording,
+    groups,
+    image_totals,
+    interval_name,
+    totals,
+)
+from toftrack.evaluation.statistics import interval, text_of
 from toftrack.json_text import read_json
 from toftrack.safe_files import write_whole
 
 FORMAT = "toftrack accuracy 1"
+COMPARED = (*MEANS, "longest_silent", "never_right", "first_right", *IMAGE_MEANS)
+_COLUMNS = (
+    ("visible", "visible", 0),
+    ("usable %", "usable_pct", 1),
+    ("partly %", "partly_pct", 1),
+    ("silent %", "silent_pct", 1),
+    ("longest", "longest_silent", 0),
+    ("false alarms %", "false_alarm_pct", 1),
+    ("never right", "never_right", 1),
+    ("first right", "first_right", 0),
+    ("mean mm", "mean_all_mm", 1),
+    ("unflagged", "mean_mm", 1),
+    ("usable mm", "usable_mean_mm", 1),
+    ("tips mm", "usable_tip_mm", 1),
+    ("swaps %", "swap_pct", 1),
+    ("jitter mm", "jitter_mm", 2),
+    ("90 % regions", "in_region_90_pct", 1),
+    ("wrong tips", "tips_wrong", 0),
+    ("flagged %", "wrong_flagged_pct", 1),
+    ("right tips", "tips_right", 0),
+    ("right flagged %", "right_flagged_pct", 1),
+    ("gestures %", "gesture_pct", 1),
+    ("side at end %", "side_right_end_pct", 0),
+    ("after 10 %", "side_right_soon_pct", 0),
+    ("certain, wrong %", "side_wrong_certain_pct", 1),
+    ("2nd usable %", "second_usable_pct", 1),
+    ("2nd silent %", "second_silent_pct", 1),
+    ("ghosts %", "ghost_pct", 1),
+    ("ms", "median_ms", 1),
+    ("p90 ms", "p90_ms", 1),
+)
+"""Columns that no row has anything for are left out."""
+_GROUP_COLUMNS = (
+    ("frames", "frames", 0),
+    ("usable %", "usable_pct", 1),
+    ("partly %", "partly_pct", 1),
+    ("silent %", "silent_pct", 1),
+    ("false alarms %", "false_alarm_pct", 1),
+    ("unflagged mm", "mean_mm", 1),
+    ("gestures %", "gesture_pct", 1),
+)
+_IMAGE_COLUMNS = (
+    ("images", "images", 0),
+    ("tips < 20 mm %", "tips_20_pct", 1),
+    ("< 40 mm %", "tips_40_pct", 1),
+    ("wrong, unflagged %", "wrong_pct", 1),
+    ("lost %", "flagged_pct", 1),
+    ("wrong, no flag %", "wrong_no_flag_pct", 1),
+    ("wrong tips", "tips_wrong", 0),
+    ("flagged %", "wrong_flagged_pct", 1),
+    ("right tips", "tips_right", 0),
+    ("right flagged %", "right_flagged_pct", 1),
+    ("tips median mm", "tips_median_mm", 1),
+    ("tips mean mm", "tips_mean_mm", 1),
+    ("found %", "found_pct", 1),
+    ("named rightly %", "named_pct", 1),
+    ("wrong name %", "wrong_name_pct", 1),
+)
+Table = list[list[str]]
+"""Rows of cells, the heads first; the first column is text."""
 
 
 def circumstances() -> dict[str, Any]:
@@ -100,19 +168,25 @@ def read_rows(path: Path) -> list[Row]:
     """The rows of an earlier measurement; ToftrackError where the file is none."""
     what = f"'{path}', to compare with, is nothing that toftrack benchmark accuracy --json wrote"
     with reported_errors(what, "give such a file", OSError, ValueError):
-        rows = rows_of(read_json(path))
+        content = read_json(path)
+        rows = content.get("rows") if isinstance(content, dict) else None
+        if not isinstance(rows, list) or not rows:
+            raise ValueError("it has no 'rows'")
+        for row in rows:
+            _check_row(row)
     return rows
 
 
-def comparison_with(rows: Sequence[Row], others: Sequence[Row], name: str) -> dict[str, Any]:
-    """Paired differences, JSON-able; ToftrackError where the two have nothing in common."""
-    found = compared(rows, others)
-    if not found["pairs"]:
-        raise ToftrackError(
-            f"'{name}' has none of these recordings with one of these seeds, so that nothing can "
-            "be compared; measure the same recordings with the same seeds"
-        )
-    return {"with": name, **found}
+def _check_row(row: Any) -> None:
+    if not isinstance(row, dict) or not isinstance(row.get("recording"), str):
+        raise ValueError("its 'rows' do not name recordings")
+    if type(row.get("seed")) is not int:
+        raise ValueError(f"its row of '{row['recording']}' has no seed")
+    for key in COMPARED:
+        value = row.get(key)
+        number = isinstance(value, int | float) and math.isfinite(value)
+        if value is not None and not number:
+            raise ValueError(f"'{key}' of '{row['recording']}' is no number")
 
 
 def checked_targets(*paths: Path | None) -> None:
@@ -139,26 +213,18 @@ def json_text(result: dict[str, Any]) -> str:
     return f'{head},\n "rows": [\n{rows}\n ]\n}}\n'
 
 
-COMPARED = ("longest_silent", "never_right", "first_right")
-"""What is compared beside the means."""
-
-
 def compared(here: Sequence[Row], there: Sequence[Row]) -> dict[str, Any]:
     """The differences of rows by recording and seed, JSON-able.
 
-    Returns:
-        pairs: recordings with a seed that both have.
-        only_here, only_there: what is left out, in words, "crowd/01_back_turn, seed 2".
-        differences: of each figure that both have, its means over the pairs `here` and `there`, and
-            the `mean` difference (here - there) with its 90 % interval, `low` to `high`, over
-            `recordings`.
+    pairs: recordings with a seed that both have.  only_here, only_there: what is left out, in
+    words, "crowd/01_back_turn, seed 2".  differences: of each figure that both have, its means over
+    the pairs, `here` and `there`, and the `mean` difference (here - there) with its 90 % interval,
+    `low` to `high`, over `recordings`.
     """
-    mine, theirs = (
-        {(row["recording"], row["seed"]): row for row in rows} for rows in (here, there)
-    )
+    mine, theirs = ({(row["recording"], row["seed"]): row for row in of} for of in (here, there))
     common = [pair for pair in mine if pair in theirs]
     differences = {}
-    for key in (*MEANS, *COMPARED, *IMAGE_MEANS):
+    for key in COMPARED:
         both: dict[str, list[tuple[float, float]]] = {}
         for pair in common:
             values = mine[pair].get(key), theirs[pair].get(key)
@@ -167,7 +233,7 @@ def compared(here: Sequence[Row], there: Sequence[Row]) -> dict[str, Any]:
         if both:
             means = np.array([np.mean(values, axis=0) for values in both.values()])
             found = dict(zip(("here", "there"), means.mean(0).tolist(), strict=True))
-            found |= asdict(interval((means[:, 0] - means[:, 1]).tolist()))
+            found |= interval((means[:, 0] - means[:, 1]).tolist())._asdict()
             differences[key] = {name: round(value, 4) for name, value in found.items()}
             differences[key]["recordings"] = len(means)
     return {
@@ -182,19 +248,74 @@ def _named(these: dict[Any, Row], others: dict[Any, Row]) -> list[str]:
     return [f"{name}, seed {seed}" for name, seed in these if (name, seed) not in others]
 
 
-def rows_of(content: Any) -> list[Row]:
-    """The rows of a measurement's JSON; ValueError, a few words, where it is none."""
-    rows = content.get("rows") if isinstance(content, dict) else None
-    if not isinstance(rows, list) or not rows:
-        raise ValueError("it has no 'rows'")
-    for row in rows:
-        if not isinstance(row, dict) or not isinstance(row.get("recording"), str):
-            raise ValueError("its 'rows' do not name recordings")
-        if type(row.get("seed")) is not int:
-            raise ValueError(f"its row of '{row['recording']}' has no seed")
-        for key in (*MEANS, *COMPARED, *IMAGE_MEANS):
-            value = row.get(key)
-            number = isinstance(value, int | float) and math.isfinite(value)
-            if value is not None and not number:
-                raise ValueError(f"'{key}' of '{row['recording']}' is no number")
-    return rows
+def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
+    """By their titles: recordings, labelled images, groups, differences."""
+    tables: dict[str, Table] = {}
+    total = result.get("total")
+    if total:
+        all_of = {**total, "first_right": total["median_first_right"]}
+        table = table_of(_COLUMNS, {**result["each"], "total": all_of}, "recording")
+        shares = [(key, digits) for title, key, digits in _COLUMNS if title in table[0]]
+        table.append(["90 % interval", *(_interval(total, *share) for share in shares)])
+        tables["recordings"] = table
+    shown: dict[str, Any] = {}
+    for name, figures in result.get("images", {}).items():
+        shown[name] = figures
+        shown |= {f"  {of}": row for of, row in figures.get("by", {}).items()}
+    if shown:
+        tables["labelled images"] = table_of(_IMAGE_COLUMNS, shown, "labels")
+    for kind, found in result.get("groups", {}).items():
+        tables[kind] = table_of(_GROUP_COLUMNS, found, kind)
+    if comparison := result.get("comparison"):
+        tables[f"differences to {comparison['with']}"] = difference_table(comparison["differences"])
+    return tables
+
+
+def difference_table(differences: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Here, there, the difference and its interval; marked where that does not hold 0."""
+    table = [["figure", "here", "there", "difference", "90 % interval", "recordings", ""]]
+    for key, of in differences.items():
+        cells = [f"{of[name]:.2f}" for name in ("here", "there")]
+        change = [f"{of['mean']:+.2f}", f"{of['low']:+.2f} to {of['high']:+.2f}"]
+        table.append([key, *cells, *change, str(of["recordings"]), clear_mark(of)])
+    return table
+
+
+def clear_mark(of: Mapping[str, Any]) -> str:
+    """A star for a difference whose interval, over several recordings, does not hold 0."""
+    return "*" if of["recordings"] > 1 and (of["low"] > 0 or of["high"] < 0) else ""
+
+
+def plain(table: Table) -> str:
+    """Columns that line up, without final newline."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = []
+    for row in table:
+        cells = [row[0].ljust(widths[0])]
+        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def markdown(table: Table) -> str:
+    """The same as a table of Markdown."""
+    rule = ["---"] + ["---:"] * (len(table[0]) - 1)
+    return "\n".join(f"| {' | '.join(row)} |" for row in [table[0], rule, *table[1:]])
+
+
+def table_of(
+    columns: Sequence[tuple[str, str, int]], rows: Mapping[str, Mapping[str, Any]], first: str
+) -> Table:
+    """Rows by name; columns (title, key, digits) that no row has anything for are left out."""
+    used = [
+        column for column in columns if any(r.get(column[1]) is not None for r in rows.values())
+    ]
+    table = [[first, *(title for title, _, _ in used)]]
+    for name, row in rows.items():
+        table.append([name, *(text_of(row.get(key), digits) for _, key, digits in used)])
+    return table
+
+
+def _interval(total: Mapping[str, Any], key: str, digits: int) -> str:
+    ends = total.get(interval_name(key))
+    return "" if ends is None else f"{text_of(ends[0], digits)}..{text_of(ends[1], digits)}"

@@ -59,7 +59,7 @@ _MIDDLE = (0, 9, 10, 11, 12)
 """The joints from the wrist to the middle finger's tip."""
 
 
-def row_figures(found: MeasuredRecording, compute_s: np.ndarray | None = None) -> Row:
+def row_figures(found: MeasuredRecording, compute_s: np.ndarray) -> Row:
     """The figures of a row.  compute_s: (T,) seconds of each frame; NaN where nobody says."""
     first = found.first
     figures = _figures_of_hand(first) | {
@@ -74,7 +74,7 @@ def row_figures(found: MeasuredRecording, compute_s: np.ndarray | None = None) -
         figures |= {f"second_{name}": second[name] for name in ("usable_pct", "silent_pct")}
     if found.ghost_pct is not None:
         figures["ghost_pct"] = found.ghost_pct
-    known = compute_s[np.isfinite(compute_s)] if compute_s is not None else np.ones(0)
+    known = compute_s[np.isfinite(compute_s)]
     if len(known):
         figures["median_ms"] = 1e3 * float(np.median(known))
         figures["p90_ms"] = 1e3 * float(np.percentile(known, 90))
@@ -110,21 +110,11 @@ def _figures_of_hand(of: Measured) -> Row:
 def group_counts(
     of: Measured, truth: Truth, sensor: str, length_mm: float | None
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """By kind of group and group: the visible frames of a row, and what they are.
-
-    Args:
-        sensor: what camera it was.
-        length_mm: of the hand, wrist to middle fingertip; None: by the truth.
-    """
-    flags = {
-        "usable": of.frames.usable,
-        "partly": of.frames.partly,
-        "silent": of.frames.silent,
-        "false_alarm": of.frames.false_alarm,
-        "named": of.named,
-        "called_right": of.called,
-        "said": of.frames.seen & of.frames.said,
-    }
+    """By kind of group and group: the visible frames of a row, and what they are.  length_mm: of
+    the hand, wrist to middle fingertip; None: by the truth."""
+    kinds = [share.removesuffix("_pct") for share in SHARES]
+    flags = {kind: getattr(of.frames, kind) for kind in kinds}
+    flags |= {"named": of.named, "called_right": of.called, "said": of.frames.seen & of.frames.said}
     distance = np.asarray(truth.joints_m, np.float64)[:, :, 2].mean(1)
     length = _length_mm(truth) if length_mm is None else length_mm
     poses = np.full(len(distance), "") if truth.pose_name is None else truth.pose_name
@@ -138,13 +128,10 @@ def group_counts(
     for kind, names in of_frames.items():
         for name in sorted(set(names[of.frames.seen].tolist()) - {""}):
             rows = of.frames.seen & (names == name)
-            mine = {flag: int((values & rows).sum()) for flag, values in flags.items()}
-            error = float(of.frames.mean_mm[rows & of.frames.said].sum())
-            counts.setdefault(kind, {})[name] = {
-                "frames": int(rows.sum()),
-                **mine,
-                "error_sum_mm": round(error, 3),
-            }
+            mine: dict[str, float] = {"frames": int(rows.sum())}
+            mine |= {flag: int((values & rows).sum()) for flag, values in flags.items()}
+            mine["error_sum_mm"] = round(float(of.frames.mean_mm[rows & of.frames.said].sum()), 3)
+            counts.setdefault(kind, {})[name] = mine
     return counts
 
 
@@ -159,11 +146,10 @@ def by_recording(rows: Sequence[Row]) -> dict[str, Row]:
             for key, value in row.items()
             if key not in _POOLED and (value is None or isinstance(value, int | float))
         )
-        each[name] = {key: mean_of([row.get(key) for row in mine]) for key in keys}
+        each[name] = {key: rounded(mean_of([row.get(key) for row in mine])) for key in keys}
         runs = [row["longest_silent"] for row in mine if row.get("longest_silent") is not None]
         if runs:
             each[name]["longest_silent"] = max(runs)
-        each[name] = {key: rounded(value) for key, value in each[name].items()}
         each[name] |= flag_figures(mine)
     return each
 
@@ -187,8 +173,7 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _means(each: Sequence[Row], keys: Sequence[str]) -> dict[str, Any]:
-    """Of recordings, with intervals; those of one recording say nothing, and are given of shares
-    alone, which others count on."""
+    """Of recordings, with intervals; of one recording, of shares alone."""
     found: dict[str, Any] = {}
     for key in keys:
         values = [row[key] for row in each if row.get(key) is not None]
@@ -268,9 +253,8 @@ def _length_mm(truth: Truth) -> float:
 
 def _band(value: float, ends: Sequence[float], unit: str) -> str:
     """Which band a value is in."""
-    for low, high in zip((None, *ends), (*ends, None), strict=True):
-        if high is None:
-            return f"{low:g} {unit} and more"
-        if value < high:
-            return f"below {high:g} {unit}" if low is None else f"{low:g} to {high:g} {unit}"
-    raise AssertionError
+    above = sum(not value < end for end in ends)  # a length that is not known is above all
+    if above == 0:
+        return f"below {ends[0]:g} {unit}"
+    low = ends[above - 1]
+    return f"{low:g} {unit} and more" if low == ends[-1] else f"{low:g} to {ends[above]:g} {unit}"

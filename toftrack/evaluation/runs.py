@@ -22,7 +22,7 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.evaluation.image_labels import Points, Stills, point_rows, read_labels, still_row
 from toftrack.evaluation.measures import Estimates, measured
-from toftrack.evaluation.peer import Peer, PeerEstimate, peer_process
+from toftrack.evaluation.peer import PEER, PeerEstimate, peer_process
 from toftrack.evaluation.rows import Row, group_counts, row_figures
 from toftrack.frames import Truth
 from toftrack.recordings.npz import read_recording
@@ -39,15 +39,13 @@ _SIDE_FIELDS = ("side", "side_probability")
 class Source:
     """A recording that can be measured.
 
-    name: what it is called, its folder's name and its own.  frames: how many it has.
-    labels: the file with labels of its images; None: it has truth.
-    amplitude: whether it has amplitude images.
+    name: its folder's name and its own.  labels: of its images; None: it has truth.
     """
 
     path: Path
     name: str
     frames: int
-    labels: Path | None = None
+    labels: Points | Stills | None = None
     amplitude: bool = False
 
 
@@ -55,16 +53,15 @@ class Source:
 class Job:
     """A recording to be tracked with a seed.
 
-    side: of SIDES.  overrides: of the tracker.
-    peer: name and Python of another method that says what it sees in the same frames, in turn with
-        the tracker; None: there is none.
+    side: of SIDES.  overrides: of the tracker.  peer: the Python of MediaPipe, which says what it
+    sees in the same frames, in turn with the tracker; None: without it.
     """
 
     source: Source
     seed: int
     side: str = "told"
     overrides: tuple[str, ...] = ()
-    peer: tuple[str, str] | None = None
+    peer: str | None = None
 
 
 def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> list[Source]:
@@ -86,7 +83,7 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
             )
         found += mine
     for one in known:
-        if not any(source.labels == one.path for source in found):
+        if not any(source.labels is one for source in found):
             raise ToftrackError(
                 f"the labels '{one.path}' are of images of {one.size[0]} x {one.size[1]} pixels, "
                 "which no recording without truth has; give the recording that was labelled"
@@ -119,7 +116,7 @@ def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
                 f"'{fitting[0].path}' and '{fitting[1].path}' could both be the labels of "
                 f"'{file}'; give one of them at a time"
             )
-        return Source(file, name, count, fitting[0].path) if fitting else None
+        return Source(file, name, count, fitting[0]) if fitting else None
     finally:
         recording.close()
 
@@ -129,19 +126,16 @@ def jobs(
     seeds: Sequence[int],
     side: str,
     overrides: Sequence[str],
-    peer: tuple[str, str] | None = None,
+    peer: str | None = None,
 ) -> list[Job]:
-    """Every recording with every seed; the peer, which has none, beside the first.
-
-    Raises ToftrackError for a recording without amplitude, where there is a peer.
-    """
-    if peer is not None:
-        for one in found:
-            if not one.amplitude:
-                raise ToftrackError(
-                    f"'{one.path}' has no amplitude image, which --peer {peer[0]} needs; leave "
-                    "the recording out, or --peer"
-                )
+    """Every recording with every seed; the peer, which has none, beside the first. Raises
+    ToftrackError for a recording without amplitude, where there is a peer."""
+    for one in found if peer is not None else ():
+        if not one.amplitude:
+            raise ToftrackError(
+                f"'{one.path}' has no amplitude image, which --peer {PEER} needs; leave "
+                "the recording out, or --peer"
+            )
     given = tuple(overrides)
     return [
         Job(one, seed, side, given, peer if seed == seeds[0] else None)
@@ -151,10 +145,7 @@ def jobs(
 
 
 def run_jobs(todo: Sequence[Job], workers: int, words: str = "") -> Iterator[list[Row]]:
-    """Run all of them; the rows of each, in any order.
-
-    Raises ToftrackError, also of a worker.
-    """
+    """Run all of them; the rows of each, in any order. Raises ToftrackError, also of a worker."""
     total = sum(job.source.frames for job in todo)
     here = workers == 1 or len(todo) < 2
     finished = ((job, rows_of_job(job)) for job in todo) if here else _in_processes(todo, workers)
@@ -192,31 +183,34 @@ def _begin_worker() -> None:
 
 def rows_of_job(job: Job) -> list[Row]:
     """Track a recording: one row, or one for each labelled image."""
-    if job.source.labels is None:
-        return _true_rows(job)
-    labels = read_labels(job.source.labels)
-    rows = _stills(job, labels) if isinstance(labels, Stills) else _points(job, labels)
-    return [{"recording": name, "seed": job.seed, **figures} for name, figures in rows]
-
-
-def _true_rows(job: Job) -> list[Row]:
-    """A row of the tracker, and one of the peer, if there is one."""
     with Replay(job.source.path) as device:
-        truth = device.truth
-        assert truth is not None
-        if job.side == "told" and not truth.side:
-            raise ToftrackError(
-                f"'{job.source.path}' does not say whose hand it shows ('side' in its metadata), "
-                "and so no side can be given; give --side auto"
-            )
-        peer = None if job.peer is None else peer_process(*job.peer)
-        if peer is not None:
-            peer.begin(device.camera, truth.side if job.side == "told" else "")
-        reported, others = _tracked(device, job, truth.side, peer)
+        labels = job.source.labels
+        if labels is None:
+            return _true_rows(job, device)
+        if isinstance(labels, Stills):
+            rows = _stills(job, device, labels)
+        else:
+            rows = _points(job, device, labels)
+        return [
+            {"recording": f"{job.source.name}#{number:04d}", "seed": job.seed, **figures}
+            for number, figures in rows
+        ]
+
+
+def _true_rows(job: Job, device: Replay) -> list[Row]:
+    """A row of the tracker, and one of the peer, if there is one."""
+    truth = device.truth
+    assert truth is not None
+    if job.side == "told" and not truth.side:
+        raise ToftrackError(
+            f"'{job.source.path}' does not say whose hand it shows ('side' in its metadata), "
+            "and so no side can be given; give --side auto"
+        )
+    reported, others = _tracked(device, job, truth.side)
     rows = [_row(job, device, truth, reported, FIELDS)]
-    if peer is not None:
+    if others:
         of_peer = _row(job, device, truth, [(one,) for one in others], _PEER_FIELDS)
-        rows.append({"method": peer.name, **of_peer})
+        rows.append({"method": PEER, **of_peer})
     return rows
 
 
@@ -246,9 +240,12 @@ def _row(
 
 
 def _tracked(
-    device: Replay, job: Job, side: str, peer: Peer | None = None
+    device: Replay, job: Job, side: str
 ) -> tuple[list[tuple[Estimate, ...]], list[PeerEstimate]]:
-    """What the tracker says of each frame, and what a peer says after it."""
+    """What the tracker says of each frame, and what the peer, if there is one, says after it."""
+    peer = None if job.peer is None else peer_process(job.peer)
+    if peer is not None:
+        peer.begin(device.camera, side if job.side == "told" else "")
     tracker = _tracker(job, side)
     reported: list[tuple[Estimate, ...]] = []
     others: list[PeerEstimate] = []
@@ -264,10 +261,8 @@ def _tracked(
 def estimates_of(
     reported: Sequence[Sequence[Estimate | PeerEstimate]], fields: Sequence[str] = FIELDS
 ) -> Estimates:
-    """What was said in T frames of each slot; with one slot without its axis.
-
-    fields: which of those of Estimates the reported ones have.
-    """
+    """What was said in T frames of each slot, by those fields of Estimates that the reported ones
+    have; with one slot without its axis."""
 
     def column(name: str) -> np.ndarray:
         values = np.array([[getattr(one, name) for one in frame] for frame in reported])
@@ -276,28 +271,25 @@ def estimates_of(
     return Estimates(**{name: column(name) for name in fields})
 
 
-def _points(job: Job, labels: Points) -> Iterator[tuple[str, dict[str, Any]]]:
-    with Replay(job.source.path) as device:
-        reported, _ = _tracked(device, job, labels.side)
-        _expect_one_hand(reported[0])
-        track = estimates_of(reported)
-        assert track.joint_ok is not None
-        rows = point_rows(labels, track.joints_m, track.lost, track.joint_ok, device.camera.K)
+def _points(job: Job, device: Replay, labels: Points) -> Iterator[tuple[int, Row]]:
+    reported, _ = _tracked(device, job, labels.side)
+    _expect_one_hand(reported[0])
+    track = estimates_of(reported)
+    assert track.joint_ok is not None
+    rows = point_rows(labels, track.joints_m, track.lost, track.joint_ok, device.camera.K)
     for number, figures in rows.items():
-        yield f"{job.source.name}#{number:04d}", {"kind": "points", **figures}
+        yield number, {"kind": "points", **figures}
 
 
-def _stills(job: Job, labels: Stills) -> Iterator[tuple[str, dict[str, Any]]]:
-    with Replay(job.source.path) as device:
-        for number, (frame, shown) in enumerate(zip(device, labels.images, strict=True)):
-            depth = device.camera.rectify(frame.depth, frame.radial)
-            tracker = _tracker(job, labels.side)
-            for index in range(labels.shown_frames):
-                reported = tracker.step(depth, device.camera.K, index, index / device.fps)
-            _expect_one_hand(reported)
-            figures = still_row(reported[0].gesture, reported[0].lost, labels.called[shown])
-            about = {"kind": "stills", "shown": shown, "gesture": reported[0].gesture}
-            yield f"{job.source.name}#{number:04d}", about | figures
+def _stills(job: Job, device: Replay, labels: Stills) -> Iterator[tuple[int, Row]]:
+    for number, (frame, shown) in enumerate(zip(device, labels.images, strict=True)):
+        depth = device.camera.rectify(frame.depth, frame.radial)
+        tracker = _tracker(job, labels.side)
+        for index in range(labels.shown_frames):
+            reported = tracker.step(depth, device.camera.K, index, index / device.fps)
+        _expect_one_hand(reported)
+        figures = still_row(reported[0].gesture, reported[0].lost, labels.called[shown])
+        yield number, {"kind": "stills", "shown": shown, "gesture": reported[0].gesture, **figures}
 
 
 def _expect_one_hand(reported: Sequence[Estimate]) -> None:

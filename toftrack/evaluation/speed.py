@@ -13,10 +13,11 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +30,6 @@ from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.results import processor
 from toftrack.hand.shape import default_hand_shape
-from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import fit_pose_space
 from toftrack.recordings.store import open_source
 from toftrack.render.reference import ReferenceScorer
@@ -50,52 +50,47 @@ PARTS = (
     "refinement",
     "rest",
 )
-"""What a frame's time is spent on. Of the networks, which look in another thread where there is a
-second core, only what is waited for counts."""
+"""What a frame's time is spent on; of the networks, which have a thread, what is waited for."""
 _SLOW_PARTICLES = 300
 """The baselines are not timed with more particles than this."""
 _MOST_REPEATS = 200
 _MARGIN_PX = 12
+_LATENTS = 10_000
 _FEWEST_FRAMES, _STARTS = 12, 6
 _BODY_M, _WALL_M = 0.9, 1.5
 """From where on the packaged recording shows the body, and where the wall is."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of a table, times in milliseconds.
+Row = dict[str, Any]
+"""One line of a table, times in milliseconds; JSON-able.
 
-    table: "scoring" (from states to counts), "decoding" (from latents to angles) or "whole frame".
-    method: a back end or baseline, a pose space, or a configuration; ", start" says that the hand
-        was looked for anew in every frame, ", searching" that moreover there was none, but the
-        person and the room.
-    count: hypotheses, latents or particles.
-    pixels: of the image; None where there is none.
-    parts: of a frame, what is spent on each of PARTS.
-    """
-
-    table: str
-    method: str
-    count: int
-    pixels: int | None
-    min_ms: float
-    median_ms: float
-    repeats: int
-    parts: dict[str, float] = field(default_factory=dict)
+table: "scoring" (from states to counts), "decoding" (from latents to angles) or "whole frame".
+method: a back end or baseline, a pose space, or a configuration; ", start" says that the hand was
+    looked for anew in every frame, ", searching" that moreover there was none, but the person and
+    the room.
+count: hypotheses, latents or particles.  pixels: of the image; None where there is none.
+parts: of a frame, what is spent on each of PARTS.
+"""
 
 
 def _row(table: str, method: str, count: int, pixels: int | None, seconds: Sequence[float]) -> Row:
-    least, median = 1e3 * min(seconds), 1e3 * statistics.median(seconds)
-    return Row(table, method, count, pixels, least, median, len(seconds))
+    return {
+        "table": table,
+        "method": method,
+        "count": count,
+        "pixels": pixels,
+        "min_ms": 1e3 * min(seconds),
+        "median_ms": 1e3 * statistics.median(seconds),
+        "repeats": len(seconds),
+        "parts": {},
+    }
 
 
 def interleaved(
     calls: Mapping[str, Callable[[], object]], seconds: float, device: torch.device
 ) -> dict[str, list[float]]:
-    """Seconds of each call, timed in turn; slow ones have fewer repeats, in the first rounds.
-
-    seconds: how long to time each.
-    """
+    """Seconds of each call, timed in turn for so long each; slow ones have fewer repeats, in the
+    first rounds."""
 
     def timed(call: Callable[[], object]) -> float:
         began = time.perf_counter()
@@ -133,41 +128,35 @@ def sample_evidence() -> tuple[Evidence, Tensor]:
     return evidence.cropped(left, top, right, bottom), wrist
 
 
-def filter_states(n: int, wrist: Tensor, seed: int = 0) -> Tensor:
+def filter_states(n: int, wrist: Tensor) -> Tensor:
     """(N, 27) open palms at the wrist's position, spread by 1 cm and by 0.1 rad an angle."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     states = torch.zeros(n, 27)
     states[:, :3] = wrist
     spread = torch.tensor([0.01] * 3 + [0.1] * 24)
     return states + spread * torch.randn(n, 27, generator=generator)
 
 
-def methods(device: torch.device, baselines: bool) -> tuple[dict[str, Scorer], list[str]]:
-    """What can score hypotheses on a device, and notes on why others do not."""
+def score_times(
+    particles: Sequence[int], seconds: float, device: torch.device, baselines: bool
+) -> tuple[list[Row], list[str]]:
+    """By the number of particles, the baselines at few of them, and notes on why a back end does
+    not score on this device."""
     shape = default_hand_shape().to(device)
     chunk = 4 if device.type == "cpu" else 128  # hypotheses whose images suit the cache
-    found: dict[str, Scorer] = {}
+    scorers: dict[str, Scorer] = {}
     notes = []
     for name in BASELINES if baselines else ():
-        found[name] = ReferenceScorer(shape, chunk, name == "stepping")
+        scorers[name] = ReferenceScorer(shape, chunk, name == "stepping")
     for name in BACK_ENDS:
         if name == "numba" and device.type == "cuda":
             continue  # it would measure the way to the CPU and back
         try:
-            found[name] = make_scorer(name, shape, device)
+            scorers[name] = make_scorer(name, shape, device)
         except ToftrackError as error:
             notes.append(f"{name}: {error}")
-    return found, notes
-
-
-def score_times(
-    scorers: Mapping[str, Scorer], particles: Sequence[int], seconds: float, device: torch.device
-) -> list[Row]:
-    """By the number of particles, the baselines at few of them."""
     found, wrist = sample_evidence()
-    images = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "radius_px"}
-    evidence = replace(found, **{name: image.to(device) for name, image in images.items()})
-    rows: list[Row] = []
+    evidence, rows = found.to(device), []
     for n in particles:
         states = filter_states(n, wrist).to(device)
         calls = {
@@ -175,44 +164,26 @@ def score_times(
             for name, scorer in scorers.items()
             if name not in BASELINES or n <= _SLOW_PARTICLES
         }
-        times = interleaved(calls, seconds, device)
-        pixels = evidence.hand.numel()
+        times, pixels = interleaved(calls, seconds, device), evidence.hand.numel()
         rows += [_row("scoring", name, n, pixels, took) for name, took in times.items()]
-    return rows
+    return rows, notes
 
 
-def decode_times(
-    spaces: Mapping[str, PoseSpace], count: int, seconds: float, device: torch.device
-) -> list[Row]:
-    """Time the decoding of `count` latents drawn from the box of each space, in turn."""
-
-    def decoding(space: PoseSpace) -> Callable[[], object]:
-        space = space.to(device)
+def decode_times(seconds: float, device: torch.device) -> list[Row]:
+    """The decoding of latents drawn from the box of each space."""
+    calls: dict[str, Callable[[], object]] = {}
+    for kind in SPACES:
+        space = fit_pose_space(kind, 4).to(device)
         generator = torch.Generator(device).manual_seed(0)
-        unit = torch.rand(count, space.dims, generator=generator, device=device)
-        latent = space.lower + unit * (space.upper - space.lower)
-        return lambda: space.decode(latent)
-
-    calls = {name: decoding(space) for name, space in spaces.items()}
+        unit = torch.rand(_LATENTS, space.dims, generator=generator, device=device)
+        calls[kind] = partial(space.decode, space.lower + unit * (space.upper - space.lower))
     times = interleaved(calls, seconds, device)
-    return [_row("decoding", name, count, None, found) for name, found in times.items()]
+    return [_row("decoding", name, _LATENTS, None, found) for name, found in times.items()]
 
 
-def frame_times(seconds: float, compute: str, particles: Sequence[int] = ()) -> Iterator[Row]:
-    """Whole frames of the packaged recording, rectification included, capture and drawing not.
-
-    seconds: how long to time each configuration.
-    particles: numbers of them to time the first configuration with besides its own.
-    """
-    first = next(iter(CONFIGURATIONS))
-    for name, overrides in CONFIGURATIONS.items():
-        yield from _frames(name, [*overrides, f"compute={compute}"], seconds)
-    for n in particles:
-        overrides = (*CONFIGURATIONS[first], f"filter.particles={n}", f"compute={compute}")
-        yield _frames(f"{first}, {n}", overrides, seconds)[0]
-
-
-def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
+def frame_times(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
+    """Whole frames of the packaged recording, rectification included, capture and drawing not: as
+    they are tracked, with a start in each, and with a search in each."""
     tracker = make_tracker(*overrides)
     with make_device("device=sample") as device:
         camera, frames = device.camera, [(frame.depth, frame.radial) for frame in device]
@@ -236,7 +207,7 @@ def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
             part: 1e3 * statistics.median(spent.get(part, 0.0) for _, spent in found)
             for part in PARTS
         }
-        return replace(_row("whole frame", what, n, pixels, [t for t, _ in found]), parts=parts)
+        return _row("whole frame", what, n, pixels, [t for t, _ in found]) | {"parts": parts}
 
     starts = [step(index, anew=True) for index in range(_STARTS)]
     step(_STARTS)
@@ -264,10 +235,8 @@ def _frames(name: str, overrides: Sequence[str], seconds: float) -> list[Row]:
 def enlarged(
     camera: Camera, frames: Sequence[tuple[np.ndarray, bool]], size: tuple[int, int]
 ) -> tuple[Camera, list[tuple[np.ndarray, bool]]]:
-    """A camera and its frames (depth, radial) as of a camera with so many columns and rows.
-
-    The image is in the middle of the larger one, each pixel repeated, with the wall around it.
-    """
+    """A camera and its frames (depth, radial) as of one with so many columns and rows: the image is
+    in the middle of the larger one, each pixel repeated, with the wall around it."""
     scale = min(size[0] / camera.width, size[1] / camera.height)
     left, top = (
         (of - round(scale * side)) // 2
@@ -291,21 +260,19 @@ def enlarged(
 def run(
     particles: Sequence[int], compute: str, seconds: float, frames: bool, baselines: bool
 ) -> dict[str, object]:
-    """Measure everything; returns what --json writes.
-
-    Raises ToftrackError where there is no such device.
-    """
+    """Measure everything; returns what --json writes. Raises ToftrackError: no such device."""
     if compute == "cuda" and not torch.cuda.is_available():
         raise ToftrackError("there is no CUDA device here; give --compute cpu")
     device = torch.device(compute)
-    scorers, notes = methods(device, baselines)
-    rows = score_times(scorers, particles, seconds, device)
+    rows, notes = score_times(particles, seconds, device, baselines)
     if frames:
+        for name, overrides in CONFIGURATIONS.items():
+            rows += frame_times(name, [*overrides, f"compute={compute}"], seconds)
         # On the CPU so many as the table's take seconds; there the configuration's say enough.
-        rows += frame_times(seconds, compute, particles if compute == "cuda" else ())
-    rows += decode_times(
-        {kind: fit_pose_space(kind, 4) for kind in SPACES}, 10_000, seconds, device
-    )
+        for n in particles if compute == "cuda" else ():
+            given = (f"filter.particles={n}", f"compute={compute}")
+            rows.append(frame_times(f"default, {n}", given, seconds)[0])
+    rows += decode_times(seconds, device)
     return {
         "machine": {
             "processor": processor(),
@@ -314,7 +281,7 @@ def run(
             "torch": torch.__version__,
             "device": torch.cuda.get_device_name() if compute == "cuda" else "cpu",
         },
-        "rows": [asdict(row) for row in rows],
+        "rows": rows,
         "notes": notes,
     }
 

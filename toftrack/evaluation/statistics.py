@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+_DRAWS = 2000
 
-@dataclass(frozen=True)
-class Share:
+
+class Interval(NamedTuple):
     """A mean over recordings with its 90 % bootstrap interval."""
 
     mean: float
@@ -18,12 +18,12 @@ class Share:
     high: float
 
 
-def interval(values: Sequence[float], draws: int = 2000, seed: int = 0) -> Share:
+def interval(values: Sequence[float]) -> Interval:
     """The mean over recordings, with the interval from resampling the recordings."""
     known = np.asarray(values, np.float64)
-    rng = np.random.default_rng(seed)
-    low, high = np.percentile(rng.choice(known, (draws, len(known))).mean(1), (5, 95))
-    return Share(mean=float(known.mean()), low=float(low), high=float(high))
+    rng = np.random.default_rng(0)
+    low, high = np.percentile(rng.choice(known, (_DRAWS, len(known))).mean(1), (5, 95))
+    return Interval(float(known.mean()), float(low), float(high))
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:

@@ -47,45 +47,45 @@ _MISS_M = 0.1
 
 @dataclass(frozen=True)
 class Trust:
-    """The figures of one track of one hand, see the head of this module. Shares in per cent."""
+    """The figures of one track of one hand, see the head of this module. Shares in per cent.
+
+    visible: frames that show the hand.  longest_silent: frames of the longest run.
+    mean_mm: mean joint error over visible frames that are not flagged lost; None: there are none.
+    mean_all_mm: the same over all visible frames; one frame counts for at most a metre.
+    first_right: the frame from which the track is right for the first time; None: never.
+    found_after: each time that the hand becomes visible again, frames until the track is right.
+    """
 
     frames: int
     visible: int
-    """How many show the hand."""
     usable_pct: float
     partly_pct: float
     false_alarm_pct: float
     silent_pct: float
     longest_silent: int
-    """Frames of the longest run of silently wrong ones."""
     mean_mm: float | None
-    """Mean joint error over visible frames that are not flagged lost; None: there are none."""
     mean_all_mm: float | None
-    """The same over all visible frames; one frame counts for at most a metre."""
     first_right: int | None
-    """From which frame on the track is right for the first time; None: never."""
     found_after: tuple[int | None, ...]
-    """For each time that the hand becomes visible again: frames until the track is right."""
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """What each of T frames is, see the head of this module: (T,) bool, but for the errors."""
+    """What each of T frames is, see the head of this module: (T,) bool, but for the errors.
+
+    seen: the hand is visible.  there: there is an estimate.  said: one that is not flagged lost.
+    error_mm: (T, J) of `joint_errors_mm`.  mean_mm: (T,) their means.
+    """
 
     seen: np.ndarray
-    """The hand is visible."""
     there: np.ndarray
-    """There is an estimate."""
     said: np.ndarray
-    """There is an estimate that is not flagged lost."""
     usable: np.ndarray
     partly: np.ndarray
     false_alarm: np.ndarray
     silent: np.ndarray
     error_mm: np.ndarray
-    """(T, J) joint errors; of estimates that are not finite, those to a point a kilometre away."""
     mean_mm: np.ndarray
-    """(T,) their means."""
 
 
 def trust(of: Judged) -> Trust:
@@ -111,13 +111,8 @@ def trust(of: Judged) -> Trust:
 def judged(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> Judged:
     """What each frame of a track is.
 
-    Args:
-        joints_m: (T, J, 3) estimates in metres, camera frame; not finite where there is none.
-        lost: (T,) bool.
-        truth: of the same T frames and J joints, which need not be all 21.
-
-    Raises:
-        ToftrackError: estimates and truth differ in shape.
+    joints_m: (T, J, 3) metres, camera frame, not finite where there is none; J need not be 21.
+    lost: (T,) bool.  Raises ToftrackError: estimates and truth differ in shape.
     """
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
     _check(estimate.shape, lost.shape, truth)
@@ -148,8 +143,7 @@ def joint_errors_mm(joints_m: np.ndarray, truth: Truth) -> tuple[np.ndarray, np.
 
 
 def tips_inset(joints_m: np.ndarray, inset_m: float) -> np.ndarray:
-    """Joints (T, 21, 3) with the fingertips where other labels have them: so many metres inwards,
-    along the last bone towards the joint before."""
+    """Joints (T, 21, 3) with the fingertips, as labels have them, inwards along the last bone."""
     moved = np.array(joints_m, np.float64)
     for tip in TIPS:
         inwards = moved[:, tip - 1] - moved[:, tip]
@@ -161,18 +155,11 @@ def tips_inset(joints_m: np.ndarray, inset_m: float) -> np.ndarray:
 def slots_of_hands(
     joints_m: np.ndarray, lost: np.ndarray, hands: Sequence[Truth]
 ) -> tuple[int, ...]:
-    """The slot of each hand.
-
-    Each true hand has one slot for the whole recording, so that the sum of errors is smallest; a
+    """The slot of each hand: one for the whole recording, so that the sum of errors is smallest; a
     swap on the way counts as error.
 
-    Args:
-        joints_m: (T, S, J, 3) metres, camera frame.
-        lost: (T, S) bool.
-        hands: at most S.
-
-    Raises:
-        ToftrackError: as `judged`, or there are no slots, or fewer than hands.
+    joints_m: (T, S, J, 3) metres, camera frame.  lost: (T, S) bool.
+    Raises ToftrackError: as `judged`, or there are no slots, or fewer than hands.
     """
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
     fits = estimate.ndim == 4 and lost.shape == estimate.shape[:2]
@@ -197,10 +184,8 @@ def lingering(visible: np.ndarray, frames: int) -> np.ndarray:
 
 
 def runs(flags: np.ndarray, length: int, cut: bool = False) -> np.ndarray:
-    """(T,) bool: the frame and those after it, `length` together, are all true.
-
-    cut: whether at the end of the recording fewer will do.
-    """
+    """(T,) bool: the frame and those after it, `length` together (with `cut`, fewer at the end of
+    the recording), are all true."""
     longer = np.concatenate([flags, np.full(length - 1, cut)])
     steady: np.ndarray = np.all([longer[i : i + len(flags)] for i in range(length)], axis=0)
     return steady

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.errors import ToftrackError
-from toftrack.evaluation.measures import REGION_FIGURES, Estimates, Measured, measured
-from toftrack.evaluation.metrics import evaluate
+from toftrack.evaluation.measures import REGION_FIGURES, Estimates, Measured, evaluate, measured
 from toftrack.evaluation.statistics import text_of
 from toftrack.frames import Truth
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape

@@ -82,7 +82,7 @@ def _alternating(arguments: Sequence[str]) -> None:
 
 def _accuracy(arguments: Sequence[str]) -> None:
     from toftrack.evaluation import accuracy
-    from toftrack.evaluation.peer import PEERS
+    from toftrack.evaluation.peer import PEER
     from toftrack.evaluation.runs import SIDES
 
     parser = _parser_of_recordings("accuracy", accuracy.__doc__)
@@ -94,7 +94,7 @@ def _accuracy(arguments: Sequence[str]) -> None:
     add = parser.add_argument
     add("--labels", type=Path, metavar="FILE", action="append", default=[], help=about)
     parser.add_argument("--compare", type=Path, metavar="FILE", help="an earlier --json")
-    parser.add_argument("--peer", choices=PEERS, help="measure another method, too")
+    parser.add_argument("--peer", choices=(PEER,), help="measure another method, too")
     parser.add_argument("--peer-python", type=Path, metavar="PYTHON", help="of its environment")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the shares there (.png)")
     command = shlex.join(["toftrack", "benchmark", "accuracy", *arguments])
@@ -102,9 +102,9 @@ def _accuracy(arguments: Sequence[str]) -> None:
 
 
 def _ablation(arguments: Sequence[str]) -> None:
-    from toftrack.evaluation import ablation
+    from toftrack.evaluation import accuracy
 
-    known = list(ablation.VARIANTS)
+    known = list(accuracy.VARIANTS)
 
     def variants(text: str) -> list[str]:
         names = text.split(",")
@@ -114,11 +114,11 @@ def _ablation(arguments: Sequence[str]) -> None:
                 raise ToftrackError(f"there is no variant '{name}'; give some of {some}")
         return names
 
-    parser = _parser_of_recordings("ablation", ablation.__doc__)
+    parser = _parser_of_recordings("ablation", accuracy.ABLATION)
     about = f"only some, separated by commas: {', '.join(known)}"
     parser.add_argument("--variants", type=variants, default=known, metavar="NAMES", help=about)
     command = shlex.join(["toftrack", "benchmark", "ablation", *arguments])
-    ablation.measure(parser.parse_intermixed_args(arguments), command)
+    accuracy.ablate(parser.parse_intermixed_args(arguments), command)
 
 
 def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentParser:

@@ -7,8 +7,7 @@ import json
 from collections.abc import Sequence
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.evaluation.datasets import DATA_SETS, open_data_set
-from toftrack.evaluation.datasets.base import LabelledSequence
+from toftrack.evaluation.datasets import DATA_SETS, LabelledSequence, open_data_set
 from toftrack.evaluation.public import evaluate, table, totals
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.safe_files import write_whole

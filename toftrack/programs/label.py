@@ -30,8 +30,7 @@ from toftrack.configuration.compose import (
 )
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError
-from toftrack.evaluation import label_frames
-from toftrack.evaluation.labelling import LabelFile, chosen_frames
+from toftrack.evaluation.labelling import LabelFile, chosen_frames, label_frames, track
 from toftrack.evaluation.results import checked_targets
 from toftrack.gestures.recognition import Gestures
 from toftrack.output.web.server import ANY_PORT
@@ -105,7 +104,7 @@ def _page(device: Device, config: DictConfig, path: Path, options: argparse.Name
     if device.truth is not None:
         note = "has truth, by which the benchmark measures, and not by labels"
         print(f"note: '{path}' {note}", file=sys.stderr)
-    known = label_frames.track(device, config) if options.least_sure else None
+    known = track(device, config) if options.least_sure else None
     given = labels.numbers()
     numbers = chosen_frames(
         len(known.confidence) if known else count,
@@ -113,7 +112,7 @@ def _page(device: Device, config: DictConfig, path: Path, options: argparse.Name
         given,
         known.confidence if known else None,
     )
-    frames = label_frames.label_frames(device, config, numbers, known)
+    frames = label_frames(device, config, numbers, known)
     labels.begin([frame.number for frame in frames])
     with one_sentence():
         gestures: Gestures | None = instantiate(config.gestures)

@@ -23,8 +23,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from toftrack.errors import ToftrackError
-from toftrack.evaluation.label_frames import LabelFrame
-from toftrack.evaluation.labelling import LABELLED, LabelFile
+from toftrack.evaluation.labelling import LABELLED, LabelFile, LabelFrame
 from toftrack.json_text import parse_json
 from toftrack.output.web.server import WebServer
 

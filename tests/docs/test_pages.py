@@ -1,0 +1,91 @@
+"""README.md, CONTRIBUTING.md and docs/: links lead to a file, and to a heading or mark in it; the
+picture of the rooms is that of the code; docs/figures.json is the one source of figures."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.tracking import ROOT
+
+sys.path.insert(0, str(ROOT / "docs"))
+from figure_tables import HISTORY_HEAD, NOT_YET, history_row, history_rows, with_tables
+from make_rooms import PICTURE, imports, layers, picture
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FIGURES = json.loads((ROOT / "docs" / "figures.json").read_text(encoding="utf-8"))
+ROW = {
+    "date": "2026-01-02",
+    "commit": "abc1234+",
+    "method": "toftrack",
+    "hands": "bare",
+    "seeds": [0, 1, 2],
+    "side": "told",
+    "machine": "a processor, 2 cores",
+    "versions": "toftrack 1, torch 2",
+    "usable_pct": 87.25,
+    "usable_90": [82.0, 92.5],
+    "silent_pct": 0.0,
+}
+
+
+def marks(page: Path) -> set[str]:
+    """The anchors of a page, headings as GitHub names them."""
+    text = page.read_text(encoding="utf-8")
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.M)
+    named = {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in headings}
+    return named | set(re.findall(r'id="([\w-]+)"', text))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere_and_marked_tables_are_those_of_the_figures(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for file, mark in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", text):
+        if file.startswith("http"):
+            continue
+        target = page.parent / file if file else page
+        assert target.exists(), file
+        assert not mark or mark in marks(target), f"{file}#{mark}"
+    assert text.count("<!-- figures: ") == text.count("<!-- end -->")
+    assert with_tables(text, FIGURES) == text, "run: python docs/make_figures.py --tables"
+
+
+def test_the_picture_of_the_rooms_is_of_this_code() -> None:
+    assert PICTURE.read_text() == picture(), "make it anew: python docs/make_rooms.py"
+    order = [room for row in layers() for room in row]
+    assert set(imports("tracking")) >= {"detector", "render", "refinement"}
+    for place, room in enumerate(order):
+        assert all(order.index(name) > place for name in imports(room) if name in order), room
+
+
+def test_the_figures_are_in_the_readme_and_say_where_they_were_made() -> None:
+    assert "<!-- figures: readme -->" in PAGES[0].read_text(encoding="utf-8")
+    history = (ROOT / "docs" / "lab" / "history.md").read_text(encoding="utf-8")
+    kept = {name: row for name, row in FIGURES["rows"].items() if name.startswith("strangers")}
+    assert kept == history_rows(history)
+    assert "| " + " | ".join(HISTORY_HEAD) + " |" in history
+    for row in FIGURES["rows"].values():
+        assert {"commit", "seeds", "machine", "versions"} <= set(row)
+
+
+def test_a_row_of_the_history_is_read_as_it_was_written() -> None:
+    later = ROW | {"usable_pct": 90.0, "method": "mediapipe"}
+    found = history_rows("\n".join(["text", history_row(ROW), history_row(later)]))
+    assert set(found) == {"strangers, bare", "strangers, bare, mediapipe"}
+    row = found["strangers, bare"]
+    assert row["usable_pct"] == pytest.approx(87.25) and row["usable_90"] == [82.0, 92.5]
+    assert row["silent_pct"] == 0.0 and row["seeds"] == [0, 1, 2] and row["commit"] == "abc1234+"
+    assert "mean_mm" not in row and history_rows("nothing | here") == {}
+    newer = history_rows("\n".join([history_row(ROW), history_row(ROW | {"usable_pct": 91.0})]))
+    assert newer["strangers, bare"]["usable_pct"] == 91.0, "the last row counts"
+
+
+def test_what_was_not_measured_says_so() -> None:
+    page = "before\n<!-- figures: readme -->\nSTALE\n<!-- end -->\nafter\n"
+    text = with_tables(page, {"rows": {}})
+    assert NOT_YET in text and "STALE" not in text
+    assert text.startswith("before\n") and text.endswith("<!-- end -->\nafter\n")
+    assert "87 %" in with_tables(page, {"rows": history_rows(history_row(ROW))})
