@@ -11,7 +11,7 @@ from helpers.rendered import hand_at, track_of
 
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.tracking.association import track_ends
-from toftrack.tracking.belief import Status, judge, probability
+from toftrack.tracking.confidence import Status, judge, probability
 from toftrack.tracking.confidence import NO_FEATURES, ConfidenceModel, LogOdds
 from toftrack.tracking.state import Track
 

@@ -18,7 +18,7 @@ from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaterni
 from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose
-from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.hand.surface import hand_surface
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.residuals_numba import (
     add_keypoints,
@@ -87,12 +87,8 @@ def _move(state, prior, settings, sums):
 
 @compiled
 def _scratch(ellipsoids, points, seen):
-    """What one thread works in.
-
-    Of the hand: frames (16, 3, 3), joints (21, 3), axes of the angles (21, 3).  Its ellipsoids
-    (E, 12), see pose_ellipsoids.  The matched points, see add_points, and which they are.  The
-    wrenches (16, 7, 6) of the frames, the twists (27, 6) of the degrees of freedom, and the normal
-    equations, see assemble.
+    """What one thread works in: the hand, see residuals_numba.py, and its ellipsoids; the matched
+    points, see add_points, and which they are; wrenches, twists and normal equations, see assemble.
     """
     hand = empty((16, 3, 3), np.float64), empty((21, 3), np.float64), empty((21, 3), np.float64)
     posed = empty((ellipsoids, 12), np.float32)
@@ -100,15 +96,8 @@ def _scratch(ellipsoids, points, seen):
     matched = empty((3, points), np.float32), distance, nearest
     sums = empty((_FREE, _FREE), np.float64), empty(_FREE, np.float64)
     within = empty(seen + 1, np.int32)
-    return (
-        hand,
-        posed,
-        matched,
-        within,
-        empty((16, 7, 6), np.float64),
-        empty((_FREE, 6), np.float64),
-        sums,
-    )
+    wrenches, twists = empty((16, 7, 6), np.float64), empty((_FREE, 6), np.float64)
+    return hand, posed, matched, within, wrenches, twists, sums
 
 
 @entry_point
@@ -159,9 +148,8 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings, coun
 class Refiner:
     """Brings hands of one shape onto what is seen, on the CPU."""
 
-    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """surface: instead of the shape's own."""
-        surface = surface or hand_surface(shape)
+    def __init__(self, shape: HandShape) -> None:
+        surface = hand_surface(shape)
         self._shape = (
             _array(shape.base_frames),
             _array(shape.base_m),
@@ -176,10 +164,10 @@ class Refiner:
 
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
-        joints = np.empty((len(states), 21, 3), np.float32)
+        joints = torch.empty(len(states), 21, 3)
         states_read = np.ascontiguousarray(states.numpy(), np.float32)
-        joints_of(states_read, *self._shape, joints, _NO_FRAMES)
-        return torch.from_numpy(joints)
+        joints_of(states_read, *self._shape, joints.numpy(), _NO_FRAMES)
+        return joints
 
     def pose(self, states: Tensor) -> HandPose:
         """(N, 27) to joints and frames, see skeleton.forward_kinematics."""
@@ -199,24 +187,11 @@ class Refiner:
         """(N, 27) the hands `states`, each refined by itself, see gauss_newton.py.
 
         prior_angles: (N, 21) the poses that the filter believes in.
-        keypoints: joints that are known besides.
-
         A hand within whose reach nothing is seen, and of which no keypoint is known, stays.
         """
         names = ("reach_m", "point_m", "silhouette_px", "angle_rad", "damping")
         numbers = tuple(float(getattr(settings, name)) for name in names)
         counts = int(settings.iterations), int(settings.points)
-        return self._refined(states, prior_angles, seen, counts + numbers, keypoints)
-
-    def _refined(
-        self,
-        states: Tensor,
-        prior_angles: Tensor,
-        seen: SeenPoints,
-        numbers: tuple,
-        keypoints: Keypoints | None,
-    ) -> Tensor:
-        n = len(states)
         if keypoints is None:
             known = np.empty((1, 21, 3)), np.full((1, 21), np.inf)
         else:
@@ -238,10 +213,10 @@ class Refiner:
             ),
             self._shape,
             self._surface,
-            numbers,
+            counts + numbers,
             np.zeros(1, np.int64),
         )
-        run_shared(task, n)
+        run_shared(task, len(states))
         return torch.from_numpy(refined.astype(np.float32))
 
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from toftrack.detector.hand_detector import Detection, merit
@@ -30,8 +29,8 @@ _GATE = 3.5
 _SAME_PALM_M, _SAME_HAND_M, _SAME_JOINTS = 0.022, 0.045, 0.3
 """Two hands are the same where their palms' middles are nearer than a palm is thick; or less near,
 and more than this share of one lies in the other, see posterior.touching."""
-_IMPOSSIBLE = 1e6
-"""Cost of an impossible pair; half of it, that of a track without detection."""
+_WITHOUT = 5e5
+"""Cost of a track without detection; that of an impossible pair is twice as much."""
 _TENTATIVE_S = 0.5
 """A tentative track beside a confirmed one ends at this age."""
 
@@ -71,10 +70,39 @@ def assign(cost: np.ndarray) -> list[int]:
     one, and the sum of their costs is least.
     """
     rows, columns = cost.shape
-    whole = np.full((rows, columns + rows), 0.5 * _IMPOSSIBLE)  # each may go without
-    whole[:, :columns] = np.where(np.isfinite(cost), cost, _IMPOSSIBLE)
-    found = linear_sum_assignment(whole)[1]
-    return [int(column) if column < columns else -1 for column in found]
+    whole = np.full((rows, columns + rows), _WITHOUT)
+    whole[:, :columns] = np.where(np.isfinite(cost), cost, 2 * _WITHOUT)
+    return [column if column < columns else -1 for column in least_cost(whole)]
+
+
+def least_cost(cost: np.ndarray) -> list[int]:
+    """The column of each row of (B, C >= B) finite costs, each its own, so that their sum is least.
+
+    The Hungarian method (Kuhn, Naval Res. Logist. Q. 2, 1955): row by row, along the shortest path
+    of exchanges, by costs that are reduced by what rows and columns are worth.
+    """
+    rows, columns = cost.shape
+    row_worth, column_worth = np.zeros(rows), np.zeros(columns + 1)
+    row_of = np.full(columns + 1, -1)  # the last column stands for that of the row to be placed
+    for row in range(rows):
+        column, row_of[-1] = columns, row
+        away, before = np.full(columns, np.inf), np.full(columns, -1)
+        done = np.zeros(columns + 1, bool)
+        while row_of[column] >= 0:
+            done[column] = True
+            at = row_of[column]
+            reduced = cost[at] - row_worth[at] - column_worth[:-1]
+            nearer = ~done[:-1] & (reduced < away)
+            away[nearer], before[nearer] = reduced[nearer], column
+            nearest = int(np.where(done[:-1], np.inf, away).argmin())
+            step = away[nearest]
+            row_worth[row_of[done]] += step
+            column_worth[done] -= step
+            away[~done[:-1]] -= step
+            column = nearest
+        while column != columns:
+            row_of[column], column = row_of[before[column]], before[column]
+    return [int(np.flatnonzero(row_of[:-1] == row)[0]) for row in range(rows)]
 
 
 def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[SideDetection]:

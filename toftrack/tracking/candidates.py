@@ -19,19 +19,13 @@ from torch import Tensor
 
 from toftrack.detector.hand_detector import Detection
 from toftrack.detector.parts import FOREARM_PART, THING_PART
+from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import out_of_sight
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
-from toftrack.tracking.posterior import (
-    ImageTerm,
-    KeypointsTerm,
-    OtherHandTerm,
-    OverlapTerm,
-    Posterior,
-    Term,
-)
+from toftrack.tracking.posterior import ImageTerm, keypoints_off, touching
 from toftrack.tracking.state import Track
 
 _SURELY_PRESENT = 0.97
@@ -88,8 +82,9 @@ class View:
     @cached_property
     def hidden(self) -> bool:
         """Whether something hides part of the hand."""
-        hand, occluder = self.observation.hand.numpy(), self.observation.occluder.numpy()
-        return int(np.count_nonzero(occluder)) > _HIDDEN * int(np.count_nonzero(hand))
+        seen = self.observation
+        hand, occluder = (np.count_nonzero(mask.numpy()) for mask in (seen.hand, seen.occluder))
+        return bool(occluder > _HIDDEN * hand)
 
     @property
     def covered(self) -> bool:
@@ -115,18 +110,26 @@ class View:
         cfg = self.model.refinement
         return self.fitted.refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
 
-    def posterior(self, keypoints: float | None = None) -> Posterior:
-        """The posterior of the hand's pose.  keypoints: their weight; None = the model's."""
-        weights, terms = self.model.weights, dict[str, Term]()
-        keypoints = weights.keypoints if keypoints is None else keypoints
-        if keypoints and not self.detection.empty:
-            terms["keypoints"] = KeypointsTerm(self.keypoints, keypoints)
+    def log_posterior(
+        self, poses: Tensor, joints_m: Tensor | None = None, keypoints: float | None = None
+    ) -> Tensor:
+        """(N,) log posteriors of poses (N, 27), see posterior.py.
+
+        joints_m: (N, 21, 3) theirs, where they are known.
+        keypoints: weight of the keypoints; None = the model's.
+        """
+        weights, total = self.model.weights, self.image(poses)
+        joints = self.fitted.refiner.joints(poses) if joints_m is None else joints_m
+        weight = weights.keypoints if keypoints is None else keypoints
+        if weight and not self.detection.empty:
+            total = total - weight * keypoints_off(joints, self.keypoints)
         if weights.overlap:
-            terms["overlap"] = OverlapTerm(self.fitted.shape.hand_length_m, weights.overlap)
+            length_m = self.fitted.shape.hand_length_m
+            total = total - weights.overlap * finger_overlap(joints, length_m)
         if weights.other_hand:
-            for number, joints in enumerate(self.others):
-                terms[f"other hand {number}"] = OtherHandTerm(joints, weights.other_hand)
-        return Posterior(self.image, self.fitted.refiner.joints, terms)
+            for other_m in self.others:
+                total = total - weights.other_hand * touching(joints, other_m)
+        return total
 
 
 def with_parts(view: View) -> View:
@@ -142,10 +145,7 @@ def with_parts(view: View) -> View:
 
 
 def image_term(
-    observation: Observation,
-    fitted: FittedHand,
-    model: FilterModel,
-    coverage: float | None = None,
+    observation: Observation, fitted: FittedHand, model: FilterModel, coverage: float | None = None
 ) -> ImageTerm:
     """The likelihood of an observation, which must not be empty.  coverage: see ImageTerm."""
     evidence = model.likelihood.evidence(observation).to(model.device)
@@ -194,14 +194,14 @@ def detector_poses(
 def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, float]:
     """The best (1, 27) of the detector's poses, raw or refined, and its log posterior.
 
-    The detection must not be empty.  keypoints: see View.posterior.
+    The detection must not be empty.  keypoints: see View.log_posterior.
     """
     model = view.model
     count = model.detector.settings.hypotheses
     poses = detector_poses(view.detection, view.observation, view.fitted, model, count)
     if model.refinement.iterations:
         poses = torch.cat((poses, view.refine(poses)))
-    values = view.posterior(keypoints)(poses)
+    values = view.log_posterior(poses, keypoints=keypoints)
     best = int(values.argmax())
     return poses[best][None], float(values[best])
 
@@ -260,22 +260,12 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
 def scored(view: View, poses: Tensor, sources: Sequence[Source]) -> Hypotheses:
     """Poses (N, 27) of these sources as they are, scored."""
     joints = view.fitted.refiner.joints(poses)
-    return Hypotheses(poses, joints, sources, view.posterior().value(poses, joints))
+    return Hypotheses(poses, joints, sources, view.log_posterior(poses, joints))
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The chosen pose of a frame.
-
-    pose: (1, 27).  moved: the detector sees it elsewhere: the track is to restart there.
-    """
-
-    pose: Tensor
-    moved: bool
-
-
-def select(table: Hypotheses, hidden: bool) -> Choice:
-    """The best of a hand's scored hypotheses; one of the detector must be better by a margin.
+def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:
+    """The best pose (1, 27) of a hand's scored hypotheses, where one of the detector must be better
+    by a margin; and whether the detector sees it elsewhere: the track is to restart there.
 
     table: with at least one row that is not the detector's.
     hidden: something hides part of the hand. Then a pose elsewhere needs a large lead, for it may
@@ -290,7 +280,7 @@ def select(table: Hypotheses, hidden: bool) -> Choice:
     elsewhere = detectors & (away >= _ELSEWHERE_M)
     values = values - np.where(elsewhere & hidden, _SURE_LEAD, _MARGIN * detectors)
     best = int(values.argmax())
-    return Choice(table.pose[best][None], bool(elsewhere[best]))
+    return table.pose[best][None], bool(elsewhere[best])
 
 
 def without_things(observation: Observation, detection: Detection) -> Observation:
@@ -301,13 +291,13 @@ def without_things(observation: Observation, detection: Detection) -> Observatio
     kind = detection.parts.kind
     if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
         return observation
-    row, column = np.nonzero(observation.hand.cpu().numpy())
+    row, column = np.nonzero(observation.hand.numpy())
     of = detection.parts.at(_points_of(row, column, observation)) == THING_PART
     if not of.any():
         return observation
     mask = np.zeros(observation.hand.shape, bool)
     mask[row[of], column[of]] = True
-    thing = torch.from_numpy(mask).to(observation.hand.device)
+    thing = torch.from_numpy(mask)
     return replace(observation, hand=observation.hand & ~thing, thing=thing)
 
 
@@ -317,7 +307,7 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     Who wears the camera has the arm nearer to it than the hand, which it does not hide. A surface
     in front is the arm when the pose network calls most of it a forearm.
     """
-    occluder = observation.occluder.cpu().numpy()
+    occluder = observation.occluder.numpy()
     count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
     row, column = np.nonzero(occluder)
     kind = detection.parts.at(_points_of(row, column, observation), outside=_UNKNOWN)
@@ -327,13 +317,12 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     of_arm = (mine > _MOSTLY * known)[surface] & occluder
     if not of_arm.any():
         return observation
-    arm = torch.from_numpy(of_arm).to(observation.hand.device)
+    arm = torch.from_numpy(of_arm)
     return replace(observation, hand=observation.hand | arm, occluder=observation.occluder & ~arm)
 
 
 def _points_of(row: np.ndarray, column: np.ndarray, observation: Observation) -> np.ndarray:
-    depth_m, k = observation.depth_m.cpu().numpy(), observation.k.cpu().numpy()
-    return points_at(row, column, depth_m, k)
+    return points_at(row, column, observation.depth_m.numpy(), observation.k.numpy())
 
 
 def points_at(

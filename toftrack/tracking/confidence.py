@@ -9,28 +9,32 @@ deviations are, and what they mean.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.pace import FRAME_S
+from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError
-from toftrack.hand.regions import joint_axes
 from toftrack.json_text import read_json
+from toftrack.render.segmentation import Observation
+
+if TYPE_CHECKING:
+    from toftrack.tracking.state import Track
 
 _FITTED = Path(__file__).parents[1] / "data" / "confidence.json"
 _LEAST = 1e-3
 _LIKELY = 0.03
 _NEAREST_M, _BEHIND_M = 0.05, 0.04
 """Least depth of a joint in projections; and how much nearer than a joint what hides it is."""
+_HIDDEN, _OUT_OF_VIEW = 0.3, 0.4
+"""A hand is hidden, or out of view, where more than this share of its joints is."""
 
 
 @dataclass(frozen=True)
@@ -80,22 +84,20 @@ def confidence_features(
     age_s: float,
     detection: Detection,
     last: ConfidenceFeatures,
-    depth_m: Tensor,
-    k: Tensor,
+    observation: Observation,
 ) -> ConfidenceFeatures:
-    """The features of an estimate with joints (21, 3) in an image (H, W) with intrinsics k.
+    """The features of an estimate with joints (21, 3) in an image.
 
     age_s: seconds since its track began.
     last: of the frame before; in a frame without a detection, all but the score hold.
     """
     if detection.empty:
         return replace(last, log_score=math.log(max(score, _LEAST)))
-    joints = joints_m.cpu()
-    at = joints.numpy()
+    at = joints_m.numpy()
     keypoints = np.linalg.norm(at - detection.keypoints.points_m.numpy(), axis=1)
     off = np.linalg.norm(at - detection.joints_m.numpy(), axis=-1).mean(1)
     likely = off[detection.log_probability.numpy() > math.log(_LIKELY)]
-    unseen, hidden = out_of_sight(joints, depth_m, k)
+    unseen, hidden = out_of_sight(joints_m, observation.depth_m, observation.k)
     return ConfidenceFeatures(
         log_score=math.log(max(score, _LEAST)),
         keypoints_off=_log_cm(float(keypoints.mean())),
@@ -134,7 +136,7 @@ def _surprise(probability: float) -> float:
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
     """The shares of joints (21, 3) outside of the image (H, W), and of those behind something."""
     at, z = joints.numpy(), np.maximum(joints[:, 2].numpy(), _NEAREST_M)
-    seen = _readings(at[:, 0] / z, at[:, 1] / z, depth_m.cpu().numpy(), k.cpu().numpy())
+    seen = _readings(at[:, 0] / z, at[:, 1] / z, depth_m.numpy(), k.numpy())
     behind = (seen > 0) & (seen < z - _BEHIND_M)
     return float(np.isnan(seen).mean()), float(behind.mean())
 
@@ -296,25 +298,6 @@ def joint_features(
     return features
 
 
-def propagated_sigma(
-    joints_m: np.ndarray, covariance: Tensor, joints_of: Callable[[Tensor], Tensor]
-) -> np.ndarray:
-    """(21, 3) m, deviations of joints (21, 3) along joint_axes by the particles' covariance.
-
-    covariance: (6 + d, 6 + d) in the tangent space.
-    joints_of: joints (N, 21, 3) of the estimate moved by tangents (N, 6 + d).
-    """
-    size = len(covariance)
-    # One step along each main axis and back; a covariance may be singular, so no Cholesky.
-    values, vectors = torch.linalg.eigh(covariance.double())
-    steps = (vectors * values.clamp(min=0).sqrt()).mT.to(covariance.dtype)
-    moved = joints_of(torch.cat((steps, -steps))).cpu().double().numpy()
-    half = 0.5 * (moved[:size] - moved[size:])
-    along = np.einsum("jab,njb->nja", joint_axes(joints_m), half)
-    sigma: np.ndarray = np.sqrt(np.square(along).sum(0)).astype(np.float32)
-    return sigma
-
-
 @dataclass(frozen=True)
 class LogOdds:
     """A logistic model of a frame's features.
@@ -394,3 +377,51 @@ def make_confidence(fitted: str | None = None, **thresholds: Any) -> ConfidenceM
             " python -m toftrack.training fit-confidence, or leave it out"
         ) from None
     return ConfidenceModel(**thresholds, log_odds=log_odds, whole_odds=whole_odds, joints=joints)
+
+
+@dataclass(frozen=True)
+class Status:
+    """What is thought of a frame's estimate.
+
+    state_name, lost: as Estimate has them.
+    confidence: probability that every joint is within 40 mm; NaN where nothing says.
+    log_odds: the same, smoothed over time.  whole_odds: likewise of the mean joint error.
+    doubtful: as Track has it, with this frame.
+    """
+
+    state_name: str
+    lost: bool
+    confidence: float = math.nan
+    log_odds: float = 0.0
+    whole_odds: float = 0.0
+    doubtful: Duration = Duration()
+
+
+def judge(
+    track: Track, features: ConfidenceFeatures, dt_s: float, model: ConfidenceModel
+) -> Status:
+    """The status of a track's estimate, dt_s after its last one."""
+    kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
+    smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
+    whole = kept * track.whole_odds + (1 - kept) * model.whole_odds(features)
+    confidence, probable = probability(smooth), probability(whole)
+    # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
+    passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
+    doubtful = Duration(track.doubtful.seconds + passed)
+    doubtful = doubtful if confidence < model.give_up else Duration()
+    confirmed = track.confirmed or confidence >= model.believe
+    lost = not confirmed or confidence < model.confidence or probable < model.whole
+    name = _state_name(features) if lost else "tracking"
+    return Status(name, lost, confidence, smooth, whole, doubtful)
+
+
+def probability(log_odds: float) -> float:
+    """The probability of log odds, which count up to 30 either way."""
+    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
+
+
+def _state_name(features: ConfidenceFeatures) -> str:
+    """Why an estimate is lost."""
+    if features.unseen > _OUT_OF_VIEW:
+        return "out of view"
+    return "hidden" if features.hidden > _HIDDEN else "searching"

@@ -159,34 +159,14 @@ class ParticleSet:
     mean: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """The pose of a track in a frame.
-
-    filtered: the particles, before they follow it.  pose: (1, 27).  trend: (27,) see Track.
-    particle: (1, 6 + d) the nearest in the pose space.  offset: (21,) rad, from there to the pose.
-    """
-
-    filtered: ParticleSet
-    pose: Tensor
-    trend: Tensor
-    particle: Tensor
-    offset: Tensor
-
-    @property
-    def off_rad(self) -> float:
-        """How far the pose lies off the pose space, rms over the 21 angles."""
-        return float(np.sqrt(np.square(self.offset.numpy()).mean()))
-
-
-def shift_particles(found: PoseEstimate, model: FilterModel) -> ParticleSet:
-    """The particles, all moved by what moves their mean onto the estimate's particle."""
-    filtered, motions = found.filtered, model.backend.motions
-    space = model.space_of(filtered.particles)
-    change = motions.difference(found.particle, filtered.mean)
+def shift_particles(filtered: ParticleSet, pose: Tensor, model: FilterModel) -> ParticleSet:
+    """The particles, all moved by what moves their mean onto the particle of a pose (1, 27)."""
+    motions, space = model.backend.motions, model.space_of(filtered.particles)
+    mean = model.encode(pose)
+    change = motions.difference(mean, filtered.mean)
     particles = motions.compose(filtered.particles, on_device(change, model.device))
     particles[:, 6:] = bound(particles[:, 6:], space.lower, space.upper, "truncate")
-    return ParticleSet(particles, filtered.weights, found.particle)
+    return ParticleSet(particles, filtered.weights, mean)
 
 
 def update_velocity(track: Track, mean: Tensor, dt_s: float, model: FilterModel) -> Tensor:

@@ -16,9 +16,8 @@ import numpy as np
 
 from toftrack.detector.hand_detector import Detection
 from toftrack.frames import DepthImage
-from toftrack.tracking.belief import probability
 from toftrack.tracking.candidates import WORST, View, best_start
-from toftrack.tracking.confidence import log_odds
+from toftrack.tracking.confidence import log_odds, probability
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 

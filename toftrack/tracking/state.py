@@ -37,6 +37,10 @@ class SideEvidence:
     comparisons: int = 0
     age_s: float = math.inf
 
+    def later(self, dt_s: float) -> SideEvidence:
+        """The same evidence after dt_s without a comparison."""
+        return replace(self, age_s=self.age_s + dt_s)
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
@@ -138,6 +142,10 @@ class TrackerState:
     def track_of(self, slot: Slot) -> Track | None:
         """The track of a slot; None where it has none."""
         return next((track for track in self.tracks if track.number == slot.track), None)
+
+    def shows(self, track: Track) -> bool:
+        """Whether a track is in a slot."""
+        return any(slot.track == track.number for slot in self.slots)
 
     def elapsed_s(self, image: DepthImage) -> float:
         """Seconds from the last frame to an image, bounded: see compute.pace.elapsed_s."""
