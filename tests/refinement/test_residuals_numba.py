@@ -11,10 +11,8 @@ from helpers.configured import refinement
 from reference.refinement import (
     Residuals,
     keypoint_residuals,
-    nearest_ellipsoids,
     point_jacobian,
     point_residuals,
-    points_around,
     silhouette_residuals,
 )
 from torch import Tensor
@@ -26,7 +24,7 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement import residuals_numba as compiled
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.refinement.gauss_newton_numba import Refiner, solve
+from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.seen_points import SeenPoints
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -36,14 +34,12 @@ SIDES = ("right", "left")
 K = np.array([[220.0, 0.0, 88.0], [0.0, 215.0, 72.0], [0.0, 0.0, 1.0]])
 
 # What an entry point calls cannot be called from Python: one that calls it.
-_choose = entry_point(lambda *a: compiled.choose_points(*a))
 _nearest = entry_point(lambda *a: compiled.nearest_ellipsoids(*a))
 _add_wrench = entry_point(lambda *a: compiled.add_wrench(*a))
 _add_points = entry_point(lambda *a: compiled.add_points(*a))
 _add_silhouette = entry_point(lambda *a: compiled.add_silhouette(*a))
 _add_keypoints = entry_point(lambda *a: compiled.add_keypoints(*a))
 _assemble = entry_point(lambda *a: compiled.assemble(*a))
-_solve = entry_point(lambda *a: solve(*a))
 
 
 @entry_point
@@ -111,35 +107,6 @@ def check_sums(sums: tuple[np.ndarray, ...], expected: Residuals, rtol: float) -
     assert np.abs(sums[1] - gradient).max() < rtol * max(np.abs(gradient).max(), 1e-9)
 
 
-@pytest.mark.parametrize("count", [1, 40, 1000])
-def test_points_are_chosen_as_by_the_reference(count: int) -> None:
-    posed = posed_hand("right", 0)
-    g = torch.Generator().manual_seed(1)
-    points = 0.1 * torch.randn(400, 3, generator=g) + posed.pose.joints_m[0].mean(0).float()
-    seen = SeenPoints(points, torch.zeros(0, 0, 2), torch.eye(3), (1, 1))
-    middle = posed.pose.joints_m.mean(1).float()
-    expected, there = points_around(seen, middle, count)
-    chosen = np.zeros((3, min(count, 400)), np.float32)
-    found = _choose(points.numpy(), posed.hand[1], count, np.empty(401, np.int32), chosen)
-    assert found == int(there.sum())
-    assert 0 < found <= count
-    np.testing.assert_array_equal(chosen[:, :found].T, expected[0, there[0]].numpy())
-
-
-@pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("z", [0.45, 0.02, -0.5])
-def test_the_nearest_ellipsoid_is_that_of_the_reference(side: str, z: float) -> None:
-    posed = posed_hand(side, 2, z)
-    points = points_near(posed, 500, 3)
-    distance, nearest = np.empty(500, np.float32), np.zeros(500, np.int32)
-    _nearest(np.ascontiguousarray(points.numpy().T), 500, posed.ellipsoids, distance, nearest)
-    expected, which, normals = nearest_ellipsoids(posed.pose, points.double()[None], posed.surface)
-    np.testing.assert_allclose(distance, expected[0].numpy(), atol=1e-5)  # 0.01 mm
-    # As near to two of them, it may be either.
-    assert (nearest != which[0].numpy()).mean() < 0.02
-    torch.testing.assert_close(normals.norm(dim=-1), torch.ones_like(expected))
-
-
 @pytest.mark.parametrize("side", SIDES)
 def test_rows_are_those_of_the_jacobian(side: str) -> None:
     posed = posed_hand(side, 4)
@@ -172,23 +139,17 @@ def test_seen_points_add_up_as_in_the_reference(side: str, z: float) -> None:
     expected = point_residuals(
         posed.pose, points.double()[None], there, posed.shape, posed.surface, SETTINGS
     )
-    check_sums(
-        assembled(wrenches, posed), expected, 0.01
-    )  # points that are as near to two bones go to either
+    # Points that are as near to two bones go to either.
+    check_sums(assembled(wrenches, posed), expected, 0.01)
 
 
 def silhouette(seed: int, height: int, width: int) -> SeenPoints:
     """For each pixel some other pixel: what is nearest does not matter here."""
     g = torch.Generator().manual_seed(seed)
-    nearest = torch.stack(
-        (
-            torch.randint(width, (height, width), generator=g),
-            torch.randint(height, (height, width), generator=g),
-        ),
-        -1,
-    )
-    k = torch.from_numpy(K)
-    return SeenPoints(torch.zeros(0, 3), nearest.float(), k, (height, width), (0, 0))
+    size = height, width
+    each = [torch.randint(most, size, generator=g) for most in (width, height)]
+    nearest = torch.stack(each, -1).float()
+    return SeenPoints(torch.zeros(0, 3), nearest, torch.from_numpy(K), size, (0, 0))
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -206,21 +167,8 @@ def test_the_silhouette_adds_up_as_in_the_reference(side: str, z: float, cut: in
     check_sums(assembled(wrenches, posed), expected, 1e-4)
 
 
-@pytest.mark.parametrize("size", [(0, 0), (1, 1), (144, 176)])
-def test_a_silhouette_that_no_bone_is_in_adds_nothing(size: tuple[int, int]) -> None:
-    """Outside of the image, an image of a pixel, or no silhouette at all."""
-    posed, nearest = posed_hand("right", 10), torch.full((*size, 2), 1e3)
-    k = K + [[0.0, 0.0, 9e3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    seen = SeenPoints(torch.zeros(0, 3), nearest, torch.from_numpy(k), size)
-    arguments = (seen.points_m.numpy(), nearest.numpy(), seen.corner, seen.size, k)
-    wrenches = no_wrenches()
-    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.0, wrenches)
-    assert not wrenches.any()
-    assert not silhouette_residuals(posed.pose, seen, posed.shape, SETTINGS).values.any()
-
-
 @pytest.mark.parametrize("side", SIDES)
-def test_landmarks_add_up_as_in_the_reference(side: str) -> None:
+def test_keypoints_add_up_as_in_the_reference(side: str) -> None:
     posed = posed_hand(side, 11)
     g = torch.Generator().manual_seed(12)
     points = posed.pose.joints_m + 0.02 * torch.randn(1, 21, 3, generator=g)
@@ -231,13 +179,3 @@ def test_landmarks_add_up_as_in_the_reference(side: str) -> None:
     _add_keypoints(points[0].numpy(), sigma[0].numpy(), posed.hand, wrenches)
     expected = keypoint_residuals(posed.pose, marks.of_each(1), posed.shape)
     check_sums(assembled(wrenches, posed), expected, 1e-5)
-
-
-def test_the_normal_equations_are_solved() -> None:
-    g = np.random.default_rng(13)
-    rows, right = g.normal(size=(60, 27)), g.normal(size=27)
-    normal = rows.T @ rows
-    expected = np.linalg.solve(normal, right)
-    lower = np.tril(normal)  # the upper triangle does not count
-    _solve(lower, right)
-    np.testing.assert_allclose(right, expected, rtol=1e-6, atol=1e-9)
