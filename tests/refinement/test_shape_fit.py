@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 import torch
 from helpers.detection import detection_of
-from helpers.tracking import make_tracker
+from helpers.tracking import make_tracker, sample
 from reference.refinement import keypoint_residuals
 
 from toftrack.detector.hand_detector import Detection
@@ -171,7 +171,9 @@ def test_the_shape_in_use_changes_in_steps_only() -> None:
 
 
 def test_only_auto_is_fitted() -> None:
-    fixed = make_tracker("hand.shape=default")
+    fixed, scene = make_tracker("hand.shape=default"), sample()
+    fixed.step(scene.depth_m[0], scene.k)
+    assert fixed.shape.hand_length_m == pytest.approx(DEFAULT_HAND_LENGTH_M)
     assert not fixed.model.fits and fixed.hands.fitted[0].fitted is None
     assert make_tracker().model.fits
     fitted_hand = make_tracker("hand.side=left").hands.fitted[0]

@@ -62,13 +62,13 @@ def test_each_source_proposes_its_poses_and_all_are_scored_by_the_posterior() ->
     assert list(table.source) == [Source.PREVIOUS, Source.DYNAMICS, *[Source.DETECTOR] * 2], (
         "the detector's as it is, and bent to the keypoints"
     )
-    torch.testing.assert_close(table.log_posterior, view.posterior()(table.pose))
+    torch.testing.assert_close(table.log_posterior, view.log_posterior(table.pose))
 
 
 def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> None:
     view = viewed(0.0)
     table = proposed(view)
-    before = float(view.posterior()(view.track.pose))
+    before = float(view.log_posterior(view.track.pose))
     assert float(table.log_posterior[table.source.index(Source.PREVIOUS)]) > before
     assert float(table.log_posterior.max()) > before + 0.1
 
@@ -80,7 +80,7 @@ def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(
     mean = mean_of(view)
     far = mean.clone()
     far[:, 2] += 0.5
-    assert bool(view.posterior()(far).isneginf())
+    assert bool(view.log_posterior(far).isneginf())
     monkeypatch.setattr(View, "refine", lambda _, poses: far.repeat(len(poses), 1))
     table = propose(view, mean)
     standing = torch.tensor(table.source) <= Source.DYNAMICS
@@ -100,7 +100,7 @@ def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
     detection = detection_of(torch.cat((bent(hand_at(), 2, 0.8), truth, hand_at())))
     detection = replace(detection, keypoints=detection_of(truth).keypoints)
     view = view_of(image_of(truth), track_of(hand_at()), detection)
-    posterior, joints = view.posterior(), view.fitted.refiner.joints
+    posterior, joints = view.log_posterior, view.fitted.refiner.joints
     pose, value = best_start(view)
     assert value == pytest.approx(float(posterior(pose)), abs=1e-5)
     as_they_are = hypotheses_of(detection, view.fitted, view.model.detector.settings.hypotheses)
@@ -126,7 +126,7 @@ def test_a_keypoint_weight_divides_the_deviations_and_0_leaves_them_without_effe
     assert bool(none.isfinite().all()) and float(none.min()) > 1000
 
 
-@pytest.mark.parametrize("count", [0, 1, 4, 8])
+@pytest.mark.parametrize("count", [0, 1, 8])
 def test_only_likely_hypotheses_are_candidates_and_at_least_one(count: int) -> None:
     hand = right_hand_model().hand("right", first_shape())
     detection = detection_of(torch.cat([hand_at(0.01 * i) for i in range(6)]))

@@ -12,8 +12,7 @@ from helpers.rendered import EMPTY, any_hand_model, hand_at, scene_of, state_of,
 from toftrack.compute.spans import Spans
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
-from toftrack.tracking.confidence import Status
-from toftrack.tracking.confidence import JOINT_FEATURES
+from toftrack.tracking.confidence import JOINT_FEATURES, Status
 from toftrack.tracking.filter import ParticleSet, PoseEstimate
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.state import SideEvidence, Track, TrackerState

@@ -30,9 +30,9 @@ def table_of(*rows: tuple[float, float, Source, float]) -> Hypotheses:
 
 def chosen(table: Hypotheses, hidden: bool = False) -> tuple[int, bool]:
     """The row, and whether it is of another place."""
-    choice = select(table, hidden)
-    (row,) = (table.pose == choice.pose).all(1).nonzero()[:1].tolist()
-    return row[0], choice.moved
+    pose, moved = select(table, hidden)
+    (row,) = (table.pose == pose).all(1).nonzero()[:1].tolist()
+    return row[0], moved
 
 
 def test_the_choice_is_that_of_a_plain_reference() -> None:
