@@ -139,11 +139,6 @@ def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
     return not track.confirmed and confirmed_beside and track.age.seconds > _TENTATIVE_S
 
 
-def sureness(track: Track) -> float:
-    """A track's log odds, raised so that any confirmed track is surer than any tentative one."""
-    return track.log_odds + 20.0 * track.confirmed
-
-
 def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
     """The state with the tracks that go on, one a hand; tentative ones that end are refused."""
     confirmed = sum(track.confirmed for track in tracks)
@@ -154,7 +149,9 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
     }
     hands = [model.hand(track.side, track.shape) for track in tracks]
     palms = [palm_of(track.pose, hand)[0][0] for track, hand in zip(tracks, hands, strict=True)]
-    surest = sorted(range(len(tracks)), key=lambda row: sureness(tracks[row]), reverse=True)
+    # Any confirmed track is surer than any tentative one.
+    sureness = [track.log_odds + 20.0 * track.confirmed for track in tracks]
+    surest = sorted(range(len(tracks)), key=lambda row: sureness[row], reverse=True)
     for first, second in itertools.combinations(surest, 2):
         if ended & {tracks[first].number, tracks[second].number}:
             continue

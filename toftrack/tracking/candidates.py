@@ -7,9 +7,7 @@ Gall et al., "Optimization and filtering for human motion capture" (IJCV 87, 201
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import cached_property
 
 import cv2
@@ -152,10 +150,14 @@ def image_term(
     return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
 
 
-def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
-    """A detection's keypoints, with the configured least deviation and weight."""
+def keypoints_of(
+    detection: Detection, model: TrackerModel, least_m: float | None = None
+) -> Keypoints:
+    """A detection's keypoints, with the configured weight.  least_m: their least deviation; None =
+    the configured one.
+    """
     cfg, found = model.detector.settings, detection.keypoints
-    sigma = found.sigma_m.clamp(min=cfg.keypoint_m)
+    sigma = found.sigma_m.clamp(min=cfg.keypoint_m if least_m is None else least_m)
     return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, _NO_WEIGHT))
 
 
@@ -184,10 +186,8 @@ def detector_poses(
         return states
     bent = states[:1]
     nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), observation.k, (0, 0))
-    weight = max(model.detector.settings.keypoint_weight, _NO_WEIGHT)
-    sigma = detection.keypoints.sigma_m.clamp(min=_BENT_M) / weight
     freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
-    keypoints = Keypoints(detection.keypoints.points_m, sigma)
+    keypoints = keypoints_of(detection, model, _BENT_M)
     return torch.cat((fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
 
 
@@ -206,31 +206,18 @@ def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, floa
     return poses[best][None], float(values[best])
 
 
-class Source(IntEnum):
-    """Where a hypothesis comes from."""
-
-    PREVIOUS = 0
-    """The last frame's fingers at the filter's wrist; of a covered hand, its last pose."""
-    DYNAMICS = 1
-    """The filter's estimate."""
-    DETECTOR = 2
-    """The detector's likeliest hypothesis, raw or bent to the keypoints."""
-
-
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
     """A table of poses of one hand, a row each.
 
-    pose: (N, 27).  joints_m: (N, 21, 3).  source: of each.  log_posterior: (N,).
+    pose: (N, 27).  joints_m: (N, 21, 3).  detected: (N,) bool, by the pose network.
+    log_posterior: (N,).
     """
 
     pose: Tensor
     joints_m: Tensor
-    source: Sequence[Source]
+    detected: np.ndarray
     log_posterior: Tensor
-
-    def __len__(self) -> int:
-        return len(self.pose)
 
 
 def propose(view: View, mean: Tensor) -> Hypotheses:
@@ -242,14 +229,13 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
     leaves the image may draw it anywhere.
     """
     if not view.model.refinement.iterations:
-        return scored(view, mean, (Source.DYNAMICS,))
+        return scored(view, mean)
     if view.covered:
-        return scored(view, view.track.pose, (Source.PREVIOUS,))
+        return scored(view, view.track.pose)
     detected = detector_poses(view.detection, view.observation, view.fitted, view.model, 1)
     previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
     poses = torch.cat((previous, mean, detected))
-    sources = (Source.PREVIOUS, Source.DYNAMICS, *[Source.DETECTOR] * len(detected))
-    table = scored(view, view.refine(poses), sources)
+    table = scored(view, view.refine(poses), len(detected))
     nothing = table.log_posterior.isneginf()
     if not nothing.any():
         return table
@@ -257,10 +243,11 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
     return replace(table, pose=pose, joints_m=view.fitted.refiner.joints(pose))
 
 
-def scored(view: View, poses: Tensor, sources: Sequence[Source]) -> Hypotheses:
-    """Poses (N, 27) of these sources as they are, scored."""
+def scored(view: View, poses: Tensor, detected: int = 0) -> Hypotheses:
+    """Poses (N, 27) as they are, scored; the last `detected` ones are the detector's."""
     joints = view.fitted.refiner.joints(poses)
-    return Hypotheses(poses, joints, sources, view.log_posterior(poses, joints))
+    detectors = np.arange(len(poses)) >= len(poses) - detected
+    return Hypotheses(poses, joints, detectors, view.log_posterior(poses, joints))
 
 
 def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:
@@ -272,13 +259,12 @@ def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:
         be of what hides the hand, such as another hand.
     """
     # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
-    joints, source = table.joints_m.numpy(), np.array(table.source)
+    joints, detected = table.joints_m.numpy(), table.detected
     values = np.maximum(table.log_posterior.numpy(), WORST)
-    detectors = source == Source.DETECTOR
-    base = int(np.where(detectors, -np.inf, values).argmax())
+    base = int(np.where(detected, -np.inf, values).argmax())
     away = np.sqrt(np.square(joints - joints[base]).sum(-1)).mean(1)
-    elsewhere = detectors & (away >= _ELSEWHERE_M)
-    values = values - np.where(elsewhere & hidden, _SURE_LEAD, _MARGIN * detectors)
+    elsewhere = detected & (away >= _ELSEWHERE_M)
+    values = values - np.where(elsewhere & hidden, _SURE_LEAD, _MARGIN * detected)
     best = int(values.argmax())
     return table.pose[best][None], bool(elsewhere[best])
 

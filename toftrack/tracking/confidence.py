@@ -141,24 +141,19 @@ def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, flo
     return float(np.isnan(seen).mean()), float(behind.mean())
 
 
-def seen_around(
-    joints_m: np.ndarray, nearest_m: float, step_m: float, depth_m: np.ndarray, k: np.ndarray
-) -> np.ndarray:
-    """(N, 3) shares of a joint's surroundings outside and without reading; median depth or NaN.
-
-    joints_m: (N, 3).  step_m: from one of the 3 x 3 readings about a joint to the next.
-    nearest_m: least depth of a joint in the projection.
+def _seen_around(joints_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """(N, 3) of joints (N, 3): shares of 3 x 3 readings about each that are outside and without
+    reading, and their median depth or NaN.
     """
-    z = np.maximum(joints_m[:, 2:], nearest_m)
-    down, right = (side.ravel() * step_m for side in np.mgrid[-1:2, -1:2])
+    z = np.maximum(joints_m[:, 2:], _NEAREST_M)
+    down, right = (side.ravel() * _AROUND_M for side in np.mgrid[-1:2, -1:2])
     x, y = (joints_m[:, :1] + right) / z, (joints_m[:, 1:2] + down) / z
     seen = _readings(x, y, depth_m, k)
     outside, unread = np.isnan(seen), seen == 0
     count = (seen > 0).sum(1)
     ordered = np.sort(np.where(seen > 0, seen, np.inf), 1)  # the lower middle is the median
     median = ordered[np.arange(len(count)), np.maximum(count - 1, 0) // 2]
-    median = np.where(count > 0, median, np.nan)
-    return np.stack((outside.mean(1), unread.mean(1), median), 1)
+    return np.stack((outside.mean(1), unread.mean(1), np.where(count > 0, median, np.nan)), 1)
 
 
 def _readings(x: np.ndarray, y: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -288,7 +283,7 @@ def joint_features(
         off = np.linalg.norm(joints - keypoints.points_m.numpy(), axis=1)
         worst = np.concatenate(([off.mean()], off[1:].reshape(5, 4).max(1).repeat(4)))
         features[:, _KEYPOINTS] = _log_cm_of(keypoints.sigma_m.numpy(), off, worst)
-    outside, unread, surface = seen_around(joints, _NEAREST_M, _AROUND_M, depth_m, k).T
+    outside, unread, surface = _seen_around(joints, depth_m, k).T
     deeper = np.where(np.isnan(surface), 0.0, joints[:, 2] - surface - _BELOW_M)
     features[:, 3], features[:, 4] = outside, unread
     features[:, 5], features[:, 6] = deeper.clip(0, 0.05) / 0.02, (-deeper).clip(0, 0.05) / 0.02

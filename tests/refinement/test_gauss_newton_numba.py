@@ -22,7 +22,7 @@ from toftrack.compute.rigid_numba import pose_hand
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
-from toftrack.refinement import residuals_numba as compiled
+from toftrack.refinement import gauss_newton_numba as compiled
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.seen_points import SeenPoints
