@@ -153,14 +153,13 @@ def test_the_paper_to_the_letter_runs_and_is_the_paper_s() -> None:
     assert (config.hand.shape, config.hand.side) == ("default", "right")
     assert config.segmentation.min_area_m2 == config.segmentation.occluder_margin_m == 0
     assert config.segmentation.reach_m == math.inf and config.refine.iterations == 0
-    model = make_tracker("experiment=paper_to_the_letter").model
-    assert isinstance(model, PaperModel) and not model.fits
-    assert isinstance(model.start, RoughStart) and isinstance(model.lost, ScoreThreshold)
     assert config.pose_space.kind == "pca" and config.pose_space.dims == 4
+    model = make_tracker("experiment=paper_to_the_letter").model
+    assert isinstance(model, PaperModel) and not (model.fits or model.detects)
+    assert isinstance(model.start, RoughStart) and isinstance(model.lost, ScoreThreshold)
     scene = first(8)
     found = follow(scene, "experiment=paper_to_the_letter")
-    assert all(np.isfinite(estimate.joints_m).all() for estimate in found)
-    assert all(0 < estimate.score <= 1 for estimate in found)
+    assert all(np.isfinite(one.joints_m).all() and 0 < one.score <= 1 for one in found)
     # Positioned by hand, as in the paper, and nearly right: it does not run away at once.
     wrist = ",".join(f"{x:.3f}" for x in (*scene.joints_m[0, 0], 0, 0, 0))
     placed = follow(scene, "experiment=paper_to_the_letter", f"start.pose=[{wrist}]")

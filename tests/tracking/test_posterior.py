@@ -113,20 +113,12 @@ def test_another_hand_costs_the_joints_that_lie_in_it() -> None:
     np.testing.assert_allclose(added(seen, other_hand=3.0), expected, rtol=1e-3, atol=1e-4)
 
 
-def test_each_other_hand_costs_its_own() -> None:
-    one, two = other_hand(0.03), other_hand(-0.03)
-    both = added(view(one, two), other_hand=2.0)
-    alone = added(view(one), other_hand=2.0) + added(view(two), other_hand=2.0)
-    np.testing.assert_allclose(both, alone, atol=1e-5)
-
-
-ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0}
-
-
-def test_terms_are_independent_of_one_another() -> None:
-    seen = view(other_hand())
-    each = sum(added(seen, **{name: weight}) for name, weight in ALL.items())
-    np.testing.assert_allclose(added(seen, **ALL), each, rtol=1e-4, atol=1e-4)
+def test_terms_and_other_hands_add_up() -> None:
+    every, one, two = {"keypoints": 0.4, "overlap": 0.5}, other_hand(0.03), other_hand(-0.03)
+    each = [added(view(), **{name: weight}) for name, weight in every.items()]
+    each += [added(view(other), other_hand=3.0) for other in (one, two)]
+    both = added(view(one, two), other_hand=3.0, **every)
+    np.testing.assert_allclose(both, sum(each), rtol=1e-4, atol=1e-4)
 
 
 def test_without_a_detection_keypoints_say_nothing() -> None:

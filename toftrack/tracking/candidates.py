@@ -167,28 +167,22 @@ def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tenso
     return detection.first(max(1, min(count, likely))).states(fitted.ratio)
 
 
-def detector_poses(
-    detection: Detection,
-    observation: Observation,
-    fitted: FittedHand,
-    model: TrackerModel,
-    count: int,
-) -> Tensor:
+def detected_poses(view: View, count: int) -> Tensor:
     """(1 + H, 27) a detection's poses: the likeliest one bent to the keypoints, and H <= `count`
     hypotheses. (0, 27) of an empty detection; without refinement, only the H.
 
     Keypoints are more exact than hypotheses where a finger is seen, but no pose by themselves.
     """
-    if detection.empty:
+    if view.detection.empty:
         return torch.zeros(0, 27)
-    states = hypotheses_of(detection, fitted, count)
-    if not model.refinement.iterations:
+    states, cfg = hypotheses_of(view.detection, view.fitted, count), view.model.refinement
+    if not cfg.iterations:
         return states
     bent = states[:1]
-    nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), observation.k, (0, 0))
-    freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
-    keypoints = keypoints_of(detection, model, _BENT_M)
-    return torch.cat((fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
+    nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), view.observation.k, (0, 0))
+    freely = replace(cfg, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
+    keypoints = keypoints_of(view.detection, view.model, _BENT_M)
+    return torch.cat((view.fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
 
 
 def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, float]:
@@ -197,8 +191,7 @@ def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, floa
     The detection must not be empty.  keypoints: see View.log_posterior.
     """
     model = view.model
-    count = model.detector.settings.hypotheses
-    poses = detector_poses(view.detection, view.observation, view.fitted, model, count)
+    poses = detected_poses(view, model.detector.settings.hypotheses)
     if model.refinement.iterations:
         poses = torch.cat((poses, view.refine(poses)))
     values = view.log_posterior(poses, keypoints=keypoints)
@@ -232,7 +225,7 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
         return scored(view, mean)
     if view.covered:
         return scored(view, view.track.pose)
-    detected = detector_poses(view.detection, view.observation, view.fitted, view.model, 1)
+    detected = detected_poses(view, 1)
     previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
     poses = torch.cat((previous, mean, detected))
     table = scored(view, view.refine(poses), len(detected))

@@ -41,17 +41,16 @@ _HIDDEN, _OUT_OF_VIEW = 0.3, 0.4
 class ConfidenceFeatures:
     """Features for and against an estimate in one frame, each a number of order 1.
 
-    log_score: natural log of the image's score.
+    log_score: log of the image's score.
     keypoints_off, farthest_keypoint_off: distance of the joints from the network's keypoints, mean
-        and largest, log of centimetres.
-    pose_off: mean distance from the hypothesis that is most like it, likewise.
-    likeliest_off: mean distance from the likeliest hypothesis.
-    expected_error, unsure: the network's own expected error of its likeliest hypothesis, and the
-        mean standard deviation of its keypoints, likewise.
+        and largest; like all distances here, log of centimetres.
+    pose_off, likeliest_off: mean distance from the likely hypothesis that is most like it, and from
+        the likeliest one.
+    expected_error, unsure: the network's own expected error of that, and the mean standard
+        deviation of its keypoints.
     absent, other_side: minus the log of the network's probability that there is a hand, and that it
         is this one: a hand that is turned round looks like the other one.
-    unseen: share of the joints that lie outside of the image.
-    hidden: share of the joints that lie behind something.
+    unseen, hidden: shares of the joints that lie outside of the image, and behind something.
     young: 1 in the first frame of a track, falling.
     """
 
@@ -70,7 +69,7 @@ class ConfidenceFeatures:
 
     def values(self) -> list[float]:
         """The features in the order of FEATURES."""
-        return [getattr(self, name) for name in FEATURES]
+        return list(vars(self).values())
 
 
 FEATURES = tuple(field.name for field in fields(ConfidenceFeatures))
@@ -233,9 +232,8 @@ class JointConfidence:
                 raise ToftrackError(f"joints.{name} must have a row for each of {', '.join(known)}")
             for key, row in rows.items():
                 if not isinstance(row, Sequence) or len(row) != len(COLUMNS):
-                    wanted = ", ".join(COLUMNS)
                     raise ToftrackError(
-                        f"joints.{name}.{key} must be {len(COLUMNS)} numbers: {wanted}"
+                        f"joints.{name}.{key} must be {len(COLUMNS)} numbers: {', '.join(COLUMNS)}"
                     )
                 for value in row:
                     check_number(f"joints.{name}.{key}", value)
@@ -251,9 +249,8 @@ class JointConfidence:
     def judge(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations (21, 3), m, and probabilities (21,) from features (21, J)."""
         predicted = features @ self._weights + self._kinds
-        sigma = (self.scale * np.exp(predicted[:, :3].clip(-30.0, 30.0))).clip(
-            _LEAST_CM, _MOST_CM
-        ) / 100
+        sigma_cm = self.scale * np.exp(predicted[:, :3].clip(-30.0, 30.0))
+        sigma = sigma_cm.clip(_LEAST_CM, _MOST_CM) / 100
         odds = (predicted[:, 3] + self.odds).clip(-30.0, 30.0)
         return sigma.astype(np.float32), (1 / (1 + np.exp(-odds))).astype(np.float32)
 

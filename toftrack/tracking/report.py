@@ -6,7 +6,7 @@ Only here it matters what the user asked for: how many hands, and of which side.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,43 +63,34 @@ def report(
 
     state: with the tracks that go on.  results: also of those that ended in this frame.
     """
-    sides = {one.track.number: right_log_odds(one.track, state) for one in results}
+    rights = [side_log_odds(one.track, state.tracks, state.told) for one in results]
     slots, infos, estimates = [], list[StepInfo | None](), []
-    for number, one in enumerate(assign_slots(state, results, sides)):
+    for number, row in enumerate(assign_slots(state, results, rights)):
         slot, info = state.slots[number], None
-        if one is None:
+        if row is None:
             slot, estimate = report_absence(slot, scene.image, scene.model, len(state.slots))
         else:
-            right = sides[one.track.number]
-            slot, info, estimate = report_track(number, one, right, state, scene, spans)
+            each = results[row], rights[row]
+            slot, info, estimate = report_track(number, *each, state, scene, spans)
         slots.append(slot)
         infos.append(info)
         estimates.append(estimate)
     return replace(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
 
 
-def right_log_odds(track: Track, state: TrackerState) -> float:
-    """Log odds that a track is a right hand, see side_log_odds."""
-    others = [one for one in state.tracks if one.confirmed and one.number != track.number]
-    return side_log_odds(track, others, state.told)
-
-
 def assign_slots(
-    state: TrackerState, results: Sequence[TrackResult], sides: Mapping[int, float]
-) -> list[TrackResult | None]:
-    """The result for each slot, None = none, so that their worth to the slots is largest in sum.
+    state: TrackerState, results: Sequence[TrackResult], rights: Sequence[float]
+) -> list[int | None]:
+    """The row of the result for each slot, None = none, so that their worth is largest in sum.
 
-    sides: log odds of a right hand by track number.
+    rights: log odds of a right hand of each.
     """
     worth = np.zeros((len(state.slots), len(results) + len(state.slots)))
     for number, slot in enumerate(state.slots):
-        for column, one in enumerate(results):
-            worth[number, column] = _worth(number, slot, one.track, sides[one.track.number], state)
-    columns = least_cost(-worth)
-    return [
-        results[column] if column < len(results) and worth[number, column] > 0 else None
-        for number, column in enumerate(columns)
-    ]
+        for row, (one, right) in enumerate(zip(results, rights, strict=True)):
+            worth[number, row] = _worth(number, slot, one.track, right, state)
+    rows = least_cost(-worth)
+    return [row if worth[number, row] > 0 else None for number, row in enumerate(rows)]
 
 
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:

@@ -51,15 +51,16 @@ _LEAST_PRESENT, _LEAST_LOG_ODDS = 0.5, -1.0
 neither pose is the hand's, and which one explains more of the image is chance."""
 
 
-def side_log_odds(track: Track, others: Sequence[Track], told: str | None) -> float:
+def side_log_odds(track: Track, tracks: Sequence[Track], told: str | None) -> float:
     """Log odds that a track is a right hand, by its evidence, the body, its partner and the user.
 
-    others: the other tracks that are confirmed; a person's two hands are not of one side.
+    tracks: all, of which the other confirmed ones count: a person's two hands are not of one side.
     told: the side that the user said, of a hand that is seen alone.
 
     A partner counts by how probable it is that it is a hand, and what was said by the rest.
     """
     evidence, total = track.evidence, track.evidence.fits
+    others = [one for one in tracks if one.confirmed and one.number != track.number]
     if told is None:
         shoulder = _SHOULDER * evidence.body_m
         total += min(max(shoulder, -_SHOULDER_MOST), _SHOULDER_MOST)

@@ -15,7 +15,7 @@ from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.association import assign, costs, keep_tracks, unassigned
-from toftrack.tracking.candidates import View, keypoints_of, propose, select
+from toftrack.tracking.candidates import View, propose, select
 from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
@@ -190,7 +190,7 @@ def learn_shape(view: View, pose: torch.Tensor) -> shape_fit.ShapeEstimate:
         fitted.shape,
         fitted.derivatives,
         view.detection,
-        keypoints_of(view.detection, model),
+        view.keypoints,
         fitted.first,
         fitted.refiner.pose,
     )

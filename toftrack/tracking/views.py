@@ -124,9 +124,8 @@ def make_view(
 def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
     """The view with its sides compared; restarted as the other side where that one is likelier."""
     evidence = compare_sides(view, mirrored, scene.image_for(row), told)
-    track, hands = replace(view.track, evidence=evidence), enumerate(scene.hands)
-    others = [hand.track for at, hand in hands if at != row and hand.track.confirmed]
-    if not changes_side(track, side_log_odds(track, others, told), told):
+    track, tracks = replace(view.track, evidence=evidence), [hand.track for hand in scene.hands]
+    if not changes_side(track, side_log_odds(track, tracks, told), told):
         return replace(view, track=track)
     track = replace(track, side=OTHER_SIDE[track.side], shape=first_shape())
     track = update_shape(replace(track, age=Duration()), mirrored, scene.model)
