@@ -16,11 +16,8 @@ REACH_M = 0.16
 """Points farther than this from the middle of a hand are none of it."""
 _MARGIN_PX = 24
 """Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
-_SQUARE = np.ones((3, 3), np.uint8)
 _EDGE_M, _FAR_M = 0.03, 10.0
 """Depths of neighbours that differ by so much are an edge; and the depth where nothing is read."""
-_KEPT = 4
-"""Observations: a frame asks for the same points where sides are compared and where it refines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +37,7 @@ class SeenPoints:
     corner: tuple[int, int] = (0, 0)
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(4)  # a frame asks for the same points where sides are compared and where it refines
 def seen_points(observation: Observation) -> SeenPoints:
     """The points and the silhouette of an observation.
 
@@ -87,7 +84,8 @@ def smooth_points(
     if not hand.any():
         return np.zeros((0, 3), np.float32)
     far = np.where(depth_m > 0, depth_m, np.float32(_FAR_M))
-    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < _EDGE_M
+    square = np.ones((3, 3), np.uint8)
+    smooth = (cv2.dilate(far, square) - cv2.erode(far, square)) < _EDGE_M
     u, v = _pixels(hand & smooth)
     z = depth_m[v, u]
     x = (u + corner[1] - k[0, 2]) / k[0, 0] * z

@@ -39,16 +39,14 @@ _UNLIKELY = 0.03
 _BENT_STEPS, _BENT_M, _BENT_RAD = 6, 0.010, 0.8
 """In how many steps a pose is bent to the keypoints; how sure the keypoints are at best, and how
 far an angle may go."""
-_NO_WEIGHT = 1e-6
-"""The least weight of keypoints: divided by 0, standard deviations would be no numbers."""
 _LEAST_PARTS = 4
 """A thing in the hand has at least so many cells of the crop's parts, of 9 mm each."""
 _MOSTLY, _UNKNOWN = 0.5, 255
 """A surface in front is the hand's arm when more than this share of it is, where the network sees
 it; and the class of what it does not see."""
 _MARGIN = 0.05
-"""What a pose of the detector loses in log posterior against the other sources: neighbouring
-fingers change places from frame to frame otherwise (swaps +0.6 points)."""
+"""What a pose of the detector loses in log posterior against the others: neighbouring fingers
+change places from frame to frame otherwise (swaps +0.6 points)."""
 _SURE_LEAD = 2.0
 """The same of a pose elsewhere while something hides the hand: without it, a second hand that
 crosses the first one is silently wrong in 5 % of the frames."""
@@ -158,7 +156,7 @@ def keypoints_of(
     """
     cfg, found = model.detector.settings, detection.keypoints
     sigma = found.sigma_m.clamp(min=cfg.keypoint_m if least_m is None else least_m)
-    return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, _NO_WEIGHT))
+    return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, 1e-6))
 
 
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:

@@ -27,10 +27,9 @@ from toftrack.tracking.state import Track, generator_on
 
 _MOVEMENT_S = 0.3
 """How long a movement goes on (to 1/e)."""
-_APPROACH_M_S = 0.05
-"""How much faster than its wrist the nearest joint of a partly hidden hand may come nearer."""
-_NEAREST_M = 0.15
-"""No palm is predicted nearer: no camera sees it there."""
+_APPROACH_M_S, _NEAREST_M = 0.05, 0.15
+"""How much faster than its wrist the nearest joint of a partly hidden hand may come nearer; and no
+palm is predicted nearer than that: no camera sees it there."""
 
 
 def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:

@@ -36,8 +36,6 @@ from toftrack.tracking.state import OTHER_SIDE, Slot, TrackerState
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
-_HANDS = 32
-"""So many hands of different sides and shapes are cached."""
 
 
 @dataclass(frozen=True)
@@ -158,12 +156,12 @@ class FilterModel:
         return _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
 
     def hand(self, side: str, shape: ShapeEstimate) -> FittedHand:
-        """The hand of a side in the applied shape; cached."""
+        """The hand of a side in the applied shape; the last 32 ones are cached."""
         return self._hands(side, shape.applied)
 
     @cached_property
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
-        return lru_cache(_HANDS)(partial(_fitted_hand, self.configured.shape, self.backend))
+        return lru_cache(32)(partial(_fitted_hand, self.configured.shape, self.backend))
 
     def decode(self, particles: Tensor) -> Tensor:
         """(N, 27) poses of particles (N, 6 + d), within the joints' limits."""

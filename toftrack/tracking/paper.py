@@ -34,14 +34,11 @@ from toftrack.tracking.report import finish_estimate, make_estimate, report_abse
 from toftrack.tracking.state import StepInfo, Track, TrackerState
 from toftrack.tracking.step import StepResult
 
-_WIDEST_PALM_M = 0.06
-"""Half the breadth of the broadest hand's palm with the ball of the thumb."""
-_DEPTH_M = 0.12
-"""How far behind the nearest surface a palm typically lies at most."""
-_DEPTH_EDGE_M = 0.04
-"""Between neighbouring pixels of one surface there is less than this."""
-_HALF_PALM_M = 0.012
-"""Half the thickness of a palm."""
+_WIDEST_PALM_M, _HALF_PALM_M = 0.06, 0.012
+"""Half the breadth of the broadest hand's palm with the ball of the thumb, and half its thickness."""
+_DEPTH_M, _DEPTH_EDGE_M = 0.12, 0.04
+"""How far behind the nearest surface a palm typically lies at most; between neighbouring pixels of
+one surface there is less than the latter."""
 
 
 @dataclass(frozen=True)
@@ -194,8 +191,9 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         nearest_m=expected.nearest_m if expected and hidden else 0.0,
     )
     ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
-    estimate = estimate.updated(joint_sigma_m=sigma_m, joint_ok=ok)
-    estimate = estimate.updated(side=slot.side, side_probability=sure)
+    estimate = estimate.updated(
+        joint_sigma_m=sigma_m, joint_ok=ok, side=slot.side, side_probability=sure
+    )
     slot, estimate = finish_estimate(slot, image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
     slot = replace(slot, track=track.number)
@@ -210,9 +208,8 @@ def _joint_sigma(
     fitted: FittedHand,
     model: FilterModel,
 ) -> np.ndarray:
-    """(21, 3) m, standard deviations of joints (21, 3) by the particles and the hand model's error.
-
-    particle: (1, 6 + d) that of the estimate.
+    """(21, 3) m, standard deviations of joints (21, 3) of an estimate with a particle (1, 6 + d) by
+    the particles and the hand model's own error.
     """
     motions = model.backend.motions
 
@@ -226,14 +223,10 @@ def _joint_sigma(
 
 
 def propagated_sigma(
-    joints_m: np.ndarray,
-    covariance: torch.Tensor,
-    joints_of: Callable[[torch.Tensor], torch.Tensor],
+    joints_m: np.ndarray, covariance: Tensor, joints_of: Callable[[Tensor], Tensor]
 ) -> np.ndarray:
-    """(21, 3) m, deviations of joints (21, 3) along joint_axes by the particles' covariance.
-
-    covariance: (6 + d, 6 + d) in the tangent space.
-    joints_of: joints (N, 21, 3) of the estimate moved by tangents (N, 6 + d).
+    """(21, 3) m, deviations of joints (21, 3) along joint_axes by a covariance (6 + d, 6 + d) of
+    tangents.  joints_of: joints (N, 21, 3) of the estimate moved by tangents (N, 6 + d).
     """
     size = len(covariance)
     # One step along each main axis and back; a covariance may be singular, so no Cholesky.

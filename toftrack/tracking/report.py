@@ -132,15 +132,8 @@ def report_track(
     estimate = make_estimate(
         image, one.filtered, track.pose, one.score, one.status, view.fitted, model
     )
-    rows = joint_features(
-        estimate.joints_m,
-        view.detection,
-        slot.joint_features,
-        one.score,
-        track.log_odds,
-        image.depth_m,
-        image.k,
-    )
+    seen = view.detection, slot.joint_features, one.score, track.log_odds
+    rows = joint_features(estimate.joints_m, *seen, image.depth_m, image.k)
     sigma, confidence = model.lost.joints.judge(rows)
     estimate = with_side(estimate, track.side, right, side_of_slot(number, state))
     estimate = estimate.updated(
@@ -256,10 +249,9 @@ def finish_estimate(
 
     shape: the hand of the estimate.
     """
-    gesture, estimate = tell_gesture(
-        model.gestures, slot.gesture, estimate, model.space, dt_s / FRAME_S
-    )
-    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
+    frames, (height, width) = dt_s / FRAME_S, image.depth_m.shape
+    gesture, estimate = tell_gesture(model.gestures, slot.gesture, estimate, model.space, frames)
+    size_px = width, height
     estimate = in_all_conventions(estimate, shape, image.k, size_px)
     # While there is no hand, the last estimate that was believed is reported, if one was.
     kept = slot.last if estimate.lost and not slot.last.lost else estimate

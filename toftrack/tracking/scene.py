@@ -18,10 +18,9 @@ from toftrack.tracking.filter import PredictedHand, predict
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
 
-_TOLERANCE_M = 0.02
-"""A pixel whose depth is so near to a predicted surface is that hand's."""
-_EDGE_M = 0.06
-"""Pixels on a hand's outline mix its depth with what is behind, and are up to this farther."""
+_TOLERANCE_M, _EDGE_M = 0.02, 0.06
+"""A pixel whose depth is so near to a predicted surface is that hand's; those on its outline, which
+mix its depth with what is behind, are up to the latter farther."""
 _FAR_M = 5.0
 """Depth of removed pixels: the detector sees nothing so far away."""
 _IN_FRONT_M = 0.03

@@ -35,10 +35,9 @@ and comparisons over which the body's place is averaged."""
 _BEHIND_M, _BODY_M2, _BODY_ROWS = (0.12, 0.55), 0.03, 72
 """Range of the body's distance behind a raised hand; its least visible area; and rows of the image
 that it is searched in."""
-_PARTNER = 2.0
-"""Log odds that two hands which are seen at once are of different sides."""
-_TOLD = 2.0
-"""Log odds that a hand which is seen alone is of the side that the user said."""
+_PARTNER, _TOLD = 2.0, 2.0
+"""Log odds that two hands which are seen at once are of different sides, and that one which is seen
+alone is of the side that the user said."""
 _SURE, _FIRST = 3.0, 5
 """Sides are compared less often beyond these log odds, after so many comparisons."""
 _UNSURE_S, _SURE_S = 0.08, 0.8
