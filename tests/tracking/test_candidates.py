@@ -50,7 +50,7 @@ def viewed(x: float, seed: int = 0) -> View:
 
 def mean_of(view: View) -> torch.Tensor:
     """(1, 27) the filter's estimate, which is the track's here."""
-    return view.model.decode(view.track.mean)
+    return view.model.decode(view.track.cloud.mean)
 
 
 def proposed(view: View) -> Hypotheses:

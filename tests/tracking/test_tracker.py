@@ -166,7 +166,7 @@ def test_a_filter_of_another_size_tracks_too() -> None:
     tracker = make_tracker("filter.particles=60", "filter.passes=2", "pose_space.dims=6")
     assert isinstance(tracker, Tracker)
     found = [tracker.step(depth, scene.k, i, i / 25) for i, depth in enumerate(scene.depth_m)]
-    assert tracker.track.particles.shape == (60, 12)
-    assert float(tracker.track.weights.sum()) == pytest.approx(1)
+    assert tracker.track.cloud.particles.shape == (60, 12)
+    assert float(tracker.track.cloud.weights.sum()) == pytest.approx(1)
     assert found[-1].covariance.shape == (12, 12)
     assert errors_mm(found, scene)[-3:].mean() < 20

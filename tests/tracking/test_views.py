@@ -87,7 +87,7 @@ def test_a_track_that_was_seen_elsewhere_begins_anew_there_and_is_the_same_hand(
     assert view is not None and not view.track.age.begun
     assert off_m(view, THERE) < 0.01
     assert view.track.number == 3 and view.track.confirmed
-    assert bool((view.track.particles[:, 0] > 0.9 * ELSEWHERE).all())
+    assert bool((view.track.cloud.particles[:, 0] > 0.9 * ELSEWHERE).all())
 
 
 @pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(THERE)])

@@ -28,14 +28,14 @@ from toftrack.hand.regions import joint_axes
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import image_term
 from toftrack.tracking.confidence import Status
-from toftrack.tracking.filter import ParticleSet, predict, run_filter, update_velocity
+from toftrack.tracking.filter import predict, run_filter, update_velocity
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.report import finish_estimate, make_estimate, report_absence
-from toftrack.tracking.state import StepInfo, Track, TrackerState
+from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState
 from toftrack.tracking.step import StepResult
 
 _WIDEST_PALM_M, _HALF_PALM_M = 0.06, 0.012
-"""Half the breadth of the broadest hand's palm with the ball of the thumb, and half its thickness."""
+"""Half the breadth of the broadest palm with the ball of the thumb, and half its thickness."""
 _DEPTH_M, _DEPTH_EDGE_M = 0.12, 0.04
 """How far behind the nearest surface a palm typically lies at most; between neighbouring pixels of
 one surface there is less than the latter."""
@@ -85,9 +85,8 @@ class RoughStart:
         there = on_device(particles, model.device)
         weights = there.new_full((n,), 1.0 / n, dtype=torch.float64)
         mean, still = particles[:1], particles.new_zeros(6 + space.dims)
-        return Track(
-            there, weights, mean, still, model.decode(mean), side=model.configured.shape.side
-        )
+        cloud, side = ParticleSet(there, weights, mean), model.configured.shape.side
+        return Track(cloud, still, model.decode(mean), side=side)
 
 
 def palm_centre(observation: Observation) -> np.ndarray:
@@ -180,9 +179,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     hidden = bool(observation.occluder.any())
     track = replace(
         track,
-        particles=filtered.particles,
-        weights=filtered.weights,
-        mean=filtered.mean,
+        cloud=filtered,
         velocity=update_velocity(track, filtered.mean, dt_s, model),
         pose=pose,
         age=track.age.extended(dt_s),

@@ -26,11 +26,10 @@ from toftrack.hand.shape import HandShape
 from toftrack.tracking.association import least_cost
 from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import Status, joint_features, probability
-from toftrack.tracking.filter import ParticleSet
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import side_log_odds
-from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Slot, StepInfo, Track, TrackerState
 
 _OTHER = 0.4
 """A hand that is less probably of the side that the user said is flagged as another one."""

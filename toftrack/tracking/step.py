@@ -19,7 +19,6 @@ from toftrack.tracking.candidates import View, propose, select
 from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
-    ParticleSet,
     new_track,
     predict_particles,
     run_filter,
@@ -29,7 +28,7 @@ from toftrack.tracking.filter import (
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.state import StepInfo, Track, TrackerState
+from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState
 from toftrack.tracking.views import begin_track, continue_track, max_new_tracks, predicted_view
 
 StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
@@ -98,11 +97,10 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
 def rest_track(scene: Scene, row: int) -> Track:
     """The track of a row after a frame in which it is only moved on."""
     hand, dt_s = scene.hands[row], scene.dt_s
-    track, moved = hand.track, predict_particles(hand.track, dt_s, scene.model)
+    track = hand.track
     return replace(
         track,
-        particles=moved.particles,
-        mean=moved.mean,
+        cloud=predict_particles(track, dt_s, scene.model),
         pose=hand.pose,
         age=track.age.extended(dt_s),
         asked_s=track.asked_s + dt_s,
@@ -159,9 +157,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
     believed = not status.lost
     track = replace(
         track,
-        particles=drawn.particles,
-        weights=drawn.weights,
-        mean=drawn.mean,
+        cloud=drawn,
         velocity=update_velocity(track, drawn.mean, dt_s, model),
         pose=pose,
         shape=learn_shape(view, pose) if believed else track.shape,

@@ -20,7 +20,7 @@ from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import changes_side, compare_sides, side_log_odds
-from toftrack.tracking.state import OTHER_SIDE, Track, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Track, TrackerState
 
 _SPARE = 1
 """So many tracks may exist beyond the slots, or beyond the two hands of a person."""
@@ -79,10 +79,8 @@ def begin_track(scene: Scene, one: SideDetection, number: int, state: TrackerSta
     """The view of a new tentative track of a number; None where no hand can be."""
     model, detection, image = scene.model, one.detection, scene.unexplained()
     nothing, shape = torch.zeros(1, 6 + model.space.dims), known_shape(one.side, state)
-    pose = torch.zeros(1, 27)
-    track = Track(
-        nothing, nothing[:, 0], nothing, nothing[0], pose, number=number, side=one.side, shape=shape
-    )
+    cloud, pose = ParticleSet(nothing, nothing[:, 0], nothing), torch.zeros(1, 27)
+    track = Track(cloud, nothing[0], pose, number=number, side=one.side, shape=shape)
     track = update_shape(track, detection, model)
     view = make_view(scene, -1, track, detection, expected_of(detection))
     if view is None:
