@@ -65,6 +65,14 @@ def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: f
     return cost
 
 
+def associate(
+    hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: float
+) -> tuple[list[SideDetection | None], list[SideDetection]]:
+    """The detection of each track's hand, None where it has none; and those that may begin one."""
+    columns = assign(costs(hands, seen, dt_s))
+    return [seen[at] if at >= 0 else None for at in columns], unassigned(seen, columns)
+
+
 def assign(cost: np.ndarray) -> list[int]:
     """The column of each row of (B, D) costs, -1 where it has none: as many rows as possible have
     one, and the sum of their costs is least.

@@ -14,7 +14,7 @@ from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.association import assign, costs, keep_tracks, unassigned
+from toftrack.tracking.association import associate, keep_tracks
 from toftrack.tracking.candidates import View, propose, select
 from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
@@ -63,15 +63,12 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
             None if rests(scene, row, state) else predicted_view(scene, row) for row in rows
         ]
         detections = finish_detection(pending, scene, state)
-        matches = assign(costs(scene.hands, detections, dt_s))
-        new = unassigned(detections, matches)[: max_new_tracks(state)]
-        seen = [detections[column] if column >= 0 else None for column in matches]
+        found, new = associate(scene.hands, detections, dt_s)
         continued = [
-            continue_track(scene, row, predicted[row], seen[row], state.told) for row in rows
+            continue_track(scene, row, predicted[row], found[row], state.told) for row in rows
         ]
-        begun = [
-            begin_track(scene, one, state.next_track + at, state) for at, one in enumerate(new)
-        ]
+        numbered = list(enumerate(new[: max_new_tracks(state)], state.next_track))
+        begun = [begin_track(scene, one, number, state) for number, one in numbered]
         views = [view for view in continued + begun if view is not None]
     with spans("filter: rest"):
         particles = filter_tracks(views, state, dt_s, model, generator, spans)
@@ -87,7 +84,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         state,
         places=places,
         found_s=state.found_s if pending.finder is None else 0.0,
-        next_track=state.next_track + len(new),
+        next_track=state.next_track + len(begun),
         generator=generator.get_state(),
     )
     state = keep_tracks(state, [*resting, *(result.track for result in results)], model)
