@@ -25,7 +25,6 @@ from toftrack.tracking.candidates import (
     View,
     best_start,
     hypotheses_of,
-    keypoints_of,
     propose,
     select,
     with_own_arm,
@@ -108,18 +107,23 @@ def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
     assert float((joints(pose) - joints(truth)).norm(dim=-1).mean()) < 0.005
 
 
+def keypoint_sigma(detection: Detection, **settings: float) -> torch.Tensor:
+    model = model_with(**settings)
+    return view_of(
+        image_of(hand_at()), track_of(hand_at()), detection, model=model
+    ).keypoints.sigma_m
+
+
 def test_keypoints_are_trusted_no_more_than_is_set() -> None:
     for sigma_m in (0.005, 0.03):
         keypoints = replace(detection_of(hand_at()).keypoints, sigma_m=torch.full((21,), sigma_m))
         detection = replace(detection_of(hand_at()), keypoints=keypoints)
-        found = keypoints_of(detection, model_with(keypoint_m=0.02)).sigma_m
-        assert found == pytest.approx(max(sigma_m, 0.02))
+        assert keypoint_sigma(detection, keypoint_m=0.02) == pytest.approx(max(sigma_m, 0.02))
 
 
 def test_a_keypoint_weight_divides_the_deviations_and_0_leaves_them_without_effect() -> None:
-    detection = detection_of(hand_at())
     plain, half, none = (
-        keypoints_of(detection, model_with(keypoint_weight=weight)).sigma_m
+        keypoint_sigma(detection_of(hand_at()), keypoint_weight=weight)
         for weight in (1.0, 0.5, 0.0)
     )
     torch.testing.assert_close(half, 2 * plain)

@@ -43,8 +43,13 @@ def view(*others: torch.Tensor) -> View:
 
 def weighed(seen: View, coverage: float | None = None, **weights: float) -> np.ndarray:
     """(N,) log posteriors, only with the terms that are weighted here."""
-    model = replace(seen.model, weights=posterior_weights(**(NONE | weights)))
-    seen = replace(seen, model=model, image=replace(seen.image, coverage=coverage))
+    used = posterior_weights(**(NONE | weights))
+    seen = replace(
+        seen,
+        model=replace(seen.model, weights=used),
+        image=replace(seen.image, coverage=coverage),
+        keypoint_weight=used.keypoints,
+    )
     return seen.log_posterior(poses()).numpy()
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.hand_detector import Detection, DetectorSettings
 from toftrack.detector.parts import FOREARM_PART, THING_PART
 from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints
@@ -62,7 +62,7 @@ class View:
 
     fitted: the hand in the applied shape.  observation: not empty.
     expected_m: the depth of its nearest joint, as predicted, or as detected where it (re)starts.
-    detection: empty where the pose network did not look.
+    detection: empty where the pose network did not look.  keypoint_weight: of its keypoints.
     others: joints (21, 3) m of each other hand.  image: the likelihood of the image.
     """
 
@@ -74,6 +74,7 @@ class View:
     others: tuple[Tensor, ...]
     image: ImageTerm
     model: TrackerModel
+    keypoint_weight: float
 
     @cached_property
     def hidden(self) -> bool:
@@ -93,8 +94,9 @@ class View:
 
     @cached_property
     def keypoints(self) -> Keypoints:
-        """The detection's keypoints, see keypoints_of."""
-        return keypoints_of(self.detection, self.model)
+        """The detection's keypoints, with the configured least deviation."""
+        cfg = self.model.detector.settings
+        return keypoints_of(self.detection, cfg, cfg.keypoint_m)
 
     @cached_property
     def seen(self) -> SeenPoints:
@@ -106,19 +108,12 @@ class View:
         cfg = self.model.refinement
         return self.fitted.refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
 
-    def log_posterior(
-        self, poses: Tensor, joints_m: Tensor | None = None, keypoints: float | None = None
-    ) -> Tensor:
-        """(N,) log posteriors of poses (N, 27), see posterior.py.
-
-        joints_m: (N, 21, 3) theirs, where they are known.
-        keypoints: weight of the keypoints; None = the model's.
-        """
+    def log_posterior(self, poses: Tensor) -> Tensor:
+        """(N,) log posteriors of poses (N, 27), see posterior.py."""
         weights, total = self.model.weights, self.image(poses)
-        joints = self.fitted.refiner.joints(poses) if joints_m is None else joints_m
-        weight = weights.keypoints if keypoints is None else keypoints
-        if weight and not self.detection.empty:
-            total = total - weight * keypoints_off(joints, self.keypoints)
+        joints = self.fitted.refiner.joints(poses)
+        if self.keypoint_weight and not self.detection.empty:
+            total = total - self.keypoint_weight * keypoints_off(joints, self.keypoints)
         if weights.overlap:
             length_m = self.fitted.shape.hand_length_m
             total = total - weights.overlap * finger_overlap(joints, length_m)
@@ -148,15 +143,11 @@ def image_term(
     return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
 
 
-def keypoints_of(
-    detection: Detection, model: TrackerModel, least_m: float | None = None
-) -> Keypoints:
-    """A detection's keypoints, with the configured weight.  least_m: their least deviation; None =
-    the configured one.
-    """
-    cfg, found = model.detector.settings, detection.keypoints
-    sigma = found.sigma_m.clamp(min=cfg.keypoint_m if least_m is None else least_m)
-    return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, 1e-6))
+def keypoints_of(detection: Detection, settings: DetectorSettings, least_m: float) -> Keypoints:
+    """A detection's keypoints, with the configured weight and a least deviation."""
+    found = detection.keypoints
+    sigma = found.sigma_m.clamp(min=least_m)
+    return Keypoints(found.points_m, sigma / max(settings.keypoint_weight, 1e-6))
 
 
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
@@ -179,20 +170,20 @@ def detected_poses(view: View, count: int) -> Tensor:
     bent = states[:1]
     nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), view.observation.k, (0, 0))
     freely = replace(cfg, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
-    keypoints = keypoints_of(view.detection, view.model, _BENT_M)
+    keypoints = keypoints_of(view.detection, view.model.detector.settings, _BENT_M)
     return torch.cat((view.fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
 
 
-def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, float]:
+def best_start(view: View) -> tuple[Tensor, float]:
     """The best (1, 27) of the detector's poses, raw or refined, and its log posterior.
 
-    The detection must not be empty.  keypoints: see View.log_posterior.
+    The detection must not be empty.
     """
     model = view.model
     poses = detected_poses(view, model.detector.settings.hypotheses)
     if model.refinement.iterations:
         poses = torch.cat((poses, view.refine(poses)))
-    values = view.log_posterior(poses, keypoints=keypoints)
+    values = view.log_posterior(poses)
     best = int(values.argmax())
     return poses[best][None], float(values[best])
 
@@ -238,7 +229,7 @@ def scored(view: View, poses: Tensor, detected: int = 0) -> Hypotheses:
     """Poses (N, 27) as they are, scored; the last `detected` ones are the detector's."""
     joints = view.fitted.refiner.joints(poses)
     detectors = np.arange(len(poses)) >= len(poses) - detected
-    return Hypotheses(poses, joints, detectors, view.log_posterior(poses, joints))
+    return Hypotheses(poses, joints, detectors, view.log_posterior(poses))
 
 
 def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:

@@ -36,17 +36,18 @@ class PendingDetections:
     """The networks at work on a frame.
 
     at_tracks: each waits for the detection at a predicted hand.
-    finder: waits for the finder's places; None where it is not asked.
-    at_once: its places are used in this frame, to find a hand anew; else in the next one.
+    asked: whether the finder looks at this frame.  finder: waits for its places.
+    at_once: they are used in this frame, to find a hand anew; else in the next one.
     """
 
     at_tracks: Sequence[Callable[[], SideDetection]]
-    finder: Callable[[], Places] | None
+    asked: bool
+    finder: Callable[[], Places]
     at_once: bool
 
     def for_next_frame(self) -> Places:
         """The places that are left to look at in the next frame."""
-        return NO_PLACES if self.finder is None or self.at_once else self.finder()
+        return NO_PLACES if self.at_once else self.finder()
 
 
 def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
@@ -59,21 +60,27 @@ def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     frames = detector.settings.search * (1 if urgent else _FOLLOWED)
     due = frames == 1 or Duration(state.found_s).reached(frames)
     search = partial(detector.start_search, image.depth_m, image.k, len(scene.hands))
-    finder = search() if due and urgent else None  # what is waited for first is begun first
+    finder: Callable[[], Places] = no_places
+    if due and urgent:  # what is waited for first is begun first
+        finder = search()
     at_tracks = [
         _start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row, state)
     ]
     if due and not urgent:
         finder = search()
-    return PendingDetections(at_tracks, finder, urgent)
+    return PendingDetections(at_tracks, due, finder, due and urgent)
+
+
+def no_places() -> Places:
+    """The places of a finder that is not asked."""
+    return NO_PLACES
 
 
 def finish_detection(
     pending: PendingDetections, scene: Scene, state: TrackerState
 ) -> list[SideDetection]:
     """All detections of a frame, those at tracks first."""
-    at_once = pending.finder if pending.at_once else None
-    places = state.places if at_once is None else at_once()
+    places = pending.finder() if pending.at_once else state.places
     seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]

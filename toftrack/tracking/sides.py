@@ -116,8 +116,10 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     fitted = view.model.hand(side, view.track.shape)
     # Very different poses are compared: what explains more of the image counts in full.
     image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
-    seen = replace(view, fitted=fitted, detection=detection, image=image)
-    return max(best_start(seen, _KEYPOINTS)[1], WORST)
+    seen = replace(
+        view, fitted=fitted, detection=detection, image=image, keypoint_weight=_KEYPOINTS
+    )
+    return max(best_start(seen)[1], WORST)
 
 
 def _turned_lead(mirrored: Detection, side: str, image: DepthImage, model: TrackerModel) -> float:

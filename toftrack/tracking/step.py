@@ -83,7 +83,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     state = replace(
         state,
         places=places,
-        found_s=state.found_s if pending.finder is None else 0.0,
+        found_s=0.0 if pending.asked else state.found_s,
         next_track=state.next_track + len(begun),
         generator=generator.get_state(),
     )
