@@ -106,4 +106,5 @@ def view_of(
     expected = expected_of(detection_of(track.pose))
     seen = model.segmentation(image.depth_m, image.k, expected)
     term = image_term(seen, fitted, model)
-    return View(track, fitted, seen, expected.nearest_m, detection, others, term, model)
+    at = expected.nearest_m
+    return View(track, fitted, seen, at, detection, others, term, model, model.weights.keypoints)

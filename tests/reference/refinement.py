@@ -29,34 +29,6 @@ from toftrack.refinement.gauss_newton import (
 from toftrack.refinement.seen_points import REACH_M, SeenPoints
 
 
-class TorchRefiner:
-    """The reference, which runs on any device."""
-
-    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """shape: on the device of the states to come.  surface: instead of the shape's own."""
-        self.shape = shape
-        self.surface = surface or hand_surface(shape)
-
-    def __call__(
-        self,
-        states: Tensor,
-        prior_angles: Tensor,
-        seen: SeenPoints,
-        settings: Refinement,
-        keypoints: Keypoints | None = None,
-    ) -> Tensor:
-        """See refine."""
-        return refine(states, prior_angles, seen, self.shape, self.surface, settings, keypoints)
-
-    def joints(self, states: Tensor) -> Tensor:
-        """See gauss_newton_numba.Refiner."""
-        return self.pose(states).joints_m
-
-    def pose(self, states: Tensor) -> HandPose:
-        """See gauss_newton_numba.Refiner."""
-        return forward_kinematics(states, self.shape)
-
-
 class Residuals(NamedTuple):
     """R residuals of N hypotheses, in standard deviations.
 
@@ -113,17 +85,11 @@ def refine(
     prior_angles: Tensor,
     seen: SeenPoints,
     shape: HandShape,
-    surface: HandSurface,
     settings: Refinement,
     keypoints: Keypoints | None = None,
 ) -> Tensor:
-    """Bring N hands onto the seen points, each by itself.
-
-    states: (N, 27).  prior_angles: (N, 21) the poses that the filter believes in.
-    keypoints: joints that are known besides.
-    Returns (N, 27); a hand within whose reach nothing is seen, and of which no keypoint is known,
-    stays as it is.
-    """
+    """What Refiner does with hands (N, 27)."""
+    surface = hand_surface(shape)
     middle = forward_kinematics(states, shape).joints_m.mean(1)
     points, there = points_around(seen, middle, settings.points)
     informed = there.any(1)

@@ -1,174 +1,181 @@
-"""The compiled refinement does what the reference does, and what it is for."""
+"""The compiled parts of the refinement, each by itself against the one reference."""
 
 from __future__ import annotations
 
-import math
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import torch
-from helpers.configured import nearest_surface, refinement
-from helpers.tracking import sample
-from reference.refinement import TorchRefiner
+from helpers.configured import refinement
+from reference.refinement import (
+    Residuals,
+    keypoint_residuals,
+    point_jacobian,
+    point_residuals,
+    silhouette_residuals,
+)
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
+from toftrack.compute.rigid_numba import pose_hand
 from toftrack.hand.shape import HandShape, default_hand_shape
-from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
+from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
+from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.refinement import gauss_newton_numba as compiled
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.gauss_newton_numba import Refiner
-from toftrack.refinement.seen_points import SeenPoints, seen_points
-from toftrack.render.closed_form import render_range_images
-from toftrack.render.segmentation import Observation
+from toftrack.refinement.seen_points import SeenPoints
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-K = torch.tensor([[220.0, 0.0, 88.0], [0.0, 220.0, 72.0], [0.0, 0.0, 1.0]])
 SETTINGS = refinement()
-SPREAD = torch.tensor([0.005] * 3 + [0.08] * 24)
+SIDES = ("right", "left")
+K = np.array([[220.0, 0.0, 88.0], [0.0, 215.0, 72.0], [0.0, 0.0, 1.0]])
+
+# What an entry point calls cannot be called from Python: one that calls it.
+_nearest = entry_point(lambda *a: compiled.nearest_ellipsoids(*a))
+_add_wrench = entry_point(lambda *a: compiled.add_wrench(*a))
+_add_points = entry_point(lambda *a: compiled.add_points(*a))
+_add_silhouette = entry_point(lambda *a: compiled.add_silhouette(*a))
+_add_keypoints = entry_point(lambda *a: compiled.add_keypoints(*a))
+_assemble = entry_point(lambda *a: compiled.assemble(*a))
 
 
-def seen_hand(
-    shape: HandShape, generator: torch.Generator, n: int = 1
-) -> tuple[Tensor, SeenPoints, Tensor]:
-    """A random true state, what the camera sees of it, and n states near it to start from."""
-    state = torch.zeros(1, 27)
-    state[0, :3] = torch.tensor([0.0, 0.05, 0.45])
-    state[0, 3:] = 0.2 * torch.randn(24, generator=generator)
-    both = hand_surface(shape).pose(forward_kinematics(state, shape))
-    hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
-    depth = render_range_images(hand, K, 144, 176)[0]
-    observation = Observation(depth, depth > 0, torch.zeros_like(depth, dtype=torch.bool), K, 0.4)
-    starts = state + SPREAD * torch.randn(n, 27, generator=generator)
-    return state, seen_points(observation), starts
+@entry_point
+def _pose(state, shape, surface, hand, posed):
+    base_frames, base, lengths, mirror = shape
+    pose_hand(state, base_frames, base, lengths, mirror, hand[0], hand[1])
+    compiled.joint_axes(hand[0], base_frames, mirror, hand[2])
+    compiled.pose_ellipsoids(hand[0], hand[1], surface[0], surface[1], surface[2], posed)
 
 
-def error_m(refiner: TorchRefiner | Refiner, states: Tensor, truth: Tensor) -> Tensor:
-    return (refiner.joints(states) - refiner.joints(truth)).norm(dim=-1).mean(-1)
+@dataclass(frozen=True)
+class Posed:
+    """One hand as both sides have it, float64."""
+
+    shape: HandShape
+    surface: HandSurface
+    pose: HandPose
+    refiner: Refiner
+    hand: tuple[np.ndarray, ...]
+    ellipsoids: np.ndarray
 
 
-def check_joints(shape: HandShape, found: Tensor, expected: Tensor, atol_m: float = 0.002) -> None:
-    """A point that is as near to two bones goes to either, and the steps part by a little."""
-    joints = [forward_kinematics(states, shape).joints_m for states in (found, expected)]
-    torch.testing.assert_close(*joints, atol=atol_m, rtol=0)
+def posed_hand(side: str, seed: int, z: float = 0.45) -> Posed:
+    """A hand in any pose; z: of its wrist."""
+    g = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(ANGLE_LIMITS, dtype=torch.float64).T
+    state = torch.randn(27, generator=g, dtype=torch.float64)
+    state[:3] = torch.tensor([0.0, 0.03, z])
+    state[6:] = low + (high - low) * torch.rand(21, generator=g, dtype=torch.float64)
+    single = default_hand_shape(side=side)
+    shape, surface = single.to(torch.float64), hand_surface(single).to(torch.float64)
+    refiner = Refiner(single)
+    hand = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty((21, 3))
+    ellipsoids = np.empty((len(surface), 12), np.float32)
+    _pose(state.numpy(), refiner._shape, refiner._surface, hand, ellipsoids)
+    pose = forward_kinematics(state[None], shape)
+    return Posed(shape, surface, pose, refiner, hand, ellipsoids)
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize("iterations", [1, 5])
-def test_it_agrees_with_the_reference(side: str, iterations: int) -> None:
-    shape, settings = default_hand_shape(side=side), refinement(iterations=iterations)
-    reference, compiled = TorchRefiner(shape), Refiner(shape)
-    generator = torch.Generator().manual_seed(1)
-    for _ in range(2):
-        _, seen, starts = seen_hand(shape, generator, n=5)
-        expected = reference(starts, starts[:, 6:], seen, settings)
-        found = compiled(starts, starts[:, 6:], seen, settings)
-        assert found.dtype == torch.float32 and found.shape == (5, 27)
-        assert ((expected - starts).abs().amax(1) > 0.01).all()
-        check_joints(shape, found, expected)
-        torch.testing.assert_close(
-            compiled.joints(found), reference.joints(found), atol=1e-5, rtol=0
-        )
+def points_near(posed: Posed, n: int, seed: int) -> Tensor:
+    """(n, 3) float32 points around the joints, on both sides of the surface."""
+    g = torch.Generator().manual_seed(seed)
+    joints = posed.pose.joints_m[0, torch.randint(21, (n,), generator=g)]
+    return (joints + 0.012 * torch.randn(n, 3, generator=g)).float()
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_it_agrees_with_the_reference_on_a_recording(side: str) -> None:
-    shape = default_hand_shape(side=side)
-    reference, compiled = TorchRefiner(shape), Refiner(shape)
-    for frame in (0, 36, 72):
-        scene = sample().cut(frame)
-        if side == "left":
-            scene = scene.mirrored()
-        seen = seen_points(nearest_surface()(scene.depth_m[0], scene.k))
-        starts = torch.zeros(3, 27)
-        starts[:, :3] = torch.from_numpy(scene.joints_m[0, 0])
-        starts += SPREAD * torch.randn(3, 27, generator=torch.Generator().manual_seed(frame))
-        found = [r(starts, starts[:, 6:], seen, SETTINGS) for r in (reference, compiled)]
-        check_joints(shape, *found, atol_m=0.003)
+def no_wrenches() -> np.ndarray:
+    return np.zeros((16, 7, 6))
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_it_agrees_with_the_reference_about_landmarks(own: bool) -> None:
-    shape = default_hand_shape()
-    reference, compiled = TorchRefiner(shape), Refiner(shape)
-    generator = torch.Generator().manual_seed(5)
-    truth, seen, starts = seen_hand(shape, generator, n=3)
-    points = reference.joints(truth)[0] + 0.004 * torch.randn(21, 3, generator=generator)
-    sigma = 0.002 + 0.02 * torch.rand(21, generator=generator)
-    sigma[4], sigma[8], points[12, 1] = math.inf, 0.0, math.nan
-    if own:
-        points, sigma = points + 0.01 * torch.arange(3)[:, None, None], sigma.repeat(3, 1)
-    without = compiled(starts, starts[:, 6:], seen, SETTINGS)
-    nothing = replace(seen, points_m=torch.zeros(0, 3))
-    for what in (seen, nothing):
-        marks = Keypoints(points, sigma)
-        found = compiled(starts, starts[:, 6:], what, SETTINGS, marks)
-        check_joints(shape, found, reference(starts, starts[:, 6:], what, SETTINGS, marks))
-        assert (error_m(compiled, found, without) > 1e-4).all()
+def assembled(wrenches: np.ndarray, posed: Posed) -> tuple[np.ndarray, np.ndarray]:
+    """The normal equations that the sums of the frames make."""
+    sums = np.empty((27, 27)), np.empty(27)
+    _assemble(wrenches, posed.hand, np.empty((27, 6)), sums)
+    return sums
 
 
-def test_it_draws_hands_onto_the_points() -> None:
-    refiner = Refiner(default_hand_shape())
-    generator = torch.Generator().manual_seed(2)
-    before, after = 0.0, 0.0
-    for _ in range(4):
-        truth, seen, starts = seen_hand(default_hand_shape(), generator, n=4)
-        found = refiner(starts, starts[:, 6:], seen, SETTINGS)
-        before += float(error_m(refiner, starts, truth).mean())
-        after += float(error_m(refiner, found, truth).mean())
-    assert after < 0.6 * before
+def check_sums(sums: tuple[np.ndarray, ...], expected: Residuals, rtol: float) -> None:
+    """The normal equations, in parts of their largest entry."""
+    rows, values = expected.rows[0].numpy(), expected.values[0].numpy()
+    normal, gradient = rows.T @ rows, rows.T @ values
+    assert np.abs(normal).max() > 0, "something is compared"
+    off = np.abs(np.tril(sums[0]) - np.tril(normal)).max() / np.abs(normal).max()
+    assert off < rtol
+    assert np.abs(sums[1] - gradient).max() < rtol * max(np.abs(gradient).max(), 1e-9)
 
 
-def test_hypotheses_do_not_know_of_each_other() -> None:
-    """Together, alone, in threads and in calls at the same time: the same to the last bit."""
-    refiner = Refiner(default_hand_shape())
-    _, seen, starts = seen_hand(default_hand_shape(), torch.Generator().manual_seed(3), n=12)
-    starts[1], starts[4, 3] = math.nan, math.inf
-    starts[7, 0] += 1.0
-    alone = [refiner(start, start[:, 6:], seen, SETTINGS) for start in starts.split(1)]
-    torch.set_num_threads(4)
-    with ThreadPoolExecutor(3) as pool:
-        calls = [pool.submit(refiner, starts, starts[:, 6:], seen, SETTINGS) for _ in range(6)]
-    for call in calls:
-        assert torch.equal(call.result().nan_to_num(), torch.cat(alone).nan_to_num())
-    assert alone[1].isnan().all() and not alone[4].isfinite().all()
-    assert torch.equal(alone[7], starts[7:8]), "it sees nothing"
+@pytest.mark.parametrize("side", SIDES)
+def test_rows_are_those_of_the_jacobian(side: str) -> None:
+    posed = posed_hand(side, 4)
+    g = np.random.default_rng(5)
+    for frame in range(16):
+        x, n = 0.1 * g.normal(size=3) + posed.hand[1][0], g.normal(size=3)
+        wrenches = no_wrenches()
+        # With a weight and a residual of 1 the gradient is the row itself.
+        _add_wrench(frame, tuple(x), tuple(n), 1.0, 1.0, wrenches)
+        normal, gradient = assembled(wrenches, posed)
+        as_tensor = (torch.from_numpy(a)[None, None] for a in (x, n))
+        expected = point_jacobian(posed.pose, posed.shape, *as_tensor, torch.tensor([frame]))
+        row = expected[0, 0].numpy()
+        np.testing.assert_allclose(gradient, row, atol=1e-6)  # metres a radian
+        np.testing.assert_allclose(np.tril(normal), np.tril(np.outer(row, row)), atol=1e-6)
 
 
-def test_nothing_seen_leaves_the_states_as_they_are() -> None:
-    refiner = Refiner(default_hand_shape())
-    _, seen, starts = seen_hand(default_hand_shape(), torch.Generator().manual_seed(4), n=3)
-    nothing = replace(seen, points_m=torch.zeros(0, 3), nearest_px=torch.zeros(0, 0, 2))
-    assert torch.equal(refiner(starts, 0 * starts[:, 6:], nothing, SETTINGS), starts)
-    assert refiner(starts[:0], starts[:0, 6:], seen, SETTINGS).shape == (0, 27)
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("z", [0.45, 0.02, -0.5])
+def test_seen_points_add_up_as_in_the_reference(side: str, z: float) -> None:
+    posed = posed_hand(side, 6, z)
+    points = points_near(posed, 500, 7)
+    xyz = np.ascontiguousarray(points.numpy().T)
+    matched = xyz, np.empty(500, np.float32), np.zeros(500, np.int32)
+    _nearest(xyz, 500, posed.ellipsoids, *matched[1:])
+    numbers = (5, 500, SETTINGS.reach_m, SETTINGS.point_m, 1.0, 1.0, 1.0)
+    wrenches, index = no_wrenches(), posed.refiner._surface[0]
+    _add_points(matched, 500, index, posed.ellipsoids, posed.hand, numbers, wrenches)
+    there = torch.ones(1, 500, dtype=torch.bool)
+    expected = point_residuals(
+        posed.pose, points.double()[None], there, posed.shape, posed.surface, SETTINGS
+    )
+    # Points that are as near to two bones go to either.
+    check_sums(assembled(wrenches, posed), expected, 0.01)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1)])
-def test_images_of_a_pixel_s_width_do_no_harm(size: tuple[int, int]) -> None:
-    depth = torch.full(size, 0.45)
-    hand = torch.ones(size, dtype=torch.bool)
-    k = torch.tensor([[220.0, 0.0, 0.0], [0.0, 220.0, 0.0], [0.0, 0.0, 1.0]])
-    seen = seen_points(Observation(depth, hand, ~hand, k, 0.45))
-    shape = default_hand_shape()
-    start = torch.zeros(1, 27)
-    start[0, 1:3] = torch.tensor([0.08, 0.46])
-    found = [
-        refiner(start, start[:, 6:], seen, SETTINGS)
-        for refiner in (TorchRefiner(shape), Refiner(shape))
-    ]
-    check_joints(shape, *found)
+def silhouette(seed: int, height: int, width: int) -> SeenPoints:
+    """For each pixel some other pixel: what is nearest does not matter here."""
+    g = torch.Generator().manual_seed(seed)
+    size = height, width
+    each = [torch.randint(most, size, generator=g) for most in (width, height)]
+    nearest = torch.stack(each, -1).float()
+    return SeenPoints(torch.zeros(0, 3), nearest, torch.from_numpy(K), size, (0, 0))
 
 
-@pytest.mark.parametrize("z", [-0.4, 0.0, 0.03])
-def test_hands_at_and_behind_the_camera_agree_too(z: float) -> None:
-    shape = default_hand_shape()
-    _, seen, start = seen_hand(shape, torch.Generator().manual_seed(6))
-    start[0, 2] = z
-    moved = replace(seen, points_m=seen.points_m + torch.tensor([0.0, 0.0, z - 0.45]))
-    found = [
-        refiner(start, start[:, 6:], moved, refinement(iterations=1))
-        for refiner in (TorchRefiner(shape), Refiner(shape))
-    ]
-    assert found[0].isfinite().all()
-    check_joints(shape, *found)
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize(("z", "cut"), [(0.45, 0), (0.45, 31), (0.2, 0)])
+def test_the_silhouette_adds_up_as_in_the_reference(side: str, z: float, cut: int) -> None:
+    """cut: rows and columns that the crop lacks on either side."""
+    posed, seen = posed_hand(side, 8, z), silhouette(9, 144, 176)
+    inner = seen.nearest_px[cut : 144 - cut, cut : 176 - cut].contiguous()
+    seen = replace(seen, nearest_px=inner, corner=(cut, cut))
+    arguments = (seen.points_m.numpy(), inner.numpy(), seen.corner, seen.size, K)
+    wrenches = no_wrenches()
+    _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.5, wrenches)
+    settings = refinement(silhouette_px=1.5)
+    expected = silhouette_residuals(posed.pose, seen, posed.shape, settings)
+    check_sums(assembled(wrenches, posed), expected, 1e-4)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_keypoints_add_up_as_in_the_reference(side: str) -> None:
+    posed = posed_hand(side, 11)
+    g = torch.Generator().manual_seed(12)
+    points = posed.pose.joints_m + 0.02 * torch.randn(1, 21, 3, generator=g)
+    sigma = 0.003 + 0.02 * torch.rand(1, 21, generator=g, dtype=torch.float64)
+    sigma[0, 5], points[0, 9] = torch.inf, torch.nan
+    marks = Keypoints(points, sigma)
+    wrenches = no_wrenches()
+    _add_keypoints(points[0].numpy(), sigma[0].numpy(), posed.hand, wrenches)
+    expected = keypoint_residuals(posed.pose, marks.of_each(1), posed.shape)
+    check_sums(assembled(wrenches, posed), expected, 1e-5)

@@ -9,14 +9,10 @@ import pytest
 import torch
 from helpers.configured import nearest_surface
 from helpers.tracking import sample
-from reference.refinement import points_around
-from torch import Tensor
 
 from toftrack.refinement import seen_points as seen_points_of
-from toftrack.refinement.seen_points import REACH_M, SeenPoints, seen_points
+from toftrack.refinement.seen_points import seen_points
 from toftrack.render.segmentation import Observation
-
-COUNT = 500
 
 
 def observed(frame: int) -> Observation:
@@ -69,7 +65,7 @@ def test_points_and_nearest_pixels_are_those_of_plain_loops(shape: tuple[int, in
         if np.ptp(np.where(around > 0, around, 10.0)) < 0.03:
             z = depth[v, u]
             expected.append(((u + 4 - 44) / 200 * z, (v + 3 - 33) / 210 * z, z))
-    found = seen_points_of.smooth_points(depth, hand, (3, 4), k, 0.03, 10.0)
+    found = seen_points_of.smooth_points(depth, hand, (3, 4), k)
     np.testing.assert_allclose(found, np.reshape(expected, (-1, 3)), rtol=1e-5, atol=1e-6)
     labels = np.zeros(shape, np.int32)
     labels[hand] = draw.permutation(np.count_nonzero(hand)) + 1
@@ -78,36 +74,6 @@ def test_points_and_nearest_pixels_are_those_of_plain_loops(shape: tuple[int, in
     found = seen_points_of.nearest_of_labels(labels, hand, (3, 4))
     expected = [place.get(label, (0, 0)) for label in labels.ravel()]
     np.testing.assert_array_equal(found, np.reshape(expected, (*shape, 2)))
-
-
-def by_a_loop(points: Tensor, middle: Tensor, count: int) -> Tensor:
-    near = points[(points - middle).square().sum(1) < REACH_M**2]
-    return near[:: max(1, -(-len(near) // count))]
-
-
-@pytest.mark.parametrize("count", [1, 7, 500, 100_000])
-def test_each_hypothesis_has_the_points_around_itself(count: int) -> None:
-    seen = seen_points(observed(0))
-    middles = seen.points_m[::200].clone()
-    middles[1] += 0.15
-    middles[2] += 1.0
-    middles[3] = torch.nan
-    points, there = points_around(seen, middles, count)
-    assert points.shape[:2] == there.shape and there.shape[1] <= count
-    for i, middle in enumerate(middles):
-        assert torch.equal(points[i, there[i]], by_a_loop(seen.points_m, middle, count))
-    assert not there[2:4].any() and there[0].any()
-
-
-def no_points(seen: SeenPoints) -> SeenPoints:
-    return replace(seen, points_m=torch.zeros(0, 3))
-
-
-def test_without_points_or_hypotheses_there_are_none() -> None:
-    seen = seen_points(observed(0))
-    points, there = points_around(no_points(seen), torch.zeros(4, 3), COUNT)
-    assert points.shape == (4, 0, 3) and there.shape == (4, 0)
-    assert points_around(seen, torch.zeros(0, 3), COUNT)[0].shape[0] == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (40, 30)])

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from helpers.detection import detection_of
-from helpers.tracking import make_tracker
+from helpers.tracking import make_tracker, sample
 from reference.refinement import keypoint_residuals
 
 from toftrack.detector.hand_detector import Detection
@@ -17,12 +18,11 @@ from toftrack.hand.shape_space import POPULATION_SIGMA, shape_derivatives, shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement import shape_fit
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.refinement.shape_fit import ShapeEstimate, ShapeFit, first_shape, keypoints_system
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape, keypoints_system
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-FIT = ShapeFit()
-KEYPOINTS_OFF = torch.tensor(shape_fit._KEYPOINTS_OFF)
+KEYPOINTS_OFF = torch.tensor(shape_fit.KEYPOINTS_OFF)
 BETWEEN_FINGERS = torch.tensor([0.05, 0.06, 0.0, 0.0, -0.05, 0.04])
 
 
@@ -45,30 +45,27 @@ def detection(shape: HandShape, state: torch.Tensor, sigma_m: float = 0.004) -> 
 
 
 def fitted(
-    belief: ShapeEstimate,
-    shape: HandShape,
-    states: torch.Tensor,
-    sigma_m: float = 0.004,
-    fit: ShapeFit = FIT,
+    belief: ShapeEstimate, shape: HandShape, states: torch.Tensor, sigma_m: float = 0.004
 ) -> ShapeEstimate:
     """After believed estimates of a hand, whose poses are right: so many frames of each pose that
     one is looked at.
     """
     first = default_hand_shape(side=shape.side)
-    for state in states[:, None].repeat_interleave(shape_fit._EVERY, 0):
+    for state in states[:, None].repeat_interleave(shape_fit.EVERY, 0):
         seen = detection(shape, state, sigma_m)
-        belief = shape_fit.contradicted(belief, seen, fit, first)
+        belief = shape_fit.contradicted(belief, seen, first)
         applied = torch.tensor(belief.applied)
+        used = shaped(first, applied)
         keypoints = Keypoints(seen.keypoints.points_m, seen.keypoints.sigma_m.clamp(min=0.008))
         belief = shape_fit.learned(
             belief,
             state,
-            shaped(first, applied),
+            used,
             shape_derivatives(first, applied),
             seen,
             keypoints,
-            fit,
             first,
+            partial(forward_kinematics, shape=used),
         )
     return belief
 
@@ -109,7 +106,7 @@ def test_a_hand_is_found_in_different_poses_and_the_fit_says_how_surely() -> Non
     off = (applied.bone_lengths_m.sum(1) / shape.bone_lengths_m.sum(1)).log()
     before = default_hand_shape().scaled(math.exp(0.05)).bone_lengths_m.sum(1)
     assert off.square().mean() < 0.6 * (before / shape.bone_lengths_m.sum(1)).log().square().mean()
-    sigma = belief.summary(FIT).sigma
+    sigma = belief.summary().sigma
     assert sigma[0] < 0.3 * POPULATION_SIGMA[0]
     assert sigma[3] == pytest.approx(POPULATION_SIGMA[3], rel=1e-3)  # joints tell no thickness
 
@@ -132,20 +129,20 @@ def test_a_hand_that_is_hardly_seen_says_little() -> None:
     assert unsure.covariance[0, 0] > 1.5 * sure.covariance[0, 0]
 
 
-def test_a_hand_is_frozen_when_it_is_certain() -> None:
-    fit = replace(FIT, certain_poses=3.9)
+def test_a_hand_is_frozen_when_it_is_certain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shape_fit, "CERTAIN_POSES", 3.9)
     shape = default_hand_shape(0.18)
-    belief = fitted(first_shape(), shape, poses(10), fit=fit)
-    assert belief.frozen(fit) and belief.poses == pytest.approx(4, rel=1e-3)
+    belief = fitted(first_shape(), shape, poses(10))
+    assert belief.frozen and belief.poses == pytest.approx(4, rel=1e-3)
     extended = default_hand_shape(0.185)
-    assert fitted(belief, extended, poses(5, seed=1), fit=fit).applied == belief.applied
+    assert fitted(belief, extended, poses(5, seed=1)).applied == belief.applied
 
 
-def test_another_person_s_hand_is_noticed_and_fitted_anew() -> None:
-    fit = replace(FIT, certain_poses=6)
-    belief = fitted(first_shape(), default_hand_shape(0.20), poses(12), fit=fit)
-    assert belief.frozen(fit)
-    after = fitted(belief, default_hand_shape(0.15), poses(14, seed=1), fit=fit)
+def test_another_person_s_hand_is_noticed_and_fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shape_fit, "CERTAIN_POSES", 6)
+    belief = fitted(first_shape(), default_hand_shape(0.20), poses(12))
+    assert belief.frozen
+    after = fitted(belief, default_hand_shape(0.15), poses(14, seed=1))
     applied = shaped(default_hand_shape(), torch.tensor(after.applied))
     assert applied.hand_length_m == pytest.approx(0.15, rel=0.04)
 
@@ -158,13 +155,13 @@ def test_a_single_odd_frame_reopens_nothing() -> None:
 
 def test_the_network_s_length_is_applied_until_estimates_say_better() -> None:
     first = default_hand_shape()
-    said = shape_fit.with_network_length(first_shape(), 0.16, FIT, first)
+    said = shape_fit.with_network_length(first_shape(), 0.16, first)
     assert shaped(first, torch.tensor(said.applied)).hand_length_m == pytest.approx(0.16, rel=1e-4)
     for absurd in (1e-3, 10.0):
-        applied = shape_fit.with_network_length(first_shape(), absurd, FIT, first).applied
+        applied = shape_fit.with_network_length(first_shape(), absurd, first).applied
         assert abs(applied[0]) <= 3 * POPULATION_SIGMA[0]
     known = fitted(first_shape(), default_hand_shape(0.18), poses(3))
-    assert shape_fit.with_network_length(known, 0.15, FIT, first) is known
+    assert shape_fit.with_network_length(known, 0.15, first) is known
 
 
 def test_the_shape_in_use_changes_in_steps_only() -> None:
@@ -173,17 +170,10 @@ def test_the_shape_in_use_changes_in_steps_only() -> None:
     assert nearly.applied == belief.applied and (nearly.mean != belief.mean).any()
 
 
-def test_a_fixed_hand_stays_whatever_is_seen_of_another() -> None:
-    fit, shape = replace(FIT, fixed=True), default_hand_shape(0.16)
-    assert (
-        shape_fit.with_network_length(first_shape(), 0.16, fit, default_hand_shape()).applied
-        == (0.0,) * 6
-    )
-    assert fitted(first_shape(), shape, poses(3), fit=fit).applied == (0.0,) * 6
-
-
 def test_only_auto_is_fitted() -> None:
-    fixed = make_tracker("hand.shape=default")
+    fixed, scene = make_tracker("hand.shape=default"), sample()
+    fixed.step(scene.depth_m[0], scene.k)
+    assert fixed.shape.hand_length_m == pytest.approx(DEFAULT_HAND_LENGTH_M)
     assert not fixed.model.fits and fixed.hands.fitted[0].fitted is None
     assert make_tracker().model.fits
     fitted_hand = make_tracker("hand.side=left").hands.fitted[0]

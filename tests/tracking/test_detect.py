@@ -50,12 +50,13 @@ LOST = known(believed_s=0.2)
 def looked(
     *tracks: Track, found: Sequence[Detection] = (), dt_s: float = FRAME_S, **changes: object
 ) -> tuple[FixedDetector, list[SideDetection], PendingDetections]:
-    """What a detector was asked in a frame of tracks, what it has seen, and what it still does."""
+    """What a detector was asked in a frame of tracks, what it has seen, and what was begun."""
     detector = changes.pop("detector", None) or FixedDetector(found)
     model = replace(any_hand_model(), detector=detector)
     state = state_of(*tracks, model=model, **changes)
     scene = Scene.of(state.tracks, IMAGE, dt_s, model)
-    return detector, *finish_detection(start_detection(scene, state), scene, state)
+    pending = start_detection(scene, state)
+    return detector, finish_detection(pending, scene, state), pending
 
 
 def at(detection: Detection) -> np.ndarray:
@@ -111,7 +112,7 @@ def test_the_pose_network_is_asked_about_a_sure_hand_only_every_few_frames(
 @pytest.mark.parametrize("factor", [0.7, 1.2])
 def test_it_is_asked_about_the_middle_of_a_palm_of_that_size(factor: float) -> None:
     length_m, first = factor * DEFAULT_HAND_LENGTH_M, default_hand_shape()
-    small = with_network_length(first_shape(), length_m, any_hand_model().fit, first)
+    small = with_network_length(first_shape(), length_m, first)
     detector, *_ = looked(known(shape=small))
     joints = any_hand_model().hand("right", small).refiner.joints(HERE)[0].numpy()
     along = (joints[9] - joints[0]) / np.linalg.norm(joints[9] - joints[0])
@@ -159,14 +160,16 @@ def test_what_the_finder_sees_is_looked_at_at_once_but_a_frame_later_while_all_h
 ) -> None:
     third = [detection_of(hand_at(-0.3))]
     detector, seen, asked = looked(*tracks, found=third, dt_s=dt_s)
-    assert asked.finder_asked and detector.known == [len(tracks)]
-    assert bool(elsewhere(seen)) == at_once == (asked.finder is no_places)
+    assert detector.known == [len(tracks)]
+    assert bool(elsewhere(seen)) == at_once
+    assert len(asked.for_next_frame().centre_m) == (not at_once)
 
 
 def test_what_the_finder_saw_a_frame_ago_is_looked_at() -> None:
     _, _, asked = looked(known(), found=FOUND)
-    again, seen, asked = looked(known(), found=FOUND, found_s=FRAME_S, places=asked.finder())
-    assert not asked.finder_asked and asked.finder is no_places
+    places = asked.for_next_frame()
+    again, seen, asked = looked(known(), found=FOUND, found_s=FRAME_S, places=places)
+    assert not asked.asked and not len(asked.for_next_frame().centre_m)
     assert elsewhere(seen) == [("left", 0.3)] and again.looked == ["left"], "the other hand"
 
 
@@ -218,20 +221,17 @@ def test_where_frames_are_rare_hands_are_looked_for_where_the_tracks_are_as_well
     assert {("right", 0.0), ("right", 0.3)} < set(elsewhere(seen))
 
 
-@pytest.mark.parametrize(("search", "frames", "due"), [(1, 0, True), (5, 4, False), (5, 5, True)])
-@pytest.mark.parametrize("tracks", [(), (LOST,)], ids=["none", "lost"])
-def test_the_finder_is_asked_every_so_many_frames(
-    tracks: tuple[Track, ...], search: int, frames: int, due: bool
+@pytest.mark.parametrize(
+    ("tracks", "times"), [((), 1), ((LOST,), 1), ((known(),), 2)], ids=["none", "lost", "sure"]
+)
+@pytest.mark.parametrize("search", [1, 5])
+def test_the_finder_is_asked_every_so_many_frames_and_half_as_often_while_all_hands_are_sure(
+    tracks: tuple[Track, ...], times: int, search: int
 ) -> None:
-    detector, *_ = looked(*tracks, detector=FixedDetector(search=search), found_s=frames * FRAME_S)
-    assert bool(detector.images) == due
-
-
-@pytest.mark.parametrize("search", [1, 3])
-def test_the_finder_is_asked_half_as_often_while_all_hands_are_sure(search: int) -> None:
-    for frames, due in ((search, False), (2 * search - 1, False), (2 * search, True)):
-        found_s = frames * FRAME_S
-        detector, *_ = looked(known(), detector=FixedDetector(search=search), found_s=found_s)
+    every = search * times
+    for frames, due in ((every - 1, every == 1), (every, True)):
+        detector = FixedDetector(search=search)
+        looked(*tracks, detector=detector, found_s=frames * FRAME_S)
         assert bool(detector.images) == due
 
 
@@ -275,8 +275,8 @@ def left_of(seen: Detection | None, dt_s: float = FRAME_S) -> set[torch.Tensor]:
     state = state_of(known(), model=model, places=places_of(*others.values()))
     scene = scene_of(*state.tracks, image=replace(IMAGE, depth_m=depth), model=model)
     at_tracks = [] if seen is None else [lambda: SideDetection(seen, "right", 0)]
-    asked = PendingDetections(at_tracks, no_places, False, False)
-    found, _ = finish_detection(asked, replace(scene, dt_s=dt_s), state)
+    asked = PendingDetections(at_tracks, False, no_places, False)
+    found = finish_detection(asked, replace(scene, dt_s=dt_s), state)
     return {pose for pose, one in others.items() if any(one is each.detection for each in found)}
 
 
@@ -290,13 +290,10 @@ def test_the_arm_is_where_the_network_sees_it_or_the_fingers_do_not_point() -> N
     assert left_of(replace(seen, parts=parts)) == {DOWN_THE_ARM, BESIDE, BELOW}
 
 
-def test_a_track_that_nobody_looks_at_has_its_predicted_arm() -> None:
+def test_what_nobody_looks_at_has_its_predicted_arm_and_what_is_hardly_a_hand_none() -> None:
     assert left_of(None) == {BESIDE, ACROSS, BELOW}
-
-
-def test_what_is_hardly_a_hand_or_was_seen_long_ago_has_no_arm() -> None:
     assert left_of(replace(FOUND[0], present=1e-4)) == EVERYTHING
-    assert left_of(FOUND[0], dt_s=0.2) == EVERYTHING
+    assert left_of(FOUND[0], dt_s=0.2) == EVERYTHING, "it was seen long ago"
 
 
 # Which one is meant.

@@ -26,9 +26,9 @@ from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.association import keep_tracks
 from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import LogOdds
-from toftrack.tracking.filter import ParticleSet, predict_particles
+from toftrack.tracking.filter import predict_particles
 from toftrack.tracking.report import TrackResult
-from toftrack.tracking.state import REFUSED_S, Track, TrackerState
+from toftrack.tracking.state import REFUSED_S, ParticleSet, Track, TrackerState
 from toftrack.tracking.step import filter_tracks, step, update_track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -82,8 +82,8 @@ def test_a_track_is_confirmed_once_and_not_believed_while_it_is_lost(
 def test_the_particles_follow_the_pose_that_was_found() -> None:
     after = followed(track_of(hand_at(-0.01)), 2.0).track
     assert after.pose[0, :3].numpy() == pytest.approx(HERE[0, :3].numpy(), abs=0.003)
-    assert float(after.mean[0, 0]) == pytest.approx(float(after.pose[0, 0]), abs=1e-4)
-    assert float(after.particles[:, 0].mean()) == pytest.approx(0.0, abs=0.01)
+    assert float(after.cloud.mean[0, 0]) == pytest.approx(float(after.pose[0, 0]), abs=1e-4)
+    assert float(after.cloud.particles[:, 0].mean()) == pytest.approx(0.0, abs=0.01)
     assert after.velocity[0] > 0
 
 
@@ -119,7 +119,7 @@ def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> No
     torch.testing.assert_close(
         other.mean, predict_particles(track, FRAME_S, right_hand_model()).mean
     )
-    torch.testing.assert_close(other.weights, track.weights)
+    torch.testing.assert_close(other.weights, track.cloud.weights)
     assert 0.0 < float(other.mean[0, 0]) < 0.1 * FRAME_S
 
 
@@ -147,8 +147,8 @@ def test_while_all_hands_are_sure_those_that_are_not_reported_are_followed_witho
     state = state_of(track_of(HERE), second)
     after, _, (estimate,) = step(state, replace(IMAGE, timestamp_s=FRAME_S), right_hand_model())
     reported, other = after.tracks
-    assert reported.particles.std(0).any() and not estimate.lost
-    assert bool(other.particles.std(0).any()) != sure
+    assert reported.cloud.particles.std(0).any() and not estimate.lost
+    assert bool(other.cloud.particles.std(0).any()) != sure
     torch.testing.assert_close(other.pose[:, :3], THERE[:, :3], atol=0.01, rtol=0.0)
 
 

@@ -41,17 +41,17 @@ def begun(start: RoughStart, n: int = 300, seed: int = 0) -> tuple[FilterModel, 
 
 def test_a_start_has_as_many_particles_as_asked_for_inside_the_pose_space() -> None:
     (model, one), (_, two) = (begun(rough_start(), n=37, seed=5) for _ in range(2))
-    x, space = one.particles, model.space
+    x, space = one.cloud.particles, model.space
     assert x.shape == (37, 6 + space.dims) and x.isfinite().all()
     assert (x[:, 6:] >= space.lower - 1e-5).all() and (x[:, 6:] <= space.upper + 1e-5).all()
-    assert torch.equal(x, two.particles), "the generator alone decides"
+    assert torch.equal(x, two.cloud.particles), "the generator alone decides"
 
 
 def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
     pose = (0.05, -0.02, 0.6, 0.3, -0.4, 1.2)
     n = 4000
     model, track = begun(rough_start(pose=pose, position_m=0.01, rotation_rad=0.1), n)
-    x = track.particles
+    x = track.cloud.particles
     reference = torch.cat((torch.tensor(pose), x[0, 6:]))[None]
     off = MOTIONS.difference(x, reference)[:, :6]
     sigma = torch.tensor([0.01] * 3 + [0.1] * 3)
@@ -66,9 +66,13 @@ def test_a_pose_given_by_hand_is_where_the_particles_are() -> None:
 def test_rough_positioning_puts_an_open_palm_on_the_nearest_blob() -> None:
     scene = first(1)
     model, track = begun(rough_start())
-    middle = (track.particles[:, :3] + rotated_pivot(track.particles[:, 3:6])).mean(0).numpy()
+    middle = (
+        (track.cloud.particles[:, :3] + rotated_pivot(track.cloud.particles[:, 3:6]))
+        .mean(0)
+        .numpy()
+    )
     assert np.linalg.norm(middle - scene.joints_m[0, PALM].mean(0)) < 0.06
-    mean = MOTIONS.mean(track.particles, torch.full((300,), 1 / 300))
+    mean = MOTIONS.mean(track.cloud.particles, torch.full((300,), 1 / 300))
     hand = model.hand("right", first_shape())
     joints = hand.refiner.joints(model.decode(mean))[0]
     tips = joints[[8, 12, 16, 20]]
@@ -100,7 +104,7 @@ def test_the_estimate_is_the_filters_mean_and_nothing_else() -> None:
     scene, tracker = first(4), make_tracker(*PAPER)
     for i, depth in enumerate(scene.depth_m):
         estimate = tracker.step(depth, scene.k, i, i / 25)
-        mean = tracker.model.decode(tracker.track.mean)[0].numpy()
+        mean = tracker.model.decode(tracker.track.cloud.mean)[0].numpy()
         assert np.array_equal(estimate.state, mean)
         assert (estimate.side, estimate.side_probability) == ("right", 1.0)
         assert math.isnan(estimate.confidence), "nobody says"
@@ -153,14 +157,13 @@ def test_the_paper_to_the_letter_runs_and_is_the_paper_s() -> None:
     assert (config.hand.shape, config.hand.side) == ("default", "right")
     assert config.segmentation.min_area_m2 == config.segmentation.occluder_margin_m == 0
     assert config.segmentation.reach_m == math.inf and config.refine.iterations == 0
-    model = make_tracker("experiment=paper_to_the_letter").model
-    assert isinstance(model, PaperModel) and not model.fits
-    assert isinstance(model.start, RoughStart) and isinstance(model.lost, ScoreThreshold)
     assert config.pose_space.kind == "pca" and config.pose_space.dims == 4
+    model = make_tracker("experiment=paper_to_the_letter").model
+    assert isinstance(model, PaperModel) and not (model.fits or model.detects)
+    assert isinstance(model.start, RoughStart) and isinstance(model.lost, ScoreThreshold)
     scene = first(8)
     found = follow(scene, "experiment=paper_to_the_letter")
-    assert all(np.isfinite(estimate.joints_m).all() for estimate in found)
-    assert all(0 < estimate.score <= 1 for estimate in found)
+    assert all(np.isfinite(one.joints_m).all() and 0 < one.score <= 1 for one in found)
     # Positioned by hand, as in the paper, and nearly right: it does not run away at once.
     wrist = ",".join(f"{x:.3f}" for x in (*scene.joints_m[0, 0], 0, 0, 0))
     placed = follow(scene, "experiment=paper_to_the_letter", f"start.pose=[{wrist}]")

@@ -16,7 +16,6 @@ from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of
 from toftrack.errors import ToftrackError
 from toftrack.hand.overlap import RADII_MM
 from toftrack.tracking.candidates import View
-from toftrack.tracking.posterior import Posterior
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -42,16 +41,21 @@ def view(*others: torch.Tensor) -> View:
     return view_of(image_of(TRUTH), track_of(TRUTH), detection_of(bent(TRUTH, 1)), others)
 
 
-def posterior(seen: View, coverage: float | None = None, **weights: float) -> Posterior:
-    """Only with the terms that are weighted here."""
-    model = replace(seen.model, weights=posterior_weights(**(NONE | weights)))
-    return replace(seen, model=model, image=replace(seen.image, coverage=coverage)).posterior()
+def weighed(seen: View, coverage: float | None = None, **weights: float) -> np.ndarray:
+    """(N,) log posteriors, only with the terms that are weighted here."""
+    used = posterior_weights(**(NONE | weights))
+    seen = replace(
+        seen,
+        model=replace(seen.model, weights=used),
+        image=replace(seen.image, coverage=coverage),
+        keypoint_weight=used.keypoints,
+    )
+    return seen.log_posterior(poses()).numpy()
 
 
 def added(seen: View, **weights: float) -> np.ndarray:
     """(N,) what the terms add to the image's."""
-    alone, all_terms = posterior(seen), posterior(seen, **weights)
-    return (all_terms(poses()) - alone(poses())).numpy()
+    return weighed(seen, **weights) - weighed(seen)
 
 
 def joints_of(seen: View) -> np.ndarray:
@@ -63,7 +67,7 @@ def test_the_image_says_its_likelihood(coverage: float | None) -> None:
     seen, likelihood = view(), right_hand_model().likelihood
     counts = seen.fitted.scorer(poses(), seen.image.evidence)
     expected = likelihood.log_score(counts, coverage)
-    torch.testing.assert_close(posterior(seen, coverage)(poses()), expected)
+    np.testing.assert_allclose(weighed(seen, coverage), expected, rtol=1e-5)
     assert seen.image.score(poses()[:1]) == pytest.approx(float(likelihood.score(counts)[0]))
     assert np.ptp(expected.numpy()) > 1, "the poses differ"
 
@@ -114,33 +118,12 @@ def test_another_hand_costs_the_joints_that_lie_in_it() -> None:
     np.testing.assert_allclose(added(seen, other_hand=3.0), expected, rtol=1e-3, atol=1e-4)
 
 
-def test_each_other_hand_costs_its_own() -> None:
-    one, two = other_hand(0.03), other_hand(-0.03)
-    both = added(view(one, two), other_hand=2.0)
-    alone = added(view(one), other_hand=2.0) + added(view(two), other_hand=2.0)
-    np.testing.assert_allclose(both, alone, atol=1e-5)
-
-
-ALL = {"keypoints": 0.4, "overlap": 0.5, "other_hand": 3.0}
-
-
-def test_terms_are_independent_of_one_another() -> None:
-    seen = view(other_hand())
-    each = sum(added(seen, **{name: weight}) for name, weight in ALL.items())
-    np.testing.assert_allclose(added(seen, **ALL), each, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("names", "left"),
-    [
-        (("keypoints",), {"overlap", "other hand 0"}),
-        (("other_hand",), {"keypoints", "overlap"}),
-        (tuple(ALL), set()),
-    ],
-)
-def test_a_term_of_weight_0_is_left_out(names: tuple[str, ...], left: set[str]) -> None:
-    weights = ALL | dict.fromkeys(names, 0.0)
-    assert set(posterior(view(other_hand()), **weights).terms) == left
+def test_terms_and_other_hands_add_up() -> None:
+    every, one, two = {"keypoints": 0.4, "overlap": 0.5}, other_hand(0.03), other_hand(-0.03)
+    each = [added(view(), **{name: weight}) for name, weight in every.items()]
+    each += [added(view(other), other_hand=3.0) for other in (one, two)]
+    both = added(view(one, two), other_hand=3.0, **every)
+    np.testing.assert_allclose(both, sum(each), rtol=1e-4, atol=1e-4)
 
 
 def test_without_a_detection_keypoints_say_nothing() -> None:

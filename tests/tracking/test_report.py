@@ -12,9 +12,7 @@ from helpers.rendered import EMPTY, any_hand_model, hand_at, scene_of, state_of,
 from toftrack.compute.spans import Spans
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
-from toftrack.tracking.belief import Status
-from toftrack.tracking.confidence import JOINT_FEATURES
-from toftrack.tracking.filter import ParticleSet, PoseEstimate
+from toftrack.tracking.confidence import JOINT_FEATURES, Status
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.state import SideEvidence, Track, TrackerState
 
@@ -39,11 +37,9 @@ def hand(number: int, side: str = "right", lost: bool = False, **changes: object
 def followed(track: Track) -> TrackResult:
     """Its pose is what was found; the wrist is where its number says."""
     model = any_hand_model()
-    particles = ParticleSet(track.particles, track.weights, track.mean)
-    found = PoseEstimate(particles, track.pose, track.trend, *model.nearest(track.pose))
     lost = not track.reliable
     status = Status("searching" if lost else "tracking", lost, confidence=0.9)
-    return TrackResult(view_of(EMPTY, track, model=model), track, found, 0.8, status)
+    return TrackResult(view_of(EMPTY, track, model=model), track, track.cloud, 0.8, status)
 
 
 def before(hands: int = 1, told: str | None = None, **slot: object) -> TrackerState:

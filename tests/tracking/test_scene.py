@@ -90,14 +90,11 @@ def test_in_what_is_unexplained_there_is_no_hand_of_a_track() -> None:
     assert scene_of(image=BOTH).unexplained() is BOTH
 
 
-def test_the_networks_see_a_hand_without_the_other_one() -> None:
+def test_the_networks_see_a_hand_without_the_other_one_but_with_what_hides_it() -> None:
     seen = two().image_for(0).depth_m
     np.testing.assert_array_equal(seen[visible(LEFT)], BOTH.depth_m[visible(LEFT)])
     assert (seen[visible(RIGHT)] > 2.0).mean() > 0.99
     assert scene_of(track_of(LEFT), image=BOTH).image_for(0) is BOTH
-
-
-def test_what_hides_a_hand_stays_in_its_image() -> None:
     front, back = hand_at(0.0, 0.4), hand_at(0.03, 0.52)
     image = image_of(front, back)
     scene = scene_of(track_of(back), track_of(front), image=image)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,8 +44,15 @@ def known(fits: float = 0.0, side: str = "right", **changes: object) -> Track:
 # What is known besides.
 
 
+def odds_of(track: Track, others: Sequence[Track], told: str | None) -> float:
+    """Beside other tracks, which get numbers of their own."""
+    return side_log_odds(
+        track, [replace(one, number=1 + at) for at, one in enumerate(others)], told
+    )
+
+
 def test_two_hands_are_of_different_sides_the_more_surely_the_surer_the_other_one_is() -> None:
-    odds = [side_log_odds(known(), [known(fits)], None) for fits in (-4.0, 0.0, 1.0, 4.0)]
+    odds = [odds_of(known(), [known(fits)], None) for fits in (-4.0, 0.0, 1.0, 4.0)]
     assert odds == sorted(odds, reverse=True)
     assert odds[1] == pytest.approx(0.0) and odds[0] == pytest.approx(-odds[3])
     assert -3.0 < odds[3] < -1.0
@@ -52,24 +60,24 @@ def test_two_hands_are_of_different_sides_the_more_surely_the_surer_the_other_on
 
 def test_a_partner_that_is_hardly_a_hand_says_little_and_what_the_user_said_counts() -> None:
     ghost, partner = known(6.0, log_odds=-2.0), known(6.0, log_odds=3.0)
-    said = [side_log_odds(known(), [one], "right") for one in (ghost, partner)]
+    said = [odds_of(known(), [one], "right") for one in (ghost, partner)]
     assert said[0] > 1.0 > -1.0 > said[1]
 
 
 def test_a_hand_that_is_seen_alone_is_rather_of_the_side_that_the_user_said() -> None:
-    right, none, left = (side_log_odds(known(), [], told) for told in ("right", None, "left"))
+    right, none, left = (odds_of(known(), [], told) for told in ("right", None, "left"))
     assert right == pytest.approx(-left) and right > 1 and none == pytest.approx(0.0)
     for others in ([known()], [known(), known()]):
-        beside = side_log_odds(known(), others, "left")
+        beside = odds_of(known(), others, "left")
         assert beside == pytest.approx(0.0, abs=0.02), "not beside another"
-    assert side_log_odds(known(-6.0), [], "right") < 0, "but what is seen may say otherwise"
+    assert odds_of(known(-6.0), [], "right") < 0, "but what is seen may say otherwise"
 
 
 def test_where_no_side_was_said_the_body_counts_a_little() -> None:
-    beside, far = (side_log_odds(known(body_m=body_m), [], None) for body_m in (0.05, 5.0))
+    beside, far = (odds_of(known(body_m=body_m), [], None) for body_m in (0.05, 5.0))
     assert 0 < beside < far < 2
-    assert side_log_odds(known(body_m=-0.05), [], None) == pytest.approx(-beside)
-    told = [side_log_odds(known(body_m=body_m), [], "left") for body_m in (0.0, 0.3)]
+    assert odds_of(known(body_m=-0.05), [], None) == pytest.approx(-beside)
+    told = [odds_of(known(body_m=body_m), [], "left") for body_m in (0.0, 0.3)]
     assert told[0] == pytest.approx(told[1])
 
 

@@ -161,4 +161,4 @@ def test_a_clock_that_jumps_does_not_lose_the_hand(jump_s: float) -> None:
     found = tracked(tracker, scene, range(8, 12), begin_s=jump_s)
     assert not any(estimate.lost for estimate in found)
     assert errors_mm(found, scene.cut(*range(8, 12)))[-1] < 15
-    assert tracker.track.particles.isfinite().all()
+    assert tracker.track.cloud.particles.isfinite().all()

@@ -76,15 +76,6 @@ def test_an_estimate_is_complete_and_consistent(default: Run) -> None:
         assert np.abs(joints - estimate.joints_m).max() < 1e-5, "the state decodes to the joints"
 
 
-def test_the_range_image_shows_the_hand_where_it_was_seen(default: Run) -> None:
-    scene, estimate = first(FRAMES), default.estimates[-1]
-    model = model_range_image(estimate.state, default.tracker.shape, scene.k, 144, 176)
-    seen = scene.depth_m[FRAMES - 1]
-    assert model.shape == (144, 176) and (model > 0).sum() > 1000
-    close = np.abs(model - seen)[model > 0] < 0.02
-    assert close.mean() > 0.75
-
-
 def test_the_torch_back_end_finds_the_same_hand_as_numba() -> None:
     scene = first(3)
     quick = ("hand.shape=default", "filter.particles=60")
@@ -175,7 +166,7 @@ def test_a_filter_of_another_size_tracks_too() -> None:
     tracker = make_tracker("filter.particles=60", "filter.passes=2", "pose_space.dims=6")
     assert isinstance(tracker, Tracker)
     found = [tracker.step(depth, scene.k, i, i / 25) for i, depth in enumerate(scene.depth_m)]
-    assert tracker.track.particles.shape == (60, 12)
-    assert float(tracker.track.weights.sum()) == pytest.approx(1)
+    assert tracker.track.cloud.particles.shape == (60, 12)
+    assert float(tracker.track.cloud.weights.sum()) == pytest.approx(1)
     assert found[-1].covariance.shape == (12, 12)
     assert errors_mm(found, scene)[-3:].mean() < 20

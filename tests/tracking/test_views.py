@@ -31,7 +31,7 @@ from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.sides import changes_side, side_log_odds
 from toftrack.tracking.state import SideEvidence, Slot, Track
 from toftrack.tracking.views import (
-    begin_tracks,
+    begin_track,
     continue_track,
     known_shape,
     max_new_tracks,
@@ -87,7 +87,7 @@ def test_a_track_that_was_seen_elsewhere_begins_anew_there_and_is_the_same_hand(
     assert view is not None and not view.track.age.begun
     assert off_m(view, THERE) < 0.01
     assert view.track.number == 3 and view.track.confirmed
-    assert bool((view.track.particles[:, 0] > 0.9 * ELSEWHERE).all())
+    assert bool((view.track.cloud.particles[:, 0] > 0.9 * ELSEWHERE).all())
 
 
 @pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(THERE)])
@@ -137,16 +137,11 @@ def test_a_track_changes_to_the_side_that_is_likelier(
 # Begun.
 
 
-def began(
-    new: Sequence[SideDetection],
-    *tracks: Track,
-    image: DepthImage = BOTH,
-    hands: int = 1,
-    **changes: object,
-) -> list[View]:
+def began(new: Sequence[SideDetection], *tracks: Track, image: DepthImage = BOTH) -> list[View]:
     used = model()
-    state = state_of(*tracks, hands=hands, model=used, **changes)
-    views = begin_tracks(scene_of(*tracks, image=image, model=used), new, state)
+    state = state_of(*tracks, model=used)
+    scene = scene_of(*tracks, image=image, model=used)
+    views = [begin_track(scene, one, 7 + at, state) for at, one in enumerate(new)]
     return [view for view in views if view is not None]
 
 
@@ -181,11 +176,11 @@ def test_as_many_tracks_are_tentative_as_hands_are_missing_or_one(
         assert max_new_tracks(state_of(*tracks, hands=hands)) == most - tentative
 
 
-def test_tracks_begin_where_there_is_room_the_first_ones_first_each_with_a_number() -> None:
-    places = [hand_at(x) for x in (-0.15, -0.05, 0.05)]
-    views = began([seen(pose) for pose in places], image=image_of(*places), next_track=7)
+def test_tracks_begin_each_at_its_place_and_with_its_number() -> None:
+    places = [hand_at(x) for x in (-0.15, -0.05)]
+    views = began([seen(pose) for pose in places], image=image_of(*places))
     assert [view.track.number for view in views] == [7, 8]
-    assert all(off_m(view, pose) < 0.01 for view, pose in zip(views, places, strict=False))
+    assert all(off_m(view, pose) < 0.01 for view, pose in zip(views, places, strict=True))
 
 
 def test_a_new_track_keeps_off_a_reliable_hand_s_pixels_and_joints() -> None:
@@ -222,7 +217,7 @@ def test_a_track_that_changes_its_side_takes_the_length_that_was_detected_anew()
 
 
 def test_a_hand_that_is_back_has_the_shape_that_it_had() -> None:
-    of_length = with_network_length(first_shape(), 0.15, model().fit, default_hand_shape())
+    of_length = with_network_length(first_shape(), 0.15, default_hand_shape())
     state = state_of(track_of(HERE), hands=2)
     first, second = state.slots
 

@@ -45,10 +45,7 @@ MOVES = tuple(
     for f in range(16)
 )
 """(16, 21) which angles move a point that is attached to a frame."""
-JOINT_FRAME = (
-    0,
-    *(0 if bone == 0 else 3 * finger + bone for finger in range(5) for bone in range(4)),
-)
+JOINT_FRAME = (0, *(3 * finger + bone if bone else 0 for finger in range(5) for bone in range(4)))
 """The frame that each of the 21 joints moves with: that of the bone which ends there."""
 
 FACING_M = 0.005
@@ -68,11 +65,9 @@ POINT_REACH = 0.4
 class Refinement:
     """How an estimate is refined; see conf/refine/gauss_newton.yaml for what each does.
 
-    iterations: Gauss-Newton steps; 0 leaves the filter's estimate as it is.
-    points: seen points that are used at most.
-    reach_m: points farther than this from the surface are no part of the hand.
-    point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual: smaller
-        ones count more.
+    points: seen points that are used at most; those farther than reach_m from the surface are no
+        part of the hand.
+    point_m, silhouette_px, angle_rad: standard deviations of the three kinds of residual.
     damping: Levenberg's, relative to the mean diagonal of the normal matrix.
     """
 

@@ -16,10 +16,8 @@ REACH_M = 0.16
 """Points farther than this from the middle of a hand are none of it."""
 _MARGIN_PX = 24
 """Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
-_SQUARE = np.ones((3, 3), np.uint8)
 _EDGE_M, _FAR_M = 0.03, 10.0
-_KEPT = 4
-"""Observations: a frame asks for the same points where sides are compared and where it refines."""
+"""Depths of neighbours that differ by so much are an edge; and the depth where nothing is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +27,7 @@ class SeenPoints:
     points_m: (P, 3) seen points of the hand and the arm, row by row.
     nearest_px: (h, w, 2) for each pixel of a crop the nearest pixel (u, v) of the image that is
         not background. The crop holds all of these and a margin; it is empty where there are none.
-    k: (3, 3) of the image.
-    size: (H, W) of the image.
-    corner: row and column of the crop's first pixel.
+    k, size: (3, 3) and (H, W) of the image.  corner: row and column of the crop's first pixel.
     """
 
     points_m: Tensor
@@ -41,63 +37,55 @@ class SeenPoints:
     corner: tuple[int, int] = (0, 0)
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(4)  # a frame asks for the same points where sides are compared and where it refines
 def seen_points(observation: Observation) -> SeenPoints:
-    """The points and the silhouette of an observation, on its device.
+    """The points and the silhouette of an observation.
 
     Pixels on depth edges are left out: they mix foreground and background.
     """
     # Whatever is not behind the hand may hide it or be it.
-    hand = observation.hand.cpu().numpy()
-    solid = hand | observation.occluder.cpu().numpy()
+    hand = observation.hand.numpy()
+    solid = hand | observation.occluder.numpy()
     for mask in (observation.other, observation.thing):
         if mask is not None:
-            solid |= mask.cpu().numpy()
+            solid |= mask.numpy()
     left, top, wide, high = cv2.boundingRect(solid.view(np.uint8))
     left, right = max(0, left - _MARGIN_PX), min(solid.shape[1], left + wide + _MARGIN_PX)
     top, bottom = max(0, top - _MARGIN_PX), min(solid.shape[0], top + high + _MARGIN_PX)
     if wide == 0:
         left = top = right = bottom = 0
     part = slice(top, bottom), slice(left, right)
-    k = observation.k.cpu().numpy()
-    depth = observation.depth_m.cpu().numpy()[part]
-    points = smooth_points(depth, hand[part], (top, left), k, _EDGE_M, _FAR_M)
+    k = observation.k.numpy()
+    depth = observation.depth_m.numpy()[part]
+    points = smooth_points(depth, hand[part], (top, left), k)
     nearest = np.zeros((0, 0, 2), np.float32)
     if solid[part].size:
+        away, kind = (~solid[part]).view(np.uint8), cv2.DIST_LABEL_PIXEL
         labels = cv2.distanceTransformWithLabels(
-            (~solid[part]).view(np.uint8),
-            cv2.DIST_L2,
-            cv2.DIST_MASK_5,
-            labelType=cv2.DIST_LABEL_PIXEL,
+            away, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=kind
         )[1]
         nearest = nearest_of_labels(labels, solid[part], (top, left))
-    device = observation.depth_m.device
     return SeenPoints(
-        torch.from_numpy(points).to(device),
-        torch.from_numpy(nearest).to(device),
+        torch.from_numpy(points),
+        torch.from_numpy(nearest),
         observation.k,
-        (observation.hand.shape[0], observation.hand.shape[1]),
+        (solid.shape[0], solid.shape[1]),
         (top, left),
     )
 
 
 def smooth_points(
-    depth_m: np.ndarray,
-    hand: np.ndarray,
-    corner: tuple[int, int],
-    k: np.ndarray,
-    edge_m: float,
-    far_m: float,
+    depth_m: np.ndarray, hand: np.ndarray, corner: tuple[int, int], k: np.ndarray
 ) -> np.ndarray:
     """(P, 3) float32 points of the hand's pixels that are on no depth edge, row by row.
 
     depth_m, hand: (h, w) of a crop whose first pixel is at `corner`, row and column.  k: (3, 3).
-    edge_m: depths of neighbours that differ by so much are one; where nothing is read it is far_m.
     """
     if not hand.any():
         return np.zeros((0, 3), np.float32)
-    far = np.where(depth_m > 0, depth_m, np.float32(far_m))
-    smooth = (cv2.dilate(far, _SQUARE) - cv2.erode(far, _SQUARE)) < edge_m
+    far = np.where(depth_m > 0, depth_m, np.float32(_FAR_M))
+    square = np.ones((3, 3), np.uint8)
+    smooth = (cv2.dilate(far, square) - cv2.erode(far, square)) < _EDGE_M
     u, v = _pixels(hand & smooth)
     z = depth_m[v, u]
     x = (u + corner[1] - k[0, 2]) / k[0, 0] * z

@@ -8,7 +8,7 @@ Gauss-Newton system of the pose and the components with the pose marginalised (a
 How much a frame counts falls with the fourth power of the keypoints' standard deviation. On
 rendered sequences of other hands the error of the length does so: 3 % in frames of 3.8 mm, 5 % and
 more from 4.5 mm on. Frames of one pose and view err alike, so they count once, as a *key pose*; key
-poses of one hand err alike too, by `alike`, so that no number of them makes the fit arbitrarily
+poses of one hand err alike too, so that no number of them makes the fit arbitrarily
 sure.
 
 Thickness is no part of what joints tell: it keeps the population's mean and spread, but for what
@@ -32,7 +32,7 @@ from torch import Tensor
 from toftrack.compute.rotations import rotation_matrix
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
-from toftrack.hand.skeleton import HandPose, forward_kinematics
+from toftrack.hand.skeleton import HandPose
 from toftrack.refinement.gauss_newton import (
     AXIS_ROW,
     JOINT_FRAME,
@@ -43,18 +43,27 @@ from toftrack.refinement.gauss_newton import (
 )
 
 _COUNT = len(COMPONENTS)
+_SURE_M = 0.004
+"""Deviation of the keypoints in a frame that counts fully."""
+_LENGTH_SIGMA, _KEYPOINTS, _ALIKE = 0.03, 4.0, 0.65
+"""In such a frame: error of the network's log length; times that the keypoints count by what the
+refinement takes them for; and part of its error that all frames of a hand share."""
+CERTAIN_POSES = 12.0
+"""Different poses seen as surely as that, from which on the shape stays."""
+_CONTRADICTION, _MEMORY = 3.5, 20.0
+"""The fit is begun anew when the network's lengths are off by so many expected errors over about so
+many detections, one in EVERY frames."""
 _ANGLE_RAD = 0.25
 """Standard deviation of a refined joint angle where the keypoints are to say it."""
-_KEY_RAD, _KEY_TURN_RAD = 0.25, 0.35
-"""Poses are another key pose when their angles, rms, or their rotations differ by so much."""
-_KEYS = 24
-"""Key poses that are kept; then only surer ones come in."""
-_EVERY = 3
+_KEY_RAD, _KEY_TURN_RAD, _KEYS = 0.25, 0.35, 24
+"""Poses are another key pose when their angles, rms, or their rotations differ by so much; and key
+poses that are kept: then only surer ones come in."""
+EVERY = 3
 """Frames from one update to the next: they are alike, and an update costs a millisecond."""
 _ENOUGH, _ENOUGH_FRAMES, _SURER = 1.5, 3, 1.2
-"""Weight of the frames of a key pose from which on no more are used; or their number, from
-which on only frames that count so many times as much are: an update costs a millisecond."""
-_KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
+"""Weight of the frames of a key pose from which on no more are used; or their number, from which on
+only frames that count so many times as much are."""
+KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
 """By how much the keypoints put the components wrong: means of uncertain places shorten fingers.
 Of rendered sequences of other hands, like what is said above."""
 _JOINT_MOVES = np.array(MOVES)[list(JOINT_FRAME)]
@@ -67,43 +76,17 @@ much, and so many of its standard deviations."""
 
 
 class SeenHand(Protocol):
-    """What the pose network says of a hand; see detector/hand_detector.py."""
+    """What the pose network says of a hand: its joints, its length, and how probably there is one;
+    see detector/hand_detector.py."""
 
     @property
-    def keypoints(self) -> Keypoints:
-        """The joints."""
+    def keypoints(self) -> Keypoints: ...
 
     @property
-    def length_m(self) -> float:
-        """The hand's length."""
+    def length_m(self) -> float: ...
 
     @property
-    def present(self) -> float:
-        """Probability that there is a hand."""
-
-
-@dataclass(frozen=True)
-class ShapeFit:
-    """How the shape is fitted.
-
-    sure_m: deviation of the keypoints in a frame that counts fully; see above.
-    length_sigma: error of the network's log length in such a frame.
-    keypoints: times that the keypoints count by what the refinement takes them for.
-    alike: part of a frame's error that all frames of a hand share.
-    certain_poses: different poses seen as surely as that, from which on the shape stays.
-    contradiction, memory: the fit is begun anew when the network's lengths are off by so many
-        expected errors over about so many detections, one in _EVERY frames.
-    fixed: the shape is not fitted, and stays as it is configured.
-    """
-
-    sure_m: float = 0.004
-    length_sigma: float = 0.03
-    keypoints: float = 4.0
-    alike: float = 0.65
-    certain_poses: float = 12
-    contradiction: float = 3.5
-    memory: float = 20
-    fixed: bool = False
+    def present(self) -> float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,19 +132,6 @@ class KeyPoses:
         return float((self.square / each).sum()), information, vector
 
 
-def _no_poses() -> KeyPoses:
-    none = np.zeros(0)
-    return KeyPoses(
-        np.zeros((0, 21)),
-        np.zeros((0, 3, 3)),
-        none,
-        none,
-        none,
-        np.zeros((0, _COUNT, _COUNT)),
-        np.zeros((0, _COUNT)),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class ShapeEstimate:
     """What is believed of the user's hand.
@@ -183,31 +153,34 @@ class ShapeEstimate:
     considered: float = 0.0
     frames: int = 0
 
-    def frozen(self, fit: ShapeFit) -> bool:
+    @property
+    def frozen(self) -> bool:
         """Whether the hand is known so well that no more is learned."""
-        return fit.fixed or self.poses >= fit.certain_poses
+        return self.poses >= CERTAIN_POSES
 
-    def summary(self, fit: ShapeFit) -> Fitted:
+    def summary(self) -> Fitted:
         """For the file of the shape."""
         covariance = tuple(tuple(row) for row in self.covariance.tolist())
-        mean = tuple(self.mean.tolist())
-        return Fitted(COMPONENTS, mean, covariance, self.poses, self.frozen(fit))
+        return Fitted(COMPONENTS, tuple(self.mean.tolist()), covariance, self.poses, self.frozen)
 
 
 def first_shape() -> ShapeEstimate:
     """Before any frame was seen: the population."""
+    none, square = np.zeros(0), (0, _COUNT, _COUNT)
+    angles, rotations, vector = np.zeros((0, 21)), np.zeros((0, 3, 3)), np.zeros((0, _COUNT))
+    keys = KeyPoses(angles, rotations, none, none, none, np.zeros(square), vector)
     population = np.diag(np.square(POPULATION_SIGMA))
-    return ShapeEstimate(np.zeros(_COUNT), population, _no_poses(), (0.0,) * _COUNT)
+    return ShapeEstimate(np.zeros(_COUNT), population, keys, (0.0,) * _COUNT)
 
 
 def with_network_length(
-    estimate: ShapeEstimate, length_m: float, fit: ShapeFit, first: HandShape
+    estimate: ShapeEstimate, length_m: float, first: HandShape
 ) -> ShapeEstimate:
-    """Before any estimate, when somebody else says how long the hand is: that length is applied.
+    """Before any estimate, the length that the network says is applied.
 
     first: the hand whose components are 0.
     """
-    if estimate.poses or fit.fixed:
+    if estimate.poses:
         return estimate
     sigma = POPULATION_SIGMA[0]
     log_length = math.log(length_m / first.hand_length_m)
@@ -217,30 +190,28 @@ def with_network_length(
     return replace(estimate, mean=mean, applied=(applied, *estimate.applied[1:]))
 
 
-def weight_of(detection: SeenHand, fit: ShapeFit) -> float:
+def weight_of(detection: SeenHand) -> float:
     """How much a detection of the hand counts, at most 1."""
     sigma = float(detection.keypoints.sigma_m.square().mean().sqrt())
-    weight = min(1.0, (fit.sure_m / max(sigma, 1e-6)) ** 4)
+    weight = min(1.0, (_SURE_M / max(sigma, 1e-6)) ** 4)
     return weight if math.isfinite(weight) else 0.0
 
 
-def contradicted(
-    estimate: ShapeEstimate, detection: SeenHand, fit: ShapeFit, first: HandShape
-) -> ShapeEstimate:
+def contradicted(estimate: ShapeEstimate, detection: SeenHand, first: HandShape) -> ShapeEstimate:
     """The estimate after one more frame, believed or not; begun anew where detections disagree."""
     estimate = replace(estimate, frames=estimate.frames + 1)
-    if not estimate.poses or estimate.frames % _EVERY:
+    if not estimate.poses or estimate.frames % EVERY:
         return estimate
-    weight = weight_of(detection, fit) * detection.present
-    keep = 1 - 1 / fit.memory
+    weight = weight_of(detection) * detection.present
+    keep = 1 - 1 / _MEMORY
     log_length = math.log(detection.length_m / first.hand_length_m)
     off = keep * estimate.off + weight * (log_length - float(estimate.mean[0]))
     considered = keep * estimate.considered + weight
-    # What a frame of weight 1 errs, of which `alike` stays however many there are.
-    error = fit.length_sigma**2 * (fit.alike + (1 - fit.alike) / max(considered, 1e-9))
+    # What a frame of weight 1 errs, of which `_ALIKE` stays however many there are.
+    error = _LENGTH_SIGMA**2 * (_ALIKE + (1 - _ALIKE) / max(considered, 1e-9))
     expected = math.sqrt(error + float(estimate.covariance[0, 0]))
-    if considered > 1 and abs(off / considered) > fit.contradiction * expected:
-        return with_network_length(first_shape(), detection.length_m, fit, first)
+    if considered > 1 and abs(off / considered) > _CONTRADICTION * expected:
+        return with_network_length(first_shape(), detection.length_m, first)
     return replace(estimate, off=off, considered=considered)
 
 
@@ -251,41 +222,39 @@ def learned(
     derivatives: tuple[np.ndarray, np.ndarray],
     detection: SeenHand,
     keypoints: Keypoints,
-    fit: ShapeFit,
     first: HandShape,
-    posed: Callable[[Tensor], HandPose] | None = None,
+    posed: Callable[[Tensor], HandPose],
 ) -> ShapeEstimate:
     """The estimate after a believed estimate; everything on the CPU.
 
     state: (1, 27).  shape: the hand applied.  derivatives: see shape_derivatives.
-    posed: its forward kinematics where they are compiled.
     keypoints: the detection's, as the refinement takes them.
-    first: the hand whose components are 0.
+    first: the hand whose components are 0.  posed: the forward kinematics of `shape`.
     """
-    if estimate.frozen(fit) or (estimate.poses and estimate.frames % _EVERY):
+    if estimate.frozen or (estimate.poses and estimate.frames % EVERY):
         return estimate
-    weight = weight_of(detection, fit)
+    weight = weight_of(detection)
     if weight < _LEAST:
         return estimate
-    row, far = estimate.keys.nearest(state)
+    keys = estimate.keys
+    row, far = keys.nearest(state)
     known = far <= 1
-    if known and estimate.keys.considered(row, weight):
+    if known and keys.considered(row, weight):
         return estimate
-    if not known and len(estimate.keys.weight) == _KEYS:
-        row = int((estimate.keys.square / estimate.keys.weight).argmin())
-        if float(estimate.keys.square[row] / estimate.keys.weight[row]) >= weight:
+    if not known and len(keys.weight) == _KEYS:
+        row = int((keys.square / keys.weight).argmin())
+        if float(keys.square[row] / keys.weight[row]) >= weight:
             return estimate
-    pose = posed(state) if posed is not None else forward_kinematics(state, shape)
-    information, vector = keypoints_system(pose, shape, derivatives, keypoints)
-    reported_here = np.subtract(estimate.applied, _KEYPOINTS_OFF)
+    information, vector = keypoints_system(posed(state), shape, derivatives, keypoints)
+    reported_here = np.subtract(estimate.applied, KEYPOINTS_OFF)
     # The network's length and its keypoints rest on the same image: each counts half.
-    vector = 0.5 * fit.keypoints * (information @ reported_here + vector)
-    information = 0.5 * fit.keypoints * information
-    precision = 0.5 / fit.length_sigma**2
+    vector = 0.5 * _KEYPOINTS * (information @ reported_here + vector)
+    information = 0.5 * _KEYPOINTS * information
+    precision = 0.5 / _LENGTH_SIGMA**2
     information[0, 0] += precision
     vector[0] += precision * math.log(detection.length_m / first.hand_length_m)
-    keys = _kept(estimate.keys, row, known, state, weight, information, vector)
-    return _posterior(replace(estimate, keys=keys), fit)
+    keys = _kept(keys, row, known, state, weight, information, vector)
+    return _posterior(replace(estimate, keys=keys))
 
 
 def keypoints_system(
@@ -317,7 +286,7 @@ def keypoints_system(
 
 def _joint_jacobian(pose: HandPose, shape: HandShape) -> np.ndarray:
     """(63, 27) how the joints' coordinates change with translation, rotation and angles; as
-    gauss_newton.point_jacobian, of all joints of one hand.
+    point_jacobian of tests/reference/refinement.py, of all joints of one hand.
     """
     frames, origins = pose.frames[0].numpy(), pose.origins_m[0].numpy()
     joints = pose.joints_m[0].numpy().astype(np.float64)
@@ -377,10 +346,10 @@ def _kept(
     return KeyPoses(*kept)
 
 
-def _posterior(estimate: ShapeEstimate, fit: ShapeFit) -> ShapeEstimate:
+def _posterior(estimate: ShapeEstimate) -> ShapeEstimate:
     """Mean, covariance and the hand in use by the key poses that there are."""
     poses, information, vector = estimate.keys.summed()
-    shared = 1 / (1 + fit.alike * max(poses - 1, 0.0))
+    shared = 1 / (1 + _ALIKE * max(poses - 1, 0.0))
     precision = np.diag(np.square(POPULATION_SIGMA) ** -1) + shared * information
     covariance = np.linalg.inv(precision)
     mean = covariance @ (shared * vector)

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from toftrack.detector.hand_detector import Detection, merit
@@ -30,8 +29,8 @@ _GATE = 3.5
 _SAME_PALM_M, _SAME_HAND_M, _SAME_JOINTS = 0.022, 0.045, 0.3
 """Two hands are the same where their palms' middles are nearer than a palm is thick; or less near,
 and more than this share of one lies in the other, see posterior.touching."""
-_IMPOSSIBLE = 1e6
-"""Cost of an impossible pair; half of it, that of a track without detection."""
+_WITHOUT = 5e5
+"""Cost of a track without detection; that of an impossible pair is twice as much."""
 _TENTATIVE_S = 0.5
 """A tentative track beside a confirmed one ends at this age."""
 
@@ -66,15 +65,52 @@ def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: f
     return cost
 
 
+def associate(
+    hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: float
+) -> tuple[list[SideDetection | None], list[SideDetection]]:
+    """The detection of each track's hand, None where it has none; and those that may begin one."""
+    columns = assign(costs(hands, seen, dt_s))
+    return [seen[at] if at >= 0 else None for at in columns], unassigned(seen, columns)
+
+
 def assign(cost: np.ndarray) -> list[int]:
     """The column of each row of (B, D) costs, -1 where it has none: as many rows as possible have
     one, and the sum of their costs is least.
     """
     rows, columns = cost.shape
-    whole = np.full((rows, columns + rows), 0.5 * _IMPOSSIBLE)  # each may go without
-    whole[:, :columns] = np.where(np.isfinite(cost), cost, _IMPOSSIBLE)
-    found = linear_sum_assignment(whole)[1]
-    return [int(column) if column < columns else -1 for column in found]
+    whole = np.full((rows, columns + rows), _WITHOUT)
+    whole[:, :columns] = np.where(np.isfinite(cost), cost, 2 * _WITHOUT)
+    return [column if column < columns else -1 for column in least_cost(whole)]
+
+
+def least_cost(cost: np.ndarray) -> list[int]:
+    """The column of each row of (B, C >= B) finite costs, each its own, so that their sum is least.
+
+    The Hungarian method (Kuhn, Naval Res. Logist. Q. 2, 1955): row by row, along the shortest path
+    of exchanges, by costs that are reduced by what rows and columns are worth.
+    """
+    rows, columns = cost.shape
+    row_worth, column_worth = np.zeros(rows), np.zeros(columns + 1)
+    row_of = np.full(columns + 1, -1)  # the last column stands for that of the row to be placed
+    for row in range(rows):
+        column, row_of[-1] = columns, row
+        away, before = np.full(columns, np.inf), np.full(columns, -1)
+        done = np.zeros(columns + 1, bool)
+        while row_of[column] >= 0:
+            done[column] = True
+            at = row_of[column]
+            reduced = cost[at] - row_worth[at] - column_worth[:-1]
+            nearer = ~done[:-1] & (reduced < away)
+            away[nearer], before[nearer] = reduced[nearer], column
+            nearest = int(np.where(done[:-1], np.inf, away).argmin())
+            step = away[nearest]
+            row_worth[row_of[done]] += step
+            column_worth[done] -= step
+            away[~done[:-1]] -= step
+            column = nearest
+        while column != columns:
+            row_of[column], column = row_of[before[column]], before[column]
+    return [int(np.flatnonzero(row_of[:-1] == row)[0]) for row in range(rows)]
 
 
 def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[SideDetection]:
@@ -111,11 +147,6 @@ def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
     return not track.confirmed and confirmed_beside and track.age.seconds > _TENTATIVE_S
 
 
-def sureness(track: Track) -> float:
-    """A track's log odds, raised so that any confirmed track is surer than any tentative one."""
-    return track.log_odds + 20.0 * track.confirmed
-
-
 def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
     """The state with the tracks that go on, one a hand; tentative ones that end are refused."""
     confirmed = sum(track.confirmed for track in tracks)
@@ -126,7 +157,9 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
     }
     hands = [model.hand(track.side, track.shape) for track in tracks]
     palms = [palm_of(track.pose, hand)[0][0] for track, hand in zip(tracks, hands, strict=True)]
-    surest = sorted(range(len(tracks)), key=lambda row: sureness(tracks[row]), reverse=True)
+    # Any confirmed track is surer than any tentative one.
+    sureness = [track.log_odds + 20.0 * track.confirmed for track in tracks]
+    surest = sorted(range(len(tracks)), key=lambda row: sureness[row], reverse=True)
     for first, second in itertools.combinations(surest, 2):
         if ended & {tracks[first].number, tracks[second].number}:
             continue

@@ -9,11 +9,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from toftrack.compute import rigid
+from toftrack.compute import rigid, rigid_numba
 from toftrack.compute.redraw import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
+from toftrack.render.numba.scorer import NumbaScorer
+from toftrack.render.numba.scorer import score_rows as score_rows_compiled
 from toftrack.render.scoring import Scorer, ScoreRows, score_rows
 from toftrack.render.torch_scorer import TorchScorer
 
@@ -47,16 +49,14 @@ def choose_backend(renderer: str, device: torch.device | str = "cpu") -> Backend
     Raises ToftrackError for an unknown name or a back end that cannot run here.
     """
     device = torch.device(device)
-    if renderer == "auto":
-        wanted = "triton" if device.type == "cuda" else "numba"
-    elif renderer in BACK_ENDS:
-        wanted = renderer
-    else:
+    fastest = "triton" if device.type == "cuda" else "numba"
+    wanted = fastest if renderer == "auto" else renderer
+    if wanted not in BACK_ENDS:
         raise ToftrackError(
             f"renderer={renderer} is unknown; give one of auto, {', '.join(BACK_ENDS)}"
         )
     try:
-        return _MAKERS[wanted](device)
+        return _make(wanted, device)
     except ImportError as error:
         raise ToftrackError(
             f"renderer={wanted} cannot run here ({error}); install it or give renderer=torch"
@@ -69,23 +69,33 @@ def make_scorer(renderer: str, shape: HandShape, device: torch.device | str = "c
     return choose_backend(renderer, device).make_scorer(shape)
 
 
-def _torch(device: torch.device) -> Backend:
-    return Backend(
-        "torch",
-        device,
-        _on_cpu_too(device, rigid.MOTIONS),
-        lambda shape: TorchScorer(shape.to(device), hand_surface(shape).to(device)),
-    )
+def _make(name: str, device: torch.device) -> Backend:
+    if name == "torch":
+        motions = _on_cpu_too(device, rigid.MOTIONS)
+        return Backend(name, device, motions, partial(_torch_scorer, device=device))
+    if name == "numba":  # which also scores particles elsewhere; torch moves those
+        there = rigid_numba.MOTIONS if device.type == "cpu" else rigid.MOTIONS
+        motions = _on_cpu_too(device, there)
+        return Backend(name, device, motions, NumbaScorer, score_rows_compiled)
+    from toftrack.compute import rigid_triton
+    from toftrack.render.triton.scorer import TritonScorer, require_device
+
+    require_device()
+    motions = _on_cpu_too(device, rigid_triton.MOTIONS)
+    return Backend(name, device, motions, partial(TritonScorer, device=device))
+
+
+def _torch_scorer(shape: HandShape, device: torch.device) -> Scorer:
+    return TorchScorer(shape.to(device), hand_surface(shape).to(device))
 
 
 def _on_cpu_too(device: torch.device, there: Motions) -> Motions:
     """The motions `there` for tensors on the device, and compiled ones for those on the CPU."""
     if device.type == "cpu":
         return there
-    from toftrack.compute.rigid_numba import MOTIONS as HERE
 
     def at(tensor: Tensor) -> Motions:
-        return HERE if tensor.device.type == "cpu" else there
+        return rigid_numba.MOTIONS if tensor.device.type == "cpu" else there
 
     return Motions(
         compose=lambda reference, tangent: at(reference).compose(reference, tangent),
@@ -93,30 +103,3 @@ def _on_cpu_too(device: torch.device, there: Motions) -> Motions:
         redraw=there.redraw,
         mean=there.mean,
     )
-
-
-def _numba(device: torch.device) -> Backend:
-    """Compiled code on the CPU, which also scores particles elsewhere; torch moves those."""
-    from toftrack.compute import rigid_numba
-    from toftrack.render.numba.scorer import NumbaScorer, score_rows
-
-    there = rigid_numba.MOTIONS if device.type == "cpu" else rigid.MOTIONS
-    motions = _on_cpu_too(device, there)
-    return Backend("numba", device, motions, NumbaScorer, score_rows)
-
-
-def _triton(device: torch.device) -> Backend:
-    from toftrack.compute import rigid_triton
-    from toftrack.render.triton.scorer import TritonScorer, require_device
-
-    require_device()
-    motions = _on_cpu_too(device, rigid_triton.MOTIONS)
-    scorer = partial(TritonScorer, device=device)
-    return Backend("triton", device, motions, scorer)
-
-
-_MAKERS: dict[str, Callable[[torch.device], Backend]] = {
-    "torch": _torch,
-    "numba": _numba,
-    "triton": _triton,
-}

@@ -7,9 +7,7 @@ Gall et al., "Optimization and filtering for human motion capture" (IJCV 87, 201
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import cached_property
 
 import cv2
@@ -17,21 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.hand_detector import Detection, DetectorSettings
 from toftrack.detector.parts import FOREARM_PART, THING_PART
+from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import out_of_sight
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
-from toftrack.tracking.posterior import (
-    ImageTerm,
-    KeypointsTerm,
-    OtherHandTerm,
-    OverlapTerm,
-    Posterior,
-    Term,
-)
+from toftrack.tracking.posterior import ImageTerm, keypoints_off, touching
 from toftrack.tracking.state import Track
 
 _SURELY_PRESENT = 0.97
@@ -47,16 +39,14 @@ _UNLIKELY = 0.03
 _BENT_STEPS, _BENT_M, _BENT_RAD = 6, 0.010, 0.8
 """In how many steps a pose is bent to the keypoints; how sure the keypoints are at best, and how
 far an angle may go."""
-_NO_WEIGHT = 1e-6
-"""The least weight of keypoints: divided by 0, standard deviations would be no numbers."""
 _LEAST_PARTS = 4
 """A thing in the hand has at least so many cells of the crop's parts, of 9 mm each."""
 _MOSTLY, _UNKNOWN = 0.5, 255
 """A surface in front is the hand's arm when more than this share of it is, where the network sees
 it; and the class of what it does not see."""
 _MARGIN = 0.05
-"""What a pose of the detector loses in log posterior against the other sources: neighbouring
-fingers change places from frame to frame otherwise (swaps +0.6 points)."""
+"""What a pose of the detector loses in log posterior against the others: neighbouring fingers
+change places from frame to frame otherwise (swaps +0.6 points)."""
 _SURE_LEAD = 2.0
 """The same of a pose elsewhere while something hides the hand: without it, a second hand that
 crosses the first one is silently wrong in 5 % of the frames."""
@@ -72,7 +62,7 @@ class View:
 
     fitted: the hand in the applied shape.  observation: not empty.
     expected_m: the depth of its nearest joint, as predicted, or as detected where it (re)starts.
-    detection: empty where the pose network did not look.
+    detection: empty where the pose network did not look.  keypoint_weight: of its keypoints.
     others: joints (21, 3) m of each other hand.  image: the likelihood of the image.
     """
 
@@ -84,12 +74,14 @@ class View:
     others: tuple[Tensor, ...]
     image: ImageTerm
     model: TrackerModel
+    keypoint_weight: float
 
     @cached_property
     def hidden(self) -> bool:
         """Whether something hides part of the hand."""
-        hand, occluder = self.observation.hand.numpy(), self.observation.occluder.numpy()
-        return int(np.count_nonzero(occluder)) > _HIDDEN * int(np.count_nonzero(hand))
+        seen = self.observation
+        hand, occluder = (np.count_nonzero(mask.numpy()) for mask in (seen.hand, seen.occluder))
+        return bool(occluder > _HIDDEN * hand)
 
     @property
     def covered(self) -> bool:
@@ -102,8 +94,9 @@ class View:
 
     @cached_property
     def keypoints(self) -> Keypoints:
-        """The detection's keypoints, see keypoints_of."""
-        return keypoints_of(self.detection, self.model)
+        """The detection's keypoints, with the configured least deviation."""
+        cfg = self.model.detector.settings
+        return keypoints_of(self.detection, cfg, cfg.keypoint_m)
 
     @cached_property
     def seen(self) -> SeenPoints:
@@ -115,18 +108,19 @@ class View:
         cfg = self.model.refinement
         return self.fitted.refiner(poses, poses[:, 6:], self.seen, cfg, self.keypoints)
 
-    def posterior(self, keypoints: float | None = None) -> Posterior:
-        """The posterior of the hand's pose.  keypoints: their weight; None = the model's."""
-        weights, terms = self.model.weights, dict[str, Term]()
-        keypoints = weights.keypoints if keypoints is None else keypoints
-        if keypoints and not self.detection.empty:
-            terms["keypoints"] = KeypointsTerm(self.keypoints, keypoints)
+    def log_posterior(self, poses: Tensor) -> Tensor:
+        """(N,) log posteriors of poses (N, 27), see posterior.py."""
+        weights, total = self.model.weights, self.image(poses)
+        joints = self.fitted.refiner.joints(poses)
+        if self.keypoint_weight and not self.detection.empty:
+            total = total - self.keypoint_weight * keypoints_off(joints, self.keypoints)
         if weights.overlap:
-            terms["overlap"] = OverlapTerm(self.fitted.shape.hand_length_m, weights.overlap)
+            length_m = self.fitted.shape.hand_length_m
+            total = total - weights.overlap * finger_overlap(joints, length_m)
         if weights.other_hand:
-            for number, joints in enumerate(self.others):
-                terms[f"other hand {number}"] = OtherHandTerm(joints, weights.other_hand)
-        return Posterior(self.image, self.fitted.refiner.joints, terms)
+            for other_m in self.others:
+                total = total - weights.other_hand * touching(joints, other_m)
+        return total
 
 
 def with_parts(view: View) -> View:
@@ -142,21 +136,18 @@ def with_parts(view: View) -> View:
 
 
 def image_term(
-    observation: Observation,
-    fitted: FittedHand,
-    model: FilterModel,
-    coverage: float | None = None,
+    observation: Observation, fitted: FittedHand, model: FilterModel, coverage: float | None = None
 ) -> ImageTerm:
     """The likelihood of an observation, which must not be empty.  coverage: see ImageTerm."""
     evidence = model.likelihood.evidence(observation).to(model.device)
     return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
 
 
-def keypoints_of(detection: Detection, model: TrackerModel) -> Keypoints:
-    """A detection's keypoints, with the configured least deviation and weight."""
-    cfg, found = model.detector.settings, detection.keypoints
-    sigma = found.sigma_m.clamp(min=cfg.keypoint_m)
-    return Keypoints(found.points_m, sigma / max(cfg.keypoint_weight, _NO_WEIGHT))
+def keypoints_of(detection: Detection, settings: DetectorSettings, least_m: float) -> Keypoints:
+    """A detection's keypoints, with the configured weight and a least deviation."""
+    found = detection.keypoints
+    sigma = found.sigma_m.clamp(min=least_m)
+    return Keypoints(found.points_m, sigma / max(settings.keypoint_weight, 1e-6))
 
 
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
@@ -165,72 +156,50 @@ def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tenso
     return detection.first(max(1, min(count, likely))).states(fitted.ratio)
 
 
-def detector_poses(
-    detection: Detection,
-    observation: Observation,
-    fitted: FittedHand,
-    model: TrackerModel,
-    count: int,
-) -> Tensor:
+def detected_poses(view: View, count: int) -> Tensor:
     """(1 + H, 27) a detection's poses: the likeliest one bent to the keypoints, and H <= `count`
     hypotheses. (0, 27) of an empty detection; without refinement, only the H.
 
     Keypoints are more exact than hypotheses where a finger is seen, but no pose by themselves.
     """
-    if detection.empty:
+    if view.detection.empty:
         return torch.zeros(0, 27)
-    states = hypotheses_of(detection, fitted, count)
-    if not model.refinement.iterations:
+    states, cfg = hypotheses_of(view.detection, view.fitted, count), view.model.refinement
+    if not cfg.iterations:
         return states
     bent = states[:1]
-    nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), observation.k, (0, 0))
-    weight = max(model.detector.settings.keypoint_weight, _NO_WEIGHT)
-    sigma = detection.keypoints.sigma_m.clamp(min=_BENT_M) / weight
-    freely = replace(model.refinement, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
-    keypoints = Keypoints(detection.keypoints.points_m, sigma)
-    return torch.cat((fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
+    nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), view.observation.k, (0, 0))
+    freely = replace(cfg, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
+    keypoints = keypoints_of(view.detection, view.model.detector.settings, _BENT_M)
+    return torch.cat((view.fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
 
 
-def best_start(view: View, keypoints: float | None = None) -> tuple[Tensor, float]:
+def best_start(view: View) -> tuple[Tensor, float]:
     """The best (1, 27) of the detector's poses, raw or refined, and its log posterior.
 
-    The detection must not be empty.  keypoints: see View.posterior.
+    The detection must not be empty.
     """
     model = view.model
-    count = model.detector.settings.hypotheses
-    poses = detector_poses(view.detection, view.observation, view.fitted, model, count)
+    poses = detected_poses(view, model.detector.settings.hypotheses)
     if model.refinement.iterations:
         poses = torch.cat((poses, view.refine(poses)))
-    values = view.posterior(keypoints)(poses)
+    values = view.log_posterior(poses)
     best = int(values.argmax())
     return poses[best][None], float(values[best])
-
-
-class Source(IntEnum):
-    """Where a hypothesis comes from."""
-
-    PREVIOUS = 0
-    """The last frame's fingers at the filter's wrist; of a covered hand, its last pose."""
-    DYNAMICS = 1
-    """The filter's estimate."""
-    DETECTOR = 2
-    """The detector's likeliest hypothesis, raw or bent to the keypoints."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
     """A table of poses of one hand, a row each.
 
-    pose: (N, 27).  joints_m: (N, 21, 3).  source: of each.  log_posterior: (N,).
+    pose: (N, 27).  joints_m: (N, 21, 3).  detected: (N,) bool, by the pose network.
+    log_posterior: (N,).
     """
 
     pose: Tensor
     joints_m: Tensor
-    source: Sequence[Source]
+    detected: np.ndarray
     log_posterior: Tensor
-
-    def __len__(self) -> int:
-        return len(self.pose)
 
 
 def propose(view: View, mean: Tensor) -> Hypotheses:
@@ -242,14 +211,13 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
     leaves the image may draw it anywhere.
     """
     if not view.model.refinement.iterations:
-        return scored(view, mean, (Source.DYNAMICS,))
+        return scored(view, mean)
     if view.covered:
-        return scored(view, view.track.pose, (Source.PREVIOUS,))
-    detected = detector_poses(view.detection, view.observation, view.fitted, view.model, 1)
+        return scored(view, view.track.pose)
+    detected = detected_poses(view, 1)
     previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
     poses = torch.cat((previous, mean, detected))
-    sources = (Source.PREVIOUS, Source.DYNAMICS, *[Source.DETECTOR] * len(detected))
-    table = scored(view, view.refine(poses), sources)
+    table = scored(view, view.refine(poses), len(detected))
     nothing = table.log_posterior.isneginf()
     if not nothing.any():
         return table
@@ -257,40 +225,30 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
     return replace(table, pose=pose, joints_m=view.fitted.refiner.joints(pose))
 
 
-def scored(view: View, poses: Tensor, sources: Sequence[Source]) -> Hypotheses:
-    """Poses (N, 27) of these sources as they are, scored."""
+def scored(view: View, poses: Tensor, detected: int = 0) -> Hypotheses:
+    """Poses (N, 27) as they are, scored; the last `detected` ones are the detector's."""
     joints = view.fitted.refiner.joints(poses)
-    return Hypotheses(poses, joints, sources, view.posterior().value(poses, joints))
+    detectors = np.arange(len(poses)) >= len(poses) - detected
+    return Hypotheses(poses, joints, detectors, view.log_posterior(poses))
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The chosen pose of a frame.
-
-    pose: (1, 27).  moved: the detector sees it elsewhere: the track is to restart there.
-    """
-
-    pose: Tensor
-    moved: bool
-
-
-def select(table: Hypotheses, hidden: bool) -> Choice:
-    """The best of a hand's scored hypotheses; one of the detector must be better by a margin.
+def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:
+    """The best pose (1, 27) of a hand's scored hypotheses, where one of the detector must be better
+    by a margin; and whether the detector sees it elsewhere: the track is to restart there.
 
     table: with at least one row that is not the detector's.
     hidden: something hides part of the hand. Then a pose elsewhere needs a large lead, for it may
         be of what hides the hand, such as another hand.
     """
     # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
-    joints, source = table.joints_m.numpy(), np.array(table.source)
+    joints, detected = table.joints_m.numpy(), table.detected
     values = np.maximum(table.log_posterior.numpy(), WORST)
-    detectors = source == Source.DETECTOR
-    base = int(np.where(detectors, -np.inf, values).argmax())
+    base = int(np.where(detected, -np.inf, values).argmax())
     away = np.sqrt(np.square(joints - joints[base]).sum(-1)).mean(1)
-    elsewhere = detectors & (away >= _ELSEWHERE_M)
-    values = values - np.where(elsewhere & hidden, _SURE_LEAD, _MARGIN * detectors)
+    elsewhere = detected & (away >= _ELSEWHERE_M)
+    values = values - np.where(elsewhere & hidden, _SURE_LEAD, _MARGIN * detected)
     best = int(values.argmax())
-    return Choice(table.pose[best][None], bool(elsewhere[best]))
+    return table.pose[best][None], bool(elsewhere[best])
 
 
 def without_things(observation: Observation, detection: Detection) -> Observation:
@@ -301,13 +259,13 @@ def without_things(observation: Observation, detection: Detection) -> Observatio
     kind = detection.parts.kind
     if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
         return observation
-    row, column = np.nonzero(observation.hand.cpu().numpy())
+    row, column = np.nonzero(observation.hand.numpy())
     of = detection.parts.at(_points_of(row, column, observation)) == THING_PART
     if not of.any():
         return observation
     mask = np.zeros(observation.hand.shape, bool)
     mask[row[of], column[of]] = True
-    thing = torch.from_numpy(mask).to(observation.hand.device)
+    thing = torch.from_numpy(mask)
     return replace(observation, hand=observation.hand & ~thing, thing=thing)
 
 
@@ -317,7 +275,7 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     Who wears the camera has the arm nearer to it than the hand, which it does not hide. A surface
     in front is the arm when the pose network calls most of it a forearm.
     """
-    occluder = observation.occluder.cpu().numpy()
+    occluder = observation.occluder.numpy()
     count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
     row, column = np.nonzero(occluder)
     kind = detection.parts.at(_points_of(row, column, observation), outside=_UNKNOWN)
@@ -327,13 +285,12 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     of_arm = (mine > _MOSTLY * known)[surface] & occluder
     if not of_arm.any():
         return observation
-    arm = torch.from_numpy(of_arm).to(observation.hand.device)
+    arm = torch.from_numpy(of_arm)
     return replace(observation, hand=observation.hand | arm, occluder=observation.occluder & ~arm)
 
 
 def _points_of(row: np.ndarray, column: np.ndarray, observation: Observation) -> np.ndarray:
-    depth_m, k = observation.depth_m.cpu().numpy(), observation.k.cpu().numpy()
-    return points_at(row, column, depth_m, k)
+    return points_at(row, column, observation.depth_m.numpy(), observation.k.numpy())
 
 
 def points_at(

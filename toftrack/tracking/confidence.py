@@ -9,45 +9,48 @@ deviations are, and what they mean.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.pace import FRAME_S
+from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError
-from toftrack.hand.regions import joint_axes
 from toftrack.json_text import read_json
+from toftrack.render.segmentation import Observation
+
+if TYPE_CHECKING:
+    from toftrack.tracking.state import Track
 
 _FITTED = Path(__file__).parents[1] / "data" / "confidence.json"
 _LEAST = 1e-3
 _LIKELY = 0.03
 _NEAREST_M, _BEHIND_M = 0.05, 0.04
 """Least depth of a joint in projections; and how much nearer than a joint what hides it is."""
+_HIDDEN, _OUT_OF_VIEW = 0.3, 0.4
+"""A hand is hidden, or out of view, where more than this share of its joints is."""
 
 
 @dataclass(frozen=True)
 class ConfidenceFeatures:
     """Features for and against an estimate in one frame, each a number of order 1.
 
-    log_score: natural log of the image's score.
+    log_score: log of the image's score.
     keypoints_off, farthest_keypoint_off: distance of the joints from the network's keypoints, mean
-        and largest, log of centimetres.
-    pose_off: mean distance from the hypothesis that is most like it, likewise.
-    likeliest_off: mean distance from the likeliest hypothesis.
-    expected_error, unsure: the network's own expected error of its likeliest hypothesis, and the
-        mean standard deviation of its keypoints, likewise.
+        and largest; like all distances here, log of centimetres.
+    pose_off, likeliest_off: mean distance from the likely hypothesis that is most like it, and from
+        the likeliest one.
+    expected_error, unsure: the network's own expected error of that, and the mean standard
+        deviation of its keypoints.
     absent, other_side: minus the log of the network's probability that there is a hand, and that it
         is this one: a hand that is turned round looks like the other one.
-    unseen: share of the joints that lie outside of the image.
-    hidden: share of the joints that lie behind something.
+    unseen, hidden: shares of the joints that lie outside of the image, and behind something.
     young: 1 in the first frame of a track, falling.
     """
 
@@ -66,7 +69,7 @@ class ConfidenceFeatures:
 
     def values(self) -> list[float]:
         """The features in the order of FEATURES."""
-        return [getattr(self, name) for name in FEATURES]
+        return list(vars(self).values())
 
 
 FEATURES = tuple(field.name for field in fields(ConfidenceFeatures))
@@ -80,22 +83,20 @@ def confidence_features(
     age_s: float,
     detection: Detection,
     last: ConfidenceFeatures,
-    depth_m: Tensor,
-    k: Tensor,
+    observation: Observation,
 ) -> ConfidenceFeatures:
-    """The features of an estimate with joints (21, 3) in an image (H, W) with intrinsics k.
+    """The features of an estimate with joints (21, 3) in an image.
 
     age_s: seconds since its track began.
     last: of the frame before; in a frame without a detection, all but the score hold.
     """
     if detection.empty:
         return replace(last, log_score=math.log(max(score, _LEAST)))
-    joints = joints_m.cpu()
-    at = joints.numpy()
+    at = joints_m.numpy()
     keypoints = np.linalg.norm(at - detection.keypoints.points_m.numpy(), axis=1)
     off = np.linalg.norm(at - detection.joints_m.numpy(), axis=-1).mean(1)
     likely = off[detection.log_probability.numpy() > math.log(_LIKELY)]
-    unseen, hidden = out_of_sight(joints, depth_m, k)
+    unseen, hidden = out_of_sight(joints_m, observation.depth_m, observation.k)
     return ConfidenceFeatures(
         log_score=math.log(max(score, _LEAST)),
         keypoints_off=_log_cm(float(keypoints.mean())),
@@ -134,29 +135,24 @@ def _surprise(probability: float) -> float:
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
     """The shares of joints (21, 3) outside of the image (H, W), and of those behind something."""
     at, z = joints.numpy(), np.maximum(joints[:, 2].numpy(), _NEAREST_M)
-    seen = _readings(at[:, 0] / z, at[:, 1] / z, depth_m.cpu().numpy(), k.cpu().numpy())
+    seen = _readings(at[:, 0] / z, at[:, 1] / z, depth_m.numpy(), k.numpy())
     behind = (seen > 0) & (seen < z - _BEHIND_M)
     return float(np.isnan(seen).mean()), float(behind.mean())
 
 
-def seen_around(
-    joints_m: np.ndarray, nearest_m: float, step_m: float, depth_m: np.ndarray, k: np.ndarray
-) -> np.ndarray:
-    """(N, 3) shares of a joint's surroundings outside and without reading; median depth or NaN.
-
-    joints_m: (N, 3).  step_m: from one of the 3 x 3 readings about a joint to the next.
-    nearest_m: least depth of a joint in the projection.
+def _seen_around(joints_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """(N, 3) of joints (N, 3): shares of 3 x 3 readings about each that are outside and without
+    reading, and their median depth or NaN.
     """
-    z = np.maximum(joints_m[:, 2:], nearest_m)
-    down, right = (side.ravel() * step_m for side in np.mgrid[-1:2, -1:2])
+    z = np.maximum(joints_m[:, 2:], _NEAREST_M)
+    down, right = (side.ravel() * _AROUND_M for side in np.mgrid[-1:2, -1:2])
     x, y = (joints_m[:, :1] + right) / z, (joints_m[:, 1:2] + down) / z
     seen = _readings(x, y, depth_m, k)
     outside, unread = np.isnan(seen), seen == 0
     count = (seen > 0).sum(1)
     ordered = np.sort(np.where(seen > 0, seen, np.inf), 1)  # the lower middle is the median
     median = ordered[np.arange(len(count)), np.maximum(count - 1, 0) // 2]
-    median = np.where(count > 0, median, np.nan)
-    return np.stack((outside.mean(1), unread.mean(1), median), 1)
+    return np.stack((outside.mean(1), unread.mean(1), np.where(count > 0, median, np.nan)), 1)
 
 
 def _readings(x: np.ndarray, y: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -236,9 +232,8 @@ class JointConfidence:
                 raise ToftrackError(f"joints.{name} must have a row for each of {', '.join(known)}")
             for key, row in rows.items():
                 if not isinstance(row, Sequence) or len(row) != len(COLUMNS):
-                    wanted = ", ".join(COLUMNS)
                     raise ToftrackError(
-                        f"joints.{name}.{key} must be {len(COLUMNS)} numbers: {wanted}"
+                        f"joints.{name}.{key} must be {len(COLUMNS)} numbers: {', '.join(COLUMNS)}"
                     )
                 for value in row:
                     check_number(f"joints.{name}.{key}", value)
@@ -254,9 +249,8 @@ class JointConfidence:
     def judge(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations (21, 3), m, and probabilities (21,) from features (21, J)."""
         predicted = features @ self._weights + self._kinds
-        sigma = (self.scale * np.exp(predicted[:, :3].clip(-30.0, 30.0))).clip(
-            _LEAST_CM, _MOST_CM
-        ) / 100
+        sigma_cm = self.scale * np.exp(predicted[:, :3].clip(-30.0, 30.0))
+        sigma = sigma_cm.clip(_LEAST_CM, _MOST_CM) / 100
         odds = (predicted[:, 3] + self.odds).clip(-30.0, 30.0)
         return sigma.astype(np.float32), (1 / (1 + np.exp(-odds))).astype(np.float32)
 
@@ -286,7 +280,7 @@ def joint_features(
         off = np.linalg.norm(joints - keypoints.points_m.numpy(), axis=1)
         worst = np.concatenate(([off.mean()], off[1:].reshape(5, 4).max(1).repeat(4)))
         features[:, _KEYPOINTS] = _log_cm_of(keypoints.sigma_m.numpy(), off, worst)
-    outside, unread, surface = seen_around(joints, _NEAREST_M, _AROUND_M, depth_m, k).T
+    outside, unread, surface = _seen_around(joints, depth_m, k).T
     deeper = np.where(np.isnan(surface), 0.0, joints[:, 2] - surface - _BELOW_M)
     features[:, 3], features[:, 4] = outside, unread
     features[:, 5], features[:, 6] = deeper.clip(0, 0.05) / 0.02, (-deeper).clip(0, 0.05) / 0.02
@@ -294,25 +288,6 @@ def joint_features(
     features[:, 8] = np.log(1e3 * np.maximum(joints[:, 2], _NEAREST_M) / k[0, 0])
     features[:, 9] = np.logaddexp(0.0, -log_odds)
     return features
-
-
-def propagated_sigma(
-    joints_m: np.ndarray, covariance: Tensor, joints_of: Callable[[Tensor], Tensor]
-) -> np.ndarray:
-    """(21, 3) m, deviations of joints (21, 3) along joint_axes by the particles' covariance.
-
-    covariance: (6 + d, 6 + d) in the tangent space.
-    joints_of: joints (N, 21, 3) of the estimate moved by tangents (N, 6 + d).
-    """
-    size = len(covariance)
-    # One step along each main axis and back; a covariance may be singular, so no Cholesky.
-    values, vectors = torch.linalg.eigh(covariance.double())
-    steps = (vectors * values.clamp(min=0).sqrt()).mT.to(covariance.dtype)
-    moved = joints_of(torch.cat((steps, -steps))).cpu().double().numpy()
-    half = 0.5 * (moved[:size] - moved[size:])
-    along = np.einsum("jab,njb->nja", joint_axes(joints_m), half)
-    sigma: np.ndarray = np.sqrt(np.square(along).sum(0)).astype(np.float32)
-    return sigma
 
 
 @dataclass(frozen=True)
@@ -394,3 +369,51 @@ def make_confidence(fitted: str | None = None, **thresholds: Any) -> ConfidenceM
             " python -m toftrack.training fit-confidence, or leave it out"
         ) from None
     return ConfidenceModel(**thresholds, log_odds=log_odds, whole_odds=whole_odds, joints=joints)
+
+
+@dataclass(frozen=True)
+class Status:
+    """What is thought of a frame's estimate.
+
+    state_name, lost: as Estimate has them.
+    confidence: probability that every joint is within 40 mm; NaN where nothing says.
+    log_odds: the same, smoothed over time.  whole_odds: likewise of the mean joint error.
+    doubtful: as Track has it, with this frame.
+    """
+
+    state_name: str
+    lost: bool
+    confidence: float = math.nan
+    log_odds: float = 0.0
+    whole_odds: float = 0.0
+    doubtful: Duration = Duration()
+
+
+def judge(
+    track: Track, features: ConfidenceFeatures, dt_s: float, model: ConfidenceModel
+) -> Status:
+    """The status of a track's estimate, dt_s after its last one."""
+    kept = model.memory ** (dt_s / FRAME_S) if track.age.begun else 0.0
+    smooth = kept * track.log_odds + (1 - kept) * model.log_odds(features)
+    whole = kept * track.whole_odds + (1 - kept) * model.whole_odds(features)
+    confidence, probable = probability(smooth), probability(whole)
+    # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
+    passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
+    doubtful = Duration(track.doubtful.seconds + passed)
+    doubtful = doubtful if confidence < model.give_up else Duration()
+    confirmed = track.confirmed or confidence >= model.believe
+    lost = not confirmed or confidence < model.confidence or probable < model.whole
+    name = _state_name(features) if lost else "tracking"
+    return Status(name, lost, confidence, smooth, whole, doubtful)
+
+
+def probability(log_odds: float) -> float:
+    """The probability of log odds, which count up to 30 either way."""
+    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
+
+
+def _state_name(features: ConfidenceFeatures) -> str:
+    """Why an estimate is lost."""
+    if features.unseen > _OUT_OF_VIEW:
+        return "out of view"
+    return "hidden" if features.hidden > _HIDDEN else "searching"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -35,15 +36,18 @@ class PendingDetections:
     """The networks at work on a frame.
 
     at_tracks: each waits for the detection at a predicted hand.
-    finder: waits for the finder's places; there are none where it is not asked, or was waited for.
-    at_once: the finder's places are used in this frame, to find a hand anew; else in the next one.
-    finder_asked: whether the finder looks at this frame.
+    asked: whether the finder looks at this frame.  finder: waits for its places.
+    at_once: they are used in this frame, to find a hand anew; else in the next one.
     """
 
     at_tracks: Sequence[Callable[[], SideDetection]]
+    asked: bool
     finder: Callable[[], Places]
     at_once: bool
-    finder_asked: bool
+
+    def for_next_frame(self) -> Places:
+        """The places that are left to look at in the next frame."""
+        return NO_PLACES if self.at_once else self.finder()
 
 
 def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
@@ -55,30 +59,28 @@ def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     urgent = not followed or scene.dt_s > _RARE_S
     frames = detector.settings.search * (1 if urgent else _FOLLOWED)
     due = frames == 1 or Duration(state.found_s).reached(frames)
-    whole = image.depth_m, image.k, len(scene.hands)
+    search = partial(detector.start_search, image.depth_m, image.k, len(scene.hands))
     finder: Callable[[], Places] = no_places
-    if due and urgent:
-        finder = detector.start_search(*whole)
+    if due and urgent:  # what is waited for first is begun first
+        finder = search()
     at_tracks = [
         _start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row, state)
     ]
     if due and not urgent:
-        finder = detector.start_search(*whole)
-    return PendingDetections(at_tracks, finder, due and urgent, due)
+        finder = search()
+    return PendingDetections(at_tracks, due, finder, due and urgent)
 
 
 def no_places() -> Places:
-    """The places of a finder that is not asked, or was waited for."""
+    """The places of a finder that is not asked."""
     return NO_PLACES
 
 
 def finish_detection(
     pending: PendingDetections, scene: Scene, state: TrackerState
-) -> tuple[list[SideDetection], PendingDetections]:
-    """All detections of a frame, those at tracks first; and what is still pending."""
-    places = state.places
-    if pending.at_once:
-        places, pending = pending.finder(), replace(pending, finder=no_places)
+) -> list[SideDetection]:
+    """All detections of a frame, those at tracks first."""
+    places = pending.finder() if pending.at_once else state.places
     seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
@@ -87,7 +89,7 @@ def finish_detection(
         arms = [] if rare else _arms(scene, seen)
         found = _elsewhere(scene, state, places, rare)
         seen += [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
-    return seen, pending
+    return seen
 
 
 def rests(scene: Scene, row: int, state: TrackerState) -> bool:
@@ -95,8 +97,7 @@ def rests(scene: Scene, row: int, state: TrackerState) -> bool:
     second frame, which saves a quarter of the time of two hands of which one is reported.
     """
     track = scene.hands[row].track
-    shown = any(slot.track == track.number for slot in state.slots)
-    return not shown and track.asked_s == 0 and _is_sure(scene, row)
+    return not state.shows(track) and track.asked_s == 0 and _is_sure(scene, row)
 
 
 def _is_sure(scene: Scene, row: int) -> bool:
@@ -120,10 +121,11 @@ def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
     hand, image = scene.hands[row], scene.image_for(row)
     at = image.depth_m, image.k, hand.palm_m[0]
     side, start = hand.track.side, scene.model.detector.start
-    wait, mirrored = start(*at, side, hand.up_m[0]), None
-    if comparison_due(hand.track, scene.dt_s):
-        mirrored = start(*at, OTHER_SIDE[side], hand.up_m[0])
-    return lambda: SideDetection(wait(), side, row, None if mirrored is None else mirrored())
+    wait = start(*at, side, hand.up_m[0])
+    if not comparison_due(hand.track, scene.dt_s):
+        return lambda: SideDetection(wait(), side, row)
+    mirrored = start(*at, OTHER_SIDE[side], hand.up_m[0])
+    return lambda: SideDetection(wait(), side, row, mirrored())
 
 
 def _elsewhere(

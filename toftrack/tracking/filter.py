@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,14 +23,13 @@ from toftrack.compute.transfer import on_device
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.posterior import ImageTerm
-from toftrack.tracking.state import Track, generator_on
+from toftrack.tracking.state import ParticleSet, Track, generator_on
 
 _MOVEMENT_S = 0.3
 """How long a movement goes on (to 1/e)."""
-_APPROACH_M_S = 0.05
-"""How much faster than its wrist the nearest joint of a partly hidden hand may come nearer."""
-_NEAREST_M = 0.15
-"""No palm is predicted nearer: no camera sees it there."""
+_APPROACH_M_S, _NEAREST_M = 0.05, 0.15
+"""How much faster than its wrist the nearest joint of a partly hidden hand may come nearer; and no
+palm is predicted nearer than that: no camera sees it there."""
 
 
 def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:
@@ -102,7 +101,7 @@ def run_filter(
     """
     if not tracks:
         return []
-    space, motions = model.space_of(tracks[0].particles), model.backend.motions
+    space, motions = model.space_of(tracks[0].cloud.particles), model.backend.motions
     scorers, evidences = [image.scorer for image in images], [image.evidence for image in images]
 
     def log_scores(particles: Tensor) -> Tensor:
@@ -113,8 +112,8 @@ def run_filter(
     moves = [predicted_motion(track, dt_s, model.filter) for track in tracks]
     given = zip(tracks, moves, strict=True)
     particles, weights = particle_filter.annealed(
-        torch.stack([_moved(track.particles, moved, model) for track, moved in given]),
-        torch.stack([track.weights for track in tracks]),
+        torch.stack([_moved(track.cloud.particles, moved, model) for track, moved in given]),
+        torch.stack([track.cloud.weights for track in tracks]),
         on_device(torch.stack([_sigmas(moved, dt_s, model) for moved in moves]), model.device),
         log_scores,
         space.lower,
@@ -141,59 +140,26 @@ def _moved(particles: Tensor, tangent: Tensor, model: FilterModel) -> Tensor:
 
 def predict_particles(track: Track, dt_s: float, model: FilterModel) -> ParticleSet:
     """A track's particles dt_s later, moved as predicted; weights and spread stay."""
-    moved = predicted_motion(track, dt_s, model.filter)
-    mean = model.backend.motions.compose(track.mean, moved[None])
-    return ParticleSet(_moved(track.particles, moved, model), track.weights, mean)
+    cloud, moved = track.cloud, predicted_motion(track, dt_s, model.filter)
+    mean = model.backend.motions.compose(cloud.mean, moved[None])
+    return replace(cloud, particles=_moved(cloud.particles, moved, model), mean=mean)
 
 
-@dataclass(frozen=True, eq=False)
-class ParticleSet:
-    """The particles of a track in a frame.
-
-    particles, weights: (N, 6 + d) and (N,), on the model's device.
-    mean: (1, 6 + d) of them, on the CPU.
-    """
-
-    particles: Tensor
-    weights: Tensor
-    mean: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """The pose of a track in a frame.
-
-    filtered: the particles, before they follow it.  pose: (1, 27).  trend: (27,) see Track.
-    particle: (1, 6 + d) the nearest in the pose space.  offset: (21,) rad, from there to the pose.
-    """
-
-    filtered: ParticleSet
-    pose: Tensor
-    trend: Tensor
-    particle: Tensor
-    offset: Tensor
-
-    @property
-    def off_rad(self) -> float:
-        """How far the pose lies off the pose space, rms over the 21 angles."""
-        return float(np.sqrt(np.square(self.offset.numpy()).mean()))
-
-
-def shift_particles(found: PoseEstimate, model: FilterModel) -> ParticleSet:
-    """The particles, all moved by what moves their mean onto the estimate's particle."""
-    filtered, motions = found.filtered, model.backend.motions
-    space = model.space_of(filtered.particles)
-    change = motions.difference(found.particle, filtered.mean)
+def shift_particles(filtered: ParticleSet, pose: Tensor, model: FilterModel) -> ParticleSet:
+    """The particles, all moved by what moves their mean onto the particle of a pose (1, 27)."""
+    motions, space = model.backend.motions, model.space_of(filtered.particles)
+    mean = model.encode(pose)
+    change = motions.difference(mean, filtered.mean)
     particles = motions.compose(filtered.particles, on_device(change, model.device))
     particles[:, 6:] = bound(particles[:, 6:], space.lower, space.upper, "truncate")
-    return ParticleSet(particles, filtered.weights, found.particle)
+    return replace(filtered, particles=particles, mean=mean)
 
 
 def update_velocity(track: Track, mean: Tensor, dt_s: float, model: FilterModel) -> Tensor:
     """(6 + d,) a second, the smoothed velocity of a track with a new mean; 0 in its first frame."""
     if not track.age.begun:
         return torch.zeros_like(track.velocity)
-    moved = model.backend.motions.difference(mean, track.mean)[0]
+    moved = model.backend.motions.difference(mean, track.cloud.mean)[0]
     keep = model.filter.velocity_smoothing ** (dt_s / FRAME_S)
     return torch.lerp(moved / dt_s, track.velocity, keep)
 
@@ -205,4 +171,4 @@ def new_track(pose: Tensor, model: FilterModel) -> Track:
     particles = on_device(particle, model.device).repeat(n, 1)
     weights = particles.new_full((n,), 1.0 / n, dtype=torch.float64)
     still = particle.new_zeros(particle.shape[1])
-    return Track(particles, weights, particle, still, pose)
+    return Track(ParticleSet(particles, weights, particle), still, pose)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.gauss_newton_numba import Refiner
-from toftrack.refinement.shape_fit import ShapeEstimate, ShapeFit, first_shape
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Scorer
 from toftrack.render.segmentation import NearestSurface
@@ -36,19 +36,16 @@ from toftrack.tracking.state import OTHER_SIDE, Slot, TrackerState
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
 the 90 % region of a joint hold the truth in about 93 % of the frames of rendered recordings."""
-_HANDS = 32
-"""So many hands of different sides and shapes are cached."""
 
 
 @dataclass(frozen=True)
 class Hand:
-    """The configured hand: a shape, and how it is fitted to the user.
-
-    side_given: whether the user said its side; otherwise it is detected.
+    """The configured hand: a shape, whether it is fitted to the user, and whether the user said its
+    side; otherwise it is detected.
     """
 
     shape: HandShape
-    fit: ShapeFit
+    fitted: bool
     side_given: bool
 
 
@@ -58,7 +55,7 @@ def make_hand(shape: str, side: str, length_m: float) -> Hand:
     Only shape="auto" is fitted; only side="auto" is detected, and begins as a right hand.
     """
     made = make_hand_shape(shape, "right" if side == "auto" else side, length_m)
-    return Hand(made, ShapeFit(fixed=shape != "auto"), side != "auto")
+    return Hand(made, shape == "auto", side != "auto")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +86,11 @@ class FittedHand:
 class FilterModel:
     """The parts of every tracker; on the CPU but for the particles and the back end's scorers.
 
-    configured: the hand as the user configured it.
+    detects: whether networks detect hands: they tell several apart, and a hand's side.
     gestures: None recognises none.
     """
+
+    detects: ClassVar[bool] = False
 
     configured: Hand
     space: PoseSpace
@@ -122,18 +121,16 @@ class FilterModel:
         return self
 
     @property
-    def detects(self) -> bool:
-        """Whether networks detect hands: they tell several apart, and a hand's side."""
-        return False
-
-    @property
     def fits(self) -> bool:
         """Whether the hand's shape is fitted to the user."""
-        return False
+        return self.detects and self.configured.fitted
 
     def fitted(self, slot: Slot) -> HandShape:
-        """A slot's hand; where its shape is fitted, with the uncertainty."""
-        return self.hand(slot.side, slot.shape).shape
+        """A slot's hand; where its shape was fitted to some pose, with the uncertainty."""
+        shape = self.hand(slot.side, slot.shape).shape
+        if not (self.fits and slot.shape.poses):
+            return shape
+        return replace(shape, fitted=slot.shape.summary())
 
     @property
     def device(self) -> torch.device:
@@ -159,12 +156,12 @@ class FilterModel:
         return _MODEL_ERROR.sigmas(self.space.lower, self.space.upper).square()
 
     def hand(self, side: str, shape: ShapeEstimate) -> FittedHand:
-        """The hand of a side in the applied shape; cached."""
+        """The hand of a side in the applied shape; the last 32 ones are cached."""
         return self._hands(side, shape.applied)
 
     @cached_property
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
-        return lru_cache(_HANDS)(partial(_fitted_hand, self.configured.shape, self.backend))
+        return lru_cache(32)(partial(_fitted_hand, self.configured.shape, self.backend))
 
     def decode(self, particles: Tensor) -> Tensor:
         """(N, 27) poses of particles (N, 6 + d), within the joints' limits."""
@@ -177,11 +174,6 @@ class FilterModel:
         latent = bound(latent, self.space.lower, self.space.upper, "truncate")
         return torch.cat((states[:, :6], latent), 1)
 
-    def nearest(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest particle (1, 6 + d) to a pose (1, 27), and from there to it, (21,) rad."""
-        particle = self.encode(state)
-        return particle, state[0, 6:] - self.space.decode(particle[:, 6:])[0]
-
 
 @dataclass(frozen=True, eq=False)
 class TrackerModel(FilterModel):
@@ -190,6 +182,8 @@ class TrackerModel(FilterModel):
     weights: of the terms of the posterior.
     lost: when an estimate is lost, and when its track ends.
     """
+
+    detects: ClassVar[bool] = True
 
     detector: HandDetector
     refinement: Refinement
@@ -200,50 +194,24 @@ class TrackerModel(FilterModel):
         """See FilterModel."""
         return self._at_quality(quality)
 
-    @property
-    def detects(self) -> bool:
-        """See FilterModel."""
-        return True
-
     @cached_property
     def _at_quality(self) -> Callable[[Quality], TrackerModel]:
         return lru_cache(partial(_at_quality, self))
-
-    @property
-    def fit(self) -> ShapeFit:
-        """How the hand's shape is fitted."""
-        return self.configured.fit
-
-    @property
-    def fits(self) -> bool:
-        """See FilterModel."""
-        return not self.fit.fixed
-
-    def fitted(self, slot: Slot) -> HandShape:
-        """See FilterModel; without the uncertainty before any pose was fitted."""
-        shape = super().fitted(slot)
-        if not (self.fits and slot.shape.poses):
-            return shape
-        return replace(shape, fitted=slot.shape.summary(self.fit))
 
 
 def _at_quality(model: TrackerModel, quality: Quality) -> TrackerModel:
     if quality == Quality(quality.threads):
         return model
-    settings = model.detector.settings
+    settings, most = model.detector.settings, quality.places
     settings = replace(
         settings,
         every=max(settings.every, quality.every),
         search=max(settings.search, quality.search),
-        places=_at_most(settings.places, quality.places),
+        places=settings.places if most is None else min(settings.places, most),
     )
     made = replace(model, detector=replace(model.detector, settings=settings))
     vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the quality
     return made
-
-
-def _at_most(count: int, most: int | None) -> int:
-    return count if most is None else min(count, most)
 
 
 def _fitted_hand(

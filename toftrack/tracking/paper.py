@@ -8,11 +8,13 @@ print.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from toftrack.checks import check_number
 from toftrack.compute.particle_filter import Spread, covariance
@@ -22,24 +24,21 @@ from toftrack.compute.threads import small_operations
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import ToftrackError
 from toftrack.frames import DepthImage
+from toftrack.hand.regions import joint_axes
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.belief import Status
 from toftrack.tracking.candidates import image_term
-from toftrack.tracking.confidence import propagated_sigma
-from toftrack.tracking.filter import PoseEstimate, predict, run_filter, update_velocity
+from toftrack.tracking.confidence import Status
+from toftrack.tracking.filter import predict, run_filter, update_velocity
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.report import finish_estimate, make_estimate, report_absence
-from toftrack.tracking.state import StepInfo, Track, TrackerState
+from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState
 from toftrack.tracking.step import StepResult
 
-_WIDEST_PALM_M = 0.06
-"""Half the breadth of the broadest hand's palm with the ball of the thumb."""
-_DEPTH_M = 0.12
-"""How far behind the nearest surface a palm typically lies at most."""
-_DEPTH_EDGE_M = 0.04
-"""Between neighbouring pixels of one surface there is less than this."""
-_HALF_PALM_M = 0.012
-"""Half the thickness of a palm."""
+_WIDEST_PALM_M, _HALF_PALM_M = 0.06, 0.012
+"""Half the breadth of the broadest palm with the ball of the thumb, and half its thickness."""
+_DEPTH_M, _DEPTH_EDGE_M = 0.12, 0.04
+"""How far behind the nearest surface a palm typically lies at most; between neighbouring pixels of
+one surface there is less than the latter."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +85,8 @@ class RoughStart:
         there = on_device(particles, model.device)
         weights = there.new_full((n,), 1.0 / n, dtype=torch.float64)
         mean, still = particles[:1], particles.new_zeros(6 + space.dims)
-        return Track(
-            there, weights, mean, still, model.decode(mean), side=model.configured.shape.side
-        )
+        cloud, side = ParticleSet(there, weights, mean), model.configured.shape.side
+        return Track(cloud, still, model.decode(mean), side=side)
 
 
 def palm_centre(observation: Observation) -> np.ndarray:
@@ -176,15 +174,12 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         pose = model.decode(filtered.mean)
     score = likelihood.score(pose)
     status = model.lost.judge(track, score)
-    found = PoseEstimate(filtered, pose, track.trend, *model.nearest(pose))
-    estimate = make_estimate(image, found, score, status, fitted, model)
-    sigma_m = _particles_sigma(estimate.joints_m, found, track, fitted, model)
+    estimate = make_estimate(image, filtered, pose, score, status, fitted, model)
+    sigma_m = _joint_sigma(estimate.joints_m, filtered, model.encode(pose), fitted, model)
     hidden = bool(observation.occluder.any())
     track = replace(
         track,
-        particles=filtered.particles,
-        weights=filtered.weights,
-        mean=filtered.mean,
+        cloud=filtered,
         velocity=update_velocity(track, filtered.mean, dt_s, model),
         pose=pose,
         age=track.age.extended(dt_s),
@@ -193,8 +188,9 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         nearest_m=expected.nearest_m if expected and hidden else 0.0,
     )
     ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
-    estimate = estimate.updated(joint_sigma_m=sigma_m, joint_ok=ok)
-    estimate = estimate.updated(side=slot.side, side_probability=sure)
+    estimate = estimate.updated(
+        joint_sigma_m=sigma_m, joint_ok=ok, side=slot.side, side_probability=sure
+    )
     slot, estimate = finish_estimate(slot, image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
     slot = replace(slot, track=track.number)
@@ -202,16 +198,39 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     return state, (info,), (estimate,)
 
 
-def _particles_sigma(
-    joints_m: np.ndarray, found: PoseEstimate, track: Track, fitted: FittedHand, model: FilterModel
+def _joint_sigma(
+    joints_m: np.ndarray,
+    filtered: ParticleSet,
+    particle: Tensor,
+    fitted: FittedHand,
+    model: FilterModel,
 ) -> np.ndarray:
-    """(21, 3) m, standard deviations of joints by the particles and _MODEL_ERROR alone."""
-    motions, filtered = model.backend.motions, found.filtered
+    """(21, 3) m, standard deviations of joints (21, 3) of an estimate with a particle (1, 6 + d) by
+    the particles and the hand model's own error.
+    """
+    motions = model.backend.motions
 
-    def joints_of(tangents: torch.Tensor) -> torch.Tensor:
-        moved = motions.compose(found.particle.repeat(len(tangents), 1), tangents)
+    def joints_of(tangents: Tensor) -> Tensor:
+        moved = motions.compose(particle.repeat(len(tangents), 1), tangents)
         return fitted.refiner.joints(model.decode(moved))
 
     around = motions.difference(filtered.particles, on_device(filtered.mean, model.device))
     (spread,) = on_host(covariance(around, filtered.weights))
     return propagated_sigma(joints_m, spread + torch.diag(model.model_variance), joints_of)
+
+
+def propagated_sigma(
+    joints_m: np.ndarray, covariance: Tensor, joints_of: Callable[[Tensor], Tensor]
+) -> np.ndarray:
+    """(21, 3) m, deviations of joints (21, 3) along joint_axes by a covariance (6 + d, 6 + d) of
+    tangents.  joints_of: joints (N, 21, 3) of the estimate moved by tangents (N, 6 + d).
+    """
+    size = len(covariance)
+    # One step along each main axis and back; a covariance may be singular, so no Cholesky.
+    values, vectors = torch.linalg.eigh(covariance.double())
+    steps = (vectors * values.clamp(min=0).sqrt()).mT.to(covariance.dtype)
+    moved = joints_of(torch.cat((steps, -steps))).double().numpy()
+    half = 0.5 * (moved[:size] - moved[size:])
+    along = np.einsum("jab,njb->nja", joint_axes(joints_m), half)
+    sigma: np.ndarray = np.sqrt(np.square(along).sum(0)).astype(np.float32)
+    return sigma

@@ -6,16 +6,16 @@ Only here it matters what the user asked for: how many hands, and of which side.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from toftrack.compute import particle_filter
 from toftrack.compute.pace import FRAME_S
+from toftrack.compute.redraw import bound
 from toftrack.compute.spans import Spans
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
@@ -23,14 +23,13 @@ from toftrack.frames import DepthImage
 from toftrack.gestures.recognition import tell_gesture
 from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
-from toftrack.tracking.belief import Status, probability
+from toftrack.tracking.association import least_cost
 from toftrack.tracking.candidates import View
-from toftrack.tracking.confidence import joint_features
-from toftrack.tracking.filter import ParticleSet, PoseEstimate
+from toftrack.tracking.confidence import Status, joint_features, probability
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import side_log_odds
-from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Slot, StepInfo, Track, TrackerState
 
 _OTHER = 0.4
 """A hand that is less probably of the side that the user said is flagged as another one."""
@@ -43,11 +42,15 @@ _GONE_S = 2.0
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """A track after a frame.  score: the F-measure of its pose, 0 .. 1."""
+    """A track after a frame.
+
+    view: before it.  filtered: the particles, before they followed the pose.
+    score: the F-measure of its pose, 0 .. 1.
+    """
 
     view: View
     track: Track
-    found: PoseEstimate
+    filtered: ParticleSet
     score: float
     status: Status
 
@@ -59,44 +62,34 @@ def report(
 
     state: with the tracks that go on.  results: also of those that ended in this frame.
     """
-    sides = {one.track.number: right_log_odds(one.track, state) for one in results}
+    rights = [side_log_odds(one.track, state.tracks, state.told) for one in results]
     slots, infos, estimates = [], list[StepInfo | None](), []
-    for number, one in enumerate(assign_slots(state, results, sides)):
+    for number, row in enumerate(assign_slots(state, results, rights)):
         slot, info = state.slots[number], None
-        if one is None:
+        if row is None:
             slot, estimate = report_absence(slot, scene.image, scene.model, len(state.slots))
         else:
-            right = sides[one.track.number]
-            slot, info, estimate = report_track(number, one, right, state, scene)
-            info = replace(info, seconds=spans.seconds())
+            each = results[row], rights[row]
+            slot, info, estimate = report_track(number, *each, state, scene, spans)
         slots.append(slot)
         infos.append(info)
         estimates.append(estimate)
     return replace(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
 
 
-def right_log_odds(track: Track, state: TrackerState) -> float:
-    """Log odds that a track is a right hand, see side_log_odds."""
-    others = [one for one in state.tracks if one.confirmed and one.number != track.number]
-    return side_log_odds(track, others, state.told)
-
-
 def assign_slots(
-    state: TrackerState, results: Sequence[TrackResult], sides: Mapping[int, float]
-) -> list[TrackResult | None]:
-    """The result for each slot, None = none, so that their worth to the slots is largest in sum.
+    state: TrackerState, results: Sequence[TrackResult], rights: Sequence[float]
+) -> list[int | None]:
+    """The row of the result for each slot, None = none, so that their worth is largest in sum.
 
-    sides: log odds of a right hand by track number.
+    rights: log odds of a right hand of each.
     """
     worth = np.zeros((len(state.slots), len(results) + len(state.slots)))
     for number, slot in enumerate(state.slots):
-        for column, one in enumerate(results):
-            worth[number, column] = _worth(number, slot, one.track, sides[one.track.number], state)
-    columns = linear_sum_assignment(-worth)[1]
-    return [
-        results[column] if column < len(results) and worth[number, column] > 0 else None
-        for number, column in enumerate(columns)
-    ]
+        for row, (one, right) in enumerate(zip(results, rights, strict=True)):
+            worth[number, row] = _worth(number, slot, one.track, right, state)
+    rows = least_cost(-worth)
+    return [row if worth[number, row] > 0 else None for number, row in enumerate(rows)]
 
 
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
@@ -120,26 +113,26 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
 
 
 def report_track(
-    number: int, one: TrackResult, right: float, state: TrackerState, scene: Scene
+    number: int,
+    one: TrackResult,
+    right: float,
+    state: TrackerState,
+    scene: Scene,
+    spans: Spans,
 ) -> tuple[Slot, StepInfo, Estimate]:
-    """Slot `number` with a track's result, the info but for its seconds, and the estimate.
+    """Slot `number` with a track's result, the info, and the estimate.
 
     right: log odds that it is a right hand.
     """
     slot, track, view, model = state.slots[number], one.track, one.view, scene.model
     if slot.track != track.number:
         slot = replace(slot, gesture=None, joint_features=np.zeros_like(slot.joint_features))
-    estimate = make_estimate(scene.image, one.found, one.score, one.status, view.fitted, model)
     image = scene.image  # as the camera took it, and not reduced
-    rows = joint_features(
-        estimate.joints_m,
-        view.detection,
-        slot.joint_features,
-        one.score,
-        track.log_odds,
-        image.depth_m,
-        image.k,
+    estimate = make_estimate(
+        image, one.filtered, track.pose, one.score, one.status, view.fitted, model
     )
+    seen = view.detection, slot.joint_features, one.score, track.log_odds
+    rows = joint_features(estimate.joints_m, *seen, image.depth_m, image.k)
     sigma, confidence = model.lost.joints.judge(rows)
     estimate = with_side(estimate, track.side, right, side_of_slot(number, state))
     estimate = estimate.updated(
@@ -148,17 +141,6 @@ def report_track(
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
     slot, estimate = finish_estimate(slot, image, estimate, view.fitted.shape, scene.dt_s, model)
-    detection = None if view.detection.empty else view.detection
-    particles = one.found.filtered
-    info = StepInfo(
-        view.observation,
-        particles.particles,
-        particles.weights,
-        {},
-        track.features,
-        rows,
-        detection,
-    )
     slot = replace(
         slot,
         track=track.number,
@@ -167,6 +149,15 @@ def report_track(
         known=slot.known or track.confirmed,
         away_s=slot.away_s if estimate.lost else 0.0,
         joint_features=rows,
+    )
+    info = StepInfo(
+        view.observation,
+        one.filtered.particles,
+        one.filtered.weights,
+        spans.seconds(),
+        track.features,
+        rows,
+        None if view.detection.empty else view.detection,
     )
     return slot, info, estimate
 
@@ -206,28 +197,33 @@ def report_absence(
 
 def make_estimate(
     image: DepthImage,
-    found: PoseEstimate,
+    filtered: ParticleSet,
+    pose: Tensor,
     score: float,
     status: Status,
     fitted: FittedHand,
     model: FilterModel,
 ) -> Estimate:
-    """A frame's estimate, without side, joint deviations and what `finish_estimate` adds."""
-    (effective,) = on_host(particle_filter.effective_sample_size(found.filtered.weights))
+    """A frame's estimate of a pose (1, 27), without side, joint deviations and what
+    `finish_estimate` adds.
+    """
+    space = model.space
+    latent = space.encode(pose[:, 6:])
+    off = pose[:, 6:] - space.decode(bound(latent, space.lower, space.upper, "truncate"))
+    (effective,) = on_host(particle_filter.effective_sample_size(filtered.weights))
     return Estimate(
         index=image.index,
         timestamp_s=image.timestamp_s,
         state_name=status.state_name,
         lost=status.lost,
         confidence=status.confidence,
-        outside_rad=found.off_rad,
-        joints_m=_host(fitted.refiner.joints(found.pose)[0]),
-        state=_host(found.pose[0]),
-        latent=_host(model.space.encode(found.pose[:, 6:])[0]),
+        outside_rad=float(np.sqrt(np.square(off.numpy()).mean())),
+        joints_m=_host(fitted.refiner.joints(pose)[0]),
+        state=_host(pose[0]),
+        latent=_host(latent[0]),
         score=score,
-        covariance=lambda: covariance_of(found.filtered, model),
+        covariance=lambda: covariance_of(filtered, model),
         effective_sample_size=float(effective),
-        compute_s=math.nan,
     )
 
 
@@ -252,10 +248,9 @@ def finish_estimate(
 
     shape: the hand of the estimate.
     """
-    gesture, estimate = tell_gesture(
-        model.gestures, slot.gesture, estimate, model.space, dt_s / FRAME_S
-    )
-    size_px = image.depth_m.shape[1], image.depth_m.shape[0]
+    frames, (height, width) = dt_s / FRAME_S, image.depth_m.shape
+    gesture, estimate = tell_gesture(model.gestures, slot.gesture, estimate, model.space, frames)
+    size_px = width, height
     estimate = in_all_conventions(estimate, shape, image.k, size_px)
     # While there is no hand, the last estimate that was believed is reported, if one was.
     kept = slot.last if estimate.lost and not slot.last.lost else estimate

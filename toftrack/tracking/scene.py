@@ -18,10 +18,9 @@ from toftrack.tracking.filter import PredictedHand, predict
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
 
-_TOLERANCE_M = 0.02
-"""A pixel whose depth is so near to a predicted surface is that hand's."""
-_EDGE_M = 0.06
-"""Pixels on a hand's outline mix its depth with what is behind, and are up to this farther."""
+_TOLERANCE_M, _EDGE_M = 0.02, 0.06
+"""A pixel whose depth is so near to a predicted surface is that hand's; those on its outline, which
+mix its depth with what is behind, are up to the latter farther."""
 _FAR_M = 5.0
 """Depth of removed pixels: the detector sees nothing so far away."""
 _IN_FRONT_M = 0.03
@@ -55,17 +54,13 @@ class Scene:
     @cached_property
     def _surfaces(self) -> np.ndarray:
         """(B, H, W) m, Z of each predicted hand's surface, 0 = none."""
-        height, width = self.depth_m.shape
-        each = [
-            range_image(
-                parted(cpu_surface(hand.fitted.shape).pose(hand.fitted.refiner.pose(hand.pose)))[0],
-                self.k,
-                height,
-                width,
-            )
-            for hand in self.hands
-        ]
-        return np.array(each, np.float32).reshape(-1, height, width)
+        size = self.depth_m.shape
+
+        def drawn(hand: PredictedHand) -> np.ndarray:
+            surface = cpu_surface(hand.fitted.shape).pose(hand.fitted.refiner.pose(hand.pose))
+            return range_image(parted(surface)[0], self.k, *size)
+
+        return np.array([drawn(hand) for hand in self.hands], np.float32).reshape(-1, *size)
 
     @cached_property
     def owners(self) -> np.ndarray:
@@ -99,20 +94,16 @@ class Scene:
 
     def owned_by_others(self, row: int) -> np.ndarray | None:
         """(H, W) bool, the pixels that other hands own; None where no other one is reliable."""
-        if row not in self._others:
-            others = (hand.track.reliable for at, hand in enumerate(self.hands) if at != row)
-            mask = (self.owners >= 0) & (self.owners != row) if any(others) else None
-            self._others[row] = mask
-        return self._others[row]
-
-    @cached_property
-    def _others(self) -> dict[int, np.ndarray | None]:
-        return {}
+        others = (hand.track.reliable for at, hand in enumerate(self.hands) if at != row)
+        return (self.owners >= 0) & (self.owners != row) if any(others) else None
 
     def image_for(self, row: int) -> DepthImage:
         """The image for the pose network at a hand: without the pixels of other hands, or keypoints
         lie on their fingers, but for those in front of it: the network knows what hides a hand.
+        A new hand's, row -1: without all of them.
         """
+        if row < 0:
+            return self.unexplained()
         others = self.owned_by_others(row)
         if others is None:
             return self.image

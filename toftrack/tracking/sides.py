@@ -16,9 +16,8 @@ import numpy as np
 
 from toftrack.detector.hand_detector import Detection
 from toftrack.frames import DepthImage
-from toftrack.tracking.belief import probability
 from toftrack.tracking.candidates import WORST, View, best_start
-from toftrack.tracking.confidence import log_odds
+from toftrack.tracking.confidence import log_odds, probability
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 
@@ -36,10 +35,9 @@ and comparisons over which the body's place is averaged."""
 _BEHIND_M, _BODY_M2, _BODY_ROWS = (0.12, 0.55), 0.03, 72
 """Range of the body's distance behind a raised hand; its least visible area; and rows of the image
 that it is searched in."""
-_PARTNER = 2.0
-"""Log odds that two hands which are seen at once are of different sides."""
-_TOLD = 2.0
-"""Log odds that a hand which is seen alone is of the side that the user said."""
+_PARTNER, _TOLD = 2.0, 2.0
+"""Log odds that two hands which are seen at once are of different sides, and that one which is seen
+alone is of the side that the user said."""
 _SURE, _FIRST = 3.0, 5
 """Sides are compared less often beyond these log odds, after so many comparisons."""
 _UNSURE_S, _SURE_S = 0.08, 0.8
@@ -52,15 +50,16 @@ _LEAST_PRESENT, _LEAST_LOG_ODDS = 0.5, -1.0
 neither pose is the hand's, and which one explains more of the image is chance."""
 
 
-def side_log_odds(track: Track, others: Sequence[Track], told: str | None) -> float:
+def side_log_odds(track: Track, tracks: Sequence[Track], told: str | None) -> float:
     """Log odds that a track is a right hand, by its evidence, the body, its partner and the user.
 
-    others: the other tracks that are confirmed; a person's two hands are not of one side.
+    tracks: all, of which the other confirmed ones count: a person's two hands are not of one side.
     told: the side that the user said, of a hand that is seen alone.
 
     A partner counts by how probable it is that it is a hand, and what was said by the rest.
     """
     evidence, total = track.evidence, track.evidence.fits
+    others = [one for one in tracks if one.confirmed and one.number != track.number]
     if told is None:
         shoulder = _SHOULDER * evidence.body_m
         total += min(max(shoulder, -_SHOULDER_MOST), _SHOULDER_MOST)
@@ -117,8 +116,10 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     fitted = view.model.hand(side, view.track.shape)
     # Very different poses are compared: what explains more of the image counts in full.
     image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
-    seen = replace(view, fitted=fitted, detection=detection, image=image)
-    return max(best_start(seen, _KEYPOINTS)[1], WORST)
+    seen = replace(
+        view, fitted=fitted, detection=detection, image=image, keypoint_weight=_KEYPOINTS
+    )
+    return max(best_start(seen)[1], WORST)
 
 
 def _turned_lead(mirrored: Detection, side: str, image: DepthImage, model: TrackerModel) -> float:

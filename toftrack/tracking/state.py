@@ -37,14 +37,30 @@ class SideEvidence:
     comparisons: int = 0
     age_s: float = math.inf
 
+    def later(self, dt_s: float) -> SideEvidence:
+        """The same evidence after dt_s without a comparison."""
+        return replace(self, age_s=self.age_s + dt_s)
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleSet:
+    """The particles of a track.
+
+    particles: (N, 6 + d).  weights: (N,) normalised. Both are on the model's device, and all else
+        of a track on the CPU.
+    mean: (1, 6 + d) of them.
+    """
+
+    particles: Tensor
+    weights: Tensor
+    mean: Tensor
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """A hand that is followed.
 
-    particles: (N, 6 + d), after the last observation.  weights: (N,) normalised. Both are on the
-        model's device; all else is on the CPU.
-    mean: (1, 6 + d), of the particles.  velocity: (6 + d,) its smoothed change a second.
+    cloud: after the last observation.  velocity: (6 + d,) its mean's smoothed change a second.
     pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
     number: unique.  side: right or left, with the `evidence`.
@@ -59,9 +75,7 @@ class Track:
         at; 0 while nothing does.
     """
 
-    particles: Tensor
-    weights: Tensor
-    mean: Tensor
+    cloud: ParticleSet
     velocity: Tensor
     pose: Tensor
     trend: Tensor = field(default_factory=lambda: torch.full((27,), math.nan))
@@ -138,6 +152,10 @@ class TrackerState:
     def track_of(self, slot: Slot) -> Track | None:
         """The track of a slot; None where it has none."""
         return next((track for track in self.tracks if track.number == slot.track), None)
+
+    def shows(self, track: Track) -> bool:
+        """Whether a track is in a slot."""
+        return any(slot.track == track.number for slot in self.slots)
 
     def elapsed_s(self, image: DepthImage) -> float:
         """Seconds from the last frame to an image, bounded: see compute.pace.elapsed_s."""

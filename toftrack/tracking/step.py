@@ -14,15 +14,11 @@ from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking.association import assign, costs, keep_tracks, unassigned
-from toftrack.tracking.belief import judge
-from toftrack.tracking.candidates import View, keypoints_of, propose, select
-from toftrack.tracking.confidence import confidence_features
+from toftrack.tracking.association import associate, keep_tracks
+from toftrack.tracking.candidates import View, propose, select
+from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
-    ParticleSet,
-    PoseEstimate,
-    PredictedHand,
     new_track,
     predict_particles,
     run_filter,
@@ -32,8 +28,8 @@ from toftrack.tracking.filter import (
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.state import StepInfo, Track, TrackerState
-from toftrack.tracking.views import begin_tracks, continue_track, predicted_view
+from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState
+from toftrack.tracking.views import begin_track, continue_track, max_new_tracks, predicted_view
 
 StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
 """The next state; per slot what the step saw, None where it has no track; per slot the estimate."""
@@ -58,59 +54,54 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     7. Report the tracks in the slots that the user asked for.
     """
     spans, generator, dt_s = Spans(), state.random_generator(), state.elapsed_s(image)
-    before = state.at(image)
+    state = state.at(image)
     with spans("detector"):
-        scene = Scene.of(before.tracks, image, dt_s, model)
-        pending = start_detection(scene, before)
-        resting = [rests(scene, row, before) for row in range(len(scene.hands))]
+        scene = Scene.of(state.tracks, image, dt_s, model)
+        rows = range(len(scene.hands))
+        pending = start_detection(scene, state)
         predicted = [
-            None if rest else predicted_view(scene, row) for row, rest in enumerate(resting)
+            None if rests(scene, row, state) else predicted_view(scene, row) for row in rows
         ]
-        detections, pending = finish_detection(pending, scene, before)
-        columns = assign(costs(scene.hands, detections, dt_s))
-        views = [
-            continue_track(
-                scene, row, view, detections[column] if column >= 0 else None, before.told
-            )
-            for row, (view, column) in enumerate(zip(predicted, columns, strict=True))
+        detections = finish_detection(pending, scene, state)
+        found, new = associate(scene.hands, detections, dt_s)
+        continued = [
+            continue_track(scene, row, predicted[row], found[row], state.told) for row in rows
         ]
-        views += begin_tracks(scene, unassigned(detections, columns), before)
-        there = [view for view in views if view is not None]
+        numbered = list(enumerate(new[: max_new_tracks(state)], state.next_track))
+        begun = [begin_track(scene, one, number, state) for number, one in numbered]
+        views = [view for view in continued + begun if view is not None]
     with spans("filter: rest"):
-        particles = filter_tracks(there, before, dt_s, model, generator, spans)
-    results = [
-        update_track(view, filtered, scene, spans)
-        for view, filtered in zip(there, particles, strict=True)
+        particles = filter_tracks(views, state, dt_s, model, generator, spans)
+    results = [update_track(*each, scene, spans) for each in zip(views, particles, strict=True)]
+    resting = [
+        rest_track(scene, row)
+        for row in rows
+        if continued[row] is None and rests(scene, row, state)
     ]
     with spans("detector"):
-        places = pending.finder()
-    after = replace(
-        before,
+        places = pending.for_next_frame()
+    state = replace(
+        state,
         places=places,
-        found_s=0.0 if pending.finder_asked else before.found_s,
-        next_track=before.next_track + len(views) - len(columns),
+        found_s=0.0 if pending.asked else state.found_s,
+        next_track=state.next_track + len(begun),
         generator=generator.get_state(),
     )
-    rested = [
-        rest_track(hand, dt_s, model)
-        for hand, rest, view in zip(scene.hands, resting, views, strict=False)
-        if rest and view is None
-    ]
-    after = keep_tracks(after, [*rested, *(result.track for result in results)], model)
-    return report(after, results, scene, spans)
+    state = keep_tracks(state, [*resting, *(result.track for result in results)], model)
+    return report(state, results, scene, spans)
 
 
-def rest_track(hand: PredictedHand, dt_s: float, model: TrackerModel) -> Track:
-    """A track after a frame in which it is only moved on."""
-    moved, track = predict_particles(hand.track, dt_s, model), hand.track
+def rest_track(scene: Scene, row: int) -> Track:
+    """The track of a row after a frame in which it is only moved on."""
+    hand, dt_s = scene.hands[row], scene.dt_s
+    track = hand.track
     return replace(
         track,
-        particles=moved.particles,
-        mean=moved.mean,
+        cloud=predict_particles(track, dt_s, scene.model),
         pose=hand.pose,
         age=track.age.extended(dt_s),
         asked_s=track.asked_s + dt_s,
-        evidence=replace(track.evidence, age_s=track.evidence.age_s + dt_s),
+        evidence=track.evidence.later(dt_s),
     )
 
 
@@ -127,19 +118,11 @@ def filter_tracks(
     What is drawn for a track depends on its number, not on which others there are.
     """
     seed = int(torch.randint(2**62, (1,), generator=generator))
-    shown = {slot.track for slot in state.slots}
-    chosen = [view.track.number in shown or not view.track.reliable for view in views]
+    chosen = [state.shows(view.track) or not view.track.reliable for view in views]
     filtered = list(compress(views, chosen))
-    found = iter(
-        run_filter(
-            [view.track for view in filtered],
-            dt_s,
-            [view.image for view in filtered],
-            model,
-            [torch.Generator().manual_seed(seed + view.track.number) for view in filtered],
-            spans,
-        )
-    )
+    tracks, images = [view.track for view in filtered], [view.image for view in filtered]
+    generators = [torch.Generator().manual_seed(seed + track.number) for track in tracks]
+    found = iter(run_filter(tracks, dt_s, images, model, generators, spans))
     return [
         next(found) if one else predict_particles(view.track, dt_s, model)
         for view, one in zip(views, chosen, strict=True)
@@ -152,56 +135,55 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
     filtered: its particles in this frame.
     """
     model, track, dt_s = view.model, view.track, scene.dt_s
+    motions, refines = model.backend.motions, model.refinement.iterations > 0
     with spans("refinement"):
-        choice = select(propose(view, model.decode(filtered.mean)), view.hidden)
-    pose, trend = choice.pose, track.trend
-    if choice.moved:
+        pose, moved = select(propose(view, model.decode(filtered.mean)), view.hidden)
+    if moved:
         fresh = new_track(pose, model)
-        track, trend = replace(track, age=fresh.age, doubtful=fresh.doubtful), fresh.trend
-    elif model.refinement.iterations:
-        pose, trend = steadied(pose, track.pose, trend, dt_s, model.backend.motions)
-    found = PoseEstimate(filtered, pose, trend, *model.nearest(pose))
-    score, joints = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
-    age_s, last, seen = track.age.seconds, track.features, view.observation
-    features = confidence_features(joints, score, age_s, view.detection, last, seen.depth_m, seen.k)
+        track = replace(track, age=fresh.age, doubtful=fresh.doubtful, trend=fresh.trend)
+    elif refines:
+        pose, trend = steadied(pose, track.pose, track.trend, dt_s, motions)
+        track = replace(track, trend=trend)
+    score, joints_m = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
+    features = confidence_features(
+        joints_m, score, track.age.seconds, view.detection, track.features, view.observation
+    )
     status = judge(track, features, dt_s, model.lost)
     # Without refinement the particles stay where they are.
-    drawn = shift_particles(found, model) if model.refinement.iterations else filtered
+    drawn = shift_particles(filtered, pose, model) if refines else filtered
+    believed = not status.lost
     track = replace(
         track,
-        particles=drawn.particles,
-        weights=drawn.weights,
-        mean=drawn.mean,
+        cloud=drawn,
         velocity=update_velocity(track, drawn.mean, dt_s, model),
-        pose=found.pose,
-        trend=found.trend,
-        shape=track.shape if status.lost else learn_shape(view, found),
+        pose=pose,
+        shape=learn_shape(view, pose) if believed else track.shape,
         age=track.age.extended(dt_s),
         doubtful=status.doubtful,
         log_odds=status.log_odds,
         whole_odds=status.whole_odds,
-        confirmed=track.confirmed or not status.lost,
-        believed_s=track.believed_s + dt_s if status.lost else 0.0,
+        confirmed=track.confirmed or believed,
+        believed_s=0.0 if believed else track.believed_s + dt_s,
         asked_s=track.asked_s + dt_s if view.detection.empty else 0.0,
         features=features,
         nearest_m=view.expected_m if view.hidden else 0.0,
     )
-    return TrackResult(view, track, found, score, status)
+    return TrackResult(view, track, filtered, score, status)
 
 
-def learn_shape(view: View, found: PoseEstimate) -> shape_fit.ShapeEstimate:
-    """The shape estimate of a track, updated by a pose that is believed and unhidden."""
-    shape, fitted = view.track.shape, view.fitted
-    if view.detection.empty or view.hidden or shape.applied != fitted.applied:
+def learn_shape(view: View, pose: torch.Tensor) -> shape_fit.ShapeEstimate:
+    """The shape estimate of a track, updated by a pose that is believed, if nothing hides it."""
+    shape, fitted, model = view.track.shape, view.fitted, view.model
+    unknown = view.detection.empty or view.hidden or shape.applied != fitted.applied
+    if unknown or not model.fits:
         return shape
     return shape_fit.learned(
         shape,
-        found.pose,
+        pose,
         fitted.shape,
         fitted.derivatives,
         view.detection,
-        keypoints_of(view.detection, view.model),
-        view.model.fit,
+        view.keypoints,
         fitted.first,
         fitted.refiner.pose,
     )

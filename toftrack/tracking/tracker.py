@@ -27,7 +27,6 @@ from toftrack.tracking.paper import PaperModel, paper_step
 from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
 from toftrack.tracking.step import StepResult, step
 
-AUTO = "auto"
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
 
@@ -78,7 +77,6 @@ class HandsTracker:
         timestamp_s: None is now, seconds on a clock that never goes back.
         began_s: time.perf_counter() when the raw frame was there, from which on compute_s counts;
             None is now.
-
         Raises ToftrackError when the image or k has the wrong shape, type or unit.
         """
         quality = self.time.begin(began_s)
@@ -98,13 +96,20 @@ class HandsTracker:
         _step(self.state, _rendered_hand(), self.model)
 
     def restart(self, side: str | None = None) -> None:
-        """Forget the hands, also their size, and search for them anew; a side is the first hand's.
+        """Forget the hands, also their size, and search for them anew; only random numbers and
+        frame numbers go on.
 
-        side: right or left, which it is told to be; auto, to detect it; None, as it was.
-
-        Only random numbers and frame numbers go on. Raises ToftrackError for an unknown side.
+        side: right or left, which the first hand is told to be; auto, to detect it (the paper's
+            tracker cannot, and treats it as None); None, as it was.
+        Raises ToftrackError for an unknown side.
         """
-        self.state = restart_state(self.state, self.model, side)
+        model, old = self.model, self.state
+        if side is not None and side not in ("auto", *OTHER_SIDE):
+            model.configured.shape.of_side(side)  # which says what it may be
+        if side is None or (side == "auto" and not model.detects):
+            side = old.told or ("auto" if model.detects else None)
+        fresh = model.first_state(0, len(old.slots), side)
+        self.state = replace(fresh, generator=old.generator, next_index=old.next_index)
         self.infos = (None,) * len(self.infos)
 
     @property
@@ -146,7 +151,7 @@ class HandsTracker:
 
 
 class Tracker:
-    """Follows one hand: the only slot of a HandsTracker, `hands`."""
+    """Follows one hand: the only slot of a HandsTracker, `hands`, which says more of each part."""
 
     def __init__(
         self,
@@ -155,7 +160,6 @@ class Tracker:
         pace: Pace | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """See HandsTracker."""
         self.hands = HandsTracker(model, seed, 1, pace, clock)
 
     def step(
@@ -209,25 +213,9 @@ class Tracker:
 
 
 def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepResult:
-    """The result of `step` or `paper_step`, as the model is of the one or the other."""
     if isinstance(model, PaperModel):
         return paper_step(state, image, model)
     return step(state, image, cast(TrackerModel, model))
-
-
-def restart_state(state: TrackerState, model: FilterModel, side: str | None = None) -> TrackerState:
-    """A state before any frame, but with the random and frame numbers of `state`.
-
-    side: see HandsTracker.restart; the paper's tracker detects none, and treats auto as None.
-
-    Raises ToftrackError for an unknown side.
-    """
-    if side is not None and side not in (AUTO, *OTHER_SIDE):
-        model.configured.shape.of_side(side)  # which says what it may be
-    if side is None or (side == AUTO and not model.detects):
-        side = state.told or (AUTO if model.detects else None)
-    fresh = model.first_state(0, len(state.slots), side)
-    return replace(fresh, generator=state.generator, next_index=state.next_index)
 
 
 def _rendered_hand() -> DepthImage:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from toftrack.compute.pace import Duration
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.detector.proposals import SAME_PLACE_M
-from toftrack.frames import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
@@ -22,7 +20,7 @@ from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import changes_side, compare_sides, side_log_odds
-from toftrack.tracking.state import OTHER_SIDE, Track, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Track, TrackerState
 
 _SPARE = 1
 """So many tracks may exist beyond the slots, or beyond the two hands of a person."""
@@ -39,7 +37,7 @@ def predicted_view(scene: Scene, row: int) -> View | None:
 def _later(scene: Scene, row: int) -> Track:
     """The track of a row, with the time since its sides were compared as of this frame."""
     track = scene.hands[row].track
-    return replace(track, evidence=replace(track.evidence, age_s=track.evidence.age_s + scene.dt_s))
+    return replace(track, evidence=track.evidence.later(scene.dt_s))
 
 
 def continue_track(
@@ -77,35 +75,20 @@ def max_new_tracks(state: TrackerState) -> int:
     return max(0, min(max(most - confirmed, 1) - tentative, most + _SPARE - len(state.tracks)))
 
 
-def begin_tracks(
-    scene: Scene, new: Sequence[SideDetection], state: TrackerState
-) -> list[View | None]:
-    """Views of new tentative tracks, as many as there is room for; None where no hand can be."""
-    model = scene.model
-    views: list[View | None] = []
-    for one in new[: max_new_tracks(state)]:
-        detection, image = one.detection, scene.unexplained()
-        nothing = torch.zeros(1, 6 + model.space.dims)
-        track = Track(
-            nothing,
-            nothing[:, 0],
-            nothing,
-            nothing[0],
-            torch.zeros(1, 27),
-            number=state.next_track + len(views),
-            side=one.side,
-            shape=known_shape(one.side, state),
-        )
-        track = update_shape(track, detection, model)
-        view = make_view(scene, -1, track, detection, expected_of(detection))
-        if view is None:
-            views.append(None)
-            continue
-        at = detection.centre_m.numpy()[None], OTHER_SIDE[one.side], detection.up[None]
-        mirrored = model.detector.detect(image.depth_m, image.k, *at)[0]
-        view = with_parts(replace(view, track=restart_track(view)))
-        views.append(choose_side(scene, -1, view, mirrored, state.told))
-    return views
+def begin_track(scene: Scene, one: SideDetection, number: int, state: TrackerState) -> View | None:
+    """The view of a new tentative track of a number; None where no hand can be."""
+    model, detection, image = scene.model, one.detection, scene.unexplained()
+    nothing, shape = torch.zeros(1, 6 + model.space.dims), known_shape(one.side, state)
+    cloud, pose = ParticleSet(nothing, nothing[:, 0], nothing), torch.zeros(1, 27)
+    track = Track(cloud, nothing[0], pose, number=number, side=one.side, shape=shape)
+    track = update_shape(track, detection, model)
+    view = make_view(scene, -1, track, detection, expected_of(detection))
+    if view is None:
+        return None
+    at = detection.centre_m.numpy()[None], OTHER_SIDE[one.side], detection.up[None]
+    mirrored = model.detector.detect(image.depth_m, image.k, *at)[0]
+    view = with_parts(replace(view, track=restart_track(view)))
+    return choose_side(scene, -1, view, mirrored, state.told)
 
 
 def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
@@ -133,16 +116,15 @@ def make_view(
         scene.others_joints(row),
         image_term(observation, fitted, model),
         model,
+        model.weights.keypoints,
     )
 
 
 def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
     """The view with its sides compared; restarted as the other side where that one is likelier."""
-    image: DepthImage = scene.image_for(row) if row >= 0 else scene.unexplained()
-    track = replace(view.track, evidence=compare_sides(view, mirrored, image, told))
-    others = [hand.track for at, hand in enumerate(scene.hands) if at != row]
-    others = [other for other in others if other.confirmed]
-    if not changes_side(track, side_log_odds(track, others, told), told):
+    evidence = compare_sides(view, mirrored, scene.image_for(row), told)
+    track, tracks = replace(view.track, evidence=evidence), [hand.track for hand in scene.hands]
+    if not changes_side(track, side_log_odds(track, tracks, told), told):
         return replace(view, track=track)
     track = replace(track, side=OTHER_SIDE[track.side], shape=first_shape())
     track = update_shape(replace(track, age=Duration()), mirrored, scene.model)
@@ -174,12 +156,12 @@ def update_shape(track: Track, detection: Detection, model: TrackerModel) -> Tra
     """The track with its shape updated: a new one takes the detection's length, and a fit that
     detections contradict is forgotten.
     """
-    if detection.empty:
+    if detection.empty or not model.fits:
         return track
     shape, first = track.shape, model.configured.shape
     if not track.age.begun:
-        shape = shape_fit.with_network_length(shape, detection.length_m, model.fit, first)
-    return replace(track, shape=shape_fit.contradicted(shape, detection, model.fit, first))
+        shape = shape_fit.with_network_length(shape, detection.length_m, first)
+    return replace(track, shape=shape_fit.contradicted(shape, detection, first))
 
 
 def expected_of(detection: Detection) -> Expected:
