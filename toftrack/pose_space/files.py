@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import json
-import pkgutil
 from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-import toftrack.pose_space
 from toftrack.archives import read_archive, write_archive
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.json_text import parse_json
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
+from toftrack.pose_space.kernel import (
+    IsomapPoseSpace,
+    KernelPCAPoseSpace,
+    LLEPoseSpace,
+    fit_isomap,
+    fit_kernel_pca,
+    fit_lle,
+)
+from toftrack.pose_space.pca import PCAPoseSpace, fit_pca
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
@@ -37,21 +42,13 @@ _SAME_RAD = 1e-6
 """Poses that differ by less than this in every angle are the same."""
 
 
-def pose_space_kinds() -> tuple[str, ...]:
-    """Every kind of space: the modules of this package that have `Space` and `fit`."""
-    names = sorted(module.name for module in pkgutil.iter_modules(toftrack.pose_space.__path__))
-    return tuple(name for name in names if _module(name) is not None)
-
-
-def _module(kind: object) -> ModuleType | None:
-    """The module of a kind of space; None when there is none of that name."""
-    if not isinstance(kind, str) or not kind.isidentifier():
-        return None
-    try:
-        module = importlib.import_module(f"toftrack.pose_space.{kind}")
-    except ModuleNotFoundError:
-        return None
-    return module if hasattr(module, "Space") and hasattr(module, "fit") else None
+KINDS: dict[str, tuple[type[PoseSpace], Callable[..., PoseSpace]]] = {
+    "isomap": (IsomapPoseSpace, fit_isomap),
+    "kernel_pca": (KernelPCAPoseSpace, fit_kernel_pca),
+    "lle": (LLEPoseSpace, fit_lle),
+    "pca": (PCAPoseSpace, fit_pca),
+}
+"""Every kind of space, and what learns one."""
 
 
 def fit_pose_space(
@@ -61,11 +58,10 @@ def fit_pose_space(
 
     settings: of that kind, as its `fit` takes them.
     """
-    module = _module(kind)
-    if module is None:
-        known = ", ".join(pose_space_kinds())
-        raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {known}")
-    takes = tuple(inspect.signature(module.fit).parameters)[3:]
+    if kind not in KINDS:
+        raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {', '.join(KINDS)}")
+    fit = KINDS[kind][1]
+    takes = tuple(inspect.signature(fit).parameters)[3:]
     unknown = [name for name in settings if name not in takes]
     if unknown:
         raise ToftrackError(
@@ -79,7 +75,7 @@ def fit_pose_space(
         )
     # Matrices of some hundred rows: a second thread only waits for the first, four times as long.
     with threadpool_limits(1, "blas"):
-        return module.fit(data.angles_rad, data.labels, dims, **settings)
+        return fit(data.angles_rad, data.labels, dims, **settings)
 
 
 def save_pose_space(
@@ -101,19 +97,19 @@ def save_pose_space(
 def load_pose_space(path: str | Path) -> PoseSpace:
     """Read a model file; ToftrackError when it is not one of this version and size."""
     header, arrays = _read(path)
-    module = _module(header.get("kind"))
-    if module is None:
+    kind = header.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ToftrackError(
-            f"{path} holds a pose space of the unknown kind {header.get('kind')!r}; known:"
-            f" {', '.join(pose_space_kinds())}"
+            f"{path} holds a pose space of the unknown kind {kind!r}; known: {', '.join(KINDS)}"
         )
+    kind_of_space = KINDS[kind][0]
     names, labels = header.get("angle_names"), header.get("training_labels", [])
     if names != list(ANGLE_NAMES):
         raise ToftrackError(
             f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
             f" hand; {_ADVICE}"
         )
-    needed = {field.name for field in fields(module.Space)} - {"training_labels"}
+    needed = {field.name for field in fields(kind_of_space)} - {"training_labels"}
     if set(arrays) != needed:
         name = min(set(arrays) ^ needed)
         what = f"no array {name!r}" if name in needed else f"an array {name!r} too many"
@@ -123,7 +119,7 @@ def load_pose_space(path: str | Path) -> PoseSpace:
     labels = tuple(labels)
     try:
         tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
-        space = module.Space(**tensors, training_labels=labels)
+        space = kind_of_space(**tensors, training_labels=labels)
         angles = space.decode(space.training_latents)
         usable = all(bool(tensor.isfinite().all()) for tensor in (*tensors.values(), angles))
         if angles.shape[-1] == len(ANGLE_NAMES):

@@ -50,8 +50,7 @@ class PoseData:
 
     angles_rad: (M, 21).
     labels: M names: a gesture, a transformation or a clip.
-    clips: M numbers; poses of one clip resemble each other as neighbours in time do, so a clip is
-        held out as a whole or not at all.
+    clips: M numbers; a clip's poses resemble each other, so it is held out as a whole.
     sources: what went in, one dictionary a file or generator, as written into the model.
     notes: sentences about the reading that the user should see.
     """
@@ -102,7 +101,6 @@ def natural_data(poses: int) -> PoseData:
 def mixed_data(parts: dict[str, PoseData], poses: int | None) -> PoseData:
     """Several sources together.
 
-    parts: by name, as the configuration gives them.
     poses: at most so many of each part, so that a long recording does not drown the others; picked
         to cover it (`spread_out`); None takes all.
     """
