@@ -19,7 +19,7 @@ from toftrack.gestures.features import features
 from toftrack.gestures.recognition import GestureState, pointing_ray, tell_gesture, update
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.pose_space.data.training_poses import synthetic_training_poses
+from toftrack.pose_space.data.pose_data import synthetic_data
 from toftrack.pose_space.files import make_pose_space
 
 PAPER = part("gestures=paper", "gestures")
@@ -160,10 +160,10 @@ def test_the_papers_gestures_have_their_names_whatever_the_thumb_does(
 
 def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
     names = {"palm": "palm", "fist": "fist", "gun": "pointing"}
-    poses = synthetic_training_poses()
+    poses = synthetic_data()
     for way in ("palm-fist", "palm-gun", "gun-fist"):
         first, last = (names[end] for end in way.split("-"))
-        rows = [a.numpy() for a, b in zip(*poses, strict=True) if b == way]
+        rows = [a.numpy() for a, b in zip(poses.angles_rad, poses.labels, strict=True) if b == way]
         labels = [label_of(angles, PAPER) for angles in rows]
         assert labels[0] == first and labels[-1] == last
         assert labels.index(last) > len(labels) // 3

@@ -16,8 +16,7 @@ from helpers.tracking import configuration
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.pose_space.base import PoseSpace, clamped_share
-from toftrack.pose_space.data.pose_data import PoseData, synthetic_data
-from toftrack.pose_space.data.training_poses import GESTURES, basic_pose
+from toftrack.pose_space.data.pose_data import GESTURES, PoseData, basic_pose, synthetic_data
 from toftrack.pose_space.files import (
     KINDS,
     fit_pose_space,
