@@ -24,6 +24,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ from typing import TypeVar
 
 import numpy as np
 from websockets.exceptions import WebSocketException
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 _T = TypeVar("_T")
 ROOT = Path(__file__).parents[2]
@@ -114,31 +115,49 @@ def soak(
 ) -> Observation:
     """Run the tracker in a folder and observe it for so long.
 
-    told: gets a line a sample.  stream: one of STREAMS.  overrides: of the run besides OVERRIDES.
+    reported: gets a line a sample.  stream: one of STREAMS.  overrides: of the run besides
+        OVERRIDES.
     """
-    ended, pictures = threading.Event(), [0, 0]
+    ended, words = threading.Event(), folder / "err.txt"
     arrivals: list[int] = []
-    words = folder / "err.txt"
+    pictures: list[int] = []
+    visits: list[str] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(0.5)
         port = listener.getsockname()[1] if stream == "udp" else 0
         asked = [*overrides, f"stream={stream}", f"stream.port={port}"]
-        with _program(folder, asked) as program, _threads(ended) as start:
-            if stream == "udp":
-                start(lambda: _listen(listener, arrivals, ended))
-            else:
-                address = _until(lambda: _found(r"for programs: (ws://\S+)", words), program)
-                start(lambda: _converse(address, arrivals, ended))
-            url = _until(lambda: _found(r"live view: (http://[^#]+)#", words), program)
-            start(lambda: _watch(url, pictures, ended))
-            _until(lambda: len(arrivals) > _WARM_FRAMES, program)
-            samples = _samples(program, 60 * minutes, arrivals, reported)
-            asked_s = time.monotonic()
-            status = _ended(program)
-            shutdown_s = time.monotonic() - asked_s
+
+        def converse(connection: ClientConnection) -> None:
+            arrivals.append(json.loads(connection.recv(10.0))["index"])
+            connection.send("thank you")
+
+        def watch(connection: ClientConnection) -> None:
+            """Ask for one picture after the other, as the page does."""
+            connection.send('{"command": "picture"}')
+            while isinstance(connection.recv(10.0), str):
+                pass  # facts
+            pictures.append(1)
+
+        with _program(folder, asked) as program, ThreadPoolExecutor(2) as threads:
+            try:
+                if stream == "udp":
+                    threads.submit(_listen, listener, arrivals, ended)
+                else:
+                    address = _until(lambda: _found(r"for programs: (ws://\S+)", words), program)
+                    threads.submit(_visit, address, _LINES_A_VISIT, converse, [], ended)
+                url = _until(lambda: _found(r"live view: http(://[^#]+)#", words), program)
+                threads.submit(_visit, f"ws{url}live", _PICTURES_A_VISIT, watch, visits, ended)
+                _until(lambda: len(arrivals) > _WARM_FRAMES, program)
+                samples = _samples(program, 60 * minutes, arrivals, reported)
+                asked_s = time.monotonic()
+                status = _ended(program)
+                shutdown_s = time.monotonic() - asked_s
+            finally:
+                ended.set()
     written_mb = sum(file.stat().st_size for file in (folder / "run").iterdir()) / 1e6
-    return Observation(tuple(samples), len(arrivals), *pictures, status, shutdown_s, written_mb)
+    counts = len(arrivals), len(pictures), len(visits)
+    return Observation(tuple(samples), *counts, status, shutdown_s, written_mb)
 
 
 def _ended(program: subprocess.Popen) -> int | None:
@@ -168,22 +187,6 @@ def _program(folder: Path, asked: Sequence[str]) -> Iterator[subprocess.Popen]:
         finally:
             program.kill()
             program.wait()
-
-
-@contextmanager
-def _threads(ended: threading.Event) -> Iterator[Callable[[Callable[[], None]], None]]:
-    started: list[threading.Thread] = []
-
-    def start(work: Callable[[], None]) -> None:
-        started.append(threading.Thread(target=work, daemon=True))
-        started[-1].start()
-
-    try:
-        yield start
-    finally:
-        ended.set()
-        for thread in started:
-            thread.join()
 
 
 def _until(reported: Callable[[], _T], program: subprocess.Popen) -> _T:
@@ -239,32 +242,20 @@ def _listen(listener: socket.socket, arrivals: list[int], ended: threading.Event
         arrivals.append(json.loads(datagram)["index"])
 
 
-def _converse(address: str, arrivals: list[int], ended: threading.Event) -> None:
-    """Listen to the websocket, answer every line, and come anew now and then."""
+def _visit(
+    address: str,
+    times: int,
+    exchange: Callable[[ClientConnection], None],
+    visits: list[str],
+    ended: threading.Event,
+) -> None:
+    """Exchange messages with a websocket, and come anew after so many times."""
     while not ended.is_set():
+        visits.append(address)
         try:
             with connect(address) as connection:
-                for _ in range(_LINES_A_VISIT):
-                    arrivals.append(json.loads(connection.recv(10.0))["index"])
-                    connection.send("thank you")
-                    if ended.is_set():
-                        break
-        except (OSError, TimeoutError, WebSocketException):
-            ended.wait(0.2)  # the program ends, or is busy
-
-
-def _watch(url: str, counts: list[int], ended: threading.Event) -> None:
-    """Ask for one picture after the other, as the page does; count pictures and visits."""
-    address = f"ws{url.removeprefix('http').partition('#')[0]}live"
-    while not ended.is_set():
-        counts[1] += 1
-        try:
-            with connect(address) as connection:
-                for _ in range(_PICTURES_A_VISIT):
-                    connection.send('{"command": "picture"}')
-                    while isinstance(connection.recv(10.0), str):
-                        pass  # facts
-                    counts[0] += 1
+                for _ in range(times):
+                    exchange(connection)
                     if ended.is_set():
                         break
         except (OSError, TimeoutError, WebSocketException):

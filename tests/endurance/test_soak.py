@@ -2,42 +2,29 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from endurance import soak
 
 pytestmark = pytest.mark.endurance
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    """soak.py, which is a program."""
-    path = Path(__file__).with_name("soak.py")
-    spec = importlib.util.spec_from_file_location("soak", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["soak"] = module  # its dataclasses look there
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_what_grows_is_named(script: ModuleType) -> None:
-    first = [script.Sample(700.0, 7, 9)] * 5
-    assert script.grown(first, [replace(first[0], memory_mb=720.0, threads=8)] * 5) == []
+def test_what_grows_is_named() -> None:
+    first = [soak.Sample(700.0, 7, 9)] * 5
+    assert soak.grown(first, [replace(first[0], memory_mb=720.0, threads=8)] * 5) == []
     for name, more in (("memory_mb", 740.0), ("threads", 9), ("handles", 11)):
-        assert script.grown(first, [replace(first[0], **{name: more})] * 5) == [name]
+        assert soak.grown(first, [replace(first[0], **{name: more})] * 5) == [name]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
 @pytest.mark.parametrize(("stream", "hands"), [("udp", 1), ("websocket", 2)])
 def test_a_live_run_with_faults_a_visitor_and_a_stream(
-    script: ModuleType, tmp_path: Path, stream: str, hands: int
+    tmp_path: Path, stream: str, hands: int
 ) -> None:
-    observation = script.soak(0.3, tmp_path, lambda line: None, stream, [f"hands={hands}"])
+    observation = soak.soak(0.3, tmp_path, lambda line: None, stream, [f"hands={hands}"])
     words = (tmp_path / "err.txt").read_text()
     assert observation.status == 143, words[-2000:]
     assert observation.grown() == []
@@ -45,4 +32,3 @@ def test_a_live_run_with_faults_a_visitor_and_a_stream(
     assert observation.lines > 0
     for name in ("track.npz", "summary.json", "track.jsonl"):
         assert (tmp_path / "run" / name).stat().st_size > 0
-    assert len(script.table(observation).splitlines()) == 11

@@ -1,4 +1,4 @@
-"""Gestures of a user's file: what is read, how they go with the others, and what is reported."""
+"""A user's gestures: files, how they go with the others, and learning one from frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from helpers.settings import gestures, part
 from helpers.shown_gestures import GESTURES, ON, SURE, fingers, label_of, pose, seen
 
 from toftrack.errors import ToftrackError
-from toftrack.gestures.files import NamedPose, read_poses, save_poses
+from toftrack.gestures.files import NamedPose, learned_pose, read_poses, save_poses
 from toftrack.gestures.recognition import gestures_with
 from toftrack.hand.skeleton import ANGLE_NAMES
 
@@ -150,10 +150,46 @@ def test_bad_csv_is_reported_in_one_sentence(tmp_path: Path, text: str, words: s
 
 
 def test_a_file_that_is_none_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ToftrackError, match="no file of gestures"):
+    with pytest.raises(ToftrackError, match="cannot be read as a file of gestures"):
         gestures(str(tmp_path / "none.json"))
     with pytest.raises(ToftrackError, match="neither .json nor .csv"):
         gestures(str(tmp_path / "poses.txt"))
     (tmp_path / "broken.json").write_text("{")
     with pytest.raises(ToftrackError, match="cannot be read as a file of gestures"):
         gestures(str(tmp_path / "broken.json"))
+
+
+STEADY = math.radians(25)
+POSE = np.linspace(0.0, 1.5, 21)
+
+
+def shown(frames: int = 20, tremor: float = 0.03) -> np.ndarray:
+    return POSE + np.random.default_rng(0).normal(0, tremor, (frames, 21))
+
+
+def test_the_pose_is_the_middle_of_the_frames_and_its_spread_their_tremor() -> None:
+    pose = learned_pose("mine", shown(200), np.ones(200, bool), STEADY)
+    assert pose.name == "mine"
+    assert pose.angles_rad == pytest.approx(POSE, abs=0.01)
+    assert pose.spread_rad == pytest.approx(np.full(21, 0.03), rel=0.4)
+
+
+def test_wrong_and_disbelieved_frames_do_no_harm() -> None:
+    angles, believed = shown(), np.ones(20, bool)
+    angles[:3, 6:9] += 1.5
+    angles[3:8], believed[3:8] = math.nan, False
+    pose = learned_pose("mine", angles, believed, STEADY)
+    assert pose.angles_rad == pytest.approx(POSE, abs=0.06)
+
+
+@pytest.mark.parametrize(("frames", "believed"), [(20, 9), (4, 4)])
+def test_a_hand_that_was_hardly_followed_is_refused(frames: int, believed: int) -> None:
+    with pytest.raises(ToftrackError, match=f"in only {believed} of the {frames} frames"):
+        learned_pose("mine", shown(frames), np.arange(frames) < believed, STEADY)
+
+
+def test_a_hand_that_moves_its_fingers_is_refused() -> None:
+    angles = shown()
+    angles[:, 14] += np.linspace(0, 2, 20)
+    with pytest.raises(ToftrackError, match="the ring finger bends and stretches"):
+        learned_pose("mine", angles, np.ones(20, bool), STEADY)

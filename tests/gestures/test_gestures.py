@@ -19,7 +19,7 @@ from toftrack.gestures.features import features
 from toftrack.gestures.recognition import GestureState, pointing_ray, tell_gesture, update
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.pose_space.data.training_poses import synthetic_training_poses
+from toftrack.pose_space.data.pose_data import synthetic_data
 from toftrack.pose_space.files import make_pose_space
 
 PAPER = part("gestures=paper", "gestures")
@@ -99,40 +99,50 @@ def test_a_gesture_is_reported_by_its_fingers_and_thumb(
         assert probability > 0.6, thumb
 
 
-@pytest.mark.parametrize(
-    ("flexions", "of_thumbs"),
-    [
-        ((40, 85, 45), {"up": "thumb_up", "out": "thumb_up"}),  # loosely curled
-        ((38, 115, 72), {"across": "fist", "beside": "fist", "up": "thumb_up"}),
-        ((35, 95, 55), {"up": "thumb_up", "out": "thumb_up"}),  # rolled up
-    ],
-)
-def test_fists_and_thumbs_up_may_have_knuckles_that_are_hardly_bent(
-    flexions: tuple[int, int, int], of_thumbs: dict[str, str]
-) -> None:
-    angles = fingers(0, 1, 2, 3)
-    for finger in range(4):
-        angles[6 + 4 * finger : 9 + 4 * finger] = np.radians(flexions)
-    assert {thumb: label_of(of_thumb(angles, thumb)) for thumb in of_thumbs} == of_thumbs
-
-
-def test_a_half_closed_hand_is_relaxed_and_a_pinch_with_straight_fingers_ok() -> None:
-    assert label_of((pose("palm") + pose("fist", "out")) / 2) == "relaxed"
-    angles = fingers()
-    angles[:9] = np.radians([8, 20, -21, 26, 23, -9, 23, 68, 22])
-    assert label_of(angles) == "ok"
-    angles[5:9] = np.radians([5, 0, 0, 0])
-    assert label_of(angles) != "ok", "the tips are apart"
-
-
-@pytest.mark.parametrize("flexions", [(0, 90, 50), (75, 5, 5)], ids=["hook", "table top"])
-def test_bent_hands_that_are_near_a_gesture_and_none_are_other(
-    flexions: tuple[int, int, int],
-) -> None:
+def each(*flexions: float) -> np.ndarray:
+    """(21,) rad: every finger's three joints bent by so many degrees."""
     angles = pose("palm")
     for finger in range(4):
         angles[6 + 4 * finger : 9 + 4 * finger] = np.radians(flexions)
-    assert label_of(angles) == "other"
+    return angles
+
+
+def loosely(*curled: int, share: float) -> np.ndarray:
+    """(21,) rad: as a real camera shows it, bent by a share, and the little finger not straight."""
+    angles = fingers() + share * (fingers(*curled) - fingers())
+    angles[[18, 19]] = math.radians(8)
+    return angles
+
+
+def pinched(*index: float) -> np.ndarray:
+    angles = fingers()
+    angles[:9] = np.radians([8, 20, -21, 26, 23, *index])
+    return angles
+
+
+@pytest.mark.parametrize(
+    ("label", "angles"),
+    [
+        *(("thumb_up", of_thumb(each(40, 85, 45), thumb)) for thumb in ("up", "out")),  # loose
+        *(("fist", of_thumb(each(38, 115, 72), thumb)) for thumb in ("across", "beside")),
+        ("thumb_up", of_thumb(each(38, 115, 72), "up")),
+        *(("thumb_up", of_thumb(each(35, 95, 55), thumb)) for thumb in ("up", "out")),  # rolled up
+        ("relaxed", (pose("palm") + pose("fist", "out")) / 2),
+        ("ok", pinched(-9, 23, 68, 22)),
+        # Near a gesture, and none.
+        ("other", each(0, 90, 50)),  # hooked
+        ("other", each(75, 5, 5)),  # a table top
+        *(("other", fingers(*curled)) for curled in ((0, 1, 2), (1, 2), (1, 3), (0, 2))),
+        ("other", loosely(0, 1, 2, share=0.68)),
+        ("other", loosely(1, 2, share=0.62)),
+    ],
+)
+def test_hands_as_people_hold_them_are_what_they_are(label: str, angles: np.ndarray) -> None:
+    assert label_of(angles) == label
+
+
+def test_tips_that_are_apart_are_not_ok() -> None:
+    assert label_of(pinched(5, 0, 0, 0)) != "ok"
 
 
 @pytest.mark.parametrize("turn", range(4))
@@ -160,35 +170,15 @@ def test_the_papers_gestures_have_their_names_whatever_the_thumb_does(
 
 def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
     names = {"palm": "palm", "fist": "fist", "gun": "pointing"}
-    poses = synthetic_training_poses()
+    poses = synthetic_data()
     for way in ("palm-fist", "palm-gun", "gun-fist"):
         first, last = (names[end] for end in way.split("-"))
-        rows = [a.numpy() for a, b in zip(*poses, strict=True) if b == way]
+        rows = [a.numpy() for a, b in zip(poses.angles_rad, poses.labels, strict=True) if b == way]
         labels = [label_of(angles, PAPER) for angles in rows]
         assert labels[0] == first and labels[-1] == last
         assert labels.index(last) > len(labels) // 3
         # The little finger leads, so that a closing hand passes a pose like pointing.
         assert set(labels) <= {"other", "pointing", first, last}
-
-
-@pytest.mark.parametrize(
-    "curled", [(0, 1, 2), (1, 2), (1, 3), (0, 2)], ids=["little", "rock", "odd", "odder"]
-)
-def test_poses_that_are_none_of_the_classes_are_other(curled: tuple[int, ...]) -> None:
-    assert label_of(fingers(*curled)) == "other"
-    assert label_of(fingers(*curled), PAPER) == "other"
-
-
-@pytest.mark.parametrize(
-    ("curled", "share"), [((0, 1, 2), 0.68), ((1, 2), 0.62)], ids=["alone", "with the index finger"]
-)
-def test_a_little_finger_that_is_up_beside_loosely_curled_ones_is_other(
-    curled: tuple[int, ...], share: float
-) -> None:
-    """As a real camera shows it: the others bent by two thirds, and the little one not straight."""
-    loose = fingers() + share * (fingers(*curled) - fingers())
-    loose[[18, 19]] = math.radians(8)
-    assert label_of(loose) == "other"
 
 
 def test_noise_leaves_a_gesture_what_it_is() -> None:

@@ -10,7 +10,7 @@ import torch
 from toftrack.hand.overlap import finger_overlap, overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
-from toftrack.pose_space.data.training_poses import basic_pose
+from toftrack.pose_space.data.pose_data import basic_pose
 
 
 def joints(pose: str, size: float = 1.0, **degrees: float) -> torch.Tensor:

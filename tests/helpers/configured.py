@@ -3,65 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import hydra
+from helpers.settings import values
 from helpers.tracking import configuration
-from omegaconf import OmegaConf
 
 from toftrack.detector.hand_detector import DetectorSettings
-from toftrack.refinement.gauss_newton import Refinement
-from toftrack.render.likelihood import FMeasure
-from toftrack.render.segmentation import NearestSurface
-from toftrack.tracking.confidence import ConfidenceModel
-from toftrack.tracking.paper import RoughStart
-from toftrack.tracking.posterior import PosteriorWeights
 
 
 @cache
-def _part(group: str, *overrides: str) -> Any:
+def _made(group: str, *overrides: str) -> Any:
     return hydra.utils.instantiate(configuration(*overrides)[group])
 
 
-def nearest_surface(**changes: Any) -> NearestSurface:
-    """conf/segmentation/nearest.yaml"""
-    return replace(_part("segmentation"), **changes)
+def _changed(*given: str, **changes: Any) -> Any:
+    return replace(_made(*given), **changes)
 
 
-def f_measure(**changes: Any) -> FMeasure:
-    """conf/likelihood/f_measure.yaml"""
-    return replace(_part("likelihood"), **changes)
-
-
-def refinement(**changes: Any) -> Refinement:
-    """conf/refine/gauss_newton.yaml"""
-    return replace(_part("refine"), **changes)
-
-
-def posterior_weights(**changes: Any) -> PosteriorWeights:
-    """conf/posterior/default.yaml"""
-    return replace(_part("posterior"), **changes)
-
-
-def rough_start(**changes: Any) -> RoughStart:
-    """conf/start/rough.yaml, of experiment=paper alone"""
-    return replace(_part("start", "experiment=paper"), **changes)
-
-
-def confidence_model(**changes: Any) -> ConfidenceModel:
-    """conf/lost/calibrated.yaml"""
-    return replace(_part("lost"), **changes)
-
-
-@cache
-def _detector_settings() -> DetectorSettings:
-    config = OmegaConf.to_container(configuration("detector=network").detector)
-    assert isinstance(config, dict)
-    del config["_target_"], config["weights"]
-    return DetectorSettings(**config)
+nearest_surface = partial(_changed, "segmentation")
+f_measure = partial(_changed, "likelihood")
+refinement = partial(_changed, "refine")
+posterior_weights = partial(_changed, "posterior")
+confidence_model = partial(_changed, "lost")
+rough_start = partial(_changed, "start", "experiment=paper")
 
 
 def detector_settings(**changes: Any) -> DetectorSettings:
     """conf/detector/network.yaml, without its weights"""
-    return replace(_detector_settings(), **changes)
+    given = values("detector=network", "detector") | changes
+    del given["weights"]
+    return DetectorSettings(**given)

@@ -43,10 +43,10 @@ def small_bank() -> ShapeBank:
 def small_networks() -> tuple[PoseNet, Finder]:
     """Untrained ones, ready for use."""
     torch.manual_seed(0)
-    pose, finder = PoseNet(4), Finder(8)
-    make_ready(pose)
-    make_ready(finder)
-    return pose, finder
+    networks = PoseNet(4), Finder(8)
+    for network in networks:
+        make_ready(network)
+    return networks
 
 
 def used(network: nn.Module, image: torch.Tensor) -> nn.Module:
@@ -65,11 +65,6 @@ def one_hand(seed: int, pivot_m: tuple[float, float, float], left: bool = False)
     """A random hand about a place, without its forearm."""
     place, side = torch.tensor([pivot_m]), torch.tensor([left])
     hands = posed_hands(small_bank(), place, side, dice(seed), HAND)
-    return cut_off(hands)
-
-
-def cut_off(hands: Hands) -> Hands:
-    """The same hands without forearms."""
     hands.labels[hands.labels != HAND] = -1
     return hands
 
@@ -89,11 +84,8 @@ def clean_sensors(n: int) -> torch.Tensor:
 
 def lens_of(k: np.ndarray, height: int, width: int, n: int = 1) -> Lens:
     """A pinhole with square pixels for each of n pictures."""
-
-    def each(value: float) -> torch.Tensor:
-        return torch.full((n,), float(value))
-
-    return Lens(each(k[0, 0]), each(k[0, 2]), each(k[1, 2]), each(width), each(height))
+    values = k[0, 0], k[0, 2], k[1, 2], width, height
+    return Lens(*(torch.full((n,), float(value)) for value in values))
 
 
 def intrinsics(focal: float, height: int, width: int) -> np.ndarray:

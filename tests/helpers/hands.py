@@ -19,9 +19,7 @@ SIZE_PX = 176, 144
 _FLEXIONS = [6 + i for i, name in enumerate(ANGLE_NAMES) if "flexion" in name]
 
 
-@cache
-def _shape(side: str):
-    return default_hand_shape(side=side)
+_shape = cache(default_hand_shape)  # one object a side, of which what follows from it is kept
 
 
 def hand_estimate(index: int, side: str = "right", bent: float = 0.0, **changes: Any) -> Estimate:
@@ -32,7 +30,7 @@ def hand_estimate(index: int, side: str = "right", bent: float = 0.0, **changes:
     state = np.zeros(27, np.float32)
     state[:3] = -0.05 + 0.001 * index, 0.08, 0.5
     state[_FLEXIONS] = bent
-    shape = _shape(side)
+    shape = _shape(side=side)
     joints = forward_kinematics(torch.from_numpy(state)[None], shape).joints_m[0].numpy()
     first = no_estimate(index, index / 25, "tracking", 4, 0.01)
     whole = replace(

@@ -7,7 +7,7 @@ from helpers.settings import gestures
 
 from toftrack.gestures.features import features_of_angles
 from toftrack.gestures.recognition import Gestures, update
-from toftrack.pose_space.data.training_poses import basic_pose
+from toftrack.pose_space.data.pose_data import basic_pose
 
 SURE, ON = 0.9, 0.0
 """A good score, and no distance from the pose space."""

@@ -11,7 +11,7 @@ from helpers.settings import gestures
 from toftrack.errors import ToftrackError
 from toftrack.gestures.features import features_of_angles
 from toftrack.gestures.files import NamedPose, read_poses, save_poses
-from toftrack.pose_space.data.training_poses import basic_pose
+from toftrack.pose_space.data.pose_data import basic_pose
 from toftrack.programs import gesture
 from toftrack.programs.gesture import main
 

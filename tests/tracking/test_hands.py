@@ -4,13 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.tracking import configuration, sample
-from helpers.two_hands import TwoHands, beside_its_mirror
+from helpers.tracking import Scene, configuration, sample
 
 from toftrack.api import build_hands_tracker
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate
 from toftrack.tracking.tracker import HandsTracker
+
+
+def beside_its_mirror(scene: Scene, shift_px: int, later: int = 0, farther: float = 1.0) -> Scene:
+    """A right hand's recording and its mirror image, whose principal point is the same; joints_m is
+    (2, T, 21, 3), the right hand's first.
+
+    shift_px: the mirrored image is moved so far to the right, as by a shear along the depth.
+    later: frames that the mirrored hand is ahead.  farther: and as much larger and farther away.
+    """
+    other = scene.mirrored().scaled(farther)
+    depth = np.roll(other.depth_m, -later, 0)
+    joints = np.roll(other.joints_m, -later, 0).copy()
+    moved = np.zeros_like(depth)
+    columns = round(scene.k[0, 2] - other.k[0, 2]) + shift_px
+    moved[:, :, max(0, columns) :] = depth[:, :, : depth.shape[2] - max(0, columns)]
+    joints[..., 0] += (other.k[0, 2] - scene.k[0, 2] + columns) / scene.k[0, 0] * joints[..., 2]
+    nearer = (scene.depth_m > 0) & ((moved == 0) | (scene.depth_m < moved))
+    merged = np.where(nearer, scene.depth_m, moved).astype(np.float32)
+    return Scene(merged, scene.k, np.stack((scene.joints_m, joints)))
+
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -23,7 +42,7 @@ def tracker_of(*overrides: str) -> HandsTracker:
     return build_hands_tracker(configuration(*SMALL, *overrides))
 
 
-def errors_mm(reported: list[tuple[Estimate, ...]], scene: TwoHands) -> np.ndarray:
+def errors_mm(reported: list[tuple[Estimate, ...]], scene: Scene) -> np.ndarray:
     """(T, 2) errors of the right hand and of the left one, in whichever slot; NaN where lost."""
     errors = np.full((len(reported), 2), np.nan)
     for t, estimates in enumerate(reported):
@@ -36,24 +55,24 @@ def errors_mm(reported: list[tuple[Estimate, ...]], scene: TwoHands) -> np.ndarr
 
 
 @pytest.fixture(scope="module")
-def apart() -> TwoHands:
+def apart() -> Scene:
     return beside_its_mirror(sample().cut(*ROWS), 30)
 
 
 @pytest.fixture(scope="module")
-def found(apart: TwoHands) -> list[tuple[Estimate, ...]]:
+def found(apart: Scene) -> list[tuple[Estimate, ...]]:
     tracker = tracker_of("hands=2")
     return [tracker.step(depth, apart.k, i, i / 25) for i, depth in enumerate(apart.depth_m)]
 
 
-def test_both_hands_are_followed(apart: TwoHands, found: list[tuple[Estimate, ...]]) -> None:
+def test_both_hands_are_followed(apart: Scene, found: list[tuple[Estimate, ...]]) -> None:
     late = errors_mm(found, apart)[8:]
     assert np.isfinite(late).mean(0).min() > 0.8, "neither is lost"
     assert np.nanmedian(late) < 15.0
     assert sorted(estimate.side for estimate in found[-1]) == ["left", "right"]
 
 
-def test_a_hand_keeps_its_slot(apart: TwoHands, found: list[tuple[Estimate, ...]]) -> None:
+def test_a_hand_keeps_its_slot(apart: Scene, found: list[tuple[Estimate, ...]]) -> None:
     places = np.array([[e.joints_m[0, 0] for e in estimates] for estimates in found[4:]])
     order = np.sign(places[:, 0] - places[:, 1])
     assert len(set(order[np.isfinite(order)])) == 1
@@ -67,7 +86,7 @@ def test_one_hand_is_not_seen_twice() -> None:
 
 
 def test_a_given_side_is_that_of_the_first_slot_and_the_other_one_is_of_the_other(
-    apart: TwoHands,
+    apart: Scene,
 ) -> None:
     tracker = tracker_of("hands=2", "hand.side=left")
     for i in range(10):
@@ -88,7 +107,7 @@ def test_other_numbers_of_hands_and_two_without_networks_are_refused() -> None:
         tracker_of("hands=2", "experiment=paper")
 
 
-def test_the_other_hand_is_not_taken_for_one_that_has_left(apart: TwoHands) -> None:
+def test_the_other_hand_is_not_taken_for_one_that_has_left(apart: Scene) -> None:
     tracker, mine = tracker_of("hand.side=right"), sample().cut(*ROWS).depth_m
     alone = np.where(apart.depth_m == mine, np.float32(1.5), apart.depth_m)
     depths = [*apart.depth_m[:8], *alone[8:]]
@@ -100,7 +119,7 @@ def test_the_other_hand_is_not_taken_for_one_that_has_left(apart: TwoHands) -> N
     assert all(one.lost for one in found[12:])
 
 
-def test_a_slot_more_than_there_are_hands_stays_empty(apart: TwoHands) -> None:
+def test_a_slot_more_than_there_are_hands_stays_empty(apart: Scene) -> None:
     tracker = tracker_of("hands=3")
     for i in range(10):
         estimates = tracker.step(apart.depth_m[i], apart.k, i, i / 25)

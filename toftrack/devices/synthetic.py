@@ -20,7 +20,7 @@ from toftrack.frames import Frame, Truth
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.pose_space.data.training_poses import basic_pose
+from toftrack.pose_space.data.pose_data import basic_pose
 from toftrack.render.closed_form import render_range_images
 
 _WIDTH, _HEIGHT, _FOCAL_PX = 176, 144, 200.0

@@ -25,8 +25,7 @@ POINTING_THUMB = "pointing_thumb"
 RAY_GESTURES = (POINTING, POINTING_THUMB)
 """Those that have a pointing ray."""
 
-_Range = tuple[float, float]
-_Features = dict[int, _Range]
+_Features = dict[int, tuple[float, float]]
 
 
 class Definition(NamedTuple):
@@ -41,26 +40,18 @@ class Definition(NamedTuple):
     high: np.ndarray
 
 
-class _Finger(NamedTuple):
-    """Ranges of total flexion and of split, degrees."""
-
-    flexion: _Range
-    split: _Range
-
-
+# Ranges of total flexion and of split, degrees.
 _FINGERS = {
-    "S": _Finger((-30, 30), (-25, 25)),
-    "C": _Finger((200, 270), (20, 160)),
-    "L": _Finger((150, 270), (-5, 100)),
-    "U": _Finger((172, 225), (80, 128)),
-    "R": _Finger((55, 130), (-5, 60)),
-    "H": _Finger((120, 176), (100, 180)),
-    "F": _Finger((60, 110), (-110, -40)),
-    "P": _Finger((70, 160), (-10, 90)),
-    "N": _Finger((-30, 60), (-25, 40)),
+    "S": ((-30, 30), (-25, 25)),  # straight
+    "C": ((200, 270), (20, 160)),  # curled
+    "L": ((150, 270), (-5, 100)),  # loosely curled
+    "U": ((172, 225), (80, 128)),  # rolled up over a knuckle that is hardly bent
+    "R": ((55, 130), (-5, 60)),  # resting
+    "H": ((120, 176), (100, 180)),  # hooked
+    "F": ((60, 110), (-110, -40)),  # flat and bent at the knuckle
+    "P": ((70, 160), (-10, 90)),  # pinching
+    "N": ((-30, 60), (-25, 40)),  # nearly straight
 }
-"""Straight, Curled, Loosely curled, rolled Up over a knuckle that is hardly bent, Resting, Hooked,
-Flat and bent at the knuckle, Pinching, Nearly straight."""
 
 # Where the thumb's tip is: reach and gap in palm lengths, total flexion in degrees.
 _ANY: _Features = {}
@@ -77,24 +68,16 @@ _APART: _Features = {features.APART: (0.42, 0.80)}
 
 def _define(name: str, fingers: str, tips: _Features) -> Definition:
     """fingers: of each the letter in _FINGERS, index to little.  tips: ranges of other features."""
-    low, high = np.full((2, features.COUNT), math.nan)
+    ranges = np.full((2, features.COUNT), math.nan)
     for number, letter in enumerate(fingers):
-        state = _FINGERS[letter]
-        for feature, values in (
-            (features.FLEXION.start + number, state.flexion),
-            (features.SPLIT.start + number, state.split),
-        ):
-            low[feature], high[feature] = np.radians(values)
+        flexion, split = _FINGERS[letter]
+        ranges[:, features.FLEXION.start + number] = np.radians(flexion)
+        ranges[:, features.SPLIT.start + number] = np.radians(split)
     for feature, values in tips.items():
-        length = feature in (features.REACH, features.GAP, features.APART)
-        low[feature], high[feature] = values if length else np.radians(values)
-    return Definition(name, low, high)
+        ranges[:, feature] = values if feature >= features.REACH else np.radians(values)
+    return Definition(name, *ranges)
 
 
-# What is near a gesture and none: a hooked hand is no fist, one bent at the knuckles not relaxed,
-# and neither is one with the little finger up, alone or with the index finger, however loosely the
-# others are curled.
-_NONE = tuple(_define(OTHER, fingers, _ANY) for fingers in ("HHHH", "FFFF", "LLLS", "SLLS"))
 _ALL = (
     _define("palm", "SSSS", _OPEN),
     _define("palm", "SSSS", _BESIDE),
@@ -114,12 +97,14 @@ _ALL = (
     _define("four", "SSSS", _ACROSS),
     _define("ok", "PNNN", _ON_INDEX_TIP),
     _define("relaxed", "RRRR", _ANY),
-    *_NONE,
+    # What is near a gesture and none: a hooked hand is no fist, one bent at the knuckles not
+    # relaxed, and neither is one with the little finger up, alone or with the index finger, however
+    # loosely the others are curled.
+    *(_define(OTHER, fingers, _ANY) for fingers in ("HHHH", "FFFF", "LLLS", "SLLS")),
 )
-_PAPER = (
-    _define("palm", "SSSS", _ANY),
-    _define(FIST, "CCCC", _ANY),
-    _define(POINTING, "SCCC", _ANY),
+_PAPER = tuple(
+    _define(name, fingers, _ANY)
+    for name, fingers in (("palm", "SSSS"), (FIST, "CCCC"), (POINTING, "SCCC"))
 )
 SETS = {"all": _ALL, "paper": _PAPER}
 """By the name that conf/gestures gives: all that are known, or the paper's three, whatever the

@@ -36,37 +36,23 @@ _THUMB_TIP, _INDEX_TIP, _MIDDLE_TIP = (
 _DISTANCES = (_THUMB_TIP, _LITTLE), (_THUMB_TIP, _INDEX_TIP), (_INDEX_TIP, _MIDDLE_TIP)
 
 
-def _sums() -> np.ndarray:
-    """(10, 21): what is added up of the angles."""
-    sums = np.zeros((REACH, len(ANGLE_NAMES)))
-    sums[THUMB_ABDUCTION, 0] = 1.0
-    sums[THUMB_FLEXION, [1, 3, 4]] = 1.0
-    for finger in range(4):
-        knuckle, *outer = range(THUMB_ANGLES + 4 * finger + 1, THUMB_ANGLES + 4 * finger + 4)
-        sums[FLEXION.start + finger, [knuckle, *outer]] = 1.0
-        sums[SPLIT.start + finger, outer] = 1.0
-        sums[SPLIT.start + finger, knuckle] = -1.0
-    return sums
-
-
-SUMS = _sums()
+SUMS = np.zeros((REACH, len(ANGLE_NAMES)))
+"""(10, 21): what is added up of the angles."""
+_JOINTS = np.zeros((COUNT, len(JOINT_NAMES)), bool)
+"""(13, 21): of which joints each feature speaks."""
+SUMS[THUMB_ABDUCTION, 0] = 1.0
+SUMS[THUMB_FLEXION, [1, 3, 4]] = 1.0
+_JOINTS[[THUMB_ABDUCTION, THUMB_FLEXION], 1:5] = True
+for _finger in range(4):
+    _both = [FLEXION.start + _finger, SPLIT.start + _finger]
+    _knuckle = THUMB_ANGLES + 4 * _finger + 1
+    SUMS[_both, _knuckle] = 1.0, -1.0
+    SUMS[_both, _knuckle + 1 : _knuckle + 3] = 1.0
+    _JOINTS[_both, 5 + 4 * _finger : 9 + 4 * _finger] = True
+for _feature, _pair in zip((REACH, GAP, APART), _DISTANCES, strict=True):
+    _JOINTS[_feature, list(_pair)] = True  # their unit, the palm, is rigid
 RANGES = np.append(np.abs(SUMS) @ np.diff(ANGLE_LIMITS)[:, 0], _DISTANCE_RANGES)
 """(13,) rad and palm lengths, from the least to the largest value within the joint limits."""
-
-
-def _joints() -> np.ndarray:
-    """(13, 21) bool: of which joints each feature speaks."""
-    asked = np.zeros((COUNT, len(JOINT_NAMES)), bool)
-    asked[[THUMB_ABDUCTION, THUMB_FLEXION], 1:5] = True
-    for finger in range(4):
-        mine = slice(5 + 4 * finger, 9 + 4 * finger)
-        asked[[FLEXION.start + finger, SPLIT.start + finger], mine] = True
-    for feature, pair in zip((REACH, GAP, APART), _DISTANCES, strict=True):
-        asked[feature, list(pair)] = True  # their unit, the palm, is rigid
-    return asked
-
-
-_JOINTS = _joints()
 
 
 def known_features(joint_ok: np.ndarray) -> np.ndarray:
@@ -96,9 +82,6 @@ def features_of_angles(angles_rad: np.ndarray) -> np.ndarray:
     found = features(np.nan_to_num(angles_rad), joints.astype(np.float64))
     unknown = np.isnan(angles_rad)
     thumb, index, middle = unknown[:THUMB_ANGLES], unknown[5:9], unknown[9:13]
-    missing = np.append(
-        (np.abs(SUMS) @ unknown) > 0,
-        (thumb.any(), (thumb.any() or index.any()), (index.any() or middle.any())),
-    )
-    found[missing.astype(bool)] = math.nan
+    tips = thumb.any(), thumb.any() or index.any(), index.any() or middle.any()
+    found[np.append((np.abs(SUMS) @ unknown) > 0, tips)] = math.nan
     return found

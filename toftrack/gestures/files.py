@@ -20,7 +20,6 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,10 +29,8 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.gestures import features
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, FINGERS
 from toftrack.json_text import read_json
-from toftrack.safe_files import open_to_read, write_whole
-
-_SLACK_DEGREES = 10.0
-_UNITS = ("degrees", "radians")
+from toftrack.pose_space.data.pose_files import SLACK_DEGREES, in_radians, named_cells, read_table
+from toftrack.safe_files import write_whole
 
 
 class NamedPose(NamedTuple):
@@ -47,50 +44,31 @@ class NamedPose(NamedTuple):
 
 
 def read_poses(path: str | Path) -> list[NamedPose]:
-    """The named poses of a file, clamped to the joint limits.
-
-    path: ending in .json or .csv.
-
-    Raises ToftrackError, naming the file and the place in it, when it cannot be read, a pose has no
-    name, an angle is unknown or not a number, the units are missing or do not fit the values, or a
-    joint cannot bend so far.
-    """
+    """The named poses of a .json or .csv file, clamped to the joint limits."""
     path = Path(path).expanduser()
-    readers = {".json": _read_json, ".csv": _read_csv}
-    reader = readers.get(path.suffix.lower())
+    reader = {".json": _read_json, ".csv": _read_csv}.get(path.suffix.lower())
     if reader is None:
         raise ToftrackError(f"{path} is neither .json nor .csv; give gestures.file=FILE of either")
-    try:
+    what = f"{path} cannot be read as a file of gestures"
+    with reported_errors(what, "give gestures.file=FILE", OSError, ValueError, csv.Error):
         units, rows = reader(path)
-    except FileNotFoundError:
-        raise ToftrackError(f"no file of gestures at {path}; give gestures.file=FILE") from None
-    except (OSError, ValueError, csv.Error) as error:
-        raise ToftrackError(f"{path} cannot be read as a file of gestures ({error})") from None
     if not rows:
         raise ToftrackError(f"{path} names no pose")
-    if units not in _UNITS:
-        what = "does not say its units" if units is None else f"has the unknown units {units!r}"
-        raise ToftrackError(f"{path} {what}; say degrees or radians in it")
-    names = [_name(path, number, row) for number, row in enumerate(rows, 1)]
-    named = list(zip(names, rows, strict=True))
+    named = [(_name(path, number, row), row) for number, row in enumerate(rows, 1)]
     angles = np.array([_angles(path, name, row) for name, row in named])
     spread = np.nan_to_num([_angles(path, name, row.get("spread") or {}) for name, row in named])
     if (spread < 0).any():
         raise ToftrackError(f"{path} has a spread below 0, and a standard deviation is none")
-    radians = _in_radians(path, angles, units)
+    radians = in_radians(path, angles, units, "say in it that they are {}")
+    spread = np.radians(spread) if units == "degrees" else spread
     return [
-        NamedPose(name, _within_limits(path, name, row), varied)
-        for name, row, varied in zip(
-            names, radians, np.radians(spread) if units == "degrees" else spread, strict=True
-        )
+        NamedPose(name, _within_limits(path, name, pose), varied)
+        for (name, _), pose, varied in zip(named, radians, spread, strict=True)
     ]
 
 
 def save_poses(path: str | Path, poses: Sequence[NamedPose]) -> None:
-    """Write named poses as .json, in degrees; what the file held before is gone.
-
-    Raises ToftrackError when it cannot be written.
-    """
+    """Write named poses as .json, in degrees; what the file held before is gone."""
     path = Path(path).expanduser()
     content = {
         "units": "degrees",
@@ -154,27 +132,11 @@ def _angles(path: Path, name: str, row: _Row) -> list[float]:
     return angles
 
 
-def _in_radians(path: Path, angles: np.ndarray, units: str) -> np.ndarray:
-    largest = float(np.nan_to_num(np.abs(angles)).max())
-    # No joint bends by more than 2.1 rad, and no gestures are all within 3 degrees of a flat hand.
-    if units == "radians" and largest > 4.0:
-        raise ToftrackError(
-            f"{path} has angles up to {largest:.1f} and is said to be in radians, which no joint"
-            " reaches; if they are degrees, say so in it"
-        )
-    if units == "degrees" and 0 < largest < 3.0:
-        raise ToftrackError(
-            f"{path} has no angle above {largest:.2f} and is said to be in degrees, so that all"
-            " gestures would be flat hands; if they are radians, say so in it"
-        )
-    return np.radians(angles) if units == "degrees" else angles
-
-
 def _within_limits(path: Path, name: str, radians: np.ndarray) -> np.ndarray:
     low, high = np.array(ANGLE_LIMITS).T
     outside = np.nan_to_num(np.maximum(low - radians, radians - high))
     worst = int(outside.argmax())
-    if outside[worst] > math.radians(_SLACK_DEGREES):
+    if outside[worst] > math.radians(SLACK_DEGREES):
         raise ToftrackError(
             f"{path}: {ANGLE_NAMES[worst]} = {math.degrees(radians[worst]):.0f} degrees in pose"
             f" {name!r} is beyond a hand's joint limits ({math.degrees(low[worst]):.0f} .."
@@ -214,24 +176,10 @@ def _by_name(path: Path, number: int, key: str, given: object) -> dict[str, Any]
 
 
 def _read_csv(path: Path) -> _Content:
-    units, lines = None, []
-    with TextIOWrapper(open_to_read(path), "utf-8-sig", newline="") as stream:
-        for line in stream:
-            if line.lstrip().startswith("#"):
-                key, _, value = line.lstrip("# \t").partition(":")
-                units = value.strip().lower() if key.strip().lower() == "units" else units
-            elif line.strip():
-                lines.append(line)
-    table = [[cell.strip() for cell in row] for row in csv.reader(lines, skipinitialspace=True)]
-    header = table[0] if table else []
-    if "name" not in header:
+    units, table = read_table(path)
+    if not table or "name" not in table[0]:
         raise ToftrackError(f"{path} has no column 'name'; the header must name it and the angles")
-    for number, row in enumerate(table[1:], 1):
-        if len(row) != len(header):
-            raise ToftrackError(
-                f"{path}: pose {number} has {len(row)} values for {len(header)} columns"
-            )
-    return units, [dict(zip(header, row, strict=True)) for row in table[1:]]
+    return units, list(named_cells(path, table))
 
 
 _NORMAL_MAD = 1.4826
@@ -248,8 +196,7 @@ def learned_pose(
 
     angles_rad: (T, 21) of the frames.  believed: (T,) bool, those whose estimate is to be used.
     steady_rad: the most that a finger's total flexion may vary, standard deviation.
-
-    Raises ToftrackError when fewer than half of the frames are believed, or the hand moves.
+    ToftrackError when fewer than half of the frames are believed, or the hand moves.
     """
     count, every = int(believed.sum()), len(believed)
     if count < max(_FEWEST_FRAMES, every / 2):

@@ -88,15 +88,12 @@ class Gestures:
         classes are equally probable.  off_rad: rms distance of the angles from the pose space; NaN
         says nothing.
         """
-        cfg, (most, members) = self.settings, self._tables
-        # Logarithms of densities, in parts of the uniform density of "other".
-        beyond = np.maximum(np.maximum(self.low - values, values - self.high), 0.0) / _WIDTHS
-        log_poses = np.nansum(most - 0.5 * beyond**2, axis=1)
+        cfg, log_poses = self.settings, self._log_densities(values)
         if cfg.off_rad is not None and math.isfinite(off_rad):
             near = math.log(_OFF_RANGE_RAD * 2 / (cfg.off_rad * math.sqrt(2 * math.pi)))
             log_poses += np.where(self.own, 0.0, near - 0.5 * (off_rad / cfg.off_rad) ** 2)
         log_poses = np.append(log_poses, 0.0)
-        log_classes = np.logaddexp.reduce(log_poses + members, axis=1)
+        log_classes = np.logaddexp.reduce(log_poses + self._tables[1], axis=1)
         log_classes[-1] += math.log(cfg.other)
         trust = (score - _DOUBTFUL_SCORE) / (_SURE_SCORE - _DOUBTFUL_SCORE)
         log_classes *= min(max(trust, 0.0), 1.0)
@@ -107,14 +104,17 @@ class Gestures:
         """Whether all is known that makes a hand's pose this class: of its definition that suits
         the values (13,) best every feature. Of "other" nothing needs to be known.
         """
-        most, _ = self._tables
         mine = self.classes == self.names.index(label)
         if label == OTHER or not mine.any():
             return True
-        low, high = self.low[mine], self.high[mine]
-        beyond = np.maximum(np.maximum(low - values, values - high), 0.0) / _WIDTHS
-        best = int(np.nansum(most[mine] - 0.5 * beyond**2, axis=1).argmax())
-        return not (np.isnan(values) & ~np.isnan(low[best])).any()
+        best = self.low[mine][self._log_densities(values)[mine].argmax()]
+        return not (np.isnan(values) & ~np.isnan(best)).any()
+
+    def _log_densities(self, values: np.ndarray) -> np.ndarray:
+        """(M,) of the values (13,), in parts of the uniform density of "other"."""
+        most, _ = self._tables
+        beyond = np.maximum(np.maximum(self.low - values, values - self.high), 0.0) / _WIDTHS
+        return np.nansum(most - 0.5 * beyond**2, axis=1)
 
     @cached_property
     def _tables(self) -> tuple[np.ndarray, np.ndarray]:
@@ -144,11 +144,7 @@ def make_gestures(
     """The gestures that are known, and those that a file names (see gestures.files).
 
     file: its poses become further classes; those with the name of a known gesture take its place.
-    known: a name of definitions.SETS.
-    settings: of GestureSettings.
-
-    Raises ToftrackError for a setting out of range, a file that cannot be understood, and two
-    classes that look alike.
+    known: a name of definitions.SETS.  settings: of GestureSettings.
     """
     named = [] if file is None else read_poses(file)
     return gestures_with(known, named, GestureSettings(pinch=pinch, **settings), str(file))
@@ -240,15 +236,15 @@ def update(
     """
     cfg = gestures.settings
     smooth = gestures.probabilities(values, score, off_rad)
-    if state is not None:
+    if state is None:
+        best, pinch = int(smooth.argmax()), PinchState()
+    else:
         keep = cfg.smoothing**frames
         smooth = keep * state.probabilities + (1 - keep) * smooth
-    best = int(smooth.argmax())
-    if state is not None:
+        best, pinch = int(smooth.argmax()), state.pinch
         current = gestures.names.index(state.label)
         best = best if smooth[best] > smooth[current] + cfg.margin else current
     label = gestures.names[best]
-    pinch = PinchState() if state is None else state.pinch
     return GestureState(smooth, label, pinch), label, float(smooth[best])
 
 

@@ -24,6 +24,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from toftrack.compute.rotations import unitquat_to_rotmat
+from toftrack.hand.regions import lengths
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import FINGERS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
@@ -146,12 +147,12 @@ def _placed(joints: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> tuple[np.n
     ways = np.concatenate(
         (phalanges, joints[:, _KNUCKLES] - metacarpals, metacarpals[:, 1:2] - joints[:, :1]), 1
     )
-    ways /= _length(ways)
+    ways /= lengths(ways)
     hinges = np.concatenate(
         (_hinges(ways, bases, state), bases[:, 1:, :, 0], palm[:, None, :, 0]), 1
     )
     nails = _cross(hinges, ways) if rig.mirrored else _cross(ways, hinges)
-    nails /= _length(nails)
+    nails /= lengths(nails)
     ways, nails = _WORLD * ways, _WORLD * nails
     axes = np.stack((_cross(ways, nails), nails, -ways), -1)  # X = Y x Z = -Z x Y
     turned = Rotation.from_matrix(axes.reshape(-1, 3, 3)).as_quat(canonical=True)
@@ -239,7 +240,3 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     # Much faster than np.cross on few vectors.
     after, before = [1, 2, 0], [2, 0, 1]
     return first[..., after] * second[..., before] - first[..., before] * second[..., after]
-
-
-def _length(vectors: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.einsum("...a,...a->...", vectors, vectors))[..., None]

@@ -31,14 +31,14 @@ def joint_axes(joints_m: np.ndarray) -> np.ndarray:
     Where a finger points straight at the camera, the camera's x axis stands in for its direction.
     """
     joints = np.asarray(joints_m, np.float64)
-    ray = joints / np.maximum(_length(joints), 1e-9)
+    ray = joints / np.maximum(lengths(joints), 1e-9)
     bone = joints - joints[..., _BEFORE, :]
     bone[..., 0, :] *= -1.0
     across_ray = bone - (bone * ray).sum(-1, keepdims=True) * ray
-    end_on = _length(across_ray) < _SHORT * _length(bone) + 1e-9
+    end_on = lengths(across_ray) < _SHORT * lengths(bone) + 1e-9
     sideways = np.array([1.0, 0.0, 0.0]) - ray[..., :1] * ray
     along = np.where(end_on, sideways, across_ray)
-    along /= np.maximum(_length(along), 1e-9)
+    along /= np.maximum(lengths(along), 1e-9)
     return np.stack((ray, along, np.cross(ray, along)), -2)
 
 
@@ -53,6 +53,6 @@ def in_region_90(joints_m: np.ndarray, sigma_m: np.ndarray, true_m: np.ndarray) 
     return inside
 
 
-def _length(vectors: np.ndarray) -> np.ndarray:
-    # By einsum, which is much faster than linalg.norm on few numbers.
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """(..., 3) to (..., 1); by einsum, much faster than linalg.norm on few numbers."""
     return np.sqrt(np.einsum("...a,...a->...", vectors, vectors))[..., None]

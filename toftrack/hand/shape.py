@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import read_json
 from toftrack.safe_files import write_whole
 
@@ -131,12 +131,8 @@ class HandShape:
 
     def to(self, *args: object, **kwargs: object) -> HandShape:
         """The same shape on another device or of another dtype, as `torch.Tensor.to`."""
-        return replace(
-            self,
-            base_m=self.base_m.to(*args, **kwargs),
-            base_frames=self.base_frames.to(*args, **kwargs),
-            bone_lengths_m=self.bone_lengths_m.to(*args, **kwargs),
-        )
+        names = ("base_m", "base_frames", "bone_lengths_m")
+        return replace(self, **{name: getattr(self, name).to(*args, **kwargs) for name in names})
 
     @cached_property
     def hand_length_m(self) -> float:
@@ -165,21 +161,16 @@ class HandShape:
             "base_m": self.base_m.tolist(),
             "base_frames": self.base_frames.tolist(),
             "bone_lengths_m": self.bone_lengths_m.tolist(),
-            "fitted": None if self.fitted is None else self.fitted.content(),
+            "fitted": self.fitted and self.fitted.content(),
         }
         write_whole(path, json.dumps(content, indent=1) + "\n")
 
     @staticmethod
     def load(path: str | Path) -> HandShape:
         """Read a shape written by `save`; ToftrackError when it is not one."""
-        try:
+        remedy = "give hand.shape=default or a file of a hand's shape"
+        with reported_errors(f"{path} cannot be read", remedy, OSError, ValueError):
             content = read_json(path)
-        except FileNotFoundError:
-            raise ToftrackError(
-                f"no hand shape file at {path}; give hand.shape=default or the path of one"
-            ) from None
-        except (OSError, ValueError) as error:
-            raise ToftrackError(f"{path} is not a readable hand shape file: {error}") from None
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
         if content.get("version") != _VERSION:
@@ -188,17 +179,15 @@ class HandShape:
                 f" reads version {_VERSION}; write it again with this version"
             )
         fitted = content.get("fitted")
-        try:
+        names = ("base_m", "base_frames", "bone_lengths_m")
+        expected = (KeyError, TypeError, ValueError, AttributeError, RuntimeError)
+        with reported_errors(f"{path} is a damaged hand shape file", remedy, *expected):
             shape = HandShape(
-                base_m=torch.tensor(content["base_m"], dtype=torch.float32),
-                base_frames=torch.tensor(content["base_frames"], dtype=torch.float32),
-                bone_lengths_m=torch.tensor(content["bone_lengths_m"], dtype=torch.float32),
+                **{name: torch.tensor(content[name], dtype=torch.float32) for name in names},
                 thickness=float(content["thickness"]),
                 side=str(content["side"]),
                 fitted=None if fitted is None else Fitted.of(fitted),
             )
-        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            raise ToftrackError(f"{path} is a damaged hand shape file: {error!r}") from None
         sizes = (shape.base_m.shape, shape.base_frames.shape, shape.bone_lengths_m.shape)
         if sizes != ((5, 3), (5, 3, 3), (5, 3)) or shape.side not in SIDES:
             raise ToftrackError(f"{path} is a damaged hand shape file: sizes {sizes}, {shape.side}")
@@ -215,12 +204,7 @@ def _rotation(degrees: float, axis: int) -> Tensor:
 def default_hand_shape(
     hand_length_m: float = DEFAULT_HAND_LENGTH_M, side: str = "right", thickness: float = 1.0
 ) -> HandShape:
-    """The mean adult hand, scaled to a hand length in metres; float32 on the CPU.
-
-    Raises ToftrackError for an unknown side or a length that no hand has.
-    """
-    if side not in SIDES:
-        raise ToftrackError(f"hand.side={side} is unknown; give hand.side=auto, right or left")
+    """The mean adult hand, scaled to a hand length in metres; float32 on the CPU."""
     if not 0.08 <= hand_length_m <= 0.30:
         raise ToftrackError(
             f"a hand length of {hand_length_m} m is outside 0.08 .. 0.30 m; give metres from"
@@ -233,10 +217,5 @@ def default_hand_shape(
     base = torch.tensor(_BASE_MM, dtype=torch.float64)
     bones = torch.tensor(_BONES_MM, dtype=torch.float64)
     scale = hand_length_m / float(base[2].norm() + bones[2].sum())
-    return HandShape(
-        base_m=(base * scale).float(),
-        base_frames=torch.stack(frames).float(),
-        bone_lengths_m=(bones * scale).float(),
-        thickness=thickness,
-        side=side,
-    )
+    sizes = (base * scale).float(), torch.stack(frames).float(), (bones * scale).float()
+    return HandShape(*sizes, thickness).of_side(side)

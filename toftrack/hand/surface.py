@@ -36,76 +36,35 @@ BONE_RADII_MM = (
 )
 
 
-class _Bone(NamedTuple):
-    """The flesh of a bone, all in parts of its half-breadth.
+# Of the three bones of the thumb and of the other fingers, in parts of the bone's half-breadth:
+# half-depth; how far the flesh's middle lies from the axis towards the palm; by how much it goes
+# past the bone's proximal and distal end. The last bone's ends exactly at the finger's tip.
+_THUMB_BONES = ((1.06, 0.21, 0.57, 0.4), (0.82, 0.21, 0.5, 0.54), (0.87, 0.26, 0.67, 0.0))
+_FINGER_BONES = ((0.96, 0.24, 0.74, 0.41), (0.78, 0.21, 0.51, 0.5), (0.76, 0.1, 0.65, 0.0))
+_BONES = np.array([_THUMB_BONES, *[_FINGER_BONES] * 4]).transpose(2, 0, 1)  # (4, 5, 3)
+# What fills the waist at the distal end of a finger's first bone: its half-breadth, in parts of the
+# mean of the bones on either side; in parts of that its half-length, half-depth and how far it lies
+# towards the palm.
+_KNUCKLES = np.array([(0.91, 0.99, 0.92, 0.17), *[(0.83, 0.64, 0.91, 0.35)] * 4]).T  # (4, 5)
 
-    depth: half-depth.  palmward: how far the middle lies from the bone's axis towards the palm.
-    before, beyond: by how much it goes past the bone's proximal and distal end.
-    """
-
-    depth: float
-    palmward: float
-    before: float
-    beyond: float
-
-
-class _Knuckle(NamedTuple):
-    """Fills the waist at the distal end of a finger's first bone.
-
-    breadth: of the mean half-breadth of the bones on either side.
-    along, depth, palmward: in parts of its own half-breadth.
-    """
-
-    breadth: float
-    along: float
-    depth: float
-    palmward: float
-
-
-class _Pad(NamedTuple):
-    """A flat ellipsoid in the palm, in millimetres.
-
-    start, end: each from the root of a finger (0 thumb .. 4 little) or, None, from the wrist.
-    wide, deep: half-axes across.  beyond: by how much it goes past its ends.
-    """
-
-    start_root: int | None
-    start: tuple[float, float, float]
-    end_root: int | None
-    end: tuple[float, float, float]
-    wide: float
-    deep: float
-    beyond: float
-
-
-_THUMB_BONES = (
-    _Bone(depth=1.06, palmward=0.21, before=0.57, beyond=0.4),
-    _Bone(depth=0.82, palmward=0.21, before=0.5, beyond=0.54),
-    _Bone(depth=0.87, palmward=0.26, before=0.67, beyond=0.0),
-)
-_FINGER_BONES = (
-    _Bone(depth=0.96, palmward=0.24, before=0.74, beyond=0.41),
-    _Bone(depth=0.78, palmward=0.21, before=0.51, beyond=0.5),
-    _Bone(depth=0.76, palmward=0.1, before=0.65, beyond=0.0),
-)
-"""The last one ends exactly at the finger's tip."""
-_THUMB_KNUCKLE = _Knuckle(breadth=0.91, along=0.99, depth=0.92, palmward=0.17)
-_FINGER_KNUCKLE = _Knuckle(breadth=0.83, along=0.64, depth=0.91, palmward=0.35)
-
+_WRIST_ROOT = 5
+# The palm's flat ellipsoids: where each starts and ends, from the root of a finger (0 thumb .. 4
+# little) or from the wrist; half-breadth, half-depth, and by how much it goes past its ends.
 _PALM = (
     # Metacarpals, from the carpus to the knuckles; the flesh lies in front of the bones.
-    _Pad(None, (10.5, -3.4, -7.0), 1, (3.0, -1.2, -3.9), 14.8, 17.0, 6.7),
-    _Pad(None, (1.8, -3.8, -5.1), 2, (-1.2, -0.6, -2.3), 14.1, 18.2, 6.6),
-    _Pad(None, (-6.2, -1.9, -10.7), 3, (-2.7, 1.8, -2.2), 13.9, 18.1, 6.3),
-    _Pad(None, (-13.2, -3.0, -7.6), 4, (-0.5, -2.7, -4.1), 13.8, 15.9, 6.1),
+    (_WRIST_ROOT, (10.5, -3.4, -7.0), 1, (3.0, -1.2, -3.9), 14.8, 17.0, 6.7),
+    (_WRIST_ROOT, (1.8, -3.8, -5.1), 2, (-1.2, -0.6, -2.3), 14.1, 18.2, 6.6),
+    (_WRIST_ROOT, (-6.2, -1.9, -10.7), 3, (-2.7, 1.8, -2.2), 13.9, 18.1, 6.3),
+    (_WRIST_ROOT, (-13.2, -3.0, -7.6), 4, (-0.5, -2.7, -4.1), 13.8, 15.9, 6.1),
     # Carpus, thenar, hypothenar, the web between thumb and index finger, and the pad of the
     # knuckles across the palm.
-    _Pad(None, (-16.5, -6.6, -1.5), None, (15.5, -6.6, -2.4), 21.5, 19.7, 12.4),
-    _Pad(None, (4.2, -18.8, -14.8), 0, (2.7, -15.9, -10.9), 21.8, 14.9, 6.5),
-    _Pad(None, (-20.7, -11.5, -8.5), 4, (4.6, 7.7, -5.0), 12.9, 14.3, 7.1),
-    _Pad(0, (0.8, -0.2, -3.9), 1, (-1.9, 11.7, -8.8), 18.6, 12.1, 7.9),
-    _Pad(4, (5.3, -2.6, -3.3), 1, (-2.8, -2.1, -9.1), 13.1, 8.2, 12.2),
+    (_WRIST_ROOT, (-16.5, -6.6, -1.5), _WRIST_ROOT, (15.5, -6.6, -2.4), 21.5, 19.7, 12.4),
+    (_WRIST_ROOT, (4.2, -18.8, -14.8), 0, (2.7, -15.9, -10.9), 21.8, 14.9, 6.5),
+    (_WRIST_ROOT, (-20.7, -11.5, -8.5), 4, (4.6, 7.7, -5.0), 12.9, 14.3, 7.1),
+    (0, (0.8, -0.2, -3.9), 1, (-1.9, 11.7, -8.8), 18.6, 12.1, 7.9),
+    (4, (5.3, -2.6, -3.3), 1, (-2.8, -2.1, -9.1), 13.1, 8.2, 12.2),
 )
+_STARTS, _STARTS_MM, _ENDS, _ENDS_MM, *_PAD_SIZES_MM = map(np.array, zip(*_PALM, strict=True))
 # Across the forearm below the hand, and wide enough for a bent wrist.
 _WRIST_MM = (0.0, 45.0, 0.0)
 _WRIST_AXES_MM = (50.0, 45.0, 45.0)
@@ -113,22 +72,6 @@ _WRIST_AXES_MM = (50.0, 45.0, 45.0)
 _REFERENCE_LENGTH_M = 0.190
 _KEPT = 8
 """Shapes whose surface is kept: scorer, refiner and OpenXR's joints each want it."""
-_BONES = np.array([_THUMB_BONES, *[_FINGER_BONES] * 4]).transpose(2, 0, 1)
-"""(4, 5, 3) depth, palmward, before and beyond of each finger's bones."""
-_KNUCKLES = np.array([_THUMB_KNUCKLE, *[_FINGER_KNUCKLE] * 4]).T
-"""(4, 5) breadth, along, depth and palmward of each finger's knuckle."""
-_PAD_ENDS = tuple(
-    (
-        [
-            5 if getattr(pad, f"{end}_root") is None else getattr(pad, f"{end}_root")
-            for pad in _PALM
-        ],
-        np.array([getattr(pad, end) for pad in _PALM]),
-    )
-    for end in ("start", "end")
-)
-"""Of both ends of each pad: the root, 5 the wrist, and (P, 3) where it is from there."""
-_PAD_SIZES = np.array([(pad.wide, pad.deep, pad.beyond) for pad in _PALM]).T
 _BONE_FRAMES = [1 + 3 * finger + bone for finger in range(5) for bone in (0, 1, 2, 0)]
 
 
@@ -224,7 +167,7 @@ def _pads(base: np.ndarray, unit: float, thick: float) -> tuple[np.ndarray, np.n
     base: (5, 3) the fingers' roots.  unit, thick: metres of a millimetre.
     """
     roots = np.concatenate((base, np.zeros((1, 3))))  # the last one is the wrist
-    start, end = (unit * offset + roots[root] for root, offset in _PAD_ENDS)
+    start, end = unit * _STARTS_MM + roots[_STARTS], unit * _ENDS_MM + roots[_ENDS]
     way = end - start
     length = np.sqrt(np.square(way).sum(1, keepdims=True))
     x, y, z = (way / length).T
@@ -232,6 +175,6 @@ def _pads(base: np.ndarray, unit: float, thick: float) -> tuple[np.ndarray, np.n
     level = np.hypot(x, y)
     out = np.stack((x * z, y * z, -np.square(level)), 1) / level[:, None]
     side = np.stack((-y, x, np.zeros_like(x)), 1) / level[:, None]
-    wide, deep, beyond = thick * _PAD_SIZES[..., None]
+    wide, deep, beyond = thick * np.array(_PAD_SIZES_MM)[..., None]
     axes = side * wide, way / length * (length / 2 + beyond), out * deep
     return (start + end) / 2, np.stack(axes, 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -13,46 +13,19 @@ from toftrack.compute.transfer import table
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
 
-@runtime_checkable
-class PoseSpace(Protocol):
+@dataclass(frozen=True, eq=False)
+class PoseSpace:
     """A learned low-dimensional space of hand poses (paper, section 2.3).
 
-    A further space is one module in this package, named as its kind, with a class `Space` of this
-    interface and a function `fit(angles, labels, dims, **settings)`, and one file in
-    conf/pose_space/.
+    A further kind is a subclass, whose tensors are what its model file holds, a function
+    `fit(angles, labels, dims, **settings)`, an entry in files.KINDS and a file in conf/pose_space/.
 
     kind: the name that stands in model files and configs.
-    dims: d, the number of latent coordinates.
     lower, upper: (d,) bounds: the extremes of the training poses in each coordinate.
     training_latents: (M, d) the training poses, and training_labels their M names.
     """
 
-    kind: str
-    dims: int
-    lower: Tensor
-    upper: Tensor
-    training_latents: Tensor
-    training_labels: tuple[str, ...]
-
-    def decode(self, latent: Tensor) -> Tensor:
-        """(N, d) latent coordinates to (N, 21) joint angles within the joint limits, radians."""
-
-    def encode(self, angles: Tensor) -> Tensor:
-        """(N, 21) joint angles, radians, to (N, d) coordinates (not clipped to the bounds)."""
-
-    def arrays(self) -> dict[str, Tensor]:
-        """Everything that a model file must hold to make this space again."""
-
-    def to(self, device: torch.device | str, dtype: torch.dtype = torch.float32) -> PoseSpace:
-        """The same space on another device or of another dtype."""
-
-
-@dataclass(frozen=True, eq=False)
-class TensorSpace:
-    """What spaces that are frozen dataclasses of tensors share.
-
-    A subclass has further tensors as it needs them, and the methods `decode_freely` and `encode`.
-    """
+    kind: ClassVar[str]
 
     lower: Tensor
     upper: Tensor
@@ -61,11 +34,15 @@ class TensorSpace:
 
     @property
     def dims(self) -> int:
-        """The number of latent coordinates."""
+        """d, the number of latent coordinates."""
         return self.training_latents.shape[1]
 
     def decode_freely(self, latent: Tensor) -> Tensor:
         """(N, d) to (N, 21) radians, without regard to the joint limits."""
+        raise NotImplementedError
+
+    def encode(self, angles: Tensor) -> Tensor:
+        """(N, 21) joint angles, radians, to (N, d) coordinates (not clipped to the bounds)."""
         raise NotImplementedError
 
     def decode(self, latent: Tensor) -> Tensor:
@@ -93,7 +70,7 @@ def _limits(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, ...]:
     return table(ANGLE_LIMITS, dtype, device).T.contiguous().unbind(0)
 
 
-def clamped_share(space: TensorSpace, latent: Tensor, slack_rad: float = 1e-3) -> float:
+def clamped_share(space: PoseSpace, latent: Tensor, slack_rad: float = 1e-3) -> float:
     """Part of the decoded angles, 0 .. 1, that the joint limits had to move; latent (N, d)."""
     free = space.decode_freely(latent)
     moved = (clamp_to_joint_limits(free) - free).abs() > slack_rad

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import json
-import pkgutil
 from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-import toftrack.pose_space
 from toftrack.archives import read_archive, write_archive
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.json_text import parse_json
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
+from toftrack.pose_space.kernel import (
+    IsomapPoseSpace,
+    KernelPCAPoseSpace,
+    LLEPoseSpace,
+    fit_isomap,
+    fit_kernel_pca,
+    fit_lle,
+)
+from toftrack.pose_space.pca import PCAPoseSpace, fit_pca
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
@@ -37,21 +42,13 @@ _SAME_RAD = 1e-6
 """Poses that differ by less than this in every angle are the same."""
 
 
-def pose_space_kinds() -> tuple[str, ...]:
-    """Every kind of space: the modules of this package that have `Space` and `fit`."""
-    names = sorted(module.name for module in pkgutil.iter_modules(toftrack.pose_space.__path__))
-    return tuple(name for name in names if _module(name) is not None)
-
-
-def _module(kind: object) -> ModuleType | None:
-    """The module of a kind of space; None when there is none of that name."""
-    if not isinstance(kind, str) or not kind.isidentifier():
-        return None
-    try:
-        module = importlib.import_module(f"toftrack.pose_space.{kind}")
-    except ModuleNotFoundError:
-        return None
-    return module if hasattr(module, "Space") and hasattr(module, "fit") else None
+KINDS: dict[str, tuple[type[PoseSpace], Callable[..., PoseSpace]]] = {
+    "isomap": (IsomapPoseSpace, fit_isomap),
+    "kernel_pca": (KernelPCAPoseSpace, fit_kernel_pca),
+    "lle": (LLEPoseSpace, fit_lle),
+    "pca": (PCAPoseSpace, fit_pca),
+}
+"""Every kind of space, and what learns one."""
 
 
 def fit_pose_space(
@@ -61,11 +58,10 @@ def fit_pose_space(
 
     settings: of that kind, as its `fit` takes them.
     """
-    module = _module(kind)
-    if module is None:
-        known = ", ".join(pose_space_kinds())
-        raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {known}")
-    takes = tuple(inspect.signature(module.fit).parameters)[3:]
+    if kind not in KINDS:
+        raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {', '.join(KINDS)}")
+    fit = KINDS[kind][1]
+    takes = tuple(inspect.signature(fit).parameters)[3:]
     unknown = [name for name in settings if name not in takes]
     if unknown:
         raise ToftrackError(
@@ -79,7 +75,7 @@ def fit_pose_space(
         )
     # Matrices of some hundred rows: a second thread only waits for the first, four times as long.
     with threadpool_limits(1, "blas"):
-        return module.fit(data.angles_rad, data.labels, dims, **settings)
+        return fit(data.angles_rad, data.labels, dims, **settings)
 
 
 def save_pose_space(
@@ -101,63 +97,49 @@ def save_pose_space(
 def load_pose_space(path: str | Path) -> PoseSpace:
     """Read a model file; ToftrackError when it is not one of this version and size."""
     header, arrays = _read(path)
-    module = _module(header.get("kind"))
-    if module is None:
+    kind, labels = header.get("kind"), header.get("training_labels")
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ToftrackError(
-            f"{path} holds a pose space of the unknown kind {header.get('kind')!r}; known:"
-            f" {', '.join(pose_space_kinds())}"
+            f"{path} holds a pose space of the unknown kind {kind!r}; known: {', '.join(KINDS)}"
         )
-    names, labels = header.get("angle_names"), header.get("training_labels", [])
-    if names != list(ANGLE_NAMES):
+    if header.get("angle_names") != list(ANGLE_NAMES):
         raise ToftrackError(
             f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
             f" hand; {_ADVICE}"
         )
-    needed = {field.name for field in fields(module.Space)} - {"training_labels"}
-    if set(arrays) != needed:
-        name = min(set(arrays) ^ needed)
-        what = f"no array {name!r}" if name in needed else f"an array {name!r} too many"
-        raise ToftrackError(f"{path} is a damaged pose-space file: it has {what}; {_ADVICE}")
-    if not isinstance(labels, list):
-        raise ToftrackError(f"{path} is a damaged pose-space file (no labels); {_ADVICE}")
-    labels = tuple(labels)
-    try:
+    kind_of_space = KINDS[kind][0]
+    expected = (TypeError, RuntimeError, IndexError, ValueError)
+    with reported_errors(f"{path} is a damaged pose-space file", _ADVICE, *expected):
+        needed = {field.name for field in fields(kind_of_space)} - {"training_labels"}
+        for name in sorted(set(arrays) ^ needed):
+            raise ValueError(f"{'no' if name in needed else 'one too many'} array {name!r}")
+        if not isinstance(labels, list):
+            raise ValueError("no labels")
         tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
-        space = module.Space(**tensors, training_labels=labels)
+        space = kind_of_space(**tensors, training_labels=tuple(labels))
         angles = space.decode(space.training_latents)
-        usable = all(bool(tensor.isfinite().all()) for tensor in (*tensors.values(), angles))
-        if angles.shape[-1] == len(ANGLE_NAMES):
-            space.encode(angles[:1])
-    except (TypeError, RuntimeError, IndexError, ValueError) as error:
-        raise ToftrackError(f"{path} is a damaged pose-space file ({error}); {_ADVICE}") from None
-    if not usable:
-        raise ToftrackError(f"{path} is a damaged pose-space file (not all finite); {_ADVICE}")
-    if angles.shape[-1] != len(ANGLE_NAMES) or any(
-        bound.shape != (space.dims,) for bound in (space.lower, space.upper)
-    ):
-        raise ToftrackError(
-            f"{path} is a pose space of another size ({angles.shape[-1]} angles); {_ADVICE}"
-        )
-    if bool((space.lower > space.upper).any()) or len(labels) != len(space.training_latents):
-        raise ToftrackError(
-            f"{path} is a damaged pose-space file (bounds or labels do not fit); {_ADVICE}"
-        )
+        if not all(bool(tensor.isfinite().all()) for tensor in (*tensors.values(), angles)):
+            raise ValueError("not all finite")
+        bounds = space.lower, space.upper
+        if angles.shape[-1] != len(ANGLE_NAMES) or any(b.shape != (space.dims,) for b in bounds):
+            raise ValueError(f"of another size, {angles.shape[-1]} angles")
+        if bool((space.lower > space.upper).any()) or len(labels) != len(space.training_latents):
+            raise ValueError("bounds or labels do not fit")
+        space.encode(angles[:1])
     return space
 
 
 def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of this format and version."""
-    try:
-        content = read_archive(path)
+    what = f"{path} is not a pose-space file"
+    with reported_errors(what, _ADVICE, OSError, ValueError, KeyError):
+        try:
+            content = read_archive(path)
+        except FileNotFoundError:
+            raise ToftrackError(f"no pose-space file at {path}; {_ADVICE}") from None
         header = parse_json(str(content.pop("header")))
-    except FileNotFoundError:
-        raise ToftrackError(f"no pose-space file at {path}; {_ADVICE}") from None
-    except KeyError:
-        raise ToftrackError(f"{path} is not a pose-space file (no header); {_ADVICE}") from None
-    except (OSError, ValueError) as error:
-        raise ToftrackError(f"{path} is not a pose-space file ({error}); {_ADVICE}") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ToftrackError(f"{path} is not a pose-space file; {_ADVICE}")
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise ValueError("its header is another")
     if header.get("version") != VERSION:
         raise ToftrackError(
             f"{path} is a pose space of version {header.get('version')} and this toftrack reads"

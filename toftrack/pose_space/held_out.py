@@ -14,7 +14,7 @@ from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.pose_space.base import PoseSpace, TensorSpace, clamped_share
+from toftrack.pose_space.base import PoseSpace, clamped_share
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space
 
@@ -45,7 +45,7 @@ class Row(NamedTuple):
     training: Errors
     held_out: Errors | None
     reached: Errors | None
-    clamped: float | None
+    clamped: float
 
 
 def reconstruction(
@@ -118,17 +118,14 @@ def evaluate_space(
         reached.append(reconstruction(fold, poses, nearest_latents(fold, poses)))
         learned()
     ratios = getattr(space, "explained_variance_ratio", None)
-    clamped = None
-    if isinstance(space, TensorSpace):
-        unit = torch.rand(2000, dims, generator=torch.Generator().manual_seed(0))
-        clamped = clamped_share(space, space.lower + unit * (space.upper - space.lower))
+    unit = torch.rand(2000, dims, generator=torch.Generator().manual_seed(0))
     return Row(
         dims=dims,
         variance=None if ratios is None else float(ratios[:dims].sum()),
         training=summarise([reconstruction(space, data.angles_rad)]),
         held_out=summarise(results) if results else None,
         reached=summarise(reached) if reached else None,
-        clamped=clamped,
+        clamped=clamped_share(space, space.lower + unit * (space.upper - space.lower)),
     )
 
 
@@ -139,7 +136,7 @@ def errors_table(rows: list[Row]) -> str:
     ]
     for row in rows:
         variance = "-" if row.variance is None else f"{100 * row.variance:.2f} %"
-        clamped = "-" if row.clamped is None else f"{100 * row.clamped:.1f} %"
+        clamped = f"{100 * row.clamped:.1f} %"
         lines.append(
             f"{row.dims:4d} {variance:>10}   {_figures(row.training)}   {_figures(row.held_out)}"
             f"   {_figures(row.reached)}   {clamped:>7}"

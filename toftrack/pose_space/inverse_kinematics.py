@@ -13,16 +13,13 @@ import roma
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, CHAIN_SLOTS, HandPose, forward_kinematics
 
 _UNIT_M = 1e-2
 """Residuals are near one in this unit, so that damping and prior need none."""
-
 _STRAIGHT = 0.97
 """A finger whose ends are at least this part of its length apart is straight."""
-
 # The thumb's root is where two skeletons agree least; it only has to tell the palm's tilt.
 _ROOT_WEIGHTS = (0.1, 1.0, 1.0, 1.0, 1.0)
 
@@ -37,10 +34,9 @@ class Fit(NamedTuple):
 def shape_of_joints(joints_m: Tensor, shape: HandShape, yaw_rad: float = 0.0) -> HandShape:
     """`shape` with the palm and the bone lengths of one person's recorded joints.
 
-    joints_m: (T, 5, 4, 3) metres, a right hand. Bones are the medians over time; the roots of the
-    fingers are the mean of the frames aligned to the shape's own roots and then turned by -yaw_rad
-    in the plane of the palm. The fingers' rest directions stay, so that an angle means the same
-    for every hand.
+    joints_m: (T, 5, 4, 3) metres, a right hand. Bones are medians over time; the fingers' roots are
+    the mean of the frames aligned to the shape's own roots, turned by -yaw_rad in the plane of the
+    palm. Rest directions stay, so that an angle means the same for every hand.
     """
     joints = joints_m.to(shape.base_m)
     bones = joints.diff(dim=2).norm(dim=-1).median(0).values
@@ -88,20 +84,12 @@ def fit_angles(
        solve (J'J + damping + prior) step = J'r - prior angles; project on the limits;
        keep the step and loosen the damping where the error fell, else tighten it.
 
-    joints_m: (T, 5, 4, 3) metres, fingers from the thumb, each from its root to its tip; right
-        hand.
+    joints_m: (T, 5, 4, 3) metres, fingers from the thumb, each from its root to its tip, of a
+        right hand; finite.
     shape: a right hand of the recorded person's size.
     prior: pull of every angle towards rest, per rad^2; it only decides what the joints leave open,
         such as turning a straight finger about itself.
-
-    Raises ToftrackError for other shapes of the input or for values that are not finite.
     """
-    if joints_m.dim() != 4 or joints_m.shape[1:] != (5, 4, 3) or len(joints_m) == 0:
-        raise ToftrackError(
-            f"joints of the shape {tuple(joints_m.shape)} are not (frames, 5 fingers, 4 joints, 3)"
-        )
-    if not bool(joints_m.isfinite().all()):
-        raise ToftrackError("joint positions must be finite numbers, without NaN")
     shape = shape.to(torch.float64)
     joints = joints_m.double()
     rotation, translation = _align(shape.base_m, joints[:, :, 0])

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.base import TensorSpace
+from toftrack.pose_space.base import PoseSpace
 
 
 @dataclass(frozen=True, eq=False)
-class PCAPoseSpace(TensorSpace):
+class PCAPoseSpace(PoseSpace):
     """A linear space: angles = mean + latent components.
 
     mean: (21,) rad.  components: (d, 21) orthonormal rows.
@@ -28,19 +28,14 @@ class PCAPoseSpace(TensorSpace):
     explained_variance_ratio: Tensor
 
     def decode_freely(self, latent: Tensor) -> Tensor:
-        """(N, d) to (N, 21) radians, without regard to the joint limits."""
         return torch.addmm(self.mean, latent, self.components)
 
     def encode(self, angles: Tensor) -> Tensor:
-        """(N, 21) radians to (N, d)."""
         return (angles - self.mean) @ self.components.mT
 
 
 def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSpace:
-    """Principal components of (M, 21) training poses; float32 on the CPU.
-
-    Raises ToftrackError when there are more dimensions than poses or angles.
-    """
+    """Principal components of (M, 21) training poses; float32 on the CPU."""
     if not 1 <= dims <= min(angles.shape):
         raise ToftrackError(
             f"pose_space.dims={dims} cannot be learned from {angles.shape[0]} poses of"
@@ -63,6 +58,3 @@ def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSp
         training_latents=torch.from_numpy(latents).float(),
         training_labels=labels,
     )
-
-
-Space, fit = PCAPoseSpace, fit_pca

@@ -3,7 +3,7 @@
 
     python tests/data/real/measure.py RECORDING.npz [...] [--side right] [--seed 0] [KEY=VALUE ...]
 
-RECORDING.npz is what one of the make_extract.py here makes. Of a recording with the truth of every
+RECORDING.npz is what make_extract.py makes. Of a recording with the truth of every
 joint: usable and silently wrong frames, wrong joints that are not ok, and how often joints are
 right by what is said of them; without the first two joints, which mean other places there. Of one
 without truth: how many frames are lost, and how sure the others are.

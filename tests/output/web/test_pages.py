@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.chromium import DRAWS_IN_3D, headless_chromium
+from helpers.chromium import DRAWS_IN_3D, headless_chromium, picture, shown
 from helpers.hands import hand_estimate
-from helpers.pages import picture, shown
 from helpers.settings import part
 from helpers.tracking import make_tracker
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from toftrack.archives import read_archive
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.hand.shape import default_hand_shape
 from toftrack.pose_space.data.pose_data import PoseData, spread_out
 from toftrack.pose_space.inverse_kinematics import (
@@ -38,18 +38,18 @@ def leap_data(path: str, poses: int | None, worst_fit_mm: float) -> PoseData:
     4. Frames that our skeleton cannot follow are dropped, and of what is left `poses` that cover
        it are kept: a sensor of 110 frames a second mostly repeats itself.
 
-    path: the .npz file.
     poses: at most so many; None keeps all.
     worst_fit_mm: frames whose mean joint error is above are dropped.
-
-    Raises ToftrackError when the file is missing or not of this format.
     """
     joints_mm, left, names, lengths = _read(path)
     joints = torch.from_numpy(joints_mm).double() / 1e3
     joints[left] *= torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     clips = list(torch.split(joints, lengths))
     family = clip_families(clips)
-    kept = [_longest(family, lengths, f) for f in dict.fromkeys(family)]
+    kept = [
+        max((i for i, other in enumerate(family) if other == f), key=lambda i: lengths[i])
+        for f in dict.fromkeys(family)
+    ]
 
     shape = default_hand_shape().to(torch.float64)
     directions = torch.stack([straight_finger_directions(clips[i], shape) for i in kept]).sum(0)
@@ -75,13 +75,8 @@ def leap_data(path: str, poses: int | None, worst_fit_mm: float) -> PoseData:
         "fit_mean_mm": round(float(error_mm.mean()), 2),
         "fit_p95_mm": round(float(error_mm.quantile(0.95)), 2),
     }
-    source = {
-        "data": "leap",
-        "file": Path(path).name,
-        "clips": [names[i] for i in kept],
-        "poses": len(rows),
-        **fit,
-    }
+    clips_kept = [names[i] for i in kept]
+    source = {"data": "leap", "file": Path(path).name, "clips": clips_kept, "poses": len(rows)}
     notes = (
         f"{Path(path).name}: {len(kept)} of {len(clips)} clips"
         f" ({len(clips) - len(kept)} repeat another), {int(left.sum())} of {len(joints)} frames"
@@ -91,7 +86,7 @@ def leap_data(path: str, poses: int | None, worst_fit_mm: float) -> PoseData:
         f" (mean above {worst_fit_mm:g} mm); {len(rows)} poses that cover the rest",
     )
     labels = tuple(names[kept[n]] for n in owner[rows].tolist())
-    return PoseData(angles[rows], labels, owner[rows], (source,), notes)
+    return PoseData(angles[rows], labels, owner[rows], (source | fit,), notes)
 
 
 def clip_families(clips: list[Tensor], share: float = 0.5) -> list[int]:
@@ -113,30 +108,20 @@ def clip_families(clips: list[Tensor], share: float = 0.5) -> list[int]:
     return family
 
 
-def _longest(family: list[int], lengths: list[int], number: int) -> int:
-    members = [i for i, f in enumerate(family) if f == number]
-    return max(members, key=lambda i: lengths[i])
-
-
 def _read(path: str) -> tuple[np.ndarray, np.ndarray, list[str], list[int]]:
-    try:
+    expected = (OSError, KeyError, ValueError, TypeError, OverflowError)
+    remedy = (
+        "give data.path=FILE of joints_mm, is_left, seq_name and seq_len; data=file reads angles"
+    )
+    with reported_errors(f"{path} cannot be read as a file of recorded joints", remedy, *expected):
         content = read_archive(path)
-        joints = np.asarray(content["joints_mm"])
+        joints = content["joints_mm"]
         if joints.dtype.kind not in "fiu":
             raise ValueError(f"joints_mm is of type {joints.dtype}, and no real numbers")
         joints = joints.astype(np.float32)
         left = np.asarray(content["is_left"], bool)
         names = [str(name) for name in content["seq_name"]]
         lengths = [int(length) for length in content["seq_len"]]
-    except FileNotFoundError:
-        raise ToftrackError(f"no file of recorded joints at {path}; give data.path=FILE") from None
-    except KeyError as error:
-        raise ToftrackError(
-            f"{path} is not a file of recorded joints, it has no array {error}; data=file reads"
-            " joint angles"
-        ) from None
-    except (OSError, ValueError, TypeError, OverflowError) as error:
-        raise ToftrackError(f"{path} is not a readable .npz of recorded joints ({error})") from None
     shapes = joints.ndim == 4 and joints.shape[1:] == (5, 4, 3) and left.shape == joints.shape[:1]
     counted = len(names) == len(lengths) and joints.shape[:1] == (sum(lengths),)
     if not shapes or not counted or min(lengths, default=0) < 1:

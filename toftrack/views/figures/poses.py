@@ -13,7 +13,7 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.pose_space.base import PoseSpace
-from toftrack.pose_space.data.training_poses import GESTURES, basic_pose
+from toftrack.pose_space.data.pose_data import GESTURES, basic_pose
 from toftrack.render.closed_form import render_range_images
 from toftrack.views.figures import chart
 from toftrack.views.overlay import range_grey

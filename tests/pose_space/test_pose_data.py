@@ -7,14 +7,17 @@ import math
 from pathlib import Path
 
 import cv2
+import hydra
 import numpy as np
 import pytest
 import torch
 from helpers import programs
-from helpers.tracking import ROOT
+from helpers.tracking import ROOT, configuration
 
 from toftrack.errors import ToftrackError
-from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, forward_kinematics
+from toftrack.pose_space.data.leap import leap_data
 from toftrack.pose_space.data.pose_data import (
     PoseData,
     drawn_poses,
@@ -25,8 +28,7 @@ from toftrack.pose_space.data.pose_data import (
     spread_out,
     synthetic_data,
 )
-from toftrack.pose_space.data.pose_files import file_data
-from toftrack.pose_space.data.run_poses import run_data
+from toftrack.pose_space.data.pose_files import file_data, run_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, make_pose_space
 from toftrack.pose_space.held_out import (
     clip_folds,
@@ -35,17 +37,17 @@ from toftrack.pose_space.held_out import (
     nearest_latents,
     reconstruction,
 )
+from toftrack.pose_space.inverse_kinematics import fit_angles, joint_jacobian, shape_of_joints
 from toftrack.programs import train
 from toftrack.views.figures.poses import corners_figure, manifold_figure, traversals_figure
 
-LIMITS = torch.tensor(ANGLE_LIMITS, dtype=torch.float64)
-LOW, HIGH = torch.tensor(ANGLE_LIMITS).unbind(1)
+LOW, HIGH = torch.tensor(ANGLE_LIMITS, dtype=torch.float64).unbind(1)
 
 
 def random_angles(count: int, seed: int = 0, part: float = 0.6) -> torch.Tensor:
     """Poses in the inner part of the joint limits, (count, 21) float64."""
     unit = torch.rand(count, 21, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return LIMITS.mean(1) + part * (unit - 0.5) * (LIMITS[:, 1] - LIMITS[:, 0])
+    return (LOW + HIGH) / 2 + part * (unit - 0.5) * (HIGH - LOW)
 
 
 def write_csv(path: Path, angles: np.ndarray, names=ANGLE_NAMES, units="degrees") -> str:
@@ -63,13 +65,9 @@ def test_a_csv_of_angles_is_read_in_its_units_and_any_order(
 ) -> None:
     radians = random_angles(6)
     values = (radians.rad2deg() if units == "degrees" else radians).numpy()
-    path = write_csv(
-        tmp_path / "mine.csv",
-        values[:, ::-1],
-        ANGLE_NAMES[::-1],
-        units if said_by == "file" else None,
-    )
-    data = file_data(path, None if said_by == "file" else units)
+    said, given = (units, None) if said_by == "file" else (None, units)
+    path = write_csv(tmp_path / "mine.csv", values[:, ::-1], ANGLE_NAMES[::-1], said)
+    data = file_data(path, given)
     torch.testing.assert_close(data.angles_rad, radians, atol=1e-5, rtol=0)
     assert data.labels == ("mine",) * 6
 
@@ -138,8 +136,6 @@ def test_a_run_that_cannot_be_learned_from_is_reported(tmp_path, changes, words)
     folder = write_run(tmp_path / "mine", random_angles(9), **changes)
     with pytest.raises(ToftrackError, match=words):
         run_data(str(folder), None, 0.8)
-    with pytest.raises(ToftrackError, match="output folder of a run"):
-        run_data(str(tmp_path / "gone"), None, 0.8)
     with pytest.raises(ToftrackError, match="give data=run data.path="):
         file_data(str(folder / "track.npz"))
 
@@ -152,40 +148,29 @@ def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
     assert data.labels == ("open", "half", "fist") and data.clips.tolist() == [0, 0, 1]
 
 
-def broken(kind: str, path: Path) -> str:
-    values = random_angles(5).rad2deg().numpy()
-    if kind == "missing column":
-        return write_csv(path, values[:, :-1], ANGLE_NAMES[:-1])
-    if kind == "radians as degrees":
-        return write_csv(path, np.radians(values))
-    if kind == "no units":
-        return write_csv(path, values, units=None)
-    if kind == "nan":
-        values[3, 2] = np.nan
-    if kind == "other signs":
-        values[:, 6::4] = -80.0
-    write_csv(path, values)
-    if kind == "text":
-        path.write_text(path.read_text() + ",".join(["1"] * 20 + ["much"]) + "\n")
-    if kind == "binary":
-        path.write_bytes(bytes(range(256)))
-    return str(path)
+GIVEN = random_angles(5).rad2deg().numpy()
+NAN, SIGNS = GIVEN.copy(), GIVEN.copy()
+NAN[3, 2], SIGNS[:, 6::4] = np.nan, -80.0
 
 
 @pytest.mark.parametrize(
-    ("kind", "part"),
+    ("values", "names", "units", "more", "part"),
     [
-        ("missing column", "no column 'little_dip_flexion'"),
-        ("text", "little_dip_flexion of pose 6 is 'much', not a number"),
-        ("nan", "thumb_mcp_abduction of pose 4 is not a finite number"),
-        ("radians as degrees", "data.units=radians"),
-        ("no units", "does not say its units"),
-        ("other signs", "beyond a hand's joint limits"),
-        ("binary", "comma-separated text in UTF-8"),
+        (GIVEN[:, :-1], ANGLE_NAMES[:-1], "degrees", b"", "no column 'little_dip_flexion'"),
+        (GIVEN, ANGLE_NAMES, "degrees", b"1," * 20 + b"much", "pose 6 is 'much', not a number"),
+        (GIVEN, ANGLE_NAMES, "degrees", b"1,2", "pose 6 has 2 values for 21 columns"),
+        (NAN, ANGLE_NAMES, "degrees", b"", "thumb_mcp_abduction of pose 4 is not a finite number"),
+        (np.radians(GIVEN), ANGLE_NAMES, "degrees", b"", "data.units=radians"),
+        (GIVEN, ANGLE_NAMES, "radians", b"", "data.units=degrees"),
+        (GIVEN, ANGLE_NAMES, None, b"", "does not say its units"),
+        (SIGNS, ANGLE_NAMES, "degrees", b"", "beyond a hand's joint limits"),
+        (GIVEN, ANGLE_NAMES, "degrees", bytes(range(256)), "comma-separated UTF-8"),
     ],
 )
-def test_a_bad_csv_is_one_clear_sentence(tmp_path: Path, kind: str, part: str) -> None:
-    path = broken(kind, tmp_path / "mine.csv")
+def test_a_bad_csv_is_one_clear_sentence(tmp_path, values, names, units, more, part) -> None:
+    path = write_csv(tmp_path / "mine.csv", values, names, units)
+    with Path(path).open("ab") as file:
+        file.write(more)
     with pytest.raises(ToftrackError, match=part) as error:
         file_data(path)
     assert path in str(error.value) and "\n" not in str(error.value)
@@ -247,9 +232,7 @@ def test_natural_poses_are_recorded_sampled_and_the_papers_always_the_same() -> 
         "sampled",
     }
     assert torch.equal(data.angles_rad, natural_data(60).angles_rad)
-    limits = torch.tensor(ANGLE_LIMITS)
-    assert (data.angles_rad >= limits[:, 0] - 1e-4).all()
-    assert (data.angles_rad <= limits[:, 1] + 1e-4).all()
+    assert (data.angles_rad >= LOW - 1e-4).all() and (data.angles_rad <= HIGH + 1e-4).all()
     assert len(data.clips.unique()) > 3, "held out in parts"
 
 
@@ -345,8 +328,130 @@ def test_the_drawn_poses_are_within_the_limits_and_of_all_kinds() -> None:
     more = natural_poses()
     assert torch.equal(more[:800], recorded_poses())
     for angles in (drawn_poses(), more[800:]):
-        assert (angles >= LOW).all() and (angles <= HIGH).all()
+        assert (angles >= LOW.float()).all() and (angles <= HIGH.float()).all()
         # Fingers straight and curled, each of them.
         bent = angles[:, 5:].unflatten(1, (4, 4))[:, :, 1:].sum(2)
         for share in ((bent < 0.7).float().mean(0), (bent > 3.0).float().mean(0)):
             assert (share > 0.1).all() and (share < 0.8).all()
+
+
+def joints_of(angles: torch.Tensor, scale: float = 1.0, seed: int = 0) -> torch.Tensor:
+    """(T, 5, 4, 3) metres of hands anywhere in space."""
+    generator = torch.Generator().manual_seed(seed)
+    placed = torch.randn(len(angles), 6, generator=generator, dtype=torch.float64)
+    shape = default_hand_shape().to(torch.float64).scaled(scale)
+    joints = forward_kinematics(torch.cat((placed, angles), 1), shape).joints_m[:, 1:]
+    return joints.unflatten(1, (5, 4))
+
+
+def test_inverse_kinematics_finds_the_angles_that_the_joints_were_made_from() -> None:
+    angles = random_angles(30)
+    fit = fit_angles(joints_of(angles), default_hand_shape(), iterations=40, prior=1e-9)
+    assert float(fit.error_m.max()) < 1e-5
+    assert math.degrees(float((fit.angles_rad - angles).abs().max())) < 0.1
+
+
+def test_inverse_kinematics_stays_within_the_joint_limits() -> None:
+    angles = random_angles(20, part=1.5)
+    fit = fit_angles(joints_of(angles), default_hand_shape())
+    assert (fit.angles_rad >= LOW - 1e-9).all() and (fit.angles_rad <= HIGH + 1e-9).all()
+    assert float(fit.error_m.mean()) < 0.01
+
+
+def test_the_jacobian_of_the_joints_agrees_with_differences() -> None:
+    shape = default_hand_shape().to(torch.float64)
+    state = torch.cat((torch.zeros(3, 6, dtype=torch.float64), random_angles(3)), 1)
+    jacobian = joint_jacobian(forward_kinematics(state, shape), shape)
+    step = 1e-6
+    for column in range(27):
+        moved = [state.clone(), state.clone()]
+        moved[0][:, column] += step
+        moved[1][:, column] -= step
+        high, low = (forward_kinematics(s, shape).joints_m[:, 1:].flatten(1) for s in moved)
+        torch.testing.assert_close(
+            jacobian[..., column], (high - low) / (2 * step), atol=1e-8, rtol=0
+        )
+
+
+def test_a_recorded_hand_gives_its_own_bones() -> None:
+    shape = shape_of_joints(joints_of(random_angles(10), scale=0.9), default_hand_shape())
+    expected = default_hand_shape().scaled(0.9)
+    torch.testing.assert_close(shape.bone_lengths_m, expected.bone_lengths_m, atol=1e-6, rtol=0)
+    torch.testing.assert_close(shape.base_m, expected.base_m, atol=1e-5, rtol=0)
+
+
+def motion(frames: int, seed: int) -> torch.Tensor:
+    """A smooth movement between random poses, (frames, 21)."""
+    ends = random_angles(2, seed)
+    return torch.lerp(ends[0], ends[1], torch.linspace(0, 1, frames).double()[:, None])
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    """Two right-handed clips, the first again at half rate, and a left-handed clip."""
+    first, second, third = (
+        joints_of(motion(40, 1), seed=1),
+        joints_of(motion(30, 2), 1.1, seed=2),
+        joints_of(motion(20, 3), 0.9, seed=3) * torch.tensor([-1.0, 1.0, 1.0]),
+    )
+    clips = [first[::2], first, second, third]
+    path = tmp_path / "joints.npz"
+    np.savez(
+        path,
+        joints_mm=torch.cat(clips).numpy().astype(np.float32) * 1e3,
+        is_left=np.repeat([False, False, False, True], [20, 40, 30, 20]),
+        seq_name=np.array(["a-half.json.lz", "a.json.lz", "b.json.lz", "c.json.lz"]),
+        seq_len=np.array([20, 40, 30, 20]),
+    )
+    return path
+
+
+def test_recorded_motion_becomes_joint_angles(recorded: Path) -> None:
+    data = leap_data(str(recorded), poses=None, worst_fit_mm=10.0)
+    assert list(dict.fromkeys(data.labels)) == ["a", "b", "c"]
+    assert data.clips.tolist() == [0] * 40 + [1] * 30 + [2] * 20
+    source = data.sources[0]
+    assert source["file"] == "joints.npz" and source["clips"] == ["a", "b", "c"]
+    assert source["fit_mean_mm"] < 1.0
+    expected = torch.cat((motion(40, 1), motion(30, 2), motion(20, 3)))
+    # The palm's direction is a convention: all abductions may be off by the same turn.
+    flexions = [i for i, name in enumerate(ANGLE_NAMES) if "flexion" in name and i > 4]
+    off = (data.angles_rad - expected)[:, flexions]
+    assert math.degrees(float(off.square().mean().sqrt())) < 6.0
+    assert "1 repeat another" in data.notes[0] and "20 of 110" in data.notes[0]
+
+
+def test_a_recording_is_thinned_to_poses_that_cover_it(recorded: Path) -> None:
+    data = leap_data(str(recorded), poses=12, worst_fit_mm=10.0)
+    assert len(data) == 12
+    assert set(data.labels) == {"a", "b", "c"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({"joints_mm": None}, "joints_mm"),
+        ({"seq_len": np.array([1, 2, 3, 4])}, "10 frames together"),
+        ({"joints_mm": np.zeros((110, 5, 3, 3), np.float32)}, "not a file of recorded joints"),
+        ({"joints_mm": np.full((110, 5, 4, 3), np.nan, np.float32)}, "NaN"),
+        ({"seq_name": np.array([{}] * 4, dtype=object)}, "pickled"),
+    ],
+)
+def test_a_bad_recording_is_one_clear_error(recorded: Path, changes: dict, part: str) -> None:
+    with np.load(recorded) as archive:
+        content = dict(archive) | changes
+    np.savez(recorded, **{name: value for name, value in content.items() if value is not None})
+    with pytest.raises(ToftrackError, match=part) as error:
+        leap_data(str(recorded), None, 10.0)
+    assert str(recorded) in str(error.value)
+
+
+def test_sources_are_mixed_by_the_configuration(recorded: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.npz"
+    np.savez(mine, angles=random_angles(6).numpy(), units=np.array("radians"))
+    more = ["+data@data.parts.mine=file", f"data.parts.mine.path={mine}", "data.poses=30"]
+    given = ("data=mixture", f"data.parts.leap.path={recorded}", *more)
+    config = configuration(*given, name="train_pose_space")
+    data = hydra.utils.instantiate(config.data)
+    assert [source["data"] for source in data.sources] == ["synthetic", "leap", "file"]
+    assert len(data) == 30 + 30 + 6
