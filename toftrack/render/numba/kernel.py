@@ -34,6 +34,7 @@ from toftrack.render.numba.hand import (
 from toftrack.render.numba.missed import clipped, count_missed, find_wanted, run
 from toftrack.render.numba.vector import (
     BLOCK,
+    WORDS,
     compare,
     down,
     draw,
@@ -48,9 +49,6 @@ from toftrack.render.numba.vector import (
     up,
     where_above,
 )
-from toftrack.render.numba.words import WORDS, no_rows, store_rows
-
-_PARTS = ("hand", "kernel", "missed", "vector", "words")
 
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _LAST = 8
@@ -273,7 +271,7 @@ def score_hands(states, frame, shape, counter, out):
             above = reach + top - first_row
             for w in range(words + 2):
                 for row in range(0, rows + 2 * reach + WORDS, WORDS):
-                    store_rows(model, w, row, no_rows())
+                    store(model[w], row, splat(np.uint64(0)))
             correct, false, residual = _compare(
                 tile, stride, spans, box, origin, images, width, model, above
             )

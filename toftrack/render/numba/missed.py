@@ -1,4 +1,4 @@
-"""The pixels of the hand that a hypothesis leaves out, counted in rows of bits."""
+"""The pixels of the hand that a hypothesis leaves out, counted in rows of bits, 64 to a word."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ import numpy as np
 
 from toftrack.compute.compiling import compiled
 from toftrack.render.numba.hand import DX, HY, IY, LANES, XY, X, Y
-from toftrack.render.numba.vector import BLOCK, down, larger, ramp, root, smaller, splat, store, up
-from toftrack.render.numba.words import (
+from toftrack.render.numba.vector import (
+    BLOCK,
     WORDS,
-    any_bit,
-    load_rows,
-    no_rows,
+    down,
+    larger,
+    load,
     ones,
+    ramp,
+    root,
     shifted,
-    store_rows,
+    smaller,
+    splat,
+    store,
+    up,
     widened,
-    without,
 )
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_ALL = ~np.uint64(0)
+_NONE, _ALL = np.uint64(0), ~np.uint64(0)
 
 
 @compiled
@@ -28,7 +32,7 @@ def run(first, last):
     """A word with bits first .. last set, as far as they lie within it."""
     first, last = max(first, 0), min(last, 63)
     if last < first:
-        return np.uint64(0)
+        return _NONE
     return (_ALL >> np.uint64(63 - last)) & (_ALL << np.uint64(first))
 
 
@@ -51,10 +55,10 @@ def find_wanted(conics, i, model, words, first_row, rows, origin, hand, reach, w
     shift, column = np.uint64(origin & 63), origin >> 6
     for w in range(words):
         for row in range(0, rows, WORDS):
-            here = load_rows(hand, column + w, first_row + row)
-            after = load_rows(hand, column + w + 1, first_row + row)
-            covered = load_rows(model, w + 1, reach + row)
-            store_rows(wanted, w, row, without(shifted(here, after, shift), covered))
+            here = load(hand[column + w], first_row + row)
+            after = load(hand[column + w + 1], first_row + row)
+            bits = shifted(here, after, shift)
+            store(wanted[w], row, bits ^ (bits & load(model[w + 1], reach + row)))
     conic = conics[conics.shape[0] - 1]
     high, y = conic[HY * LANES + i], conic[Y * LANES + i] - np.float32(first_row)
     if not high > _ZERO:
@@ -88,69 +92,58 @@ def count_missed(model, words, rows, reach, steps, wanted, buffer):
     """
     missed = 0
     for first in range(0, rows, WORDS):
-        some = no_rows()
+        some = splat(_NONE)
         for w in range(words):
-            some = some | load_rows(wanted, w, first)
-        if any_bit(some):
+            some = some | load(wanted[w], first)
+        if ones(some) > 0:
             middle = reach + first
-            if words == 1:
-                missed += _near_one(model, middle, steps, load_rows(wanted, 0, first))
-            elif words == 2:
-                left, right = load_rows(wanted, 0, first), load_rows(wanted, 1, first)
-                missed += _near_two(model, middle, steps, left, right)
+            if words <= 2:
+                missed += _near_two(model, words, middle, steps, wanted, first)
             else:
                 missed += _near_many(model, words, middle, steps, wanted, first, buffer)
     return missed
 
 
 @compiled
-def _near_one(model, middle, steps, wanted):
-    """As count_missed, of WORDS rows of a single word."""
-    near, none = load_rows(model, 1, middle), no_rows()
-    for step in range(steps.shape[0]):
-        dy = steps[step, 1]
-        if steps[step, 0]:
-            near = widened(none, near, none)
-        if dy:
-            near = near | load_rows(model, 1, middle - dy) | load_rows(model, 1, middle + dy)
-    return ones(near & wanted)
-
-
-@compiled
-def _near_two(model, middle, steps, wanted, wanted_right):
-    """As count_missed, of WORDS rows of two words, which stay in registers."""
-    near, right, none = load_rows(model, 1, middle), load_rows(model, 2, middle), no_rows()
+def _near_two(model, words, middle, steps, wanted, first):
+    """As count_missed, of WORDS rows of one or two words, which stay in registers."""
+    near, right, none = load(model[1], middle), load(model[2], middle), splat(_NONE)
     for step in range(steps.shape[0]):
         dy = steps[step, 1]
         if steps[step, 0]:
             near, right = widened(none, near, right), widened(near, right, none)
         if dy:
-            near = near | load_rows(model, 1, middle - dy) | load_rows(model, 1, middle + dy)
-            right = right | load_rows(model, 2, middle - dy) | load_rows(model, 2, middle + dy)
-    return ones(near & wanted) + ones(right & wanted_right)
+            near = near | load(model[1], middle - dy) | load(model[1], middle + dy)
+            right = right | load(model[2], middle - dy) | load(model[2], middle + dy)
+    missed = ones(near & load(wanted[0], first))
+    if words == 2:
+        missed += ones(right & load(wanted[1], first))
+    return missed
 
 
 @compiled
 def _near_many(model, words, middle, steps, wanted, first, buffer):
     """As count_missed, of WORDS rows of any number of words."""
     for w in range(words + 2):
-        store_rows(buffer, 0, w * WORDS, load_rows(model, w, middle))
-        store_rows(buffer, 1, w * WORDS, no_rows())
+        store(buffer[0], w * WORDS, load(model[w], middle))
+        store(buffer[1], w * WORDS, splat(_NONE))
     here = 0
     for step in range(steps.shape[0]):
         there = 1 - here if steps[step, 0] else here
         dy = steps[step, 1]
         for w in range(1, words + 1):
-            near = load_rows(buffer, here, w * WORDS)
+            near = load(buffer[here], w * WORDS)
             if steps[step, 0]:
-                left = load_rows(buffer, here, (w - 1) * WORDS)
-                near = widened(left, near, load_rows(buffer, here, (w + 1) * WORDS))
+                left, right = (
+                    load(buffer[here], (w - 1) * WORDS),
+                    load(buffer[here], (w + 1) * WORDS),
+                )
+                near = widened(left, near, right)
             if dy:
-                near = near | load_rows(model, w, middle - dy) | load_rows(model, w, middle + dy)
-            store_rows(buffer, there, w * WORDS, near)
+                near = near | load(model[w], middle - dy) | load(model[w], middle + dy)
+            store(buffer[there], w * WORDS, near)
         here = there
     missed = 0
     for w in range(words):
-        near = load_rows(buffer, here, (w + 1) * WORDS)
-        missed += ones(near & load_rows(wanted, w, first))
+        missed += ones(load(buffer[here], (w + 1) * WORDS) & load(wanted[w], first))
     return missed
