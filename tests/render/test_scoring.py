@@ -17,9 +17,9 @@ from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.render.closed_form import pixel_rays, project, render_range_images
-from toftrack.render.reference import ReferenceScorer, dilate_disc, step_range_images
-from toftrack.render.scoring import Counts, Evidence
-from toftrack.render.torch_scorer import count_bits, dilate_bits, pack_bits
+from toftrack.render.reference import ReferenceScorer, step_range_images
+from toftrack.render.scoring import Counts, Evidence, dilate_disc
+
 from toftrack.tracking.backend import choose_backend, make_scorer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
