@@ -7,8 +7,7 @@ import roma
 import torch
 
 from toftrack.compute import particle_filter as sir
-from toftrack.compute.redraw import bound, pick
-from toftrack.compute.rigid import MOTIONS, main_rotation, rotation_scatter
+from toftrack.compute.rigid import MOTIONS, bound, main_rotation, pick, rotation_scatter
 
 LOWER, UPPER = torch.tensor([-1.0, -2.0, 0.0, -0.5]), torch.tensor([1.0, 2.0, 3.0, 0.5])
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from toftrack.compute import rigid, rigid_numba
 from toftrack.compute.compiling import entry_point
-from toftrack.compute.redraw import BOUNDS
+from toftrack.compute.rigid import BOUNDS
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 

@@ -19,7 +19,6 @@ from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.render.closed_form import pixel_rays, project, render_range_images
 from toftrack.render.reference import ReferenceScorer, step_range_images
 from toftrack.render.scoring import Counts, Evidence, dilate_disc
-
 from toftrack.tracking.backend import choose_backend, make_scorer
 
 pytestmark = pytest.mark.usefixtures("one_thread")

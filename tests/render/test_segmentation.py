@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from helpers.configured import nearest_surface
 from helpers.tracking import sample
+from toftrack.render.numba.median import SIDE, thinned
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.trust import TIPS
-from toftrack.render.numba.median import SIDE, thinned
 from toftrack.render.segmentation import Expected, NearestSurface, reduce_image
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 100.0

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.redraw import BOUNDS, Redraw
+from toftrack.compute.rigid import BOUNDS, Redraw
 from toftrack.errors import ToftrackError
 
 

@@ -11,8 +11,7 @@ import triton.language as tl
 from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.redraw import Motions, redraw_with
-from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rigid import PIVOT_M, Motions, redraw_with
 
 _BLOCK = 64
 

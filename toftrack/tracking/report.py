@@ -15,8 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from toftrack.compute import particle_filter
-from toftrack.compute.pace import FRAME_S
-from toftrack.compute.spans import Spans
+from toftrack.compute.pace import FRAME_S, Spans
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage
