@@ -29,7 +29,7 @@ def test_resampling_is_unbiased(scheme: str, n: int) -> None:
     g, draws = generator(2), 400
     counts = torch.zeros(50, dtype=torch.float64)
     for _ in range(draws):
-        counts += torch.bincount(pick(weights, sir.RESAMPLERS[scheme](n, g)), minlength=50)
+        counts += torch.bincount(pick(weights, sir.draw_positions(scheme, n, g)), minlength=50)
     # Each draw's variance is at most the multinomial one, so 5 of its standard deviations hold
     # every one of the 50 means with a probability above 0.9999.
     sigma = (n * weights * (1 - weights) / draws).sqrt()
@@ -40,7 +40,7 @@ def test_systematic_resampling_gives_each_particle_its_share_rounded() -> None:
     weights = torch.rand(40, generator=generator(3)).double()
     weights /= weights.sum()
     for seed in range(20):
-        indices = pick(weights, sir.systematic_positions(100, generator(seed)))
+        indices = pick(weights, sir.draw_positions("systematic", 100, generator(seed)))
         counts = torch.bincount(indices, minlength=40)
         assert ((counts - 100 * weights).abs() < 1).all()
 
@@ -48,7 +48,7 @@ def test_systematic_resampling_gives_each_particle_its_share_rounded() -> None:
 @pytest.mark.parametrize("scheme", sorted(sir.RESAMPLERS))
 def test_resampling_survives_degenerate_weights(scheme: str) -> None:
     def resample(weights: torch.Tensor, n: int, g: torch.Generator) -> torch.Tensor:
-        return pick(weights, sir.RESAMPLERS[scheme](n, g))
+        return pick(weights, sir.draw_positions(scheme, n, g))
 
     one = torch.zeros(8, dtype=torch.float64)
     one[3] = 1.0

@@ -28,18 +28,16 @@ def elapsed_s(before_s: float | None, now_s: float) -> float:
 
 @dataclass(frozen=True)
 class Duration:
-    """How long something has gone on, in seconds.
+    """How long something has gone on, in seconds; 0 = it has not begun.
 
     The frame in which it begins counts as FRAME_S, so that a single frame means the same at any
-    rate. A duration of 0 has not begun.
+    rate.
     """
 
     seconds: float = 0.0
 
     def extended(self, dt_s: float, most_s: float = math.inf) -> Duration:
-        """It goes on in a frame that comes dt_s after the last one, of which at most `most_s`
-        count.
-        """
+        """It goes on in a frame dt_s after the last one, of which at most `most_s` count."""
         return Duration(self.seconds + min(dt_s, most_s) if self.seconds else FRAME_S)
 
     def reached(self, frames: float) -> bool:
