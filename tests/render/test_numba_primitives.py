@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from toftrack.render.numba.words import WORDS
 from torch import Tensor
 
 from toftrack.compute.compiling import entry_point
@@ -19,9 +18,8 @@ from toftrack.render.numba import hand, missed
 from toftrack.render.numba.hand import LANES, TERMS
 from toftrack.render.numba.kernel import pack_evidence
 from toftrack.render.numba.scorer import NumbaScorer
-from toftrack.render.numba.vector import BLOCK
-from toftrack.render.reference import dilate_disc
-from toftrack.render.scoring import disc_square, disc_steps
+from toftrack.render.numba.vector import BLOCK, WORDS
+from toftrack.render.scoring import dilate_disc, disc_square, disc_steps
 from toftrack.render.torch_scorer import Outlines, outlines
 
 pytestmark = pytest.mark.usefixtures("one_thread")
