@@ -41,7 +41,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 FLOATS, ROWS = _Vector("toftrack_floats", _VECTOR), _Vector("toftrack_rows", _ROWS)
-_KINDS = {types.float32: FLOATS, types.uint64: ROWS}
+_KINDS: dict[types.Type, _Vector] = {types.float32: FLOATS, types.uint64: ROWS}
 
 
 def _spread(builder, value, lltype=_VECTOR):
