@@ -340,19 +340,6 @@ def test_closed_form_is_what_fine_steps_find():
     assert (closed - coarse).abs()[seen].median() < 1e-3
 
 
-def test_surface_points_lie_on_an_ellipsoid():
-    k = intrinsics(48, 64, 60.0).double()
-    ellipsoids = _posed(3, 3, torch.float64)
-    depth = render_range_images(ellipsoids, k, 48, 64)
-    points = pixel_rays(k, 48, 64) * depth[..., None]
-    whiten = ellipsoids.axes_m.inverse()
-    local = torch.einsum(
-        "neij,nehwj->nehwi", whiten, points[:, None] - ellipsoids.centres_m[:, :, None, None]
-    )
-    value = local.square().sum(-1).amin(1)[depth > 0]
-    assert (value - 1).abs().max() < 1e-6
-
-
 def test_outlines_are_those_of_the_dual_conics() -> None:
     k, ellipsoids = intrinsics(144, 176, 170.0).double(), _posed(20, 4, torch.float64)
     ellipsoids.centres_m[:4, :, 2] *= -1  # behind the camera

@@ -29,19 +29,17 @@ NAMINGS = ("printed", "standard")
 class FMeasure:
     """The paper's F-measure of correct, false and missed pixels.
 
-    tolerance_m: a model pixel is correct when its depth is within this of the image's (the paper:
-        0.02).
-    neighbourhood_m: missed pixels count up to this distance from the silhouette, at the hand's
-        depth ("in proportion to the finger's length": about a third of a finger).
+    tolerance_m: a model pixel this near to the image's depth is correct (the paper: 0.02).
+    neighbourhood_m: how far from the silhouette, at the hand's depth, pixels are missed ("in
+        proportion to the finger's length": about a third of a finger).
     beta: weight of the second of the two rates (paper: 1.5).
-    naming: the paper prints precision = c / (c + missed) and recall = c / (c + false), so its
+    naming: the paper prints precision = c / (c + missed) and recall = c / (c + false), so that
         beta > 1 punishes *false* pixels more, while its text wants more penalty for missed ones.
-        "printed" is the paper's formula, "standard" the usual names (beta > 1 punishes missed
-        more).
+        "printed" is the paper's formula, "standard" the usual names.
     residual_weight: how much of a correct pixel is lost at the edge of the depth tolerance,
         0 (paper, all or nothing) .. 1 (a parabola that falls to 0).
-    coverage: how much hypotheses are preferred that explain more of the image. The F-measure is
-        content with a hand of which only a few pixels lie inside the image.
+    coverage: how much hypotheses are preferred that explain more of the image: the F-measure is
+        content with a hand of which only a few pixels lie inside of it.
     """
 
     tolerance_m: float
@@ -73,7 +71,8 @@ class FMeasure:
         images = _images(depth, hand, occluder, other, np.float32(self.tolerance_m))
         device = observation.depth_m.device
         low, high, front = (torch.from_numpy(image).to(device) for image in images)
-        radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
+        distance_m = 1.0 if observation.empty else observation.nearest_m
+        radius = self.neighbourhood_m * float(observation.k[0, 0]) / distance_m
         return Evidence(low, high, front, observation.hand, observation.k, radius)
 
     def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
@@ -93,9 +92,6 @@ class FMeasure:
         with np.errstate(divide="ignore"):
             score: np.ndarray = np.log(self._f_measure(*host))
             return score + np.float32(coverage) * np.log(host[0]) if coverage else score
-
-    def _distance(self, observation: Observation) -> float:
-        return observation.nearest_m if not observation.empty else 1.0
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""

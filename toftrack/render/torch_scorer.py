@@ -24,7 +24,7 @@ _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 27}
 
 
 class Outlines(NamedTuple):
-    """Ellipsoids in (column, row, inverse depth), each field (N, E); lengths in pixels and 1/m.
+    """Ellipsoids in (column, row, inverse depth), each field (N, E), in pixels and 1/m.
 
     x, y, u: the centre.  high, wide: half sizes of the box, high is -1 where nothing is drawn.
     shear: columns the middle of a row moves per row.  dx: squared half width of the middle row.
