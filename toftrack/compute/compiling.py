@@ -1,4 +1,4 @@
-"""How numba's kernels are compiled: once on a machine, announced if it takes long, then cached.
+"""How numba's kernels are compiled: once on a machine, which is announced, then cached.
 
 Whatever is wrong with the cache costs compiling once more and a sentence in the log, never a run.
 numba describes what it keeps by pickles, so only a folder is used that is closed to other users.

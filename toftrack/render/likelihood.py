@@ -63,17 +63,23 @@ class FMeasure:
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
         # A model surface at an occluder is hidden, not false; at another hand only behind it.
-        other = None if observation.other is None else observation.other.cpu().numpy()
         given = observation.depth_m, observation.hand, observation.occluder
-        depth, hand, occluder = (one.cpu().numpy() for one in given)
+        depth_m, hand, occluder = (image.cpu().numpy() for image in given)
+        front, tolerance_m = np.zeros_like(depth_m), np.float32(self.tolerance_m)
+        if observation.other is not None:
+            read = observation.other.cpu().numpy() & (depth_m > 0)
+            front[read] = 1 / depth_m[read]
+        front[occluder] = np.inf
         if observation.thing is not None:
-            occluder = occluder | observation.thing.cpu().numpy()
-        images = _images(depth, hand, occluder, other, np.float32(self.tolerance_m))
+            front[observation.thing.cpu().numpy()] = np.inf
+        low, high = np.full_like(depth_m, np.inf), np.full_like(depth_m, -np.inf)
+        z = depth_m[hand]
+        low[hand], high[hand] = 1 / (z + tolerance_m), 1 / np.maximum(z - tolerance_m, _LEAST_M)
         device = observation.depth_m.device
-        low, high, front = (torch.from_numpy(image).to(device) for image in images)
+        lowest, highest, hidden = (torch.from_numpy(a).to(device) for a in (low, high, front))
         distance_m = 1.0 if observation.empty else observation.nearest_m
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / distance_m
-        return Evidence(low, high, front, observation.hand, observation.k, radius)
+        return Evidence(lowest, highest, hidden, observation.hand, observation.k, radius)
 
     def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
         """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct).
@@ -82,16 +88,15 @@ class FMeasure:
         """
         coverage = self.coverage if coverage is None else coverage
         if counts.correct.device.type == "cpu":
-            return torch.from_numpy(self._log_score(counts, coverage))
+            host = _host(counts)
+            with np.errstate(divide="ignore"):
+                found: np.ndarray = np.log(self._f_measure(*host))
+                if coverage:
+                    found = found + np.float32(coverage) * np.log(host[0])
+            return torch.from_numpy(found)
         score = self.score(counts).log()
         # 0 times the logarithm of no correct pixel would be NaN, and the largest of all.
         return score + coverage * counts.correct.log() if coverage else score
-
-    def _log_score(self, counts: Counts, coverage: float) -> np.ndarray:
-        host = _host(counts)
-        with np.errstate(divide="ignore"):
-            score: np.ndarray = np.log(self._f_measure(*host))
-            return score + np.float32(coverage) * np.log(host[0]) if coverage else score
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
@@ -109,26 +114,6 @@ class FMeasure:
         rest = b2 * false + missed if printed else false + b2 * missed
         weighted = (1 + b2) * correct
         return weighted / (weighted + rest).clip(min=1e-9)
-
-
-def _images(
-    depth_m: np.ndarray,
-    hand: np.ndarray,
-    occluder: np.ndarray,
-    other: np.ndarray | None,
-    tolerance_m: np.float32,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Low, high and occluder of Evidence, (H, W) float32, of masks (H, W)."""
-    low, high = np.full_like(depth_m, np.inf), np.full_like(depth_m, -np.inf)
-    z = depth_m[hand]
-    low[hand] = 1 / (z + tolerance_m)
-    high[hand] = 1 / np.maximum(z - tolerance_m, _LEAST_M)
-    front = np.zeros_like(depth_m)
-    if other is not None:
-        read = other & (depth_m > 0)
-        front[read] = 1 / depth_m[read]
-    front[occluder] = np.inf
-    return low, high, front
 
 
 def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
