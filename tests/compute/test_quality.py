@@ -56,14 +56,17 @@ def test_what_is_far_too_slow_passes_over_a_level() -> None:
     assert 1 not in levels(Pace(BUDGET_S), [0.2] * 40)
 
 
-def test_frames_that_just_fit_change_nothing() -> None:
-    for level in range(len(LEVELS)):
-        assert set(levels(Pace(BUDGET_S, level), [0.8 * BUDGET_S] * 200)) == {level}
-
-
-def test_one_late_frame_changes_nothing() -> None:
-    took = [0.6 * BUDGET_S] * 20 + [1.0] + [0.6 * BUDGET_S] * 20
-    assert set(levels(Pace(BUDGET_S), took)) == {0}
+@pytest.mark.parametrize(
+    ("pace", "took_s"),
+    [
+        *((Pace(BUDGET_S, level), [0.8 * BUDGET_S] * 200) for level in range(len(LEVELS))),
+        (Pace(BUDGET_S), [0.6 * BUDGET_S] * 20 + [1.0] + [0.6 * BUDGET_S] * 20),
+        (Pace(), [0.001, 5.0, 60.0] * 20),
+    ],
+    ids=[*(f"level {level} fits" for level in range(len(LEVELS))), "one late", "no budget"],
+)
+def test_what_fits_changes_nothing(pace: Pace, took_s: list[float]) -> None:
+    assert set(levels(pace, took_s)) == {pace.level}
 
 
 def test_what_was_too_much_is_tried_ever_later() -> None:
@@ -76,10 +79,6 @@ def test_what_was_too_much_is_tried_ever_later() -> None:
             tried.append(number)
     pauses = np.diff(tried)
     assert len(pauses) > 2 and (pauses[1:] > 1.5 * pauses[:-1]).all()
-
-
-def test_without_a_budget_quality_never_changes() -> None:
-    assert set(levels(Pace(), [0.001, 5.0, 60.0] * 20)) == {0}
 
 
 @pytest.mark.parametrize("budget_ms", [0, -3, "fast", math.nan])

@@ -186,14 +186,9 @@ def test_the_score_is_the_f_measure_of_the_two_rates(naming: str, beta: float) -
     assert float(head.score(counts(correct, false, missed))) == pytest.approx(expected)
 
 
-def test_the_printed_formula_punishes_false_pixels_more_and_the_standard_one_missed_pixels() -> (
-    None
-):
+def test_printed_punishes_false_pixels_more_and_standard_missed_ones() -> None:
     false, missed = counts(70, 30, 10), counts(70, 10, 30)
-    printed, standard = (
-        f_measure(beta=1.5, naming="printed"),
-        f_measure(beta=1.5, naming="standard"),
-    )
+    printed, standard = (f_measure(beta=1.5, naming=name) for name in ("printed", "standard"))
     assert printed.score(false) < printed.score(missed)
     assert standard.score(false) > standard.score(missed)
     even = f_measure(beta=1.0)

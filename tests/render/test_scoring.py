@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 import torch
 
+from toftrack.compute.compiling import entry_point
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.render.closed_form import pixel_rays, project, render_range_images
-from toftrack.render.reference import ReferenceScorer, dilate_disc, step_range_images
-from toftrack.render.scoring import Counts, Evidence
-from toftrack.render.torch_scorer import count_bits, dilate_bits, pack_bits
+from toftrack.render.numba import kernel
+from toftrack.render.numba.vector import WORDS
+from toftrack.render.reference import ReferenceScorer, step_range_images
+from toftrack.render.scoring import Counts, Evidence, dilate_disc, disc_square, disc_steps
+from toftrack.render.torch_scorer import outlines
 from toftrack.tracking.backend import choose_backend, make_scorer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -287,12 +290,6 @@ def test_dilation_is_the_distance_transform(radius_px, size):
     expected = torch.from_numpy(exact <= radius_px + 1e-4)
     masks = torch.from_numpy(masks)
     assert torch.equal(dilate_disc(masks, radius_px), expected)
-    words = dilate_bits(pack_bits(masks), radius_px)
-    # Bits beyond the last column may be set, they are no pixels.
-    assert torch.equal(words & pack_bits(torch.ones_like(masks)), pack_bits(expected))
-    assert torch.equal(
-        count_bits(pack_bits(expected)).sum((1, 2)), expected.sum((1, 2), dtype=torch.long)
-    )
 
 
 def _posed(n: int, seed: int, dtype: torch.dtype) -> Ellipsoids:
@@ -343,14 +340,49 @@ def test_closed_form_is_what_fine_steps_find():
     assert (closed - coarse).abs()[seen].median() < 1e-3
 
 
-def test_surface_points_lie_on_an_ellipsoid():
-    k = intrinsics(48, 64, 60.0).double()
-    ellipsoids = _posed(3, 3, torch.float64)
-    depth = render_range_images(ellipsoids, k, 48, 64)
-    points = pixel_rays(k, 48, 64) * depth[..., None]
-    whiten = ellipsoids.axes_m.inverse()
-    local = torch.einsum(
-        "neij,nehwj->nehwi", whiten, points[:, None] - ellipsoids.centres_m[:, :, None, None]
-    )
-    value = local.square().sum(-1).amin(1)[depth > 0]
-    assert (value - 1).abs().max() < 1e-6
+def test_outlines_are_those_of_the_dual_conics() -> None:
+    k, ellipsoids = intrinsics(144, 176, 170.0).double(), _posed(20, 4, torch.float64)
+    ellipsoids.centres_m[:4, :, 2] *= -1  # behind the camera
+    conics, found = project(ellipsoids), outlines(ellipsoids, k)
+    assert torch.equal(conics.visible, found.high > 0)
+    dual = conics.dual / conics.dual[..., 2:, 2:]
+    for axis, middle, half in ((0, found.x, found.wide), (1, found.y, found.high)):
+        mean = dual[..., axis, 2]
+        spread = (mean.square() - dual[..., axis, axis]).clamp(min=0).sqrt()
+        expected = k[axis, axis] * mean + k[axis, 2], k[axis, axis] * spread
+        seen = conics.visible
+        torch.testing.assert_close(middle[seen], expected[0][seen], atol=1e-3, rtol=1e-5)
+        torch.testing.assert_close(half[seen], expected[1][seen], atol=1e-3, rtol=1e-4)
+
+
+@entry_point
+def _count_missed(model, words, rows, reach, steps, wanted, buffer):
+    return kernel.count_missed(model, words, rows, reach, steps, wanted, buffer)
+
+
+def bits_of(mask: np.ndarray, words: int) -> np.ndarray:
+    """(H, W) bool to (words, H) words of 64 pixels, the first in the lowest bit."""
+    padded = np.zeros((len(mask), 64 * words), np.uint64)
+    padded[:, : mask.shape[1]] = mask
+    powers = np.uint64(1) << np.arange(64, dtype=np.uint64)
+    return (padded.reshape(len(mask), words, 64) * powers).sum(-1, dtype=np.uint64).T
+
+
+@pytest.mark.parametrize("radius_px", [0.0, 1.0, 2.5, 10.5, 40.0, 90.0])
+@pytest.mark.parametrize("size", [(1, 1), (1, 130), (33, 64), (48, 131), (20, 200)])
+def test_the_compiled_dilation_is_the_disc_s(radius_px: float, size: tuple[int, int]) -> None:
+    g = np.random.default_rng(int(radius_px) + size[1])
+    height, width = size
+    words, steps = -(-width // 64), disc_steps(disc_square(radius_px, *size), *size)
+    reach = int(steps[:, 1].max())
+    for density in (0.0, 0.003, 0.3):
+        mask, wanted = g.random(size) < density, g.random(size) < 0.5
+        mask[g.integers(height), g.integers(width)] |= density > 0
+        model = np.zeros((words + 2, height + 2 * reach + WORDS), np.uint64)
+        model[1:-1, reach : reach + height] = bits_of(mask, words)
+        rows = np.zeros((words, height + WORDS), np.uint64)
+        rows[:, :height] = bits_of(wanted & ~mask, words)
+        buffer = np.empty((2, (words + 2) * WORDS), np.uint64)
+        found = _count_missed(model, words, height, reach, steps, rows, buffer)
+        near = dilate_disc(torch.from_numpy(mask[None]), radius_px)[0].numpy()
+        assert found == (near & wanted & ~mask).sum()

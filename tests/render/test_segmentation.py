@@ -12,7 +12,6 @@ from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.trust import TIPS
-from toftrack.render.numba.median import SIDE, thinned
 from toftrack.render.segmentation import Expected, NearestSurface, reduce_image
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 100.0
@@ -294,13 +293,3 @@ def test_a_reach_beyond_the_image_or_behind_the_camera_is_no_error() -> None:
     for x, y, z in ((0, 0, 1e-3), (1e6, -1e6, 0.5), (0, 0, 1e9), (-50, 0, 0.1), (0, 0, -0.3)):
         seen = nearest_surface()(depth, K, Expected(0.4, 0.6, (x, y, z)))
         assert seen.hand.shape == depth.shape
-
-
-@pytest.mark.parametrize("factor", [3, 4, 5, 7])
-@pytest.mark.parametrize("size", [(1, 1), (4, 5), (61, 130), (240, 323)])
-def test_a_large_image_is_filtered_only_where_it_is_read(size, factor):
-    g = np.random.default_rng(factor)
-    image = np.where(g.random(size) < 0.3, 0, g.random(size)).astype(np.float32)
-    offset = (factor - 1) // 2
-    everywhere = cv2.medianBlur(image, SIDE)[offset::factor, offset::factor]
-    np.testing.assert_array_equal(thinned(image, factor, offset), everywhere)

@@ -20,8 +20,7 @@ from helpers.rendered import (
     view_of,
 )
 
-from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.compute.spans import Spans
+from toftrack.compute.pace import FRAME_S, Duration, Spans
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.association import keep_tracks
 from toftrack.tracking.candidates import View

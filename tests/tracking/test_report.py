@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.rendered import EMPTY, any_hand_model, hand_at, scene_of, state_of, track_of, view_of
 
-from toftrack.compute.spans import Spans
+from toftrack.compute.pace import Spans
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage
 from toftrack.tracking.confidence import JOINT_FEATURES, Status

@@ -1,4 +1,4 @@
-"""How numba's kernels are compiled: once on a machine, announced if it takes long, then cached.
+"""How numba's kernels are compiled: once on a machine, which is announced, then cached.
 
 Whatever is wrong with the cache costs compiling once more and a sentence in the log, never a run.
 numba describes what it keeps by pickles, so only a folder is used that is closed to other users.
@@ -12,8 +12,7 @@ import inspect
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +35,6 @@ OPTIONS = {
 compiled: Any = numba.njit(**OPTIONS, no_cpython_wrapper=True)
 """Decorator of the functions that kernels call, and that Python cannot."""
 
-_SILENT_S = 1.0
-"""Taking a kernel from the cache is faster than this, compiling it is slower."""
 _config: Any = numba.config
 lock = threading.RLock()
 """Of the thread that compiles."""
@@ -45,10 +42,7 @@ _said: set[str] = set()
 
 
 class Kernel:
-    """A compiled function that Python calls: compiled, or taken from the cache, when it first is.
-
-    Only one thread compiles at a time, so that the others do not compile the same once more.
-    """
+    """A compiled function that Python calls: compiled, or taken from the cache, the first time."""
 
     def __init__(self, function: Callable) -> None:
         functools.update_wrapper(self, function)
@@ -61,14 +55,12 @@ class Kernel:
         return self.dispatcher is not None and bool(self.dispatcher.overloads)
 
     def __call__(self, *args: Any) -> Any:
-        """Run it."""
         if self.is_compiled:
             return self._run(args)
         with lock:
-            if self.dispatcher is None:
-                self.dispatcher = _cached(self.function)
-            with _announced(self.dispatcher):
-                return self._run(args)
+            self.dispatcher = self.dispatcher or _cached(self.function)
+            _announce(self.dispatcher)
+            return self._run(args)
 
     def _run(self, args: tuple) -> Any:
         try:
@@ -164,26 +156,12 @@ def _say_once(error: Exception) -> None:
         )
 
 
-@contextmanager
-def _announced(dispatcher: Any) -> Iterator[None]:
-    """Around the first call of a kernel: says once a process that compiling takes long."""
+def _announce(dispatcher: Any) -> None:
+    """Say once a process that a kernel is compiled, unless it is only loaded."""
     folder = dispatcher.stats.cache_path
-    if folder and any(os.scandir(folder)):  # it is only loaded
-        yield
-        return
-    often = "once on a machine" if folder else "in every run"
-    timer = threading.Timer(_SILENT_S, _announce, (often,))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
-def _announce(often: str) -> None:
-    if "compiling" not in _said:
+    if "compiling" not in _said and not (folder and any(os.scandir(folder))):
         _said.add("compiling")
+        often = "once on a machine" if folder else "in every run"
         log.info(f"compiling kernels ({often}, about 25 s)")
 
 

@@ -16,8 +16,10 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.compute.redraw import BOUNDS, Redraw
+from toftrack.compute.rigid import BOUNDS, Redraw
 from toftrack.errors import ToftrackError
+
+RESAMPLERS = ("systematic", "stratified")
 
 
 @dataclass(frozen=True)
@@ -81,16 +83,12 @@ class FilterSettings:
 
 
 def widened(sigmas: Tensor, frames: float, movement: Tensor, rest: float, gain: float) -> Tensor:
-    """Diffusion that follows the speed: narrow for a hand at rest, wide for a fast one.
+    """Diffusion that follows the speed: a random walk at rest, whose spread grows with the root of
+    the time, and that of a movement, which grows with the time.
 
-    What a hand at rest does is a random walk, whose spread grows with the root of the time; that of
-    a movement grows with the time.
-
-    sigmas: (6 + d,) for a moderately moving hand after one frame of 1/25 s.
-    frames: how many have passed.  movement: (6 + d,) tangent, how far it is expected to move.
-    rest: part of the sigmas that a hand at rest keeps, 1 = the same at any speed.
-    gain: standard deviation gained per unit of movement; at most the sigmas a frame are
-        doubled.
+    sigmas: (6 + d,) of a moderately moving hand in one frame of 1/25 s, of which `rest` is kept at
+    rest.  frames: how many have passed.  movement: (6 + d,) tangent, how far it is expected to
+    move.  gain: standard deviation per unit of movement; at most the sigmas a frame are doubled.
     """
     # In numpy: on ten numbers each of torch's operations takes longer than its arithmetic.
     moved, most = movement.numpy(), 2 * frames * sigmas.numpy()
@@ -106,22 +104,17 @@ def normalise(log_weights: Tensor) -> Tensor:
     NaN counts as impossible. When no particle is possible, all are equally likely: the filter then
     diffuses on without evidence instead of failing.
     """
-    if log_weights.device.type == "cpu":
-        return torch.from_numpy(_normalised(log_weights.numpy()))
-    w = log_weights.double().nan_to_num(nan=-math.inf, neginf=-math.inf, posinf=1e300)
-    top = w.amax(-1, keepdim=True)
-    w = torch.where(top.isfinite(), (w - top).exp(), torch.ones_like(w))
-    return w / w.sum(-1, keepdim=True)
-
-
-def _normalised(log_weights: np.ndarray) -> np.ndarray:
-    """The same on the CPU, where each of torch's operations takes longer than its arithmetic."""
-    w = np.where(np.isnan(log_weights), -np.inf, log_weights.astype(np.float64))
-    w = np.minimum(w, 1e300)
-    top = w.max(-1, keepdims=True)
-    w = np.exp(w - np.where(np.isfinite(top), top, np.inf)) + ~np.isfinite(top)
-    found: np.ndarray = w / w.sum(-1, keepdims=True)
-    return found
+    if log_weights.device.type == "cpu":  # where each of torch's operations takes longer
+        given = log_weights.numpy()
+        w = np.where(np.isnan(given), -np.inf, given.astype(np.float64))
+        w = np.minimum(w, 1e300)
+        top = w.max(-1, keepdims=True)
+        w = np.exp(w - np.where(np.isfinite(top), top, np.inf)) + ~np.isfinite(top)
+        return torch.from_numpy(w / w.sum(-1, keepdims=True))
+    x = log_weights.double().nan_to_num(nan=-math.inf, neginf=-math.inf, posinf=1e300)
+    most = x.amax(-1, keepdim=True)
+    x = torch.where(most.isfinite(), (x - most).exp(), torch.ones_like(x))
+    return x / x.sum(-1, keepdim=True)
 
 
 def effective_sample_size(weights: Tensor) -> Tensor:
@@ -129,28 +122,15 @@ def effective_sample_size(weights: Tensor) -> Tensor:
     return 1.0 / weights.square().sum()
 
 
-def systematic_positions(n: int, generator: torch.Generator) -> Tensor:
-    """(n,) float64, ascending in 0 .. 1: equal steps from one uniform offset on.
+def draw_positions(scheme: str, n: int, generator: torch.Generator) -> Tensor:
+    """(n,) float64, ascending in 0 .. 1, of a scheme in RESAMPLERS.
 
-    A particle of weight w then comes up floor or ceil(n w) times (Arulampalam et al. 2002,
-    algorithm 2).
+    "systematic": equal steps from one uniform offset on. A particle of weight w then comes up floor
+    or ceil(n w) times (Arulampalam et al. 2002, algorithm 2).  "stratified": one in each n-th.
     """
-    device = generator.device
-    offset = torch.rand(1, generator=generator, device=device, dtype=torch.float64)
+    device, count = generator.device, 1 if scheme == "systematic" else n
+    offset = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
     return (torch.arange(n, device=device) + offset) / n
-
-
-def stratified_positions(n: int, generator: torch.Generator) -> Tensor:
-    """(n,) float64, ascending in 0 .. 1: one in each n-th of it."""
-    device = generator.device
-    offset = torch.rand(n, generator=generator, device=device, dtype=torch.float64)
-    return (torch.arange(n, device=device) + offset) / n
-
-
-RESAMPLERS: dict[str, Callable[[int, torch.Generator], Tensor]] = {
-    "systematic": systematic_positions,
-    "stratified": stratified_positions,
-}
 
 
 def annealed(
@@ -178,7 +158,7 @@ def annealed(
     for number in range(settings.passes):
         drawn = []
         for row, generator in enumerate(generators):
-            positions = RESAMPLERS[settings.resampling](n, generator)
+            positions = draw_positions(settings.resampling, n, generator)
             noise = torch.randn((n, size), generator=generator, device=device)
             tangents = noise * (sigmas[row] * settings.shrink**number)
             given = particles[row], weights[row], positions, tangents

@@ -34,9 +34,8 @@ class Quality:
 
     threads: at most. Beside another program that takes a core, helpers are waited for longer than
         they help.
-    every: frames from one detection of a believed hand to the next.
-    search: likewise from one search of the whole image to the next, while none is.
-    places: that are looked at in a search, at most.
+    every: frames from one detection of a believed hand to the next.  search: likewise from one
+        search of the whole image to the next, while none is.  places: looked at in it, at most.
     """
 
     threads: int | None = None
@@ -61,11 +60,9 @@ REDUCED = 2
 class Pace:
     """How long frames take, and what follows for the next one.
 
-    budget_s: seconds that a frame may take; None = as long as it takes.
-    level: of LEVELS.
+    budget_s: seconds that a frame may take; None = as long as it takes.  level: of LEVELS.
     mean_s: of the frames at this level, the newest counting most.  frames: how many those are.
-    easy: how many of them in a row were at ease.
-    patience: frames at ease before more is tried.
+    easy: how many of them in a row were at ease.  patience: how many before more is tried.
     trying: more was tried, and has not proved to be possible yet.
     """
 
@@ -117,10 +114,7 @@ class Pace:
 
 
 def pace_within(budget_ms: float | None) -> Pace:
-    """A pace of tracker.budget_ms; None = a frame takes as long as it takes.
-
-    Raises ToftrackError where that is no budget.
-    """
+    """A pace of tracker.budget_ms; ToftrackError where that is no budget."""
     if budget_ms is None:
         return Pace()
     check_number("tracker.budget_ms", budget_ms, 0, above=True)
@@ -131,8 +125,6 @@ class Timekeeper:
     """Measures a tracker's frames, and says what may be spent on the next one.
 
     pace: as of the last frame.  reduced: frames from which something was left out.
-
-    pace: before the first frame.
     clock: seconds that never go back.
     """
 

@@ -1,4 +1,4 @@
-"""Rigid motions of particles in plain torch, the reference: offsets, their sum, mean rotations.
+"""How particles are moved, and drawn anew by their weights, in plain torch, the reference.
 
 A particle is a row of an (N, 6 + d) tensor: the wrist's translation (3, m), rotation vector
 (3, rad) and d further coordinates, which are simply added.
@@ -11,22 +11,41 @@ the hand, so that turning the hand does not also carry it away, as turning about
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.redraw import Motions, redraw_with
 from toftrack.compute.rotations import rotvec_composition, unitquat_to_rotvec
 from toftrack.compute.transfer import on_host, table
 
 PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
 _X, _Y, _Z = PIVOT_M
+BOUNDS = ("truncate", "reflect")
+Redraw = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, str], Tensor]
+"""See `redraw_with`, without the motion."""
+
+
+class Motions(NamedTuple):
+    """The operations that every back end has.
+
+    compose: reference particles and tangent offsets, (N, 6 + d) or broadcast, to particles.
+    difference: particles (N, 6 + d) and one reference (1, 6 + d) to tangent offsets (N, 6 + d).
+    redraw: particles anew from weighted ones.
+    mean: particles (N, 6 + d) and weights (N,) to their mean (1, 6 + d), which is on the CPU.
+    """
+
+    compose: Callable[[Tensor, Tensor], Tensor]
+    difference: Callable[[Tensor, Tensor], Tensor]
+    redraw: Redraw
+    mean: Callable[[Tensor, Tensor], Tensor]
 
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
-    """Particles at tangent offsets from reference particles; (N, 6 + d) or broadcast, each."""
+    """See Motions."""
     reference, tangent = torch.broadcast_tensors(reference, tangent)
     rotvec = rotvec_composition(tangent[:, 3:6], reference[:, 3:6])
     translation = _pivot(reference) + tangent[:, :3] - rotated_pivot(rotvec)
@@ -34,7 +53,7 @@ def compose(reference: Tensor, tangent: Tensor) -> Tensor:
 
 
 def difference(particles: Tensor, reference: Tensor) -> Tensor:
-    """Tangent offsets of particles from one reference, (N, 6 + d) and (1, 6 + d) to (N, 6 + d)."""
+    """See Motions."""
     inverse = -reference[:, 3:6].expand(len(particles), 3)
     turn = rotvec_composition(particles[:, 3:6], inverse)
     move = _pivot(particles) - _pivot(reference)
@@ -70,32 +89,71 @@ def _pivot(particles: Tensor) -> Tensor:
     return particles[:, :3] + rotated_pivot(particles[:, 3:6])
 
 
-def rotation_scatter(rotvec: Tensor, weights: Tensor) -> Tensor:
-    """What `main_rotation` needs to know of (N, 3) rotations of (N,) weights, (4, 4) float64."""
-    half = 0.5 * rotvec.double()
+def mean(particles: Tensor, weights: Tensor) -> Tensor:
+    """See Motions; the rotation's on SO(3).
+
+    That is the one nearest to the mean matrix (chordal L2 mean; Hartley et al., "Rotation
+    averaging", IJCV 2013), whose quaternion is the main axis of all quaternions, whatever their
+    signs (Markley et al., JGCD 2007).
+    """
+    found = (weights.to(particles.dtype) @ particles)[None]
+    half = 0.5 * particles[:, 3:6].double()
     angle = half.norm(dim=1, keepdim=True)
     q = torch.cat((half * (angle / torch.pi).sinc(), angle.cos()), 1)
-    # The quaternion of the rotation nearest to the mean matrix (chordal L2 mean; Hartley et al.,
-    # "Rotation averaging", IJCV 2013) is the main axis of all quaternions, whatever their signs
-    # (Markley et al., JGCD 2007).
-    return (q * weights[:, None]).mT @ q
-
-
-def main_rotation(scatter: Tensor) -> Tensor:
-    """The mean rotation (3,) of what `rotation_scatter` has summed up, float64.
-
-    The rotation nearest to the mean matrix (chordal L2 mean; Hartley et al., "Rotation averaging",
-    IJCV 2013).
-    """
-    return unitquat_to_rotvec(torch.linalg.eigh(scatter).eigenvectors[:, -1])
-
-
-def mean(particles: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean, (N, 6 + d) and (N,) to (1, 6 + d) on the CPU, the rotation's on SO(3)."""
-    found = (weights.to(particles.dtype) @ particles)[None]
-    found, scatter = on_host(found, rotation_scatter(particles[:, 3:6], weights))
-    found[0, 3:6] = main_rotation(scatter).to(found.dtype)
+    found, scatter = on_host(found, (q * weights[:, None]).mT @ q)
+    main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
+    found[0, 3:6] = unitquat_to_rotvec(main).to(found.dtype)
     return found
+
+
+def pick(weights: Tensor, positions: Tensor) -> Tensor:
+    """Which of M weighted particles lie at positions, (M,) and (n,) ascending to (n,) int64.
+
+    positions: in 0 .. 1, of the sum of the weights.
+    """
+    total = weights.double().cumsum(0)
+    # Relative to the sum that was really reached, so that rounding cannot leave a gap at the end.
+    indices = torch.searchsorted(total, positions * total[-1], right=True)
+    # The last index that has weight: one past the end is only ever a rounding.
+    last = torch.searchsorted(total, total[-1:])
+    return torch.minimum(indices, last)
+
+
+def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
+    """Keep latent coordinates in their box, (N, d).
+
+    mode: of BOUNDS. "truncate" moves what is outside onto the bound, as the paper, which draws
+        estimates near a bound away from where they should be and piles particles up on it;
+        "reflect" folds it back.
+    """
+    if mode == "truncate":
+        return torch.minimum(torch.maximum(latent, lower), upper)
+    width = upper - lower
+    folded = torch.remainder(latent - lower, 2 * width)
+    return lower + torch.minimum(folded, 2 * width - folded)
+
+
+def redraw_with(compose: Callable[[Tensor, Tensor], Tensor]) -> Redraw:
+    """Draws that move particles by a motion (paper, section 2.3)."""
+
+    def redraw(
+        particles: Tensor,
+        weights: Tensor,
+        positions: Tensor,
+        tangents: Tensor,
+        lower: Tensor,
+        upper: Tensor,
+        mode: str,
+    ) -> Tensor:
+        """(M, 6 + d) particles of weights (M,) at positions (n,), moved: (n, 6 + d).
+
+        positions, lower, upper, mode: see pick and bound.  tangents: (n, 6 + d) of the moves.
+        """
+        moved = compose(particles[pick(weights, positions)], tangents)
+        moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
+        return moved
+
+    return redraw
 
 
 MOTIONS = Motions(compose, difference, redraw_with(compose), mean)

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import compiled, entry_point
-from toftrack.compute.redraw import Motions
-from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rigid import PIVOT_M, Motions, redraw_with
 
 _PIVOT = np.array(PIVOT_M)
 
@@ -85,27 +84,22 @@ def turned(q, x, y, z):
     )
 
 
-@compiled
-def compose_row(r, t, pivot, out):
-    """One row of compose_rows."""
-    before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
-    turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
-    after = product(turn, before)
-    old = turned(before, pivot[0], pivot[1], pivot[2])
-    new = turned(after, pivot[0], pivot[1], pivot[2])
-    vector = rotation_vector(after)
-    for j in range(3):
-        out[j] = r[j] + old[j] + t[j] - new[j]
-        out[3 + j] = vector[j]
-    for j in range(6, len(out)):
-        out[j] = r[j] + t[j]
-
-
 @entry_point
 def compose_rows(reference, tangent, pivot, out):
     """See rigid.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
     for i in range(len(out)):
-        compose_row(reference[i], tangent[i], pivot, out[i])
+        r, t = reference[i], tangent[i]
+        before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
+        turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
+        after = product(turn, before)
+        old = turned(before, pivot[0], pivot[1], pivot[2])
+        new = turned(after, pivot[0], pivot[1], pivot[2])
+        vector = rotation_vector(after)
+        for j in range(3):
+            out[i, j] = r[j] + old[j] + t[j] - new[j]
+            out[i, 3 + j] = vector[j]
+        for j in range(6, out.shape[1]):
+            out[i, j] = r[j] + t[j]
 
 
 @entry_point
@@ -185,23 +179,13 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
 
     frames_out: (N, 16, 3, 3) float32 for their frames, or (0, 16, 3, 3).
     """
-    frames, posed, state = (
-        np.empty((16, 3, 3), np.float64),
-        np.empty((21, 3), np.float64),
-        np.empty(27, np.float64),
-    )
+    frames, posed, state = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty(27)
     for i in range(len(states)):
-        for j in range(27):
-            state[j] = states[i, j]
+        state[:] = states[i]
         pose_hand(state, base_frames, base, lengths, mirror, frames, posed)
-        for j in range(21):
-            for k in range(3):
-                joints[i, j, k] = posed[j, k]
+        joints[i] = posed
         if i < len(frames_out):
-            for j in range(16):
-                for row in range(3):
-                    for column in range(3):
-                        frames_out[i, j, row, column] = frames[j, row, column]
+            frames_out[i] = frames
 
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
@@ -219,32 +203,6 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return torch.from_numpy(out)
 
 
-def redraw(
-    particles: Tensor,
-    weights: Tensor,
-    positions: Tensor,
-    tangents: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    mode: str,
-) -> Tensor:
-    """See redraw.redraw_with; on the CPU, in float32."""
-    total = weights.double().numpy().cumsum()
-    chosen = np.searchsorted(total, positions.numpy() * total[-1], side="right")
-    # The last particle that has weight: one past the end is only ever a rounding.
-    chosen = np.minimum(chosen, np.searchsorted(total, total[-1]))
-    out = np.empty(tangents.shape, np.float32)
-    compose_rows(_rows(particles)[chosen], _rows(tangents), _PIVOT, out)
-    low, high = lower.numpy(), upper.numpy()
-    if mode == "reflect":
-        wide = high - low
-        folded = np.remainder(out[:, 6:] - low, 2 * wide)
-        out[:, 6:] = low + np.minimum(folded, 2 * wide - folded)
-    else:
-        out[:, 6:] = out[:, 6:].clip(low, high)
-    return torch.from_numpy(out)
-
-
 def mean(particles: Tensor, weights: Tensor) -> Tensor:
     """See rigid.mean; on the CPU, in float32."""
     rows, shares = particles.double().numpy(), weights.double().numpy()
@@ -253,7 +211,7 @@ def mean(particles: Tensor, weights: Tensor) -> Tensor:
     angle = np.sqrt((half * half).sum(1, keepdims=True))
     q = np.concatenate((np.sinc(angle / math.pi) * half, np.cos(angle)), 1)
     scatter = (q * shares[:, None]).T @ q
-    # The mean rotation's quaternion is the main axis of all, see rigid.rotation_scatter.
+    # The mean rotation's quaternion is the main axis of all, see rigid.mean.
     found[3:6] = np.nan
     if np.isfinite(scatter).all():
         main = np.linalg.eigh(scatter)[1][:, -1]
@@ -269,4 +227,4 @@ def _rows(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.numpy(), np.float32)
 
 
-MOTIONS = Motions(compose, difference, redraw, mean)
+MOTIONS = Motions(compose, difference, redraw_with(compose), mean)

@@ -11,8 +11,7 @@ import triton.language as tl
 from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.redraw import Motions, redraw_with
-from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rigid import PIVOT_M, Motions, redraw_with
 
 _BLOCK = 64
 
@@ -74,72 +73,69 @@ def _turned(x, y, z, w, u, v, s):
 
 
 @triton.jit
+def _pose(row, inside):
+    """Translation and quaternion of a particle or of an offset."""
+    x = tl.load(row, mask=inside, other=0.0)
+    y = tl.load(row + 1, mask=inside, other=0.0)
+    z = tl.load(row + 2, mask=inside, other=0.0)
+    a = tl.load(row + 3, mask=inside, other=0.0)
+    b = tl.load(row + 4, mask=inside, other=0.0)
+    c = tl.load(row + 5, mask=inside, other=0.0)
+    qx, qy, qz, qw = _quaternion(a, b, c)
+    return x, y, z, qx, qy, qz, qw
+
+
+@triton.jit
+def _write(to, inside, x, y, z, qx, qy, qz, qw):
+    a, b, c = _rotation_vector(qx, qy, qz, qw)
+    tl.store(to, x, mask=inside)
+    tl.store(to + 1, y, mask=inside)
+    tl.store(to + 2, z, mask=inside)
+    tl.store(to + 3, a, mask=inside)
+    tl.store(to + 4, b, mask=inside)
+    tl.store(to + 5, c, mask=inside)
+
+
+@triton.jit
 def compose_kernel(
     reference, tangent, out, n, size, reference_step, tangent_step, u, v, s, BLOCK: tl.constexpr
 ):
     """Particles (N, size) at tangent offsets from others; a step of 0 is one row for all.
 
-    u, v, s: the pivot in the hand frame, metres.
+    u, v, s: the pivot.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
-    r, t = reference + i.to(tl.int64) * reference_step, tangent + i.to(tl.int64) * tangent_step
-    to = out + i.to(tl.int64) * size
-    a = tl.load(r + 3, mask=inside, other=0.0)
-    b = tl.load(r + 4, mask=inside, other=0.0)
-    c = tl.load(r + 5, mask=inside, other=0.0)
-    bx, by, bz, bw = _quaternion(a, b, c)
-    a = tl.load(t + 3, mask=inside, other=0.0)
-    b = tl.load(t + 4, mask=inside, other=0.0)
-    c = tl.load(t + 5, mask=inside, other=0.0)
-    tx, ty, tz, tw = _quaternion(a, b, c)
-    ax, ay, az, aw = _product(tx, ty, tz, tw, bx, by, bz, bw)
-    old_u, old_v, old_s = _turned(bx, by, bz, bw, u, v, s)
-    new_u, new_v, new_s = _turned(ax, ay, az, aw, u, v, s)
-    a, b, c = _rotation_vector(ax, ay, az, aw)
-    x = tl.load(r, mask=inside, other=0.0) + tl.load(t, mask=inside, other=0.0)
-    y = tl.load(r + 1, mask=inside, other=0.0) + tl.load(t + 1, mask=inside, other=0.0)
-    z = tl.load(r + 2, mask=inside, other=0.0) + tl.load(t + 2, mask=inside, other=0.0)
-    tl.store(to, x + old_u - new_u, mask=inside)
-    tl.store(to + 1, y + old_v - new_v, mask=inside)
-    tl.store(to + 2, z + old_s - new_s, mask=inside)
-    tl.store(to + 3, a, mask=inside)
-    tl.store(to + 4, b, mask=inside)
-    tl.store(to + 5, c, mask=inside)
+    at = i.to(tl.int64)
+    r, t, to = reference + at * reference_step, tangent + at * tangent_step, out + at * size
+    x, y, z, qx, qy, qz, qw = _pose(r, inside)
+    tx, ty, tz, px, py, pz, pw = _pose(t, inside)
+    px, py, pz, pw = _product(px, py, pz, pw, qx, qy, qz, qw)
+    old_u, old_v, old_s = _turned(qx, qy, qz, qw, u, v, s)
+    new_u, new_v, new_s = _turned(px, py, pz, pw, u, v, s)
+    x, y, z = x + tx + old_u - new_u, y + ty + old_v - new_v, z + tz + old_s - new_s
+    _write(to, inside, x, y, z, px, py, pz, pw)
     for j in range(6, size):
         sum_ = tl.load(r + j, mask=inside, other=0.0) + tl.load(t + j, mask=inside, other=0.0)
         tl.store(to + j, sum_, mask=inside)
 
 
 @triton.jit
-def difference_kernel(particles, reference, out, n, size, step, u, v, s, BLOCK: tl.constexpr):
+def difference_kernel(particles, reference, out, n, size, u, v, s, BLOCK: tl.constexpr):
     """Tangent offsets (N, size) of particles from one other, see compose_kernel."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
-    r, to = particles + i.to(tl.int64) * step, out + i.to(tl.int64) * size
-    px, py, pz, pw = _quaternion(
-        tl.load(r + 3, mask=inside, other=0.0),
-        tl.load(r + 4, mask=inside, other=0.0),
-        tl.load(r + 5, mask=inside, other=0.0),
-    )
-    qx, qy, qz, qw = _quaternion(
-        tl.load(reference + 3), tl.load(reference + 4), tl.load(reference + 5)
-    )
-    tx, ty, tz, tw = _product(px, py, pz, pw, -qx, -qy, -qz, qw)
+    at = i.to(tl.int64)
+    p, r, to = particles + at * size, reference + at * 0, out + at * size
+    x, y, z, px, py, pz, pw = _pose(p, inside)
+    rx, ry, rz, qx, qy, qz, qw = _pose(r, inside)
     old_u, old_v, old_s = _turned(qx, qy, qz, qw, u, v, s)
     new_u, new_v, new_s = _turned(px, py, pz, pw, u, v, s)
-    a, b, c = _rotation_vector(tx, ty, tz, tw)
-    x = tl.load(r, mask=inside, other=0.0) - tl.load(reference)
-    y = tl.load(r + 1, mask=inside, other=0.0) - tl.load(reference + 1)
-    z = tl.load(r + 2, mask=inside, other=0.0) - tl.load(reference + 2)
-    tl.store(to, x + new_u - old_u, mask=inside)
-    tl.store(to + 1, y + new_v - old_v, mask=inside)
-    tl.store(to + 2, z + new_s - old_s, mask=inside)
-    tl.store(to + 3, a, mask=inside)
-    tl.store(to + 4, b, mask=inside)
-    tl.store(to + 5, c, mask=inside)
+    px, py, pz, pw = _product(px, py, pz, pw, -qx, -qy, -qz, qw)
+    x, y, z = x - rx + new_u - old_u, y - ry + new_v - old_v, z - rz + new_s - old_s
+    _write(to, inside, x, y, z, px, py, pz, pw)
     for j in range(6, size):
-        off = tl.load(r + j, mask=inside, other=0.0) - tl.load(reference + j)
+        off = tl.load(p + j, mask=inside, other=0.0) - tl.load(r + j, mask=inside, other=0.0)
         tl.store(to + j, off, mask=inside)
 
 
@@ -160,7 +156,7 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     rows = [given.float().contiguous() for given in (particles, reference)]
     out = torch.empty(n, size, device=particles.device)
     grid = (triton.cdiv(n, _BLOCK),)
-    difference_kernel[grid](*rows, out, n, size, size, *PIVOT_M, BLOCK=_BLOCK)
+    difference_kernel[grid](*rows, out, n, size, *PIVOT_M, BLOCK=_BLOCK)
     return out
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.pace import FRAME_S
-from toftrack.compute.redraw import Motions
+from toftrack.compute.rigid import Motions
 from toftrack.hand.skeleton import ANGLE_NAMES, FINGERS
 
 _GROUP = np.array([5, 5, 5, 6, 6, 6, *(FINGERS.index(name.split("_")[0]) for name in ANGLE_NAMES)])

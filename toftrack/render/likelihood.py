@@ -29,19 +29,17 @@ NAMINGS = ("printed", "standard")
 class FMeasure:
     """The paper's F-measure of correct, false and missed pixels.
 
-    tolerance_m: a model pixel is correct when its depth is within this of the image's (the paper:
-        0.02).
-    neighbourhood_m: missed pixels count up to this distance from the silhouette, at the hand's
-        depth ("in proportion to the finger's length": about a third of a finger).
+    tolerance_m: a model pixel this near to the image's depth is correct (the paper: 0.02).
+    neighbourhood_m: how far from the silhouette, at the hand's depth, pixels are missed ("in
+        proportion to the finger's length": about a third of a finger).
     beta: weight of the second of the two rates (paper: 1.5).
-    naming: the paper prints precision = c / (c + missed) and recall = c / (c + false), so its
+    naming: the paper prints precision = c / (c + missed) and recall = c / (c + false), so that
         beta > 1 punishes *false* pixels more, while its text wants more penalty for missed ones.
-        "printed" is the paper's formula, "standard" the usual names (beta > 1 punishes missed
-        more).
+        "printed" is the paper's formula, "standard" the usual names.
     residual_weight: how much of a correct pixel is lost at the edge of the depth tolerance,
         0 (paper, all or nothing) .. 1 (a parabola that falls to 0).
-    coverage: how much hypotheses are preferred that explain more of the image. The F-measure is
-        content with a hand of which only a few pixels lie inside the image.
+    coverage: how much hypotheses are preferred that explain more of the image: the F-measure is
+        content with a hand of which only a few pixels lie inside of it.
     """
 
     tolerance_m: float
@@ -65,16 +63,23 @@ class FMeasure:
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
         # A model surface at an occluder is hidden, not false; at another hand only behind it.
-        other = None if observation.other is None else observation.other.cpu().numpy()
         given = observation.depth_m, observation.hand, observation.occluder
-        depth, hand, occluder = (one.cpu().numpy() for one in given)
+        depth_m, hand, occluder = (image.cpu().numpy() for image in given)
+        front, tolerance_m = np.zeros_like(depth_m), np.float32(self.tolerance_m)
+        if observation.other is not None:
+            read = observation.other.cpu().numpy() & (depth_m > 0)
+            front[read] = 1 / depth_m[read]
+        front[occluder] = np.inf
         if observation.thing is not None:
-            occluder = occluder | observation.thing.cpu().numpy()
-        images = _images(depth, hand, occluder, other, np.float32(self.tolerance_m))
+            front[observation.thing.cpu().numpy()] = np.inf
+        low, high = np.full_like(depth_m, np.inf), np.full_like(depth_m, -np.inf)
+        z = depth_m[hand]
+        low[hand], high[hand] = 1 / (z + tolerance_m), 1 / np.maximum(z - tolerance_m, _LEAST_M)
         device = observation.depth_m.device
-        low, high, front = (torch.from_numpy(image).to(device) for image in images)
-        radius = self.neighbourhood_m * float(observation.k[0, 0]) / self._distance(observation)
-        return Evidence(low, high, front, observation.hand, observation.k, radius)
+        lowest, highest, hidden = (torch.from_numpy(a).to(device) for a in (low, high, front))
+        distance_m = 1.0 if observation.empty else observation.nearest_m
+        radius = self.neighbourhood_m * float(observation.k[0, 0]) / distance_m
+        return Evidence(lowest, highest, hidden, observation.hand, observation.k, radius)
 
     def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
         """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct).
@@ -83,19 +88,15 @@ class FMeasure:
         """
         coverage = self.coverage if coverage is None else coverage
         if counts.correct.device.type == "cpu":
-            return torch.from_numpy(self._log_score(counts, coverage))
+            host = _host(counts)
+            with np.errstate(divide="ignore"):
+                found: np.ndarray = np.log(self._f_measure(*host))
+                if coverage:
+                    found = found + np.float32(coverage) * np.log(host[0])
+            return torch.from_numpy(found)
         score = self.score(counts).log()
         # 0 times the logarithm of no correct pixel would be NaN, and the largest of all.
         return score + coverage * counts.correct.log() if coverage else score
-
-    def _log_score(self, counts: Counts, coverage: float) -> np.ndarray:
-        host = _host(counts)
-        with np.errstate(divide="ignore"):
-            score: np.ndarray = np.log(self._f_measure(*host))
-            return score + np.float32(coverage) * np.log(host[0]) if coverage else score
-
-    def _distance(self, observation: Observation) -> float:
-        return observation.nearest_m if not observation.empty else 1.0
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
@@ -113,26 +114,6 @@ class FMeasure:
         rest = b2 * false + missed if printed else false + b2 * missed
         weighted = (1 + b2) * correct
         return weighted / (weighted + rest).clip(min=1e-9)
-
-
-def _images(
-    depth_m: np.ndarray,
-    hand: np.ndarray,
-    occluder: np.ndarray,
-    other: np.ndarray | None,
-    tolerance_m: np.float32,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Low, high and occluder of Evidence, (H, W) float32, of masks (H, W)."""
-    low, high = np.full_like(depth_m, np.inf), np.full_like(depth_m, -np.inf)
-    z = depth_m[hand]
-    low[hand] = 1 / (z + tolerance_m)
-    high[hand] = 1 / np.maximum(z - tolerance_m, _LEAST_M)
-    front = np.zeros_like(depth_m)
-    if other is not None:
-        read = other & (depth_m > 0)
-        front[read] = 1 / depth_m[read]
-    front[occluder] = np.inf
-    return low, high, front
 
 
 def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -7,11 +7,11 @@ import functools
 import numpy as np
 import torch
 
+from toftrack.compute.compiling import entry_point
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
 from toftrack.render.closed_form import _NEAREST_M
-from toftrack.render.numba.drawing import draw
 
 
 @functools.lru_cache(maxsize=4)
@@ -46,15 +46,42 @@ def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) 
     x = (np.arange(width, dtype=np.float32) - k[0, 2]) / k[0, 0]
     y = (np.arange(height, dtype=np.float32) - k[1, 2]) / k[1, 1]
     image = np.zeros((height, width), np.float32)
-    draw(linear, quadratic, boxes, x, y, image)
+    _draw(linear, quadratic, boxes, x, y, image)
     return image
+
+
+@entry_point
+def _draw(linear, quadratic, boxes, x, y, image):
+    """Z of the nearest of E ellipsoids, into an image of zeros.
+
+    linear, quadratic, boxes: see _projected.  x, y: slopes of the columns' and rows' rays.
+    """
+    height, width = image.shape
+    for e in range(len(boxes)):
+        left, right, top, bottom = boxes[e]
+        if right <= left or bottom <= top:
+            continue
+        line, q = linear[e], quadratic[e]
+        for row in range(max(0, top - 1), min(height, bottom + 1)):
+            py = y[row]
+            for column in range(max(0, left - 1), min(width, right + 1)):
+                px = x[column]
+                square = (q[0, 0] * px + 2 * q[0, 2]) * px + (q[1, 1] * py + 2 * q[1, 2]) * py
+                square += q[2, 2] + 2 * q[0, 1] * px * py
+                if square >= 0:
+                    u = line[0] * px + line[1] * py + line[2] + np.sqrt(square)
+                    image[row, column] = max(image[row, column], u)
+    for row in range(height):
+        for column in range(width):
+            if image[row, column] > 0:
+                image[row, column] = 1 / image[row, column]
 
 
 def _projected(
     ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linear (E, 3) and quadratic (E, 3, 3) parts of inverse depths, and boxes (E, 4), as
-    closed_form.project, which takes as long for one hand as all the drawing, and its dual conics.
+    """Linear (E, 3) and quadratic (E, 3, 3) parts of inverse depths, as closed_form.project, which
+    takes as long for one hand as all the drawing; and boxes (E, 4): left, right, top, bottom.
     """
     centres, axes = ellipsoids.centres_m[0].numpy(), ellipsoids.axes_m[0].numpy()
     turned = axes.swapaxes(1, 2)

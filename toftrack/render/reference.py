@@ -10,33 +10,13 @@ import math
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
 from toftrack.render.closed_form import pixel_rays, render_range_images
-from toftrack.render.scoring import Counts, Evidence
-
-
-def dilate_disc(mask: Tensor, radius_px: float) -> Tensor:
-    """(N, H, W) bool: pixels within a Euclidean distance of the mask, as the exact distance
-    transform.
-
-    A disc is a horizontal run for each row offset: one running maximum and one shift per row.
-    """
-    image = mask[:, None].float()
-    height = mask.shape[1]
-    out = torch.zeros_like(image)
-    for dy in range(-int(radius_px), int(radius_px) + 1):
-        half = int(math.sqrt(radius_px**2 - dy**2))
-        rows = F.max_pool2d(image, (1, 2 * half + 1), stride=1, padding=(0, half))
-        low, high = max(0, dy), min(height, height + dy)
-        if high > low:
-            target = out[:, :, low - dy : high - dy]
-            torch.maximum(target, rows[:, :, low:high], out=target)
-    return out[:, 0] > 0
+from toftrack.render.scoring import Counts, Evidence, compare, dilate_disc
 
 
 def step_range_images(
@@ -95,23 +75,9 @@ def classify_range_images(
     reach: (N, H, W) bool, pixels within the evidence's radius of the surface.
     """
     model = depth_m > 0
-    u = torch.where(model, 1.0 / depth_m, 0.0)
-    correct = model & (u >= evidence.low) & (u <= evidence.high)
-    false = model & ~correct & (u >= evidence.occluder)
+    correct, false, _ = compare(torch.where(model, 1.0 / depth_m, 0.0), evidence)
     near = reach & ~model & ~wrist
     return PixelClasses(correct, false, evidence.hand & near, near)
-
-
-def count_range_images(depth_m: Tensor, wrist: Tensor, evidence: Evidence) -> Counts:
-    """Counts of given range images; depth_m and wrist as for `classify_range_images`."""
-    reach = dilate_disc(depth_m > 0, evidence.radius_px)
-    correct, false, missed, _ = classify_range_images(depth_m, wrist, reach, evidence)
-    u = torch.where(correct, 1.0 / depth_m, 0.0)
-    middle, half = (evidence.low + evidence.high) / 2, (evidence.high - evidence.low) / 2
-    residual = torch.where(correct, ((u - middle) / half).square(), 0.0)
-    return Counts(
-        *(image.flatten(1).sum(1).float() for image in (correct, false, missed, residual))
-    )
 
 
 class ReferenceScorer:
@@ -124,25 +90,25 @@ class ReferenceScorer:
         self.shape = shape
         self.surface: HandSurface = hand_surface(shape)
         self.chunk = chunk
-        self.stepping = stepping
+        self.render = step_range_images if stepping else render_range_images
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer."""
-        height, width = evidence.hand.shape
-        k = evidence.k.to(states.dtype)
-        parts = []
-        for part in states.split(self.chunk):
-            both = self.surface.pose(forward_kinematics(part, self.shape))
-            hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
-            wrist = Ellipsoids(both.centres_m[:, -1:], both.axes_m[:, -1:])
-            render = step_range_images if self.stepping else render_range_images
-            parts.append(
-                count_range_images(
-                    render(hand, k, height, width),
-                    render_range_images(wrist, k, height, width) > 0,
-                    evidence,
-                )
-            )
-        if not parts:
-            return Counts(*(states.new_zeros(0) for _ in range(4)))
-        return Counts(*(torch.cat(field) for field in zip(*parts, strict=True)))
+        parts = [self._score(part, evidence) for part in states.split(self.chunk)]
+        return Counts(*torch.cat(parts, 1)) if len(states) else Counts(*states.new_zeros(4, 0))
+
+    def _score(self, states: Tensor, evidence: Evidence) -> Tensor:
+        """(4, N) counts of one chunk."""
+        both = self.surface.pose(forward_kinematics(states, self.shape))
+        hand, wrist = (
+            Ellipsoids(both.centres_m[:, part], both.axes_m[:, part])
+            for part in (slice(-1), slice(-1, None))
+        )
+        view = evidence.k.to(states.dtype), *evidence.hand.shape
+        depth_m = self.render(hand, *view)
+        on_wrist = render_range_images(wrist, *view) > 0
+        reach = dilate_disc(depth_m > 0, evidence.radius_px)
+        correct, false, missed, _ = classify_range_images(depth_m, on_wrist, reach, evidence)
+        residual = compare(torch.where(depth_m > 0, 1.0 / depth_m, 0.0), evidence)[2]
+        images = correct, false, missed, residual
+        return torch.stack([image.flatten(1).sum(1).float() for image in images])

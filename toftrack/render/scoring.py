@@ -121,3 +121,28 @@ def disc_steps(square: int, height: int, width: int) -> np.ndarray:
         steps += [(1, 0)] * max(grow - 1, 0)
         steps.append((min(grow, 1), dy if dy < len(halves) - 1 else 0))
     return np.array(steps, np.int64)
+
+
+def dilate_disc(mask: Tensor, radius_px: float) -> Tensor:
+    """(N, H, W) bool: pixels within a Euclidean distance of the mask, by `disc_steps`."""
+    size = mask.shape[1:]
+    out = mask.clone()
+    for grow, dy in disc_steps(disc_square(radius_px, *size), *size).tolist():
+        if grow:
+            wider = out.clone()
+            wider[..., 1:] |= out[..., :-1]
+            wider[..., :-1] |= out[..., 1:]
+            out = wider
+        if dy:
+            out[:, dy:] |= mask[:, :-dy]
+            out[:, :-dy] |= mask[:, dy:]
+    return out
+
+
+def compare(u: Tensor, evidence: Evidence) -> tuple[Tensor, Tensor, Tensor]:
+    """Correct and false pixels and the residual's image of inverse depths (N, H, W), 0 = none."""
+    model = u > 0
+    correct = model & (u >= evidence.low) & (u <= evidence.high)
+    false = model & ~correct & (u >= evidence.occluder)
+    middle, half = (evidence.low + evidence.high) / 2, (evidence.high - evidence.low) / 2
+    return correct, false, torch.where(correct, ((u - middle) / half).square(), 0.0)

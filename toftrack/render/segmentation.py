@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,6 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
-from toftrack.render.numba.median import thinned
 
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""
@@ -22,15 +22,12 @@ _NEAREST_M = 0.05
 class Observation:
     """What the likelihood sees of one frame.
 
-    depth_m: (H, W) Z in metres, 0 = no reading; the whole scene.
+    depth_m: (H, W) Z in metres, 0 = no reading; the whole scene.  k: (3, 3) its intrinsics.
     hand: (H, W) bool, the pixels taken for the hand (and the arm it hangs on).
     occluder: (H, W) bool, surfaces in front of where the hand is expected: they hide it.
-    k: (3, 3) intrinsics of this image, which may be a crop or a reduction of the camera's.
     nearest_m: depth of the nearest surface, `inf` when nothing is in range.
-    other: (H, W) bool, pixels of another hand that is tracked as well; None where there is none. It
-        hides what is behind it.
-    thing: (H, W) bool, pixels of a thing in the hand; None where there is none. Fingers may be
-        behind it, so that these pixels say nothing.
+    other: (H, W) bool, pixels of another tracked hand, which hides what is behind it.
+    thing: (H, W) bool, pixels of a thing in the hand, which say nothing: fingers may be behind.
     """
 
     depth_m: Tensor
@@ -48,24 +45,16 @@ class Observation:
 
     def to(self, device: torch.device) -> Observation:
         """The same observation on another device."""
-        return replace(
-            self,
-            depth_m=self.depth_m.to(device),
-            hand=self.hand.to(device),
-            occluder=self.occluder.to(device),
-            k=self.k.to(device),
-            other=None if self.other is None else self.other.to(device),
-            thing=None if self.thing is None else self.thing.to(device),
-        )
+        parts = vars(self).items()
+        moved: dict[str, Any] = {
+            name: part.to(device) for name, part in parts if isinstance(part, Tensor)
+        }
+        return replace(self, **moved)
 
 
 @dataclass(frozen=True)
 class Expected:
-    """Where the surface of a hand is expected, metres.
-
-    nearest_m, farthest_m: the depths of its joints.
-    centre_m: the middle of the hand in the camera frame; None where only depths are known.
-    """
+    """The depths of an expected hand's joints, and its middle in the camera frame where known."""
 
     nearest_m: float
     farthest_m: float
@@ -76,15 +65,13 @@ class Expected:
 class NearestSurface:
     """The nearest thing in front of the camera is the hand (paper, section 2.1).
 
-    depth_range_m: everything that is more than this behind the nearest point is dropped (the
-        paper: 0.20).
-    min_area_m2: the nearest point must belong to a surface of at least this area, so that noisy and
-        flying pixels are no hand. 0 takes the single nearest pixel, as the paper.
+    depth_range_m: what is farther behind the nearest point is dropped (the paper: 0.20).
+    min_area_m2: of the surface that the nearest point belongs to, so that noisy and flying pixels
+        are no hand; 0 = the single nearest pixel, as the paper.
     max_distance_m: nothing beyond this is a hand.
-    occluder_margin_m: what is more than this in front of the nearest point of a tracked hand hides
-        it; 0 knows no occluders, as the paper.
-    reach_m: what lies farther than this beside the middle of an expected hand is none of it, and
-        hides nothing of it; inf knows no such place, as the paper.
+    occluder_margin_m: what is farther in front of a tracked hand hides it; 0 = none, as the paper.
+    reach_m: what lies farther beside the middle of an expected hand is none of it, and hides
+        nothing of it; inf = nowhere, as the paper.
     max_pixels: images with more pixels are reduced by a whole factor to at most this many.
     """
 
@@ -205,11 +192,9 @@ def reduce_image(
     factor = int(np.ceil(np.sqrt(depth_m.size / max_pixels)))
     if factor <= 1:
         return np.require(depth_m, np.float32, ("C", "W")), k
-    depth_m, offset = np.ascontiguousarray(depth_m, dtype=np.float32), (factor - 1) // 2
-    if factor == 2:
-        small = cv2.medianBlur(depth_m, 3)[offset::factor, offset::factor]
-    else:
-        small = thinned(depth_m, factor, offset)
+    offset = (factor - 1) // 2
+    filtered = cv2.medianBlur(np.ascontiguousarray(depth_m, np.float32), 3 if factor == 2 else 5)
+    small = filtered[offset::factor, offset::factor]
     k = k.copy()
     k[0] /= factor
     k[1] /= factor

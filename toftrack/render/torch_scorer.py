@@ -1,8 +1,7 @@
 """The scoring back end in plain torch: runs on any device, without anything to compile.
 
 The surface is the ellipsoid in (column, row, inverse depth) of numba/hand.py; here it is evaluated
-over the screen box of each ellipsoid (all particles at once, a loop over ellipsoids), and the disc
-around the silhouette is built from rows of bits, as in numba/kernel.py.
+over the screen box of each ellipsoid (all particles at once, a loop over ellipsoids).
 """
 
 from __future__ import annotations
@@ -14,23 +13,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toftrack.compute.transfer import table
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
 from toftrack.render.closed_form import _NEAREST_M
-from toftrack.render.scoring import Counts, Evidence
+from toftrack.render.scoring import Counts, Evidence, compare, dilate_disc
 
-_BITS = 62
-"""Pixels to an int64 word: shifts never touch the sign."""
-_POWERS = tuple(float(1 << bit) for bit in range(_BITS // 2))
-"""Exact ones: a GPU's pow is not, 2.0 ** 21 was less than 1 << 21 on one."""
 _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 27}
 """Pixels of a chunk of particles: small enough for the cache, large enough for a GPU."""
 
 
 class Outlines(NamedTuple):
-    """Ellipsoids in (column, row, inverse depth), each field (N, E); lengths in pixels and 1/m.
+    """Ellipsoids in (column, row, inverse depth), each field (N, E), in pixels and 1/m.
 
     x, y, u: the centre.  high, wide: half sizes of the box, high is -1 where nothing is drawn.
     shear: columns the middle of a row moves per row.  dx: squared half width of the middle row.
@@ -94,51 +88,8 @@ def _surface(o: Outlines, e: int, x: Tensor, y: Tensor) -> Tensor:
     return torch.where(high > 0, u + slope_y * dy + slope_x * t + below.sqrt(), torch.nan)
 
 
-def pack_bits(mask: Tensor) -> Tensor:
-    """(..., W) bool to (..., words) int64 with _BITS pixels each, the first in the lowest bit."""
-    pad = -mask.shape[-1] % _BITS
-    half = _BITS // 2
-    parts = F.pad(mask, (0, pad)).unflatten(-1, (-1, 2, half))
-    # Halves of a word fit a double exactly, and a product with powers of two is the fastest sum.
-    powers = table(_POWERS, torch.float64, mask.device)
-    halves = (parts.to(torch.float64) @ powers).long()
-    return halves[..., 0] | (halves[..., 1] << half)
-
-
-def count_bits(words: Tensor) -> Tensor:
-    """The number of bits set in each int64 word of at most _BITS bits."""
-    x = words - ((words >> 1) & 0x5555555555555555)
-    x = (x & 0x3333333333333333) + ((x >> 2) & 0x3333333333333333)
-    x = (x + (x >> 4)) & 0x0F0F0F0F0F0F0F0F
-    x = x + (x >> 8)
-    x = x + (x >> 16)
-    return (x + (x >> 32)) & 0x7F
-
-
-def dilate_bits(words: Tensor, radius_px: float) -> Tensor:
-    """Exact Euclidean disc dilation of bit images (N, H, words), see numba/kernel.py."""
-    n, height, count = words.shape
-    full = (1 << _BITS) - 1
-    radius = min(max(float(radius_px), 0.0), math.hypot(height, count * _BITS))
-    reach = min(int(radius), height)
-    halves = [min(int(math.sqrt(radius**2 - dy**2)), count * _BITS) for dy in range(reach + 1)]
-    out = words.clone()
-    for dy in range(1, reach + 2):
-        grow = halves[dy - 1] - (halves[dy] if dy <= reach else 0)
-        for _ in range(grow):
-            wider = out | ((out << 1) & full) | (out >> 1)
-            if count > 1:
-                wider[..., 1:] |= out[..., :-1] >> (_BITS - 1)
-                wider[..., :-1] |= (out[..., 1:] & 1) << (_BITS - 1)
-            out = wider
-        if dy < min(reach + 1, height):
-            out[:, dy:] |= words[:, :-dy]
-            out[:, :-dy] |= words[:, dy:]
-    return out
-
-
 class TorchScorer:
-    """Screen boxes, inverse depth and bit rows in eager torch, in chunks of bounded memory."""
+    """Screen boxes and inverse depth in eager torch, in chunks of bounded memory."""
 
     name = "torch"
 
@@ -174,29 +125,18 @@ def _score(o: Outlines, evidence: Evidence) -> Tensor:
         return o.x.new_zeros(4, len(o.x))
     u = _inverse_depth(o, boxes, box)
     inside = evidence.cropped(*box)
-    model = u > 0
-    correct = model & (u >= inside.low) & (u <= inside.high)
-    false = model & ~correct & (u >= inside.occluder)
-    middle, half = (inside.low + inside.high) / 2, (inside.high - inside.low) / 2
-    residual = torch.where(correct, ((u - middle) / half).square(), 0.0)
+    correct, false, residual = compare(u, inside)
 
     # Where a hand pixel can be missed: the box and the neighbourhood around it.
     reach = min(math.ceil(evidence.radius_px), height + width)
     first = (max(0, left - reach), max(0, top - reach))
     outer = (*first, min(width, right + reach), min(height, bottom + reach))
     margins = (left - outer[0], outer[2] - right, top - outer[1], outer[3] - bottom)
-    words = pack_bits(F.pad(model, margins))
+    model = F.pad(u > 0, margins)
     hand = evidence.hand[outer[1] : outer[3], outer[0] : outer[2]]
-    near = dilate_bits(words, evidence.radius_px) & ~words & pack_bits(hand)
-    near &= ~pack_bits(_wrist(o, outer))
-    return torch.stack(
-        (
-            correct.sum((1, 2)).float(),
-            false.sum((1, 2)).float(),
-            count_bits(near).sum((1, 2)).float(),
-            residual.sum((1, 2)),
-        )
-    )
+    missed = dilate_disc(model, evidence.radius_px) & ~model & hand & ~_wrist(o, outer)
+    counts = [image.sum((1, 2)).float() for image in (correct, false, missed, residual)]
+    return torch.stack(counts)
 
 
 class _Boxes(NamedTuple):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute import rigid, rigid_numba
-from toftrack.compute.redraw import Motions
+from toftrack.compute.rigid import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface

@@ -14,11 +14,9 @@ import torch
 from torch import Tensor
 
 from toftrack.compute import particle_filter
-from toftrack.compute.pace import FRAME_S
+from toftrack.compute.pace import FRAME_S, Spans
 from toftrack.compute.particle_filter import FilterSettings
-from toftrack.compute.redraw import bound
-from toftrack.compute.rigid import pivot_offset
-from toftrack.compute.spans import Spans
+from toftrack.compute.rigid import bound, pivot_offset
 from toftrack.compute.transfer import on_device
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.model import FilterModel, FittedHand

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from toftrack.compute.particle_filter import FilterSettings, Spread
 from toftrack.compute.quality import Quality
-from toftrack.compute.redraw import bound
+from toftrack.compute.rigid import bound
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.estimate import no_estimate
 from toftrack.gestures.recognition import Gestures

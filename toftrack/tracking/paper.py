@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from toftrack.checks import check_number
+from toftrack.compute.pace import Spans
 from toftrack.compute.particle_filter import Spread, covariance
 from toftrack.compute.rigid import PIVOT_M
-from toftrack.compute.spans import Spans
 from toftrack.compute.threads import small_operations
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import ToftrackError

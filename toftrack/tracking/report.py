@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from toftrack.compute import particle_filter
-from toftrack.compute.pace import FRAME_S
-from toftrack.compute.redraw import bound
-from toftrack.compute.spans import Spans
+from toftrack.compute.pace import FRAME_S, Spans
+from toftrack.compute.rigid import bound
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames import DepthImage

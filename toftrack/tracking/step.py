@@ -8,7 +8,7 @@ from itertools import compress
 
 import torch
 
-from toftrack.compute.spans import Spans
+from toftrack.compute.pace import Spans
 from toftrack.compute.threads import small_operations
 from toftrack.estimate import Estimate
 from toftrack.frames import DepthImage

@@ -93,24 +93,30 @@ def pose_hands(states, first, slots, base, lengths, mirror, x, frames, valid):
     _keep(frames[0], hand)
     for finger in range(5):
         # The angles' slots are abduction, flexion, abduction, flexion, flexion.
-        slot, to, bone = 5 * finger, 1 + 3 * finger, lengths[finger]
-        frame = _flexed(_abducted(_root(hand, base[finger]), x, slots[slot]), x, slots[slot + 1])
+        slot, to, bone, b = 5 * finger, 1 + 3 * finger, lengths[finger], base[finger]
+        rest = _sum(hand, b[:, 0]), _sum(hand, b[:, 1]), _sum(hand, b[:, 2])
+        frame = _turned(
+            *rest, _moved(_sum(hand, b[:, 3]), hand[3]), x, slots[slot], slots[slot + 1]
+        )
         _keep(frames[to], frame)
-        frame = _abducted(_followed(frame, bone[0]), x, slots[slot + 2])
-        frame = _flexed(frame, x, slots[slot + 3])
+        frame = _turned(*_followed(frame, bone[0]), x, slots[slot + 2], slots[slot + 3])
         _keep(frames[to + 1], frame)
-        _keep(frames[to + 2], _flexed(_followed(frame, bone[1]), x, slots[slot + 4]))
+        _keep(frames[to + 2], _turned(*_followed(frame, bone[1]), x, -1, slots[slot + 4]))
 
 
 @compiled
 def _keep(to, frame):
-    for j in range(12):
-        store(to, j * LANES, frame[j])
+    a, b, c, at = frame
+    for i in range(3):
+        store(to, 3 * i * LANES, a[i])
+        store(to, (3 * i + 1) * LANES, b[i])
+        store(to, (3 * i + 2) * LANES, c[i])
+        store(to, (9 + i) * LANES, at[i])
 
 
 @compiled
 def _hand_frame(x, mirror):
-    """The hand's own frame: nine numbers of the rotation by rows, and the origin."""
+    """The hand's own frame: the columns of its rotation, and its origin."""
     a, b, c = load(x, 3 * LANES), load(x, 4 * LANES), load(x, 5 * LANES)
     square = a * a + b * b + c * c
     half = _HALF * root(square)
@@ -119,72 +125,76 @@ def _hand_frame(x, mirror):
     p, q = sinc * cosine, _HALF * sinc * sinc
     one = _ONE - q * square
     return (
-        (one + q * a * a) * mirror,
-        q * a * b - p * c,
-        q * a * c + p * b,
-        (q * a * b + p * c) * mirror,
-        one + q * b * b,
-        q * b * c - p * a,
-        (q * a * c - p * b) * mirror,
-        q * b * c + p * a,
-        one + q * c * c,
-        load(x, 0),
-        load(x, LANES),
-        load(x, 2 * LANES),
+        ((one + q * a * a) * mirror, (q * a * b + p * c) * mirror, (q * a * c - p * b) * mirror),
+        (q * a * b - p * c, one + q * b * b, q * b * c + p * a),
+        (q * a * c + p * b, q * b * c - p * a, one + q * c * c),
+        (load(x, 0), load(x, LANES), load(x, 2 * LANES)),
     )
 
 
 @compiled
-def _root(hand, base):
-    """The rest frame of a finger's first bone; base: (3, 4) rotation and origin in the hand."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22, x, y, z = hand
-    a, b, c = base[0], base[1], base[2]
+def _sum(frame, w):
+    """The columns of a frame's rotation, weighted."""
+    a, b, c, _ = frame
     return (
-        r00 * a[0] + r01 * b[0] + r02 * c[0],
-        r00 * a[1] + r01 * b[1] + r02 * c[1],
-        r00 * a[2] + r01 * b[2] + r02 * c[2],
-        r10 * a[0] + r11 * b[0] + r12 * c[0],
-        r10 * a[1] + r11 * b[1] + r12 * c[1],
-        r10 * a[2] + r11 * b[2] + r12 * c[2],
-        r20 * a[0] + r21 * b[0] + r22 * c[0],
-        r20 * a[1] + r21 * b[1] + r22 * c[1],
-        r20 * a[2] + r21 * b[2] + r22 * c[2],
-        r00 * a[3] + r01 * b[3] + r02 * c[3] + x,
-        r10 * a[3] + r11 * b[3] + r12 * c[3] + y,
-        r20 * a[3] + r21 * b[3] + r22 * c[3] + z,
+        a[0] * w[0] + b[0] * w[1] + c[0] * w[2],
+        a[1] * w[0] + b[1] * w[1] + c[1] * w[2],
+        a[2] * w[0] + b[2] * w[1] + c[2] * w[2],
     )
+
+
+@compiled
+def _moved(point, by):
+    return point[0] + by[0], point[1] + by[1], point[2] + by[2]
 
 
 @compiled
 def _followed(frame, length):
     """The frame at the end of a bone, turned as the bone."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22, x, y, z = frame
-    x, y, z = x - length * r01, y - length * r11, z - length * r21
-    return r00, r01, r02, r10, r11, r12, r20, r21, r22, x, y, z
+    a, b, c, at = frame
+    at = at[0] - length * b[0], at[1] - length * b[1], at[2] - length * b[2]
+    return a, b, c, at
 
 
 @compiled
-def _abducted(frame, x, slot):
-    """Turned about its z axis by an angle of the state, or not where there is none."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22, ox, oy, oz = frame
-    if slot >= 0:
-        sine, cosine = _sin_cos(load(x, slot * LANES))
-        r00, r01 = cosine * r00 + sine * r01, cosine * r01 - sine * r00
-        r10, r11 = cosine * r10 + sine * r11, cosine * r11 - sine * r10
-        r20, r21 = cosine * r20 + sine * r21, cosine * r21 - sine * r20
-    return r00, r01, r02, r10, r11, r12, r20, r21, r22, ox, oy, oz
+def _turned(a, b, c, at, x, abduction, flexion):
+    """A frame turned about its z axis, then its x axis, by angles in these slots of the state."""
+    a, b = _mixed(a, b, x, abduction)
+    b, c = _mixed(b, c, x, flexion)
+    return a, b, c, at
 
 
 @compiled
-def _flexed(frame, x, slot):
-    """Turned about its x axis by an angle of the state, or not where there is none."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22, ox, oy, oz = frame
-    if slot >= 0:
-        sine, cosine = _sin_cos(load(x, slot * LANES))
-        r01, r02 = cosine * r01 + sine * r02, cosine * r02 - sine * r01
-        r11, r12 = cosine * r11 + sine * r12, cosine * r12 - sine * r11
-        r21, r22 = cosine * r21 + sine * r22, cosine * r22 - sine * r21
-    return r00, r01, r02, r10, r11, r12, r20, r21, r22, ox, oy, oz
+def _mixed(p, q, x, slot):
+    """Two columns turned by an angle of the state, or not where there is none."""
+    if slot < 0:
+        return p, q
+    sine, cosine = _sin_cos(load(x, slot * LANES))
+    return (
+        (cosine * p[0] + sine * q[0], cosine * p[1] + sine * q[1], cosine * p[2] + sine * q[2]),
+        (cosine * q[0] - sine * p[0], cosine * q[1] - sine * p[1], cosine * q[2] - sine * p[2]),
+    )
+
+
+@compiled
+def _three(frame, j):
+    """A row of a frame's rotation from 0, 3 or 6 on, its origin from 9 on."""
+    return load(frame, j * LANES), load(frame, (j + 1) * LANES), load(frame, (j + 2) * LANES)
+
+
+@compiled
+def _times(s, v):
+    """A symmetric matrix (xx, xy, xz, yy, yz, zz) times a vector."""
+    return (
+        v[0] * s[0] + v[1] * s[1] + v[2] * s[2],
+        v[0] * s[1] + v[1] * s[3] + v[2] * s[4],
+        v[0] * s[2] + v[1] * s[4] + v[2] * s[5],
+    )
+
+
+@compiled
+def _dot(p, q):
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
 @compiled
@@ -202,30 +212,13 @@ def project_hands(frames, frame_index, surface, k, width, height, out, boxes):
     right, bottom = splat(_ZERO), splat(_ZERO)
     for e in range(frame_index.shape[0]):
         frame, row = frames[frame_index[e]], out[e]
-        b0, b1, b2 = surface[e, 0], surface[e, 1], surface[e, 2]
-        sxx, sxy, sxz = surface[e, 3], surface[e, 4], surface[e, 5]
-        syy, syz, szz = surface[e, 6], surface[e, 7], surface[e, 8]
-        r0, r1, r2 = load(frame, 0), load(frame, LANES), load(frame, 2 * LANES)
-        v0, v1, v2 = load(frame, 3 * LANES), load(frame, 4 * LANES), load(frame, 5 * LANES)
-        w0, w1, w2 = load(frame, 6 * LANES), load(frame, 7 * LANES), load(frame, 8 * LANES)
-        cx = r0 * b0 + r1 * b1 + r2 * b2 + load(frame, 9 * LANES)
-        cy = v0 * b0 + v1 * b1 + v2 * b2 + load(frame, 10 * LANES)
-        cz = w0 * b0 + w1 * b1 + w2 * b2 + load(frame, 11 * LANES)
-        h0 = r0 * sxx + r1 * sxy + r2 * sxz
-        h1 = r0 * sxy + r1 * syy + r2 * syz
-        h2 = r0 * sxz + r1 * syz + r2 * szz
-        xx = h0 * r0 + h1 * r1 + h2 * r2
-        xy = h0 * v0 + h1 * v1 + h2 * v2
-        xz = h0 * w0 + h1 * w1 + h2 * w2
-        h0 = v0 * sxx + v1 * sxy + v2 * sxz
-        h1 = v0 * sxy + v1 * syy + v2 * syz
-        h2 = v0 * sxz + v1 * syz + v2 * szz
-        yy = h0 * v0 + h1 * v1 + h2 * v2
-        yz = h0 * w0 + h1 * w1 + h2 * w2
-        h0 = w0 * sxx + w1 * sxy + w2 * sxz
-        h1 = w0 * sxy + w1 * syy + w2 * syz
-        h2 = w0 * sxz + w1 * syz + w2 * szz
-        zz = h0 * w0 + h1 * w1 + h2 * w2
+        b = surface[e, 0], surface[e, 1], surface[e, 2]
+        s = surface[e, 3], surface[e, 4], surface[e, 5], surface[e, 6], surface[e, 7], surface[e, 8]
+        x, y, z, at = _three(frame, 0), _three(frame, 3), _three(frame, 6), _three(frame, 9)
+        cx, cy, cz = _dot(x, b) + at[0], _dot(y, b) + at[1], _dot(z, b) + at[2]
+        sx, sy, sz = _times(s, x), _times(s, y), _times(s, z)
+        xx, xy, xz = _dot(sx, x), _dot(sx, y), _dot(sx, z)
+        yy, yz, zz = _dot(sy, y), _dot(sy, z), _dot(sz, z)
         z2 = cz * cz
         iw = _ONE / (z2 - zz)
         iw2 = iw * iw

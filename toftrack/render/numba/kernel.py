@@ -1,7 +1,8 @@
 """The fused CPU kernel: from a state of 27 numbers to four counts, one particle at a time.
 
 Each ellipsoid is drawn into a tile that holds one hand, only over the exact span of its outline in
-each row; then the tile is compared with the evidence, which leaves the silhouette as rows of bits.
+each row; then the tile is compared with the evidence, which leaves the silhouette as rows of bits,
+64 to a word; around these, the hand's pixels that a hypothesis leaves out are counted.
 """
 
 from __future__ import annotations
@@ -31,28 +32,29 @@ from toftrack.render.numba.hand import (
     pose_hands,
     project_hands,
 )
-from toftrack.render.numba.missed import clipped, count_missed, find_wanted, run
 from toftrack.render.numba.vector import (
     BLOCK,
+    WORDS,
     compare,
     down,
     draw,
     larger,
     load,
+    ones,
     ramp,
     root,
+    shifted,
     smaller,
     splat,
     store,
     total,
     up,
     where_above,
+    widened,
 )
-from toftrack.render.numba.words import WORDS, no_rows, store_rows
-
-_PARTS = ("hand", "kernel", "missed", "vector", "words")
 
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+_NONE, _ALL = np.uint64(0), ~np.uint64(0)
 _LAST = 8
 """Particles of a task near the end."""
 _LISTED = 256
@@ -77,6 +79,23 @@ def _zeros(size):
     numbers = np.zeros(size + BLOCK, np.float32)
     skip = (-numbers.ctypes.data >> 2) & (BLOCK - 1)
     return numbers[skip : skip + size]
+
+
+@compiled
+def _run(first, last):
+    """A word with bits first .. last set, as far as they lie within it."""
+    first, last = max(first, 0), min(last, 63)
+    if last < first:
+        return _NONE
+    return (_ALL >> np.uint64(63 - last)) & (_ALL << np.uint64(first))
+
+
+@compiled
+def _clipped(value, size):
+    """A float as an integer in 0 .. size; 0 for NaN."""
+    if not value > _ZERO:
+        return 0
+    return size if value >= size else int(value)
 
 
 @compiled
@@ -109,8 +128,8 @@ def _render(conics, i, box, origin, stride, tile, spans, lines, places):
         du, u = conic[DU * LANES + i], conic[U * LANES + i]
         slope_y, slope = conic[UY * LANES + i], conic[UX * LANES + i]
         curve, widest = splat(du / dx), min(_TWO * math.sqrt(dx), right_most - left_most)
-        first = max(clipped(np.ceil(y - high), bottom), top)
-        rows = clipped(y + high + _ONE, bottom) - first
+        first = max(_clipped(np.ceil(y - high), bottom), top)
+        rows = _clipped(y + high + _ONE, bottom) - first
         for row in range(0, rows, BLOCK):
             dy = (np.float32(first + row) - y) + ramp()
             rest = _ONE - dy * dy * inverse
@@ -179,11 +198,116 @@ def _compare(tile, stride, spans, box, origin, images, width, model, above):
             )
     if right == width:
         # A block may reach past the image's edge.
-        word, inside = 1 + (right - 1 - origin) // 64, run(0, (right - 1 - origin) % 64)
+        word, inside = 1 + (right - 1 - origin) // 64, _run(0, (right - 1 - origin) % 64)
         for row in range(above, above + bottom - top):
             model[word, row] &= inside
             model[word + 1, row] = np.uint64(0)
     return total(correct), total(false), total(residual)
+
+
+@compiled
+def _find_wanted(conics, i, model, words, first_row, rows, origin, hand, reach, wanted, places):
+    """Bits of the hand's pixels outside of the silhouette and of the wrist's ellipsoid.
+
+    hand: (words of a row + 1, H + WORDS) bits of the evidence.  wanted: (words, rows + WORDS) is
+    set; rows from `rows` on may hold pixels that are too far away to be missed.
+    places: (2 * BLOCK,) int32 scratch.
+    """
+    shift, column = np.uint64(origin & 63), origin >> 6
+    for w in range(words):
+        for row in range(0, rows, WORDS):
+            here = load(hand[column + w], first_row + row)
+            after = load(hand[column + w + 1], first_row + row)
+            bits = shifted(here, after, shift)
+            store(wanted[w], row, bits ^ (bits & load(model[w + 1], reach + row)))
+    conic = conics[conics.shape[0] - 1]
+    high, y = conic[HY * LANES + i], conic[Y * LANES + i] - np.float32(first_row)
+    if not high > _ZERO:
+        return
+    x, shear = conic[X * LANES + i] - np.float32(origin), conic[XY * LANES + i]
+    inverse, dx = conic[IY * LANES + i], conic[DX * LANES + i]
+    begin, end = _clipped(np.ceil(y - high), rows), _clipped(y + high + _ONE, rows)
+    left_most, right_most = splat(_ZERO), splat(np.float32(64 * words))
+    for row in range(begin, end, BLOCK):
+        dy = (np.float32(row) - y) + ramp()
+        middle, half = x + shear * dy, root(dx * (_ONE - dy * dy * inverse))
+        # In a row that just misses it, where the root is NaN, there is nothing to leave out.
+        store(places, 0, smaller(larger(up(middle - half), left_most), right_most))
+        store(places, BLOCK, smaller(larger(down(middle + half), left_most - _ONE), right_most))
+        for j in range(min(BLOCK, end - row)):
+            for w in range(words):
+                wanted[w, row + j] &= ~_run(places[j] - 64 * w, places[BLOCK + j] - 64 * w)
+
+
+@compiled
+def count_missed(model, words, rows, reach, steps, wanted, buffer):
+    """How many wanted pixels lie within a disc of the silhouette: an exact Euclidean dilation.
+
+    A disc is a horizontal run for each row offset. Taken from the longest run to the shortest, each
+    step widens all that came before by the difference of the runs (Horner's scheme). WORDS rows
+    at once, 64 columns to a word.
+
+    model: (words + 2, R) bit rows by word with empty words around, the first at row `reach`.
+    steps: (S, 2) pairs of: widen by a pixel to both sides or not, and the row offset to add or 0.
+    wanted: (words, rows + WORDS).  buffer: (2, (parts + 2) * WORDS) scratch.
+    """
+    missed = 0
+    for first in range(0, rows, WORDS):
+        some = splat(_NONE)
+        for w in range(words):
+            some = some | load(wanted[w], first)
+        if ones(some) > 0:
+            middle = reach + first
+            if words <= 2:
+                missed += _near_two(model, words, middle, steps, wanted, first)
+            else:
+                missed += _near_many(model, words, middle, steps, wanted, first, buffer)
+    return missed
+
+
+@compiled
+def _near_two(model, words, middle, steps, wanted, first):
+    """As count_missed, of WORDS rows of one or two words, which stay in registers."""
+    near, right, none = load(model[1], middle), load(model[2], middle), splat(_NONE)
+    for step in range(steps.shape[0]):
+        dy = steps[step, 1]
+        if steps[step, 0]:
+            near, right = widened(none, near, right), widened(near, right, none)
+        if dy:
+            near = near | load(model[1], middle - dy) | load(model[1], middle + dy)
+            right = right | load(model[2], middle - dy) | load(model[2], middle + dy)
+    missed = ones(near & load(wanted[0], first))
+    if words == 2:
+        missed += ones(right & load(wanted[1], first))
+    return missed
+
+
+@compiled
+def _near_many(model, words, middle, steps, wanted, first, buffer):
+    """As count_missed, of WORDS rows of any number of words."""
+    for w in range(words + 2):
+        store(buffer[0], w * WORDS, load(model[w], middle))
+        store(buffer[1], w * WORDS, splat(_NONE))
+    here = 0
+    for step in range(steps.shape[0]):
+        there = 1 - here if steps[step, 0] else here
+        dy = steps[step, 1]
+        for w in range(1, words + 1):
+            near = load(buffer[here], w * WORDS)
+            if steps[step, 0]:
+                left, right = (
+                    load(buffer[here], (w - 1) * WORDS),
+                    load(buffer[here], (w + 1) * WORDS),
+                )
+                near = widened(left, near, right)
+            if dy:
+                near = near | load(model[w], middle - dy) | load(model[w], middle + dy)
+            store(buffer[there], w * WORDS, near)
+        here = there
+    missed = 0
+    for w in range(words):
+        missed += ones(load(buffer[here], (w + 1) * WORDS) & load(wanted[w], first))
+    return missed
 
 
 @entry_point
@@ -273,12 +397,12 @@ def score_hands(states, frame, shape, counter, out):
             above = reach + top - first_row
             for w in range(words + 2):
                 for row in range(0, rows + 2 * reach + WORDS, WORDS):
-                    store_rows(model, w, row, no_rows())
+                    store(model[w], row, splat(np.uint64(0)))
             correct, false, residual = _compare(
                 tile, stride, spans, box, origin, images, width, model, above
             )
             out[0, first + i], out[1, first + i], out[3, first + i] = correct, false, residual
-            find_wanted(
+            _find_wanted(
                 conics, i, model, words, first_row, rows, origin, hand, reach, wanted, places
             )
             out[2, first + i] = count_missed(model, words, rows, reach, steps, wanted, buffer)

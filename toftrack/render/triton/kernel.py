@@ -10,15 +10,35 @@ TERMS = 12
 
 
 @triton.jit
-def _mix(p, q, sine, cosine):
-    return cosine * p + sine * q, cosine * q - sine * p
+def _three(p):
+    return tl.load(p), tl.load(p + 1), tl.load(p + 2)
 
 
 @triton.jit
-def _angle(row, slot, keep):
-    """Sine and cosine of an angle of each state; 0 and 1 for slot -1."""
+def _state(row, j, keep):
+    return tl.load(row + j, mask=keep, other=0.0)
+
+
+@triton.jit
+def _dot(a, b, c, x, y, z):
+    return a * x + b * y + c * z
+
+
+@triton.jit
+def _map(m00, m01, m02, m10, m11, m12, m20, m21, m22, x, y, z):
+    """A matrix times a vector."""
+    return _dot(m00, m01, m02, x, y, z), _dot(m10, m11, m12, x, y, z), _dot(m20, m21, m22, x, y, z)
+
+
+@triton.jit
+def _turn(p0, p1, p2, q0, q1, q2, row, slot, keep):
+    """Two columns of a frame turned by an angle of each state, or not for slot -1."""
     angle = tl.load(row + slot, mask=keep & (slot >= 0), other=0.0)
-    return tl.sin(angle), tl.cos(angle)
+    sine, cosine = tl.sin(angle), tl.cos(angle)
+    p0, q0 = cosine * p0 + sine * q0, cosine * q0 - sine * p0
+    p1, q1 = cosine * p1 + sine * q1, cosine * q1 - sine * p1
+    p2, q2 = cosine * p2 + sine * q2, cosine * q2 - sine * p2
+    return p0, p1, p2, q0, q1, q2
 
 
 @triton.jit
@@ -35,14 +55,10 @@ def project_kernel(states, camera, numbers, slots, out, n, count, nearest, BLOCK
     row = states + at.to(tl.int64) * 27
     check = tl.zeros([BLOCK], tl.float32)
     for j in range(27):
-        check += tl.abs(tl.load(row + j, mask=inside, other=0.0))
+        check += tl.abs(_state(row, j, inside))
     valid = inside & (check < 1e9)
-    tx = tl.load(row, mask=valid, other=0.0)
-    ty = tl.load(row + 1, mask=valid, other=0.0)
-    tz = tl.load(row + 2, mask=valid, other=0.0)
-    a = tl.load(row + 3, mask=valid, other=0.0)
-    b = tl.load(row + 4, mask=valid, other=0.0)
-    c = tl.load(row + 5, mask=valid, other=0.0)
+    tx, ty, tz = _state(row, 0, valid), _state(row, 1, valid), _state(row, 2, valid)
+    a, b, c = _state(row, 3, valid), _state(row, 4, valid), _state(row, 5, valid)
     table = numbers + e * 24
     mirror = tl.load(table + 23)
     square = a * a + b * b + c * c
@@ -55,28 +71,15 @@ def project_kernel(states, camera, numbers, slots, out, n, count, nearest, BLOCK
     r20, r21, r22 = (q * a * c - p * b) * mirror, q * b * c + p * a, one + q * c * c
 
     # The finger's rest frame in the palm, then its bones; all of it the identity for the palm.
-    m00, m01, m02 = tl.load(table + 9), tl.load(table + 10), tl.load(table + 11)
-    m10, m11, m12 = tl.load(table + 13), tl.load(table + 14), tl.load(table + 15)
-    m20, m21, m22 = tl.load(table + 17), tl.load(table + 18), tl.load(table + 19)
+    m00, m01, m02 = _three(table + 9)
+    m10, m11, m12 = _three(table + 13)
+    m20, m21, m22 = _three(table + 17)
     o0, o1, o2 = tl.load(table + 12), tl.load(table + 16), tl.load(table + 20)
-    x = r00 * o0 + r01 * o1 + r02 * o2 + tx
-    y = r10 * o0 + r11 * o1 + r12 * o2 + ty
-    z = r20 * o0 + r21 * o1 + r22 * o2 + tz
-    a0, b0, c0 = (
-        r00 * m00 + r01 * m10 + r02 * m20,
-        r00 * m01 + r01 * m11 + r02 * m21,
-        r00 * m02 + r01 * m12 + r02 * m22,
-    )
-    a1, b1, c1 = (
-        r10 * m00 + r11 * m10 + r12 * m20,
-        r10 * m01 + r11 * m11 + r12 * m21,
-        r10 * m02 + r11 * m12 + r12 * m22,
-    )
-    a2, b2, c2 = (
-        r20 * m00 + r21 * m10 + r22 * m20,
-        r20 * m01 + r21 * m11 + r22 * m21,
-        r20 * m02 + r21 * m12 + r22 * m22,
-    )
+    x, y, z = _map(r00, r01, r02, r10, r11, r12, r20, r21, r22, o0, o1, o2)
+    x, y, z = x + tx, y + ty, z + tz
+    a0, a1, a2 = _map(r00, r01, r02, r10, r11, r12, r20, r21, r22, m00, m10, m20)
+    b0, b1, b2 = _map(r00, r01, r02, r10, r11, r12, r20, r21, r22, m01, m11, m21)
+    c0, c1, c2 = _map(r00, r01, r02, r10, r11, r12, r20, r21, r22, m02, m12, m22)
     for joint in tl.static_range(3):
         if joint > 0:
             length = tl.load(table + 20 + joint)
@@ -84,44 +87,23 @@ def project_kernel(states, camera, numbers, slots, out, n, count, nearest, BLOCK
             y -= length * b1
             z -= length * b2
         if joint < 2:
-            sine, cosine = _angle(row, tl.load(slots + e * 5 + 2 * joint), valid)
-            a0, b0 = _mix(a0, b0, sine, cosine)
-            a1, b1 = _mix(a1, b1, sine, cosine)
-            a2, b2 = _mix(a2, b2, sine, cosine)
-        flexion = 2 * joint + 1 if joint < 2 else 4
-        sine, cosine = _angle(row, tl.load(slots + e * 5 + flexion), valid)
-        b0, c0 = _mix(b0, c0, sine, cosine)
-        b1, c1 = _mix(b1, c1, sine, cosine)
-        b2, c2 = _mix(b2, c2, sine, cosine)
+            slot = tl.load(slots + e * 5 + 2 * joint)
+            a0, a1, a2, b0, b1, b2 = _turn(a0, a1, a2, b0, b1, b2, row, slot, valid)
+        slot = tl.load(slots + e * 5 + (2 * joint + 1 if joint < 2 else 4))
+        b0, b1, b2, c0, c1, c2 = _turn(b0, b1, b2, c0, c1, c2, row, slot, valid)
 
-    d0, d1, d2 = tl.load(table), tl.load(table + 1), tl.load(table + 2)
-    sxx, sxy, sxz = tl.load(table + 3), tl.load(table + 4), tl.load(table + 5)
-    syy, syz, szz = tl.load(table + 6), tl.load(table + 7), tl.load(table + 8)
-    cx = a0 * d0 + b0 * d1 + c0 * d2 + x
-    cy = a1 * d0 + b1 * d1 + c1 * d2 + y
-    cz = a2 * d0 + b2 * d1 + c2 * d2 + z
-    h0, h1, h2 = (
-        a0 * sxx + b0 * sxy + c0 * sxz,
-        a0 * sxy + b0 * syy + c0 * syz,
-        a0 * sxz + b0 * syz + c0 * szz,
-    )
-    xx, xy, xz = (
-        h0 * a0 + h1 * b0 + h2 * c0,
-        h0 * a1 + h1 * b1 + h2 * c1,
-        h0 * a2 + h1 * b2 + h2 * c2,
-    )
-    h0, h1, h2 = (
-        a1 * sxx + b1 * sxy + c1 * sxz,
-        a1 * sxy + b1 * syy + c1 * syz,
-        a1 * sxz + b1 * syz + c1 * szz,
-    )
-    yy, yz = h0 * a1 + h1 * b1 + h2 * c1, h0 * a2 + h1 * b2 + h2 * c2
-    h0, h1, h2 = (
-        a2 * sxx + b2 * sxy + c2 * sxz,
-        a2 * sxy + b2 * syy + c2 * syz,
-        a2 * sxz + b2 * syz + c2 * szz,
-    )
-    zz = h0 * a2 + h1 * b2 + h2 * c2
+    d0, d1, d2 = _three(table)
+    sxx, sxy, sxz = _three(table + 3)
+    syy, syz, szz = _three(table + 6)
+    cx, cy, cz = _map(a0, b0, c0, a1, b1, c1, a2, b2, c2, d0, d1, d2)
+    cx, cy, cz = cx + x, cy + y, cz + z
+    h0, h1, h2 = _map(sxx, sxy, sxz, sxy, syy, syz, sxz, syz, szz, a0, b0, c0)
+    xx, xy = _dot(h0, h1, h2, a0, b0, c0), _dot(h0, h1, h2, a1, b1, c1)
+    xz = _dot(h0, h1, h2, a2, b2, c2)
+    h0, h1, h2 = _map(sxx, sxy, sxz, sxy, syy, syz, sxz, syz, szz, a1, b1, c1)
+    yy, yz = _dot(h0, h1, h2, a1, b1, c1), _dot(h0, h1, h2, a2, b2, c2)
+    h0, h1, h2 = _map(sxx, sxy, sxz, sxy, syy, syz, sxz, syz, szz, a2, b2, c2)
+    zz = _dot(h0, h1, h2, a2, b2, c2)
 
     fx, fy, px, py = tl.load(camera), tl.load(camera + 4), tl.load(camera + 2), tl.load(camera + 5)
     visible = valid & (cz - tl.sqrt(zz) > nearest)
@@ -219,14 +201,13 @@ def count_kernel(
             depth = tl.zeros([ROWS, 64], tl.float32)
             for j in range(count - 1):
                 at = mine + j * 12
-                x0, y0, u0 = tl.load(at), tl.load(at + 1), tl.load(at + 2)
+                x0, y0, u0 = _three(at)
                 tall0, wide0 = tl.load(at + 3), tl.load(at + 4)
                 meets = (tall0 > 0) & (y0 - tall0 < tile_top + ROWS) & (y0 + tall0 >= tile_top)
                 meets = meets & (x0 - wide0 < tile_left + 64) & (x0 + wide0 >= tile_left)
                 if meets:
-                    iy, shear, dx = tl.load(at + 5), tl.load(at + 6), tl.load(at + 7)
-                    slope_y, slope_x = tl.load(at + 8), tl.load(at + 9)
-                    du = tl.load(at + 10)
+                    iy, shear, dx = _three(at + 5)
+                    slope_y, slope_x, du = _three(at + 8)
                     dy = v.to(tl.float32) - y0
                     peak = du * (1.0 - dy * dy * iy)
                     t = u.to(tl.float32)[None, :] - (x0 + shear * dy)[:, None]
@@ -307,7 +288,7 @@ def missed_kernel(
     first, last = left // 64, (right + 63) // 64
     wrist = conics + (i.to(tl.int64) * count + count - 1) * 12
     x, y, tall = tl.load(wrist), tl.load(wrist + 1), tl.load(wrist + 3)
-    iy, shear, dx = tl.load(wrist + 5), tl.load(wrist + 6), tl.load(wrist + 7)
+    iy, shear, dx = _three(wrist + 5)
     total = tl.zeros([ROWS], tl.int64)
     empty = (right <= left) | (bottom <= top)
     begin = tl.maximum(top - reach, 0)
@@ -340,12 +321,11 @@ def missed_kernel(
                     c = _wider(b, outer_right, tl.zeros_like(c))
                     b = _wider(outer_left, b, outer_right)
                 if offset > 0:
-                    a |= _row(mine, v - offset, word - 1, top, bottom, first, last, words)
-                    a |= _row(mine, v + offset, word - 1, top, bottom, first, last, words)
-                    b |= _row(mine, v - offset, word, top, bottom, first, last, words)
-                    b |= _row(mine, v + offset, word, top, bottom, first, last, words)
-                    c |= _row(mine, v - offset, word + 1, top, bottom, first, last, words)
-                    c |= _row(mine, v + offset, word + 1, top, bottom, first, last, words)
+                    for way in tl.static_range(-1, 2, 2):
+                        there = v + way * offset
+                        a |= _row(mine, there, word - 1, top, bottom, first, last, words)
+                        b |= _row(mine, there, word, top, bottom, first, last, words)
+                        c |= _row(mine, there, word + 1, top, bottom, first, last, words)
                 s += 1
             b &= wanted
             b = b - ((b >> 1) & 0x5555555555555555)

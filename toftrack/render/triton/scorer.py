@@ -52,10 +52,7 @@ class TritonScorer:
         surface: HandSurface | None = None,
         device: torch.device | None = None,
     ) -> None:
-        """surface: instead of the shape's own.  device: of the states to come; None = the shape's.
-
-        Raises ImportError where it cannot run.
-        """
+        """surface: instead of the shape's own.  device: of the states; None = the shape's."""
         require_device()
         self._device = device or shape.base_m.device
         self._shape = shape.to("cpu")
@@ -113,33 +110,16 @@ class TritonScorer:
         )
         model = torch.empty(n, height, words, dtype=torch.int64, device=device)
         boxes = torch.empty(n, 4, dtype=torch.int32, device=device)
-        size = (n, height, width, words)
         count_kernel[(n,)](
-            conics,
-            *images,
-            model,
-            boxes,
-            counts,
-            *size,
+            *(conics, *images, model, boxes, counts, n, height, width, words),
             count=count,
             ELLIPSOIDS=triton.next_power_of_2(count),
             ROWS=_ROWS,
             num_warps=4,
         )
         missed_kernel[(n,)](
-            conics,
-            model,
-            boxes,
-            hand,
-            steps,
-            counts,
-            n,
-            count,
-            height,
-            width,
-            words,
-            len(steps),
-            reach,
+            *(conics, model, boxes, hand, steps, counts, n, count),
+            *(height, width, words, len(steps), reach),
             ROWS=32,
             num_warps=1,
         )
