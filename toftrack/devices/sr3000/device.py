@@ -27,16 +27,10 @@ from toftrack.devices.sr3000.transport import (
 from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame
-from toftrack.recordings.sr_frame import (
-    HEIGHT,
-    WIDTH,
-    decode_frame,
-    nominal_camera,
-)
+from toftrack.recordings.sr_frame import HEIGHT, WIDTH, decode_frame, nominal_camera
 from toftrack.recordings.store import open_source
 
 _log = logging.getLogger(__name__)
-_KEEP = ("newest", "every")
 
 
 class Sr3000(BaseDevice):
@@ -45,23 +39,11 @@ class Sr3000(BaseDevice):
     A thread asks for frames from the first iteration on. An unplugged camera is waited for, and
     the iteration goes on with a gap in the frames' indices when it is back.
 
-    Args:
-        transport: `usb`, `libmesasr` (the vendor's library) or `emulated`.
-        serial: which camera; None = the only one.
-        keep: `newest` delivers the newest frame and drops older ones that nobody has taken;
-            `every` delivers all, and asks the camera for no more while `queue_frames` wait.
-        queue_frames: see `keep`.
-        stop: end before this index; None = go on.
-        fps: the rate that is given to those who must know one in advance (the overlay video); the
-            emulated camera has its own.
-        modulation_mhz, integration_time, amplitude_threshold: see `Exposure`.
-        usb, libmesasr, emulated, persistence: settings of the parts.
-        camera_file: a calibrated camera instead of the vendor's nominal one (emulated: instead of
-            the recording's).
+    The arguments are those of conf/device/sr3000.yaml; `fps` is the rate that is given to those who
+    must know one in advance, while the emulated camera has its own.
 
-    Raises:
-        ToftrackError: a setting makes no sense, there is no camera (or library), or the emulated
-            camera's recording cannot be used.
+    Raises ToftrackError: a setting makes no sense, there is no camera (or library), or the emulated
+    camera's recording cannot be used.
     """
 
     def __init__(
@@ -81,7 +63,12 @@ class Sr3000(BaseDevice):
         persistence: Persistence,
         camera_file: str | Path | None,
     ) -> None:
-        if keep not in _KEEP or queue_frames < 1 or (stop is not None and stop < 1) or fps <= 0:
+        if (
+            keep not in ("newest", "every")
+            or queue_frames < 1
+            or (stop is not None and stop < 1)
+            or fps <= 0
+        ):
             raise ToftrackError(
                 "device=sr3000 needs keep=newest or every, queue_frames and stop of at least 1 and "
                 f"fps above 0, but they are {keep}, {queue_frames}, {stop} and {fps}"
@@ -132,10 +119,7 @@ class Sr3000(BaseDevice):
         return self._usb.register_writes(self.exposure)
 
     def open(self) -> None:
-        """Find, claim and configure the camera.
-
-        Raises ToftrackError, with what to try, when that cannot be done.
-        """
+        """Find, claim and configure the camera; ToftrackError, with what to try, otherwise."""
         if self._opened:
             return
         self._transport.open()

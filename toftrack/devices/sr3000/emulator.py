@@ -13,18 +13,18 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import usb.core
 from usb.backend import IBackend
 
-from toftrack.devices.sr3000 import descriptors
-from toftrack.devices.sr3000.descriptors import Descriptor
 from toftrack.devices.sr3000.faults import (
     HARMLESS,
     OPEN_FAULTS,
+    PACKET_BYTES,
     REQUEST_FAULTS,
     Chunk,
     EmulatorSettings,
@@ -39,29 +39,37 @@ _TURN_S = 0.01  # how soon a waiting transfer notices that the camera was unplug
 _CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
 
 
-@dataclass(eq=False)
-class _Handle:
-    camera: int
-    plugging: int
-    """Unplugging and plugging in again makes another device of the camera."""
-    claimed: bool = False
-    closed: bool = False
-
-
 @dataclass(frozen=True)
 class _Id:
     camera: int
     plugging: int
+    """Unplugging and plugging in again makes another device of the camera."""
+
+
+@dataclass(eq=False)
+class _Handle:
+    device: _Id
+    claimed: bool = False
+    closed: bool = False
+
+
+class _Descriptor:
+    """A USB descriptor in the form that pyusb expects; fields that nobody states are 0."""
+
+    extra_descriptors = ()
+
+    def __init__(self, **fields: Any) -> None:
+        self.__dict__.update(fields)
+
+    def __getattr__(self, name: str) -> int:
+        return 0
 
 
 class EmulatedBackend(IBackend):
     """pyusb's view of a computer with virtual cameras plugged in.
 
-    Args:
-        source: what the cameras see; 176 x 144 pixels.
-        settings: how they behave.
-        range_m: their unambiguous range.
-        usb: ids, endpoints and the request that they answer.
+    source: what the cameras see, 176 x 144 pixels.  range_m: their unambiguous range.
+    usb: ids, endpoints and the request that they answer.
     """
 
     def __init__(
@@ -121,31 +129,43 @@ class EmulatedBackend(IBackend):
             serials = self._settings.serials if there else ()
             return iter([_Id(number, self._plugging) for number in range(len(serials))])
 
-    def get_device_descriptor(self, dev: _Id) -> Descriptor:
+    def get_device_descriptor(self, dev: _Id) -> _Descriptor:
         ids = self._usb.ids
         vendor, product = parse_id(ids[min(1, len(ids) - 1)])  # by default the usual SR3000
-        place = (dev.camera, 4 + dev.camera + 10 * dev.plugging)
-        return descriptors.device(vendor, product, *place)
+        return _Descriptor(
+            idVendor=vendor,
+            idProduct=product,
+            iSerialNumber=3,
+            bNumConfigurations=1,
+            bus=1,
+            address=4 + dev.camera + 10 * dev.plugging,
+            port_numbers=(1 + dev.camera,),
+        )
 
-    def get_configuration_descriptor(self, dev: _Id, config: int) -> Descriptor:
-        return descriptors.configuration(config)
+    def get_configuration_descriptor(self, dev: _Id, config: int) -> _Descriptor:
+        if config > 0:
+            raise IndexError(config)
+        return _Descriptor(bNumInterfaces=1, bConfigurationValue=1)
 
-    def get_interface_descriptor(self, dev: _Id, intf: int, alt: int, config: int) -> Descriptor:
-        return descriptors.interface(self._usb.interface, intf, alt, config)
+    def get_interface_descriptor(self, dev: _Id, intf: int, alt: int, config: int) -> _Descriptor:
+        if intf > 0 or alt > 0:
+            raise IndexError((intf, alt))
+        return _Descriptor(bInterfaceNumber=self._usb.interface, bNumEndpoints=2)
 
     def get_endpoint_descriptor(
         self, dev: _Id, ep: int, intf: int, alt: int, config: int
-    ) -> Descriptor:
-        return descriptors.endpoint((self._usb.endpoint_in, self._usb.endpoint_out)[ep])
+    ) -> _Descriptor:
+        address = (self._usb.endpoint_in, self._usb.endpoint_out)[ep]
+        bulk = 2
+        return _Descriptor(bEndpointAddress=address, bmAttributes=bulk, wMaxPacketSize=PACKET_BYTES)
 
     def open_device(self, dev: _Id) -> _Handle:
         with self._lock:
-            if not self._plugged() or dev.plugging != self._plugging:
-                raise _error(errno.ENODEV)
+            self._check_plugged(dev)
             if self._open_fault() == "permission":
                 self._opens += 1
                 raise _error(errno.EACCES)
-            handle = _Handle(dev.camera, dev.plugging)
+            handle = _Handle(dev)
             self.open_handles.add(handle)
             return handle
 
@@ -153,7 +173,7 @@ class EmulatedBackend(IBackend):
         with self._lock:
             if dev_handle.closed:
                 self.misuse.append("a handle was closed twice")
-            if dev_handle.claimed and dev_handle.plugging == self._plugging:
+            if dev_handle.claimed and dev_handle.device.plugging == self._plugging:
                 self.misuse.append("a handle was closed with its interface claimed")
             dev_handle.closed, dev_handle.claimed = True, False
             self.open_handles.discard(dev_handle)
@@ -202,17 +222,19 @@ class EmulatedBackend(IBackend):
         with self._lock:
             self._check(dev_handle, claimed=False)
             if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):
-                return descriptors.string(
-                    data, wValue & 0xFF, self._settings.serials[dev_handle.camera]
-                )
+                # A string: number 0 is the list of languages, another one the serial number.
+                serial = self._settings.serials[dev_handle.device.camera].encode("utf-16-le")
+                text = serial if wValue & 0xFF else (0x0409).to_bytes(2, "little")
+                content = (bytes((2 + len(text), 3)) + text)[: len(data)]
+                data[: len(content)] = array.array("B", content)
+                return len(content)
             usb_ = self._usb
             expected = (usb_.request_type, usb_.request, usb_.request_value, usb_.request_index)
             if (bmRequestType, bRequest, wValue, wIndex) != expected:
                 raise _error(errno.EPIPE)
             self._check(dev_handle)
             if any(chunk.error == errno.ENODEV for chunk in self._queue):
-                self.unplug(self._settings.replug_s)
-                raise _error(errno.ENODEV)
+                raise self._unplugged()
             self._request()
             return 0
 
@@ -262,36 +284,45 @@ class EmulatedBackend(IBackend):
     def _plugged(self) -> bool:
         return self._back_s is not None and time.monotonic() >= self._back_s
 
+    def _check_plugged(self, device: _Id) -> None:
+        if device.plugging != self._plugging or not self._plugged():
+            raise _error(errno.ENODEV)
+
     def _check(self, handle: _Handle, claimed: bool = True) -> None:
         if handle.closed:
             self.misuse.append("a closed handle was used")
             raise _error(errno.EINVAL)
-        if handle.plugging != self._plugging or not self._plugged():
-            raise _error(errno.ENODEV)
+        self._check_plugged(handle.device)
         if claimed and not handle.claimed:
             self.misuse.append("an interface was used without being claimed")
             raise _error(errno.EINVAL)
 
-    def _open_fault(self) -> str | None:
-        hit = (f.kind for f in self._faults if f.kind in OPEN_FAULTS and f.hits(self._opens))
+    def _fault(self, kinds: Collection[str], number: int) -> str | None:
+        """The first fault of some kinds that hits an attempt or request."""
+        hit = (f.kind for f in self._faults if f.kind in kinds and f.hits(number))
         return next(hit, None)
+
+    def _open_fault(self) -> str | None:
+        return self._fault(OPEN_FAULTS, self._opens)
 
     def _fail(self, number: int) -> None:
         self._queue.popleft()
         if number == errno.ENODEV:
-            self.unplug(self._settings.replug_s)
+            raise self._unplugged()
         self._stalled = number == errno.EPIPE
         raise _error(number)
 
+    def _unplugged(self) -> usb.core.USBError:
+        self.unplug(self._settings.replug_s)
+        return _error(errno.ENODEV)
+
     def _request_fault(self) -> str | None:
-        number = self.requests
         every = self._settings.fault_every
-        if every and (number + 1) % every == 0:
+        if every and (self.requests + 1) % every == 0:
             kind = _CYCLE[self._cycled % len(_CYCLE)]
             self._cycled += 1
             return kind
-        hit = (f.kind for f in self._faults if f.kind in REQUEST_FAULTS and f.hits(number))
-        return next(hit, None)
+        return self._fault(REQUEST_FAULTS, self.requests)
 
     def _request(self) -> None:
         fault = self._request_fault()
@@ -302,8 +333,7 @@ class EmulatedBackend(IBackend):
             return
         if fault == "unplug_before":
             self._position += 1  # the scene goes on
-            self.unplug(self._settings.replug_s)
-            raise _error(errno.ENODEV)
+            raise self._unplugged()
         if fault in ("stall", "io_error"):
             number = errno.EPIPE if fault == "stall" else errno.EIO
             self._queue.append(Chunk(0.0, error=number))
@@ -330,9 +360,8 @@ class EmulatedBackend(IBackend):
             return None
         depth, amplitude = source.image(self._position)
         self._position += 1
-        return encode_frame(
-            to_radial(depth, source.radial, source.camera), amplitude, self._range_m
-        )
+        radial_m = to_radial(depth, source.radial, source.camera)
+        return encode_frame(radial_m, amplitude, self._range_m)
 
 
 def _error(number: int) -> usb.core.USBError:

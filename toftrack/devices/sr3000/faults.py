@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toftrack.devices.sr3000.descriptors import PACKET_BYTES
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES
 
+PACKET_BYTES = 512
+"""Of a bulk endpoint at high speed."""
 _PACKETS = FRAME_BYTES // PACKET_BYTES
 
 OPEN_FAULTS = {
@@ -77,14 +78,10 @@ class Chunk:
 def transfer(
     fault: str | None, data: bytes, ready_s: float, split: int, random: np.random.Generator
 ) -> list[Chunk]:
-    """What comes over the wire for a frame.
+    """What comes over the wire for a frame at `ready_s`.
 
-    Args:
-        fault: one of REQUEST_FAULTS under which something comes, or None.
-        data: the frame.
-        ready_s: when.
-        split: how many frames came in two transfers so far.
-        random: of the garbage.
+    fault: one of REQUEST_FAULTS under which something comes, or None.  split: how many frames came
+    in two transfers so far.  random: of the garbage.
     """
     whole = memoryview(data)
     if fault == "overflow":
@@ -100,11 +97,9 @@ def transfer(
     if fault == "split":
         at = (1 + split % (_PACKETS - 1)) * PACKET_BYTES
         return [Chunk(ready_s, whole[:at], ends=True), Chunk(ready_s, whole[at:])]
-    if fault == "unplug_during":
-        half = Chunk(ready_s, whole[: 50 * PACKET_BYTES])
-        return [half, Chunk(ready_s, error=errno.ENODEV)]
-    if fault == "unplug_after":
-        return [Chunk(ready_s, whole), Chunk(ready_s, error=errno.ENODEV)]
+    if fault in ("unplug_during", "unplug_after"):
+        came = whole[: 50 * PACKET_BYTES] if fault == "unplug_during" else whole
+        return [Chunk(ready_s, came), Chunk(ready_s, error=errno.ENODEV)]
     if fault == "garbage":
         whole = memoryview(random.bytes(FRAME_BYTES))
     elif fault in ("zeros", "ones"):
@@ -113,24 +108,21 @@ def transfer(
 
 
 def parse_faults(texts: Iterable[str]) -> tuple[Fault, ...]:
-    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on).
-
-    Raises ToftrackError for an unknown kind or another form.
+    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on);
+    ToftrackError for an unknown kind or another form.
     """
-    return tuple(_parse(str(text)) for text in texts)
-
-
-def _parse(text: str) -> Fault:
-    match = re.fullmatch(r"([a-z_]+)(?:@(\d+)(\+|x(\d+))?)?", text)
-    if match is None or match[1] not in OPEN_FAULTS | REQUEST_FAULTS:
-        raise ToftrackError(
-            f"device.emulated.faults: '{text}' is unknown; give KIND, KIND@7, KIND@7x3 or KIND@7+, "
-            f"where KIND is one of {', '.join(OPEN_FAULTS | REQUEST_FAULTS)}"
-        )
-    kind, first, rest, count = match.groups()
-    if first is None or rest == "+":
-        return Fault(kind, int(first or 0), None)
-    return Fault(kind, int(first), int(count or 1))
+    faults = []
+    for text in map(str, texts):
+        match = re.fullmatch(r"([a-z_]+)(?:@(\d+)(\+|x(\d+))?)?", text)
+        if match is None or match[1] not in OPEN_FAULTS | REQUEST_FAULTS:
+            raise ToftrackError(
+                f"device.emulated.faults: '{text}' is unknown; give KIND, KIND@7, KIND@7x3 or "
+                f"KIND@7+, where KIND is one of {', '.join(OPEN_FAULTS | REQUEST_FAULTS)}"
+            )
+        kind, first, rest, count = match.groups()
+        always = first is None or rest == "+"
+        faults.append(Fault(kind, int(first or 0), None if always else int(count or 1)))
+    return tuple(faults)
 
 
 @dataclass(frozen=True)
@@ -138,21 +130,13 @@ class EmulatorSettings:
     """What the virtual camera does; see conf/device/sr3000.yaml."""
 
     source: str
-    """The recording that it sees: `sample`, or a file."""
     fps: float | None
-    """Frames a second; None = the recording's own."""
     loop: bool
-    """Begin again at the end; otherwise the stream ends there."""
     faults: tuple[str, ...]
-    """See `parse_faults`."""
     fault_every: int
-    """Each n-th request goes wrong, in all ways in turn; 0 = none."""
     replug_s: float
-    """How long it stays unplugged."""
     late_s: float
-    """How long after its time a late frame comes."""
     serials: tuple[str, ...]
-    """Of the cameras that are plugged in."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "faults", tuple(self.faults))

@@ -61,22 +61,18 @@ class Reader:
     The iteration waits for frames. It ends after `stop` or at the end of the stream, when all that
     was received is delivered, and raises ToftrackError when the camera is given up.
 
-    Args:
-        transport: an opened camera; used by the thread alone until `stop` returns.
-        persistence: how long to go on trying.
-        waiting: None keeps only the newest frame and drops older ones; a number keeps every frame,
-            and asks the camera for no more while so many are waiting.
-        first_index: of the first frame.
-        end_index: the stream ends before it; None = it goes on.
+    transport: an opened camera; used by the thread alone until `stop` returns.  waiting: None keeps
+    only the newest frame and drops older ones; a number keeps every frame, and asks the camera for
+    no more while so many are waiting.  end_index: the stream ends before it; None = it goes on.
     """
 
     def __init__(
         self,
         transport: Transport,
         persistence: Persistence,
-        waiting: int | None = None,
-        first_index: int = 0,
-        end_index: int | None = None,
+        waiting: int | None,
+        first_index: int,
+        end_index: int | None,
     ) -> None:
         self.counts = Counts()
         self.next_index, self._end_index = first_index, end_index

@@ -44,12 +44,8 @@ class UsbTransport:
 
     The camera is never reset: whether its firmware would survive that is not known.
 
-    Args:
-        settings: the USB interface.
-        exposure: written to the camera where the settings say to which registers.
-        serial: the camera's serial number; None = the only one.
-        backend: of pyusb; None = libusb.
-        ended: says that there will be no more frames.
+    exposure: written to the camera where the settings say to which registers.  serial: None = the
+    only camera.  backend: of pyusb; None = libusb.  ended: says that there will be no more frames.
     """
 
     def __init__(
@@ -69,15 +65,9 @@ class UsbTransport:
         self.patience_s = (3 * settings.timeout_ms + settings.drain_ms) / 1000
 
     def check(self) -> None:
-        """Look whether there is one camera to open. Raises ToftrackError if not."""
         _let_go([self._find()])
 
     def open(self) -> None:
-        """Find, claim and configure the camera.
-
-        Raises ToftrackError when there is none (or several, and none was chosen), when it may not
-        be opened, when another program has it, or when it does not take its settings.
-        """
         self.close()
         self._device = self._find()
         try:
@@ -94,21 +84,15 @@ class UsbTransport:
             raise
 
     def acquire(self) -> bytes:
-        """One frame, FRAME_BYTES bytes; the faults are those of `Transport.acquire`."""
         if self._ended is not None and self._ended():
             raise EndOfStreamError
         if self._device is None:
             raise UnpluggedError("it is not open")
         settings = self._settings
         try:
-            self._device.ctrl_transfer(
-                settings.request_type,
-                settings.request,
-                settings.request_value,
-                settings.request_index,
-                None,
-                settings.timeout_ms,
-            )
+            what = settings.request_type, settings.request
+            place = settings.request_value, settings.request_index
+            self._device.ctrl_transfer(*what, *place, None, settings.timeout_ms)
             data = self._read_frame(self._device)
         except usb.core.USBError as error:
             raise self._recovered(error) from error
@@ -118,7 +102,6 @@ class UsbTransport:
         return data
 
     def close(self) -> None:
-        """Release the interface and the handle; never raises."""
         device, self._device = self._device, None
         if device is None:
             return
@@ -128,7 +111,6 @@ class UsbTransport:
         _let_go([device])
 
     def facts(self) -> dict[str, Any]:
-        """Ids, place and serial number of the opened camera."""
         device = self._device
         if device is None:
             return {}
