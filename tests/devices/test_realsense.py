@@ -23,7 +23,7 @@ from toftrack.devices.realsense.device import (
     set_preset,
 )
 from toftrack.devices.realsense.emulator import EmulatedCamera
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 
 FINE = realsense_emulator(fps=500.0, unit_m=0.0001)

@@ -12,8 +12,7 @@ from helpers.videos import RATIONAL, calibration, seen_through, write_kinect
 
 from toftrack.camera import Camera
 from toftrack.devices.base import Device
-from toftrack.devices.replay import Bag, Replay
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Bag, Replay, Sample
 
 FRAMES = 30
 

@@ -9,7 +9,7 @@ import pytest
 
 import toftrack
 from toftrack.devices.base import Device
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 from toftrack.recordings.store import SAMPLES, sample_file
 

@@ -16,7 +16,7 @@ from helpers.settings import sr3000
 from helpers.sr3000_camera import STEP_M, camera, read
 
 from toftrack.devices.base import Device
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.devices.sr3000 import usb as sr3000_usb
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.devices.sr3000.faults import REQUEST_FAULTS

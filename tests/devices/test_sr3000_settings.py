@@ -17,7 +17,7 @@ from helpers.settings import (
 from helpers.sr3000_camera import STEP_M, camera, read
 
 from toftrack.camera import Camera
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.devices.sr3000.emulator import EmulatedBackend
 from toftrack.devices.sr3000.transport import Exposure
 from toftrack.devices.sr3000.usb import UsbTransport

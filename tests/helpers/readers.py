@@ -21,8 +21,7 @@ from toftrack.configuration.compose import configuration
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import onnx_file, read_session
 from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save_weights
-from toftrack.devices.replay import Replay
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.datasets import nyu, open_data_set
 from toftrack.evaluation.datasets.base import INTEL_CREATIVE

@@ -46,12 +46,7 @@ class Device(Protocol):
 class BaseDevice:
     """A `Device` but for its frames: derive from it, write `__iter__`, and `open` where needed.
 
-    Args:
-        camera: of the images.
-        fps: frames a second; what the overlay video plays at.
-        frames: how many an iteration yields at most; None = nobody knows.
-        truth: one row for each of `frames`.
-        live: frames do not wait, and what comes too late is dropped and counted in `dropped`.
+    fps: what the overlay video plays at.  The other arguments are fields of `Device`.
     """
 
     def __init__(
@@ -68,10 +63,10 @@ class BaseDevice:
         self.metadata: dict[str, Any] = {}
 
     def open(self) -> None:
-        """Nothing to open."""
+        """Nothing by default."""
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Nothing by default."""
 
     def __enter__(self) -> Self:
         self.open()

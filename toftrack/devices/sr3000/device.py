@@ -63,12 +63,8 @@ class Sr3000(BaseDevice):
         persistence: Persistence,
         camera_file: str | Path | None,
     ) -> None:
-        if (
-            keep not in ("newest", "every")
-            or queue_frames < 1
-            or (stop is not None and stop < 1)
-            or fps <= 0
-        ):
+        sensible = queue_frames >= 1 and (stop is None or stop >= 1) and fps > 0
+        if keep not in ("newest", "every") or not sensible:
             raise ToftrackError(
                 "device=sr3000 needs keep=newest or every, queue_frames and stop of at least 1 and "
                 f"fps above 0, but they are {keep}, {queue_frames}, {stop} and {fps}"
@@ -83,18 +79,16 @@ class Sr3000(BaseDevice):
         self._next_index = 0
         self._reader: Reader | None = None
         self._opened = False
-        serial = None if serial is None else str(serial)
         self._usb = usb
         self._transport: Transport
+        number = None if serial is None else str(serial)
         if transport == "usb":
-            self._transport = UsbTransport(usb, self.exposure, serial)
+            self._transport = UsbTransport(usb, self.exposure, number)
         elif transport == "libmesasr":
-            self._transport = MesaTransport(libmesasr, self.exposure, serial)
+            self._transport = MesaTransport(libmesasr, self.exposure, number)
         elif transport == "emulated":
-            backend = self._emulate(emulated, usb)
-            self._transport = UsbTransport(
-                usb, self.exposure, serial, backend, ended=lambda: backend.ended
-            )
+            backend = self._emulate(emulated)
+            self._transport = UsbTransport(usb, self.exposure, number, backend)
         else:
             raise ToftrackError(
                 f"device.transport={transport} is unknown; give usb, libmesasr or emulated"
@@ -172,7 +166,7 @@ class Sr3000(BaseDevice):
                 self._next_index, self._reader = reader.next_index, None
                 _log.info("sr3000: frames: %s", reader.counts)
 
-    def _emulate(self, settings: EmulatorSettings, usb: UsbSettings) -> EmulatedBackend:
+    def _emulate(self, settings: EmulatorSettings) -> EmulatedBackend:
         store = open_source(settings.source)
         if (store.camera.width, store.camera.height) != (WIDTH, HEIGHT):
             raise ToftrackError(
@@ -186,5 +180,5 @@ class Sr3000(BaseDevice):
             count = len(store)
             self.frames = count if self._stop is None else min(count, self._stop)
             self.truth = None if store.truth is None else store.truth[: self.frames]
-        self.emulator = EmulatedBackend(store, settings, self.exposure.range_m, usb)
+        self.emulator = EmulatedBackend(store, settings, self.exposure.range_m, self._usb)
         return self.emulator

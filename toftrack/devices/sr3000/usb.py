@@ -11,7 +11,7 @@ import array
 import contextlib
 import errno
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import usb.core
@@ -27,12 +27,16 @@ from toftrack.devices.sr3000.transport import (
     UsbSettings,
     parse_id,
 )
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.recordings.sr_frame import FRAME_BYTES
 
 WHEN_IT_DOES_NOT_ANSWER = (
     "open the camera once with the vendor's viewer (its library loads the camera's firmware), use "
     "that library with device.transport=libmesasr, or try without a camera with "
+    "device.transport=emulated"
+)
+_OTHERWISE = (
+    "use the vendor's library with device.transport=libmesasr, or try without a camera with "
     "device.transport=emulated"
 )
 # Of what a camera can leave behind, nothing is longer than a few frames.
@@ -45,7 +49,7 @@ class UsbTransport:
     The camera is never reset: whether its firmware would survive that is not known.
 
     exposure: written to the camera where the settings say to which registers.  serial: None = the
-    only camera.  backend: of pyusb; None = libusb.  ended: says that there will be no more frames.
+    only camera.  backend: of pyusb; None = libusb.
     """
 
     def __init__(
@@ -54,12 +58,10 @@ class UsbTransport:
         exposure: Exposure,
         serial: str | None = None,
         backend: IBackend | None = None,
-        ended: Callable[[], bool] | None = None,
     ) -> None:
         self._settings, self._exposure = settings, exposure
         self._serial = serial
         self._backend = backend
-        self._ended = ended
         self._device: Any = None  # a usb.core.Device while it is open
         self._length = -(-FRAME_BYTES // settings.read_multiple) * settings.read_multiple
         self.patience_s = (3 * settings.timeout_ms + settings.drain_ms) / 1000
@@ -84,7 +86,7 @@ class UsbTransport:
             raise
 
     def acquire(self) -> bytes:
-        if self._ended is not None and self._ended():
+        if getattr(self._backend, "ended", False):  # an emulated camera's
             raise EndOfStreamError
         if self._device is None:
             raise UnpluggedError("it is not open")
@@ -123,38 +125,32 @@ class UsbTransport:
     def _find(self) -> usb.core.Device:
         ids = {parse_id(text) for text in self._settings.ids}
         names = ", ".join(self._settings.ids)
+        what = f"the USB devices cannot be listed to find an SR3000 ({names})"
         try:
-            found = list(
-                usb.core.find(
-                    find_all=True,
-                    backend=self._backend,
-                    custom_match=lambda device: (device.idVendor, device.idProduct) in ids,
+            with reported_errors(what, f"may this user use USB? {_OTHERWISE}", usb.core.USBError):
+                found = list(
+                    usb.core.find(
+                        find_all=True,
+                        backend=self._backend,
+                        custom_match=lambda device: (device.idVendor, device.idProduct) in ids,
+                    )
                 )
-            )
         except usb.core.NoBackendError:
             raise ToftrackError(
                 f"no SR3000 can be looked for on USB (ids {names}), because the library "
                 "libusb-1.0 is not installed: install it (Debian, Ubuntu: apt install "
-                "libusb-1.0-0), use the vendor's library with device.transport=libmesasr, or try "
-                "without a camera with device.transport=emulated"
+                f"libusb-1.0-0), {_OTHERWISE}"
             ) from None
-        except usb.core.USBError as error:
-            raise ToftrackError(
-                f"the USB devices cannot be listed to find an SR3000 ({names}): {error}; "
-                "check that this user may use USB, or try without a camera with "
-                "device.transport=emulated"
-            ) from error
+        wanted = ""
         if self._serial is not None:
+            wanted = f" with the serial number {self._serial}"
             chosen = [device for device in found if _serial_number(device) == self._serial]
             _let_go(device for device in found if device not in chosen)
             found = chosen
         if not found:
-            wanted = "" if self._serial is None else f" with the serial number {self._serial}"
             raise ToftrackError(
                 f"no SR3000{wanted} was found on USB (looked for the ids {names}): plug it in "
-                "and switch it on (lsusb must list it), use the vendor's library with "
-                "device.transport=libmesasr, or try without a camera with "
-                "device.transport=emulated"
+                f"and switch it on (lsusb must list it), {_OTHERWISE}"
             )
         if len(found) > 1:
             numbers = ", ".join(_serial_number(device) or "unreadable" for device in found)
@@ -183,17 +179,15 @@ class UsbTransport:
             raise _unopened(error) from error
 
     def _check_endpoints(self, device: usb.core.Device) -> None:
-        settings = self._settings
         there = {
             endpoint.bEndpointAddress
             for interface in device.get_active_configuration()
-            if interface.bInterfaceNumber == settings.interface
+            if interface.bInterfaceNumber == self._settings.interface
             for endpoint in interface
         }
-        needed = {"endpoint_in": settings.endpoint_in}
-        if settings.register_writes(self._exposure):
-            needed["endpoint_out"] = settings.endpoint_out
-        for name, address in needed.items():
+        writes = self._settings.register_writes(self._exposure)
+        for name in ("endpoint_in", "endpoint_out") if writes else ("endpoint_in",):
+            address = getattr(self._settings, name)
             if address not in there:
                 listed = ", ".join(f"{address:#04x}" for address in sorted(there)) or "none"
                 raise ToftrackError(
@@ -202,14 +196,11 @@ class UsbTransport:
                 )
 
     def _write_register(self, address: int, value: int) -> None:
-        settings = self._settings
-        try:
-            self._device.write(settings.endpoint_out, bytes((address, value)), settings.timeout_ms)
-        except usb.core.USBError as error:
-            raise ToftrackError(
-                f"the camera does not take the value {value} for its register {address} "
-                f"({_reason(error)}); check device.usb.registers, or leave them out"
-            ) from error
+        endpoint, timeout_ms = self._settings.endpoint_out, self._settings.timeout_ms
+        what = f"the camera does not take the value {value} for its register {address}"
+        remedy = "check device.usb.registers, or leave them out"
+        with reported_errors(what, remedy, usb.core.USBError):
+            self._device.write(endpoint, bytes((address, value)), timeout_ms)
 
     def _read_frame(self, device: usb.core.Device) -> bytes:
         """All of one frame, or as much as came of it; more than a frame when more came."""
