@@ -36,11 +36,10 @@ from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose
 from toftrack.programs.recover import recover
 from toftrack.programs.report import read_runs
 from toftrack.recordings.npz import Recording, write_recording
-from toftrack.recordings.npz_pieces import compressed
 from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
-from toftrack.recordings.unfinished import Facts, UnfinishedRecording, recover_recording
+from toftrack.recordings.unfinished import Facts, UnfinishedRecording, compressed, recover_recording
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 3
 _MOST_FRAMES = 4

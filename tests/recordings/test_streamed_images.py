@@ -11,8 +11,7 @@ import pytest
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.recordings import npz
-from toftrack.recordings.npz import read_recording
-from toftrack.recordings.npz_pieces import StreamedImages
+from toftrack.recordings.npz import StreamedImages, read_recording
 
 K = np.array([[90.0, 0, 40], [0, 91.0, 30], [0, 0, 1]])
 RNG = np.random.default_rng(0)
