@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +25,6 @@ from helpers.bags import (
     recording,
     write_bag,
 )
-from helpers.damage import damaged
 
 from toftrack.camera import Camera
 from toftrack.devices.replay import Bag, Replay
@@ -75,7 +73,7 @@ def test_every_kind_of_bag_gives_the_frames_that_went_in(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_frames_come_in_any_order_and_from_the_middle(tmp_path: Path, kind: str) -> None:
+def test_messages_of_one_time_are_told_apart(tmp_path: Path, kind: str) -> None:
     depth = some_depth(9)
     messages = recording(depth, CAMERA)
     for message in messages[3:7]:
@@ -84,10 +82,6 @@ def test_frames_come_in_any_order_and_from_the_middle(tmp_path: Path, kind: str)
     for number in (4, 2, 3, 8, 0, 1):
         np.testing.assert_allclose(store.image(number)[0], depth[number], atol=1e-6)
     store.close()
-    np.testing.assert_allclose(store.image(5)[0], depth[5], atol=1e-6)
-    store.close()
-    frames = list(Replay(store.path, start=2, stop=4))
-    assert [frame.index for frame in frames] == [2, 3]
 
 
 def test_a_file_of_a_ros_2_bag_is_one_too_and_so_is_a_folder_without_metadata(
@@ -211,10 +205,6 @@ def test_a_unit_can_be_given(tmp_path: Path) -> None:
         Bag(path, unit_m=-1.0)
 
 
-def cut(path: Path, share: float) -> None:
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-
-
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.3, 0.9, 0.999])
 @pytest.mark.parametrize("kind", KINDS)
 def test_bags_that_were_cut_off_are_reported_or_used_so_far(
@@ -222,7 +212,7 @@ def test_bags_that_were_cut_off_are_reported_or_used_so_far(
 ) -> None:
     path = write_bag(tmp_path, kind, recording(some_depth(40), CAMERA))
     file = path if path.is_file() else next(path.glob(f"*.{kind}"))
-    cut(file, share)
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
     try:
         device = Replay(path)
     except ToftrackError as error:
@@ -234,27 +224,12 @@ def test_bags_that_were_cut_off_are_reported_or_used_so_far(
         assert 0 < len(list(device)) <= (40 if share > 0.99 else 39)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_whatever_bytes_are_damaged_it_is_read_or_reported(tmp_path: Path, kind: str) -> None:
-    path = write_bag(tmp_path, kind, recording(some_depth(), CAMERA))
-    path = path if path.is_file() else next(path.glob(f"*.{kind}"))
-    content = path.read_bytes()
-    for seed in range(24):
-        path.write_bytes(damaged(content, seed))
-        with contextlib.suppress(ToftrackError):
-            store = open_recording(path)
-            for number in range(len(store)):
-                store.image(number)
-
-
 def test_what_is_no_bag_is_reported(tmp_path: Path) -> None:
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     for name in ("a.bag", "a.mcap", "a.db3"):
         (tmp_path / name).write_bytes(b"nonsense" * 40)
         with pytest.raises(ToftrackError, match=f"{name}' cannot be read.*no bag"):
             Replay(tmp_path / name)
-    with pytest.raises(ToftrackError, match="there is no bag"):
-        Bag(tmp_path / "none.bag")
 
 
 def test_a_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
