@@ -50,7 +50,6 @@ def chosen_serial(
     numbers: Sequence[str], serial: str | int | None, maker: str, otherwise: str = ""
 ) -> str:
     """The serial number of the camera that is meant, of those plugged in; None: the only one.
-
     ToftrackError where there is none of it (`otherwise`: what else a user may do), or several and
     none is chosen.
     """
@@ -79,7 +78,6 @@ Size = tuple[int | None, int | None, int | None]
 
 def chosen_profile(offered: Sequence[T], size_of: Callable[[T], Size], size: Size, owner: str) -> T:
     """The first profile of that size, of those of depth images that a camera (`owner`) offers.
-
     ToftrackError where it has no depth images, or none of that size.
     """
     if not offered:

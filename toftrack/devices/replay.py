@@ -44,9 +44,8 @@ class Replay(BaseDevice):
     path: of any kind that `open_recording` knows.  realtime: wait for each frame's time, and drop a
     frame when the next one is already due (the last is always delivered); otherwise every frame, as
     fast as it is asked for.  camera_file, intrinsics (fx, fy, cx, cy in pixels): instead of the
-    recording's own camera.  store: the recording, where it is open already.
-
-    Raises ToftrackError: the recording or the camera cannot be used, or the range lies outside.
+    recording's own camera.  store: the recording, where it is open already. Raises ToftrackError:
+    the recording or the camera cannot be used, or the range lies outside.
     """
 
     def __init__(

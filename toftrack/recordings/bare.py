@@ -107,9 +107,8 @@ def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) 
     """Open a stack.
 
     camera_file: None = the given intrinsics, or camera.json beside the file.  bare: intrinsics,
-    unit of whole numbers (a millimetre) and frame rate (25) where given.
-
-    Raises ToftrackError: it is no such stack, holds pickled objects, or nothing tells its camera.
+    unit of whole numbers (a millimetre) and frame rate (25) where given. Raises ToftrackError: it
+    is no such stack, holds pickled objects, or nothing tells its camera.
     """
     path = file_of(path)
     try:

@@ -39,9 +39,7 @@ class FrameStore:
     @abstractmethod
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Depth, (H, W) float32 metres, 0 = no reading, a new array, and amplitude, (H, W) uint16
-        or None.
-
-        Raises ToftrackError when it cannot be read, is damaged, or of another size.
+        or None. Raises ToftrackError when it cannot be read, is damaged, or of another size.
         """
 
     def close(self) -> None:

@@ -175,9 +175,8 @@ def write_recording(
     complete one.
 
     store: read twice where it has amplitudes. Depth keeps the type of a `Recording` (float16 or
-    float32), and becomes float32 of others.  progress: called after each frame's depth.
-
-    Raises ToftrackError: the file cannot be written, or the store not be read.
+    float32), and becomes float32 of others.  progress: called after each frame's depth. Raises
+    ToftrackError: the file cannot be written, or the store not be read.
     """
 
     def depth_images() -> Iterator[np.ndarray]:

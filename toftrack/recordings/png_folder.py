@@ -35,9 +35,8 @@ _CAMERA, _TIMES = "camera.json", "timestamps.txt"
 
 
 class PngFolder(FrameStore):
-    """The frames of a folder, read from the disk one at a time.
-
-    Raises ToftrackError where `stated`, the content of the folder's `camera.json`, makes no sense.
+    """The frames of a folder, read from the disk one at a time. Raises ToftrackError where
+    `stated`, the content of the folder's `camera.json`, makes no sense.
     """
 
     unit_m: float
@@ -89,10 +88,9 @@ def read_png_folder(
     """Open a folder of depth images: the first one is checked, the others stay on the disk.
 
     camera_file: instead of the folder's `camera.json`.  bare: what is given goes before what
-    `camera.json` says; the unit is else 0.001, fps 25.
-
-    Raises ToftrackError: there is no folder, image or camera, or the first image is not a 16-bit
-    grey PNG, or of another size than the camera's; later, another one.
+    `camera.json` says; the unit is else 0.001, fps 25. Raises ToftrackError: there is no folder,
+    image or camera, or the first image is not a 16-bit grey PNG, or of another size than the
+    camera's; later, another one.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -134,9 +132,8 @@ class PngFolderWriter:
     """Writes a folder that `read_png_folder` reads; use it with `with`.
 
     folder: made when it does not exist; must not contain PNG images.  unit_m: metres of one step of
-    the depth images.  camera, radial, fps, metadata (JSON-able) go to `camera.json`.
-
-    Raises ToftrackError: the folder cannot be written or is in use.
+    the depth images.  camera, radial, fps, metadata (JSON-able) go to `camera.json`. Raises
+    ToftrackError: the folder cannot be written or is in use.
     """
 
     def __init__(

@@ -55,7 +55,6 @@ class Recorder:
 
     limit_gb: 1e9 bytes of the file, after which no more frames are taken.  overwrite: replace an
     existing file.  tell: called with `ended`, in the recorder's thread, as soon as that is so.
-
     Raises ToftrackError: the file exists, or cannot be made.
     """
 

@@ -100,10 +100,9 @@ def read_rosbag(
 
     path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.  topic: of the depth images;
     None = the only one there is.  camera_file: instead of the bag's camera_info.  unit_m: metres of
-    one step of 16UC1; None = a millimetre, as ROS says.
-
-    Raises ToftrackError: rosbags is not installed, the bag is damaged, it has no depth images or
-    several topics of them, or nothing tells their lens; one sentence.
+    one step of 16UC1; None = a millimetre, as ROS says. Raises ToftrackError: rosbags is not
+    installed, the bag is damaged, it has no depth images or several topics of them, or nothing
+    tells their lens; one sentence.
     """
     path = Path(path).expanduser()
     if not path.exists():

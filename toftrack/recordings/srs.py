@@ -74,9 +74,8 @@ class SrsFacts:
 
 
 def _parse_facts(path: Path, text: bytes) -> SrsFacts:
-    """What the content of a TOFT object says; `path` is for the message.
-
-    Raises ToftrackError: what the recorder stated must not be replaced by a guess in silence.
+    """What the content of a TOFT object says; `path` is for the message. Raises ToftrackError: what
+    the recorder stated must not be replaced by a guess in silence.
     """
     try:
         content = parse_json(text)
@@ -99,9 +98,8 @@ class SrsWriter:
     Each frame reaches the operating system before `append` returns, so that a killed program leaves
     a file that is readable to its last whole frame.
 
-    registers: the camera's 64 register bytes as far as they are known.
-
-    Raises ToftrackError: the file exists already (without `overwrite`) or cannot be written.
+    registers: the camera's 64 register bytes as far as they are known. Raises ToftrackError: the
+    file exists already (without `overwrite`) or cannot be written.
     """
 
     def __init__(
@@ -146,9 +144,8 @@ class SrsWriter:
         return self._file.bytes
 
     def append(self, data: bytes, timestamp_s: float) -> None:
-        """Add a raw frame, received at `timestamp_s`.
-
-        ToftrackError when it cannot be written; the file then ends with the frame before.
+        """Add a raw frame, received at `timestamp_s`. ToftrackError when it cannot be written; the
+        file then ends with the frame before.
         """
         if len(data) != FRAME_BYTES:
             raise ToftrackError(f"a frame has {FRAME_BYTES} bytes, but {len(data)} came")
@@ -218,10 +215,8 @@ def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> 
     A file that is cut off or damaged somewhere is usable up to there (`damage` says so).
 
     modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it in
-    registers whose meaning is not public).
-
-    Raises ToftrackError: the file is missing, not a stream file, of another version, in a wrong
-    order or without any whole frame.
+    registers whose meaning is not public). Raises ToftrackError: the file is missing, not a stream
+    file, of another version, in a wrong order or without any whole frame.
     """
     path, default_range_m = file_of(path, " (.srs)"), unambiguous_range_m(modulation_mhz)
     with reading(path), open_to_read(path) as stream:

@@ -57,9 +57,8 @@ def open_recording(
     path: `.npz`, `.srs`, a folder of PNG images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder with
     metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`.  camera_file, bare: of
     what has no camera of its own, and says nothing of itself.  modulation_mhz: tells the range of a
-    `.srs` that does not state it.  topic: of a ROS bag that has several of depth images.
-
-    Raises ToftrackError: it cannot be used; one sentence that names it.
+    `.srs` that does not state it.  topic: of a ROS bag that has several of depth images. Raises
+    ToftrackError: it cannot be used; one sentence that names it.
     """
     path = Path(path).expanduser()
     suffix = path.suffix.lower()
@@ -92,9 +91,8 @@ def open_sample(name: str = FIRST_SAMPLE) -> FrameStore:
 
 
 def packaged_sample(name: str = FIRST_SAMPLE) -> AbstractContextManager[Path]:
-    """A recording that comes with the package, as a file while the context is open.
-
-    Raises ToftrackError when there is none of that name; it lists those that there are.
+    """A recording that comes with the package, as a file while the context is open. Raises
+    ToftrackError when there is none of that name; it lists those that there are.
     """
     return resources.as_file(resources.files("toftrack") / "data" / sample_file(name))
 

@@ -81,7 +81,6 @@ class _Kept:
 
 class GrowingFile:
     """A new file that grows by whole records; each is the operating system's when `write` returns.
-
     Raises OSError: something stands there, or it cannot be made.
     """
 
@@ -110,10 +109,9 @@ class GrowingFile:
 
 
 class UnfinishedRecording(GrowingFile):
-    """A file that grows by frames; replace: let a file that stands there go.
-
-    Raises ToftrackError where another process writes the file, and OSError where it exists, or
-    cannot be made or written; then it ends with the frame before.
+    """A file that grows by frames; replace: let a file that stands there go. Raises ToftrackError
+    where another process writes the file, and OSError where it exists, or cannot be made or
+    written; then it ends with the frame before.
     """
 
     def __init__(self, path: Path, replace: bool = False) -> None:

@@ -118,9 +118,8 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
 
     path: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of 16 bits (FFV1).
     camera_file: None = the recording's own calibration, or what is given.  bare: intrinsics, unit
-    (a millimetre) and frame rate of a video that does not tell them.
-
-    Raises ToftrackError: it is damaged, has colour images or no depth, or nothing tells its camera.
+    (a millimetre) and frame rate of a video that does not tell them. Raises ToftrackError: it is
+    damaged, has colour images or no depth, or nothing tells its camera.
     """
     path = file_of(path)
     container = _opened(path)
@@ -174,9 +173,8 @@ def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
 
 
 def _scanned(container: Any, path: Path, streams: Sequence[int]) -> tuple[list[Track], str | None]:
-    """Some tracks with the times of their images, and what ended the file before its end.
-
-    Raises ToftrackError when the first track has no image.
+    """Some tracks with the times of their images, and what ended the file before its end. Raises
+    ToftrackError when the first track has no image.
     """
     ticks: dict[int, list[int]] = {number: [] for number in streams}
     damage = None
@@ -246,9 +244,8 @@ class Kinect:
 
 
 def _kinect_of(container: Any, path: Path) -> Kinect | None:
-    """What an Azure Kinect's recording says of itself; None for every other video.
-
-    Raises ToftrackError when it was recorded without depth.
+    """What an Azure Kinect's recording says of itself; None for every other video. Raises
+    ToftrackError when it was recorded without depth.
     """
     depth, infrared = _tracks(container, "DEPTH"), _tracks(container, "IR")
     if not depth:
@@ -267,9 +264,8 @@ def _kinect_of(container: Any, path: Path) -> Kinect | None:
 
 
 def _camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
-    """The depth camera for images of that size, from the attached calibration.
-
-    Raises ToftrackError when that is missing, damaged, or of a kind that no shipped camera has.
+    """The depth camera for images of that size, from the attached calibration. Raises ToftrackError
+    when that is missing, damaged, or of a kind that no shipped camera has.
     """
     text = _attachment(container)
     if text is None:

@@ -30,10 +30,9 @@ _WORST_FIT_PX = 0.5
 class RealSense(SdkCamera):
     """Depth as Z along the optical axis, infrared as amplitude, by the camera's own intrinsics.
 
-    The arguments are those of conf/device/realsense.yaml.
-
-    Raises ToftrackError: a setting makes no sense, pyrealsense2 is not installed, there is no
-    camera, the recording cannot be used, or there are no depth images of that size.
+    The arguments are those of conf/device/realsense.yaml. Raises ToftrackError: a setting makes no
+    sense, pyrealsense2 is not installed, there is no camera, the recording cannot be used, or there
+    are no depth images of that size.
     """
 
     kind, maker = "realsense", "RealSense"
@@ -282,9 +281,8 @@ def camera_of(rs: ModuleType, intrinsics: Any) -> Camera:
 
     OpenCV's distortion goes from the ideal to the measured pixel, as the SDK's own projection does.
     Its Brown-Conrady model is OpenCV's; the modified and the inverse one differ in the tangential
-    part, so the coefficients are those that fit the SDK's projection best.
-
-    ToftrackError where no coefficients fit within half a pixel.
+    part, so the coefficients are those that fit the SDK's projection best. ToftrackError where no
+    coefficients fit within half a pixel.
     """
     K = np.array(
         [[intrinsics.fx, 0, intrinsics.ppx], [0, intrinsics.fy, intrinsics.ppy], [0, 0, 1.0]]

@@ -44,14 +44,13 @@ _log = logging.getLogger(__name__)
 class Sr3000(BaseDevice):
     """A live camera: iterate over it for its frames, as radial distances with amplitudes.
 
-    A thread asks for frames from the first iteration on. An unplugged camera is waited for, and
-    the iteration goes on with a gap in the frames' indices when it is back.
+    A thread asks for frames from the first iteration on. An unplugged camera is waited for, and the
+    iteration goes on with a gap in the frames' indices when it is back.
 
     The arguments are those of conf/device/sr3000.yaml; `fps` is the rate that is given to those who
-    must know one in advance, while the emulated camera has its own.
-
-    Raises ToftrackError: a setting makes no sense, there is no camera (or library), or the emulated
-    camera's recording cannot be used.
+    must know one in advance, while the emulated camera has its own. Raises ToftrackError: a setting
+    makes no sense, there is no camera (or library), or the emulated camera's recording cannot be
+    used.
     """
 
     def __init__(

@@ -51,10 +51,8 @@ class Transport(Protocol):
     def open(self) -> None: ...
 
     def acquire(self) -> bytes:
-        """Ask for one frame and wait for its FRAME_BYTES bytes.
-
-        Raises NoAnswerError, DamagedFrameError or UnpluggedError for what may pass, and
-        EndOfStreamError at the end.
+        """Ask for one frame and wait for its FRAME_BYTES bytes. Raises NoAnswerError,
+        DamagedFrameError or UnpluggedError for what may pass, and EndOfStreamError at the end.
         """
         ...
 
