@@ -53,22 +53,19 @@ class PngFolder(FrameStore):
         self.camera = camera
         self._depth, self._amplitude = depth, amplitude
         path = folder / _CAMERA
-
-        def positive(name: str, given: float | None, default: float) -> float:
-            value = stated.get(name, default) if given is None else given
-            if not is_positive(value):
-                raise ToftrackError(
-                    f"{name} must be a positive number, but is {value!r} ('{path}')"
-                )
-            return float(value)
-
         self.radial, self.metadata = stated.get("radial", False), stated.get("metadata", {})
         if not isinstance(self.radial, bool) or not isinstance(self.metadata, dict):
             raise ToftrackError(
                 f"in '{path}', radial must be true or false, and metadata an object"
             )
-        self.unit_m = positive("depth_unit_m", bare.unit_m, MILLIMETRE)
-        self.fps = positive("fps", bare.fps, DEFAULT_FPS)
+        unit_m = bare.unit_m or stated.get("depth_unit_m", MILLIMETRE)
+        fps = bare.fps or stated.get("fps", DEFAULT_FPS)
+        for name, value in (("depth_unit_m", unit_m), ("fps", fps)):
+            if not is_positive(value):
+                raise ToftrackError(
+                    f"{name} must be a positive number, but is {value!r} ('{path}')"
+                )
+        self.unit_m, self.fps = float(unit_m), float(fps)
         times_s = _timestamps(folder / _TIMES, len(depth))
         self.timestamp_s = np.arange(len(depth)) / self.fps if times_s is None else times_s
 

@@ -100,7 +100,7 @@ class Recorder:
             self.missed += 1
 
     def close(self) -> None:
-        """Write what waits, and finish the file; a second call does nothing."""
+        """Write what waits, and finish the file."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)

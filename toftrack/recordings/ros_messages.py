@@ -124,8 +124,8 @@ def camera_of(info: Any, rectified: bool) -> Camera:
     free of distortion already: what they are seen through is P. ToftrackError, which begins with
     "it", where it is not calibrated or of another model.
     """
-    K, P, distortion = (np.asarray(_field(info, name), np.float64).ravel() for name in "KPD")
-    K, P = K.reshape(3, 3), P.reshape(3, 4)
+    stated = {name: np.asarray(_field(info, name), np.float64).ravel() for name in "KPD"}
+    K, P, distortion = stated["K"].reshape(3, 3), stated["P"].reshape(3, 4), stated["D"]
     if rectified and P[0, 0] > 0:
         return Camera(*_window(info, np.diag([P[0, 0], P[1, 1], 1.0]), P[0, 2], P[1, 2]))
     if not (K[0, 0] > 0 and K[1, 1] > 0):

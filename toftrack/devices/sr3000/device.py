@@ -28,7 +28,6 @@ from toftrack.devices.sr3000.transport import (
     Exposure,
     MesaSettings,
     Persistence,
-    Transport,
     UnpluggedError,
     UsbSettings,
 )
@@ -39,6 +38,7 @@ from toftrack.recordings.sr_frame import HEIGHT, WIDTH, decode_frame, nominal_ca
 from toftrack.recordings.store import open_source
 
 _log = logging.getLogger(__name__)
+Transport = UsbTransport | MesaTransport
 
 
 class Sr3000(BaseDevice):

@@ -1,4 +1,9 @@
-"""What the ways to an SR3000 have in common: their face, their faults and their settings.
+"""What the ways to an SR3000 have in common: their faults and their settings.
+
+A way has `check` (ToftrackError where it is plain, without opening it, that there is no camera),
+`open` (ToftrackError where none can be found, claimed and configured), `acquire` (the FRAME_BYTES
+bytes of a frame, or one of the faults below, within `patience_s`), `close`, which never raises, and
+`facts` of the opened camera. Only one thread uses it at a time.
 
 Every number below is a setting, because some of them were never tried against a camera: see
 `conf/device/sr3000.yaml` for each one's unit and source.
@@ -8,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
@@ -33,32 +37,6 @@ class UnpluggedError(CameraError):
 
 class EndOfStreamError(Exception):
     """There are no more frames (only an emulated camera's recording ends)."""
-
-
-class Transport(Protocol):
-    """A way to the camera. Only one thread uses it at a time.
-
-    `check` raises ToftrackError when it is plain, without opening it, that there is no camera, and
-    `open` when that cannot be found, claimed and configured. `close` never raises, and a second
-    call does nothing. `facts` are known of the opened camera, JSON-able.
-    """
-
-    patience_s: float
-    """How long a call of `acquire` may take."""
-
-    def check(self) -> None: ...
-
-    def open(self) -> None: ...
-
-    def acquire(self) -> bytes:
-        """Ask for one frame and wait for its FRAME_BYTES bytes. Raises NoAnswerError,
-        DamagedFrameError or UnpluggedError for what may pass, and EndOfStreamError at the end.
-        """
-        ...
-
-    def close(self) -> None: ...
-
-    def facts(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)
