@@ -118,19 +118,6 @@ def test_little_endian_distance_then_amplitude() -> None:
         decode_frame(b"1234", RANGE_M)
 
 
-def test_replay_streams_it(path: Path) -> None:
-    record(path)
-    device = Replay(path, start=1)
-    for _ in range(2):
-        frames = list(device)
-        assert [frame.index for frame in frames] == [1, 2, 3]
-    assert frames[0].radial
-    np.testing.assert_array_equal(
-        frames[0].amplitude.ravel()[:3], np.frombuffer(raw_frames()[1], "<u2")[WIDTH * HEIGHT :][:3]
-    )
-    assert device.camera.K[0, 0] == 210
-
-
 def test_a_long_recording_needs_no_more_memory_than_a_short_one(path: Path) -> None:
     count, nonzero = 1000, raw_frames(1)[0]
     record(path)
