@@ -50,9 +50,8 @@ class PngFolder(FrameStore):
         stated: dict[str, Any],
         bare: BareFacts,
     ) -> None:
-        self.camera = camera
+        self.camera, path = camera, folder / _CAMERA
         self._depth, self._amplitude = depth, amplitude
-        path = folder / _CAMERA
         self.radial, self.metadata = stated.get("radial", False), stated.get("metadata", {})
         if not isinstance(self.radial, bool) or not isinstance(self.metadata, dict):
             raise ToftrackError(
@@ -184,8 +183,7 @@ class PngFolderWriter:
             stream.write(cv2.imencode(".png", image)[1].tobytes())
 
     def _writing(self) -> AbstractContextManager[None]:
-        what = f"the folder '{self.folder}' cannot be written"
-        return reported_errors(what, "choose another place")
+        return reported_errors(f"the folder '{self.folder}' cannot be written", "choose another")
 
 
 def _camera_content(path: Path) -> dict[str, Any] | None:

@@ -73,11 +73,7 @@ class EmulatedBackend(IBackend):
     """
 
     def __init__(
-        self,
-        source: FrameStore,
-        settings: EmulatorSettings,
-        range_m: float,
-        usb: UsbSettings,
+        self, source: FrameStore, settings: EmulatorSettings, range_m: float, usb: UsbSettings
     ) -> None:
         self.served = 0
         """Whole frames put at the endpoint, those of harmless faults included."""
@@ -115,7 +111,6 @@ class EmulatedBackend(IBackend):
             self._stalled = False
 
     def plug_in(self) -> None:
-        """Plug the cameras in again."""
         with self._lock:
             self._back_s = 0.0
 
@@ -169,92 +164,81 @@ class EmulatedBackend(IBackend):
             self.open_handles.add(handle)
             return handle
 
-    def close_device(self, dev_handle: _Handle) -> None:
+    def close_device(self, handle: _Handle) -> None:
         with self._lock:
-            if dev_handle.closed:
+            if handle.closed:
                 self.misuse.append("a handle was closed twice")
-            if dev_handle.claimed and dev_handle.device.plugging == self._plugging:
+            if handle.claimed and handle.device.plugging == self._plugging:
                 self.misuse.append("a handle was closed with its interface claimed")
-            dev_handle.closed, dev_handle.claimed = True, False
-            self.open_handles.discard(dev_handle)
+            handle.closed, handle.claimed = True, False
+            self.open_handles.discard(handle)
 
-    def get_configuration(self, dev_handle: _Handle) -> int:
+    def get_configuration(self, handle: _Handle) -> int:
         with self._lock:
-            self._check(dev_handle, claimed=False)
+            self._check(handle, claimed=False)
             return 1
 
-    def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
+    def set_configuration(self, handle: _Handle, config_value: int) -> None:
         with self._lock:
-            self._check(dev_handle, claimed=False)
+            self._check(handle, claimed=False)
 
-    def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
+    def claim_interface(self, handle: _Handle, intf: int) -> None:
         with self._lock:
-            self._check(dev_handle, claimed=False)
+            self._check(handle, claimed=False)
             fault = self._open_fault()
             self._opens += 1
             if fault == "busy":
                 raise _error(errno.EBUSY)
-            dev_handle.claimed = True
+            handle.claimed = True
 
-    def release_interface(self, dev_handle: _Handle, intf: int) -> None:
+    def release_interface(self, handle: _Handle, intf: int) -> None:
         with self._lock:
-            dev_handle.claimed = False
-            self._check(dev_handle, claimed=False)
+            handle.claimed = False
+            self._check(handle, claimed=False)
 
-    def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
+    def is_kernel_driver_active(self, handle: _Handle, intf: int) -> bool:
         return False
 
-    def clear_halt(self, dev_handle: _Handle, ep: int) -> None:
+    def clear_halt(self, handle: _Handle, ep: int) -> None:
         with self._lock:
-            self._check(dev_handle)
+            self._check(handle)
             self._stalled = False
 
     def ctrl_transfer(
-        self,
-        dev_handle: _Handle,
-        bmRequestType: int,  # noqa: N803
-        bRequest: int,  # noqa: N803
-        wValue: int,  # noqa: N803
-        wIndex: int,  # noqa: N803
-        data: array.array,
-        timeout: int,
+        self, handle: _Handle, kind: int, request: int, value: int, index: int, data: Any, _: int
     ) -> int:
         with self._lock:
-            self._check(dev_handle, claimed=False)
-            if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):
+            self._check(handle, claimed=False)
+            if (kind, request, value >> 8) == (0x80, 6, 3):
                 # A string: number 0 is the list of languages, another one the serial number.
-                serial = self._settings.serials[dev_handle.device.camera].encode("utf-16-le")
-                text = serial if wValue & 0xFF else (0x0409).to_bytes(2, "little")
+                serial = self._settings.serials[handle.device.camera].encode("utf-16-le")
+                text = serial if value & 0xFF else (0x0409).to_bytes(2, "little")
                 content = (bytes((2 + len(text), 3)) + text)[: len(data)]
                 data[: len(content)] = array.array("B", content)
                 return len(content)
-            usb_ = self._usb
-            expected = (usb_.request_type, usb_.request, usb_.request_value, usb_.request_index)
-            if (bmRequestType, bRequest, wValue, wIndex) != expected:
+            known = self._usb
+            expected = (known.request_type, known.request, known.request_value, known.request_index)
+            if (kind, request, value, index) != expected:
                 raise _error(errno.EPIPE)
-            self._check(dev_handle)
+            self._check(handle)
             if any(chunk.error == errno.ENODEV for chunk in self._queue):
                 raise self._unplugged()
             self._request()
             return 0
 
-    def bulk_write(
-        self, dev_handle: _Handle, ep: int, intf: int, data: array.array, timeout: int
-    ) -> int:
+    def bulk_write(self, handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
         with self._lock:
-            self._check(dev_handle)
+            self._check(handle)
             if ep != self._usb.endpoint_out or len(data) != 2 or data[0] >= REGISTERS:
                 raise _error(errno.EPIPE)
             self.registers[data[0]] = data[1]
             return 2
 
-    def bulk_read(
-        self, dev_handle: _Handle, ep: int, intf: int, buff: array.array, timeout: int
-    ) -> int:
+    def bulk_read(self, handle: _Handle, ep: int, intf: int, buff: Any, timeout: int) -> int:
         deadline, target, count = time.monotonic() + timeout / 1000, memoryview(buff), 0
         while True:
             with self._lock:
-                self._check(dev_handle)
+                self._check(handle)
                 if self._stalled:
                     raise _error(errno.EPIPE)
                 now = time.monotonic()

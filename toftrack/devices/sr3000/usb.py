@@ -60,8 +60,7 @@ class UsbTransport:
         backend: IBackend | None = None,
     ) -> None:
         self._settings, self._exposure = settings, exposure
-        self._serial = serial
-        self._backend = backend
+        self._serial, self._backend = serial, backend
         self._device: Any = None  # a usb.core.Device while it is open
         self._length = -(-FRAME_BYTES // settings.read_multiple) * settings.read_multiple
         self.patience_s = (3 * settings.timeout_ms + settings.drain_ms) / 1000
@@ -222,10 +221,9 @@ class UsbTransport:
         if count == self._length and settings.tail_check_ms:
             # Without a look behind the frame, what is too long would shift all frames after it.
             # Whatever goes wrong here, the frame itself has come as a whole.
+            asked = device, settings.endpoint_in, self._length, settings.tail_check_ms
             with contextlib.suppress(usb.core.USBError):
-                parts.append(
-                    _read(device, settings.endpoint_in, self._length, settings.tail_check_ms)
-                )
+                parts.append(_read(*asked))
         data = b"".join(parts)
         return data[:FRAME_BYTES] if len(data) == self._length else data
 
@@ -293,17 +291,17 @@ def _reason(error: usb.core.USBError) -> str:
 
 
 def _unopened(error: usb.core.USBError) -> ToftrackError:
+    what = "the SR3000 was found, but"
     if error.errno in (errno.EACCES, errno.EPERM):
         return ToftrackError(
-            "the SR3000 was found, but this user may not open it: install the udev rule of "
-            "docs/cameras.md, then unplug the camera and plug it in again (or, to try, run as root)"
+            f"{what} this user may not open it: install the udev rule of docs/cameras.md, then "
+            "unplug the camera and plug it in again (or, to try, run as root)"
         )
     if error.errno == errno.EBUSY:
         return ToftrackError(
-            "the SR3000 is in use by another program; close that (the vendor's viewer, another "
+            f"{what} is in use by another program; close that (the vendor's viewer, another "
             "track.py), then start again"
         )
     return ToftrackError(
-        f"the SR3000 was found, but cannot be opened ({_reason(error)}): unplug it, wait a moment "
-        "and plug it in again"
+        f"{what} cannot be opened ({_reason(error)}): unplug it, wait a moment and plug it in again"
     )
