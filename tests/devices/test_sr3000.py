@@ -16,19 +16,47 @@ import usb.core
 from helpers import programs
 from helpers.programs import QUICK, interrupted_when
 from helpers.settings import persistence_settings, sr3000, sr3000_emulator, usb_settings
-from helpers.sr3000_camera import STEP_M, camera, read
 
 from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.devices.replay import Sample
 from toftrack.devices.sr3000 import usb as sr3000_usb
 from toftrack.devices.sr3000.device import Sr3000
-from toftrack.devices.sr3000.emulator import EmulatedBackend
+from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000.transport import Exposure
 from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES, unambiguous_range_m
 from toftrack.recordings.store import open_source
+
+FAST = {"fps": 1000.0, "replug_s": 0.02, "late_s": 0.06}
+STEP_M = unambiguous_range_m(20) / 0xFFFF
+
+
+def camera(*faults: str, keep: str = "every", **changes: Any) -> Sr3000:
+    """A virtual camera that is fast, and whose driver is impatient."""
+    settings = {"faults": faults} | FAST
+    settings |= {k: changes.pop(k) for k in list(changes) if k in EmulatorSettings.__annotations__}
+    persistence = {"first_frame_s": 0.6, "give_up_s": 0.6, "backoff_s": 0.01} | changes.pop(
+        "persistence", {}
+    )
+    usb_ = {"timeout_ms": 40, "drain_ms": 3, "tail_check_ms": 1} | changes.pop("usb", {})
+    return sr3000(
+        transport="emulated",
+        keep=keep,
+        emulated=sr3000_emulator(**settings),
+        persistence=persistence_settings(**persistence),
+        usb=usb_settings(**usb_),
+        **changes,
+    )
+
+
+def read(device: Sr3000) -> list[Any]:
+    """The frames of a virtual camera that is then closed, with a look at what was left behind."""
+    with device:
+        frames = list(device)
+    assert_released(device)
+    return frames
 
 
 @pytest.fixture(scope="module")

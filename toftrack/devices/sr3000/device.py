@@ -18,8 +18,7 @@ from typing import Any
 
 from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
-from toftrack.devices.sr3000.emulator import EmulatedBackend
-from toftrack.devices.sr3000.faults import EmulatorSettings
+from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000.libmesasr import MesaTransport
 from toftrack.devices.sr3000.transport import (
     CameraError,

@@ -10,10 +10,11 @@ from __future__ import annotations
 import array
 import errno
 import os
+import re
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,22 +22,149 @@ import numpy as np
 import usb.core
 from usb.backend import IBackend
 
-from toftrack.devices.sr3000.faults import (
-    HARMLESS,
-    OPEN_FAULTS,
-    PACKET_BYTES,
-    REQUEST_FAULTS,
-    Chunk,
-    EmulatorSettings,
-    parse_faults,
-    transfer,
-)
 from toftrack.devices.sr3000.transport import UsbSettings, parse_id
+from toftrack.errors import ToftrackError
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.sr_frame import REGISTERS, encode_frame, to_radial
+from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame, to_radial
 
+_PACKET_BYTES = 512
+"""Of a bulk endpoint at high speed."""
+_PACKETS = FRAME_BYTES // _PACKET_BYTES
 _TURN_S = 0.01  # how soon a waiting transfer notices that the camera was unplugged
-_CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
+
+_OPEN_FAULTS = {
+    "missing": "no camera is plugged in",
+    "permission": "the user may not open it",
+    "busy": "another program has claimed it",
+}
+"""Faults of the attempts to open the camera, numbered from 0."""
+
+_REQUEST_FAULTS = {
+    "timeout": "no frame comes",
+    "late": "the frame comes when nobody waits for it any more",
+    "refuse": "the request itself is stalled",
+    "stall": "the endpoint stalls until it is cleared",
+    "io_error": "an error of the bus",
+    "overflow": "more data in a packet than fit",
+    "short": "the frame ends in the middle of a packet",
+    "cut": "the frame ends behind a whole packet, without a word",
+    "empty": "a transfer of no bytes",
+    "long": "bytes behind the frame",
+    "split": "the frame comes in two transfers, cut behind a packet, a later one each time",
+    "garbage": "random bytes, as many as a frame has",
+    "zeros": "all 0",
+    "ones": "all 0xFFFF",
+    "unplug_before": "unplugged when the frame is asked for",
+    "unplug_during": "unplugged within the frame",
+    "unplug_after": "unplugged right behind the frame",
+}
+"""Faults of the requests for a frame, numbered from 0."""
+
+_CYCLE = tuple(kind for kind in _REQUEST_FAULTS if kind != "late")
+"""Of `fault_every`."""
+_HARMLESS = {"split", "garbage", "zeros", "ones", "unplug_after"}
+"""A whole frame comes nevertheless."""
+
+
+@dataclass(frozen=True)
+class _Fault:
+    """A fault of `count` attempts or requests in a row, the first of them number `first`."""
+
+    kind: str
+    first: int = 0
+    count: int | None = None
+    """None = all that follow."""
+
+    def hits(self, number: int) -> bool:
+        """Whether this attempt or request goes wrong."""
+        return self.first <= number and (self.count is None or number < self.first + self.count)
+
+
+@dataclass(eq=False)
+class _Chunk:
+    """A piece of what waits at the bulk IN endpoint."""
+
+    ready_s: float
+    """On the monotonic clock."""
+    data: memoryview = memoryview(b"")
+    ends: bool = False
+    """The transfer ends behind it."""
+    error: int | None = None
+    """Instead of data: the errno of a failed transfer."""
+
+
+def _transfer(
+    fault: str | None, data: bytes, ready_s: float, split: int, random: np.random.Generator
+) -> list[_Chunk]:
+    """What comes over the wire for a frame at `ready_s`.
+
+    fault: one of _REQUEST_FAULTS under which something comes, or None.  split: how many frames came
+    in two transfers so far.  random: of the garbage.
+    """
+    whole = memoryview(data)
+    if fault == "overflow":
+        return [_Chunk(ready_s, error=errno.EOVERFLOW)]
+    if fault == "short":
+        return [_Chunk(ready_s, whole[:50_001], ends=True)]
+    if fault == "cut":
+        return [_Chunk(ready_s, whole[: 99 * _PACKET_BYTES])]
+    if fault == "empty":
+        return [_Chunk(ready_s, ends=True)]
+    if fault == "long":
+        return [_Chunk(ready_s, memoryview(data + b"\xa5" * 700), ends=True)]
+    if fault == "split":
+        at = (1 + split % (_PACKETS - 1)) * _PACKET_BYTES
+        return [_Chunk(ready_s, whole[:at], ends=True), _Chunk(ready_s, whole[at:])]
+    if fault in ("unplug_during", "unplug_after"):
+        came = whole[: 50 * _PACKET_BYTES] if fault == "unplug_during" else whole
+        return [_Chunk(ready_s, came), _Chunk(ready_s, error=errno.ENODEV)]
+    if fault == "garbage":
+        whole = memoryview(random.bytes(FRAME_BYTES))
+    elif fault in ("zeros", "ones"):
+        whole = memoryview((b"\0" if fault == "zeros" else b"\xff") * FRAME_BYTES)
+    return [_Chunk(ready_s, whole)]
+
+
+def _parse_faults(texts: Iterable[str]) -> tuple[_Fault, ...]:
+    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on);
+    ToftrackError for an unknown kind or another form.
+    """
+    faults = []
+    for text in map(str, texts):
+        match = re.fullmatch(r"([a-z_]+)(?:@(\d+)(\+|x(\d+))?)?", text)
+        if match is None or match[1] not in _OPEN_FAULTS | _REQUEST_FAULTS:
+            raise ToftrackError(
+                f"device.emulated.faults: '{text}' is unknown; give KIND, KIND@7, KIND@7x3 or "
+                f"KIND@7+, where KIND is one of {', '.join(_OPEN_FAULTS | _REQUEST_FAULTS)}"
+            )
+        kind, first, rest, count = match.groups()
+        always = first is None or rest == "+"
+        faults.append(_Fault(kind, int(first or 0), None if always else int(count or 1)))
+    return tuple(faults)
+
+
+@dataclass(frozen=True)
+class EmulatorSettings:
+    """What the virtual camera does; see conf/device/sr3000.yaml."""
+
+    source: str
+    fps: float | None
+    loop: bool
+    faults: tuple[str, ...]
+    fault_every: int
+    replug_s: float
+    late_s: float
+    serials: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "faults", tuple(self.faults))
+        object.__setattr__(self, "serials", tuple(map(str, self.serials)))
+        _parse_faults(self.faults)
+        if (self.fps is not None and not self.fps > 0) or self.fault_every < 0:
+            raise ToftrackError(
+                "device.emulated needs fps above 0 and fault_every of 0 or more, but they are "
+                f"{self.fps} and {self.fault_every}"
+            )
 
 
 @dataclass(frozen=True)
@@ -84,10 +212,10 @@ class EmulatedBackend(IBackend):
         self.open_handles: set[_Handle] = set()
         self._source, self._settings, self._range_m = source, settings, range_m
         self._usb = usb
-        self._faults = parse_faults(settings.faults)
+        self._faults = _parse_faults(settings.faults)
         self._period_s = 1.0 / (settings.fps or source.fps)
         self._lock = threading.RLock()
-        self._queue: deque[Chunk] = deque()
+        self._queue: deque[_Chunk] = deque()
         self._stalled = False
         self._opens = self._position = self._splits = self._cycled = 0
         self._last_due_s = -np.inf
@@ -151,8 +279,7 @@ class EmulatedBackend(IBackend):
         self, dev: _Id, ep: int, intf: int, alt: int, config: int
     ) -> _Descriptor:
         address = (self._usb.endpoint_in, self._usb.endpoint_out)[ep]
-        bulk = 2
-        return _Descriptor(bEndpointAddress=address, bmAttributes=bulk, wMaxPacketSize=PACKET_BYTES)
+        return _Descriptor(bEndpointAddress=address, bmAttributes=2, wMaxPacketSize=_PACKET_BYTES)
 
     def open_device(self, dev: _Id) -> _Handle:
         with self._lock:
@@ -287,7 +414,7 @@ class EmulatedBackend(IBackend):
         return next(hit, None)
 
     def _open_fault(self) -> str | None:
-        return self._fault(OPEN_FAULTS, self._opens)
+        return self._fault(_OPEN_FAULTS, self._opens)
 
     def _fail(self, number: int) -> None:
         self._queue.popleft()
@@ -306,7 +433,7 @@ class EmulatedBackend(IBackend):
             kind = _CYCLE[self._cycled % len(_CYCLE)]
             self._cycled += 1
             return kind
-        return self._fault(REQUEST_FAULTS, self.requests)
+        return self._fault(_REQUEST_FAULTS, self.requests)
 
     def _request(self) -> None:
         fault = self._request_fault()
@@ -320,7 +447,7 @@ class EmulatedBackend(IBackend):
             raise self._unplugged()
         if fault in ("stall", "io_error"):
             number = errno.EPIPE if fault == "stall" else errno.EIO
-            self._queue.append(Chunk(0.0, error=number))
+            self._queue.append(_Chunk(0.0, error=number))
             return
         data = self._next_frame()
         if data is None:
@@ -329,11 +456,11 @@ class EmulatedBackend(IBackend):
         self._last_due_s = due
         if fault == "late":
             due += self._settings.late_s
-        if fault is None or fault in HARMLESS:
+        if fault is None or fault in _HARMLESS:
             self.served += 1
         if fault == "unplug_after":
             self._position += 1  # the scene goes on
-        self._queue.extend(transfer(fault, data, due, self._splits, self._random))
+        self._queue.extend(_transfer(fault, data, due, self._splits, self._random))
         self._splits += fault == "split"
 
     def _next_frame(self) -> bytes | None:
