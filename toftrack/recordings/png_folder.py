@@ -183,7 +183,8 @@ class PngFolderWriter:
             stream.write(cv2.imencode(".png", image)[1].tobytes())
 
     def _writing(self) -> AbstractContextManager[None]:
-        return reported_errors(f"the folder '{self.folder}' cannot be written", "choose another")
+        what = f"the folder '{self.folder}' cannot be written"
+        return reported_errors(what, "choose another place")
 
 
 def _camera_content(path: Path) -> dict[str, Any] | None:

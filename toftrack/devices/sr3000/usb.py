@@ -30,14 +30,13 @@ from toftrack.devices.sr3000.transport import (
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.recordings.sr_frame import FRAME_BYTES
 
-WHEN_IT_DOES_NOT_ANSWER = (
-    "open the camera once with the vendor's viewer (its library loads the camera's firmware), use "
-    "that library with device.transport=libmesasr, or try without a camera with "
-    "device.transport=emulated"
-)
 _OTHERWISE = (
     "use the vendor's library with device.transport=libmesasr, or try without a camera with "
     "device.transport=emulated"
+)
+WHEN_IT_DOES_NOT_ANSWER = (
+    "open the camera once with the vendor's viewer (its library loads the camera's firmware), "
+    + _OTHERWISE
 )
 # Of what a camera can leave behind, nothing is longer than a few frames.
 _LARGEST_DRAIN = 8 * FRAME_BYTES
@@ -125,8 +124,9 @@ class UsbTransport:
         ids = {parse_id(text) for text in self._settings.ids}
         names = ", ".join(self._settings.ids)
         what = f"the USB devices cannot be listed to find an SR3000 ({names})"
+        remedy = f"check that this user may use USB, {_OTHERWISE}"
         try:
-            with reported_errors(what, f"may this user use USB? {_OTHERWISE}", usb.core.USBError):
+            with reported_errors(what, remedy, usb.core.USBError):
                 found = list(
                     usb.core.find(
                         find_all=True,
